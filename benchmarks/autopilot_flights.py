@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Autopilots in software in flight, and the figures of a flight of the stack beside one."""
+"""Fly autopilots in software, and take the figures of a flight of the stack beside one."""
 
 import json
 import subprocess
@@ -28,7 +28,7 @@ DELAYS = np.arange(0.0, 1.0, 0.01)  # s by which y may be behind y_m
 
 @contextmanager
 def arduplane(servo: float, place: Path = FOLDER / "arduplane") -> Iterator["ArduPlane"]:
-    """An ArduPlane in flight, with servos of this speed."""
+    """Start an ArduPlane in flight, with servos of this speed."""
     from tests.sitl.kit import ArduPlane  # noqa: PLC0415 - after the kit's place is known
 
     with flying(ArduPlane(place), SIM_SERVO_SPEED=servo) as plane:
@@ -37,7 +37,7 @@ def arduplane(servo: float, place: Path = FOLDER / "arduplane") -> Iterator["Ard
 
 @contextmanager
 def px4() -> Iterator["Px4"]:
-    """PX4's airplane in flight; without an offboard heartbeat it changes to Hold."""
+    """Start PX4's airplane in flight; without an offboard heartbeat it changes to Hold."""
     from tests.sitl.kit import Px4  # noqa: PLC0415 - as above
 
     with flying(Px4(FOLDER / "px4"), COM_RCL_EXCEPT=7.0, COM_OBL_RC_ACT=5.0) as airplane:
@@ -46,7 +46,7 @@ def px4() -> Iterator["Px4"]:
 
 @contextmanager
 def flying(autopilot: Any, **parameters: float) -> Iterator[Any]:
-    """In flight."""
+    """Yield an autopilot that is in flight."""
     try:
         autopilot.up(**parameters)
         autopilot.take_off()
@@ -56,16 +56,16 @@ def flying(autopilot: Any, **parameters: float) -> Iterator[Any]:
 
 
 def on_the_ground(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """A command of rise-di without an autopilot."""
+    """Run a command of rise-di without an autopilot."""
     command = (sys.executable, "-m", "flight_cli.cli", *arguments)
     return subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - its own arguments
 
 
 def tracking(autopilot: "Autopilot") -> dict[str, Any]:
-    """The figures of the last flight.
+    """Return the figures of the last flight.
 
-    Errors while commanded, y behind y_m, the part of the time with u at a limit, whether it
-    replays.
+    They are the errors while commanded, how far y is behind y_m, the part of the time with u at a
+    limit, and whether the flight replays.
     """
     summary = autopilot.summary()
     log = read_run(autopilot.run)
@@ -87,7 +87,7 @@ def tracking(autopilot: "Autopilot") -> dict[str, Any]:
 
 
 def behind(tape: Tape, name: str, engaged: Engagement) -> float:
-    """The delay of y behind y_m with the smallest error, s."""
+    """Return the delay of y behind y_m with the smallest error, s."""
     y = tape["y"]
     y_m = tape["y_m"]
     t = np.arange(
@@ -102,6 +102,6 @@ def behind(tape: Tape, name: str, engaged: Engagement) -> float:
 
 
 def stored(name: str) -> dict[str, Any]:
-    """The stored result of a measurement; empty where there is none."""
+    """Return the stored result of a measurement; it is empty if there is none."""
     file = FOLDER / f"{name}.json"
     return dict(json.loads(file.read_text())["result"]) if file.is_file() else {}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Stuck surfaces of ArduPlane over MAVLink: when the probe of the inputs finds each.
+"""Measure when the probe of the inputs finds each stuck surface of ArduPlane over MAVLink.
 
 False alarms are counted too.
 """
@@ -34,7 +34,7 @@ KINDS = {"calm": (0.0, 0.0, False), "guided": (0.0, 0.0, True), "wind": (8.0, 0.
 
 
 def probe() -> dict[str, Any]:
-    """Each surface stuck in trim in calm air, then minutes of calm, guided and windy flight."""
+    """Stick each surface in trim in calm air, then fly minutes of calm, guided and windy flight."""
     from tests.sitl.kit import OVERRIDE_TIME, ArduPlane  # noqa: PLC0415 - after the kit's place is known
 
     plane = ArduPlane(FOLDER / "probe")
@@ -49,7 +49,10 @@ def probe() -> dict[str, Any]:
 
 
 def probed(plane: "ArduPlane", program: Mapping[str, Any]) -> Path:
-    """The scenario of the example with a probe, under guidance that holds or follows a program."""
+    """Return the scenario of the example with a probe, under guidance.
+
+    Guidance holds, or follows a program.
+    """
     from tests.sitl.kit import guided_scenario  # noqa: PLC0415 - as above
 
     content = yaml.safe_load(guided_scenario(EXAMPLE, program, SPEED))
@@ -62,9 +65,9 @@ def probed(plane: "ArduPlane", program: Mapping[str, Any]) -> Path:
 
 
 def stuck(plane: "ArduPlane", channel_map: str, surface: str) -> float:
-    """The time from a surface that sticks where it is until the release that names it, s.
+    """Return the time from when a surface sticks to the release that names it, s.
 
-    Infinite for another release, or none.
+    It is infinite if there is another release, or none.
     """
     number = SERVOS[surface]
     ends = {f"SERVO{number}_MIN": -1.0, f"SERVO{number}_MAX": 1.0, f"SERVO{number}_TRIM": 0.0}
@@ -88,9 +91,9 @@ def stuck(plane: "ArduPlane", channel_map: str, surface: str) -> float:
 
 
 def unfailed(plane: "ArduPlane", channel_map: str, name: str) -> dict[str, Any]:
-    """Minutes engaged without a fault.
+    """Return the minutes that were engaged without a fault.
 
-    The least effect that any test told, and whether the ticks replay.
+    Also returns the least effect that any test told, and whether the ticks replay.
     """
     speed, turbulence, turns = KINDS[name]
     plane.say("param", "SIM_WIND_SPD", f"{speed:g}")

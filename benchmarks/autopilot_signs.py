@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Experiments on signs with ArduPlane.
+"""Experiment on signs with ArduPlane.
 
-Whether `rise-di check` finds each sign, and each flipped one.
+The figures say whether `rise-di check` finds each sign, and each flipped one.
 """
 
 import time
@@ -37,10 +37,10 @@ MODERATE = 0.5  # SIM_WIND_TURB up to which one experiment has to show every sig
 
 
 def signs(experiments: int = 25) -> dict[str, Any]:
-    """Short experiments, open loop, and what `rise-di check` says of each.
+    """Fly short experiments, open loop, and collect what `rise-di check` says of each.
 
-    Each is in other turbulence; earlier ones are kept. The simulator draws its turbulence from one
-    stream of random numbers without a seed: each experiment has another part of it.
+    Each is in different turbulence, and earlier ones are kept. The simulator draws its turbulence
+    from one stream of random numbers without a seed, so each experiment has another part of it.
     """
     with arduplane(0.03) as plane:
         channel_map = plane.patient_map("ardupilot")
@@ -87,11 +87,11 @@ def signs(experiments: int = 25) -> dict[str, Any]:
 def signs_of_logs(
     runs: Sequence[Path], wind_of: Callable[[int, Engagement], float]
 ) -> dict[str, Any]:
-    """The stored experiments on signs, and those of logs.
+    """Return the stored experiments on signs, and those from logs.
 
     `wind_of` is the turbulence of an engagement. An engagement shorter than EXCITED was ended by
-    the bridge or with the flight: it is counted, not judged. Those of a run in strong turbulence
-    are also judged together, as `rise-di check` judges a log with several.
+    the bridge or with the flight, so it is counted but not judged. Those of a run in strong
+    turbulence are also judged together, as `rise-di check` judges a log with several.
     """
     earlier = stored("signs")
     channel_map = load_map("ardupilot")
@@ -118,9 +118,9 @@ def signs_of_logs(
 def judged(
     channel_map: ChannelMap, tape: Tape, engagements: Sequence[Engagement]
 ) -> dict[str, Any]:
-    """What `rise-di check` says of every sign, and of each flipped alone.
+    """Return what `rise-di check` says of every sign, and of each sign flipped alone.
 
-    For a flipped one its column of the recorded u has the other sign.
+    To flip a sign, its column of the recorded u gets the other sign.
     """
     pairing, expected = channel_pairs(channel_map)
     columns = [list(channel_map.inputs).index(name) for name in pairing.inputs]
@@ -157,17 +157,17 @@ def judged(
 
 
 def shows_all(experiment: dict[str, Any]) -> bool:
-    """Whether every sign is found, and right."""
+    """Return whether every sign is found, and is right."""
     return set(experiment["as flown"].values()) == {"right"}
 
 
 def finds_each(experiment: dict[str, Any]) -> bool:
-    """Whether each single sign that is flipped is found."""
+    """Return whether each single sign that is flipped is found."""
     return all(verdicts[name] == "wrong" for name, verdicts in experiment["flipped"].items())
 
 
 def counted(result: dict[str, Any]) -> dict[str, Any]:
-    """The counts of the experiments on signs."""
+    """Count the experiments on signs by their result."""
     experiments = result["experiments"]
     moderate = [each for each in experiments if each["turbulence"] <= MODERATE]
     return {

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flies real autopilots in software and writes docs/evidence/autopilots-*.csv.
+"""Fly real autopilots in software and write docs/evidence/autopilots-*.csv.
 
-Gains, engagements, signs, pose, releases.
+The figures are of gains, engagements, signs, pose and releases.
 
     python -m benchmarks.autopilots --sitl KIT                       # everything, about 80 minutes
     python -m benchmarks.autopilots --sitl KIT --only signs
@@ -83,18 +83,18 @@ END = "the end of the flight"
 
 
 def gains_of_arduplane(log: Path | None = None) -> dict[str, Any]:
-    """ArduPlane with fast servos, by its own identification."""
+    """Measure ArduPlane with fast servos, with gains of its own identification."""
     return identified(lambda: arduplane(0.03), FOLDER / "arduplane", "ardupilot", 24.0, log)
 
 
 def gains_of_slow_servos(log: Path | None = None) -> dict[str, Any]:
-    """ArduPlane with its default servos, by its own identification."""
+    """Measure ArduPlane with its default servos, with gains of its own identification."""
     place = FOLDER / "slow_servos"
     return identified(lambda: arduplane(0.14, place), place, "ardupilot", 24.0, log)
 
 
 def gains_of_px4(log: Path | None = None) -> dict[str, Any]:
-    """PX4's airplane, by its own identification."""
+    """Measure PX4's airplane, with gains of its own identification."""
     flights: list[tuple[Any, Callable[[], Signal]]] = []
 
     @contextmanager
@@ -111,7 +111,7 @@ def gains_of_px4(log: Path | None = None) -> dict[str, Any]:
 
 
 def true_errors(autopilot: "Autopilot", truth: Signal) -> dict[str, float]:
-    """The rms of the simulator's own rates less y_m while commanded, rad/s."""
+    """Return the rms of the simulator's own rates less y_m while commanded, rad/s."""
     log = read_run(autopilot.run)
     (one,) = log.engagements or []
     tape = replace(
@@ -129,10 +129,10 @@ def identified(
     speed: float,
     log: Path | None,
 ) -> dict[str, Any]:
-    """Experiment, gains, flight, replay: the commands of docs/autopilots.md.
+    """Run experiment, gains, flight and replay: the commands of docs/autopilots.md.
 
-    The log is read on the ground. With the log of an experiment that this command flew before,
-    there is no new one.
+    The log is read on the ground. If there is a log of an experiment that this command flew before,
+    there is no new experiment.
     """
     results = place / "found"
     channel_map = place / f"{Path(map_name).stem}.yaml"
@@ -173,10 +173,10 @@ def identified(
 
 
 def own_log() -> dict[str, Any]:
-    """ArduPlane at a cruise 15 % faster, over DDS and over MAVLink, calm and in wind.
+    """Measure ArduPlane at a cruise 15 % faster, over DDS and over MAVLink, calm and in wind.
 
-    The errors are by its own log, and so is Omega. Each flight has gains of its own experiment. The
-    autopilot's DataFlash log of the experiment is imported and identified too.
+    The errors come from its own log, and so does Omega. Each flight has gains of its own
+    experiment. The autopilot's DataFlash log of the experiment is imported and identified too.
     """
     from tests.sitl.kit import OVERRIDE_TIME, ArduPlane  # noqa: PLC0415 - after the kit's place is known
 
@@ -217,9 +217,9 @@ def own_log() -> dict[str, Any]:
 
 
 def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -> dict[str, Any]:
-    """Omega by channel from the autopilot's own log of an experiment.
+    """Return Omega by channel from the autopilot's own log of an experiment.
 
-    That from the log of the stack is beside it.
+    Omega from the log of the stack is beside it.
     """
     bag = place / "imported"
     shutil.rmtree(bag, ignore_errors=True)
@@ -249,7 +249,7 @@ def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -
 
 
 def guided() -> dict[str, Any]:
-    """Minutes engaged under guidance by rule: turns, climbs, changes of V.
+    """Measure minutes engaged under guidance by rule: turns, climbs, changes of V.
 
     The gains are those of the last identification.
     """
@@ -267,9 +267,9 @@ def guided() -> dict[str, Any]:
 
 
 def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
-    """How well a guided flight of turns at these times holds what it is commanded.
+    """Return how well a guided flight of turns at these times holds what it is commanded.
 
-    Whether it replays is beside it.
+    Also returns whether it replays.
     """
     (one,) = json.loads((run / "summary.json").read_text())["engagements"]
     tape = read_run(run).tape
@@ -291,7 +291,7 @@ def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
 
 
 def observed() -> dict[str, Any]:
-    """The last identified gains without and with an extended-state observer, in turbulence.
+    """Fly the last identified gains with and without an extended-state observer, in turbulence.
 
     The observer has the identified Omega and lags.
     """
@@ -325,9 +325,9 @@ def observed() -> dict[str, Any]:
 
 
 def bumpless() -> dict[str, Any]:
-    """Engagements and releases in one flight.
+    """Measure engagements and releases in one flight.
 
-    The largest step of a setpoint around each, of its range.
+    The figure is the largest step of a setpoint around each, as a part of its range.
     """
     with arduplane(0.03) as plane:
         channel_map = plane.patient_map("ardupilot")
@@ -354,9 +354,9 @@ def bumpless() -> dict[str, Any]:
 
 
 def step(sent: Signal, ranges: dict[str, float], engaged_ns: int) -> float:
-    """The largest step from one setpoint to the next around an engagement, of its range.
+    """Return the largest step of a setpoint around an engagement, as a part of its range.
 
-    Before it, that is the stick.
+    Before the engagement the setpoint is the stick.
     """
     begin, end = (engaged_ns + int(edge * NANOSECONDS) for edge in WINDOW)
     around = sent.within([(begin, end)])
@@ -364,7 +364,10 @@ def step(sent: Signal, ranges: dict[str, float], engaged_ns: int) -> float:
 
 
 def pose() -> dict[str, Any]:
-    """Rates and pose of the map `ardupilot` in turns and climbs, against the autopilot's log."""
+    """Compare rates and pose of the map `ardupilot` with the autopilot's log.
+
+    The flight has turns and climbs.
+    """
     with arduplane(0.03) as plane:
         run = plane.fly(EXAMPLE, plane.patient_map("ardupilot"), 60.0)
         run.wait_for("DISENGAGED")
@@ -378,7 +381,10 @@ def pose() -> dict[str, Any]:
 
 
 def releases() -> dict[str, Any]:
-    """`make test-sitl`: what failed, and the times until the pilot or PX4 flies again, s."""
+    """Run `make test-sitl`.
+
+    Return what failed, and the times until the pilot or PX4 flies again, s.
+    """
     report = FOLDER / "releases.xml"
     python = sys.executable
     command = [python, "-m", "pytest", "tests/sitl", "-m", "not long", f"--junitxml={report}"]

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo campaign: seconds and their floor on the device of this host.
+"""Measure the seconds of a Monte Carlo campaign, and their floor, on the device of this host.
 
-Beside them the ratio to its CPU and to the simulation in one process, integration error, memory.
+Further figures are the ratios to its CPU and to the simulation in one process, the integration
+error and the memory.
 
 python -m benchmarks.campaign  # 10,000 aircraft of osprey_servo, a minute on two cores
     # 1,000,000 on a GPU, and 10,000 on the CPU of its host
@@ -74,7 +75,7 @@ def speed(scenario: Scenario, aircraft: int, chunk: int | None, workers: int | N
 
 
 def floor(scenario: Scenario, aircraft: int) -> float:
-    """Least seconds of a campaign on the device.
+    """Compute the least seconds of a campaign on the device.
 
     Its matrices, which fit into no cache of a device, are read at each tick, at the speed of a
     copy.
@@ -99,7 +100,7 @@ def floor(scenario: Scenario, aircraft: int) -> float:
 
 
 def on_cpu(scenario: str, aircraft: int) -> dict[str, Any]:
-    """The figures of this program on the CPU of the host of a device."""
+    """Return the figures of this program on the CPU of the host of a device."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "cpu.json"
         words = ["--scenario", scenario, "--aircraft", str(aircraft), "--exact", "0"]
@@ -113,7 +114,10 @@ def on_cpu(scenario: str, aircraft: int) -> dict[str, Any]:
 
 
 def write_rows(label: str, figures: dict[str, tuple[float, str]], begun: Origin) -> None:
-    """Write the rows of a device, value and unit by name, in place of its former rows."""
+    """Write the rows of a device in place of its former rows.
+
+    A row is value and unit by name.
+    """
     DEVICES.touch()
     with DEVICES.open(newline="") as stream:
         other_rows = [
@@ -130,9 +134,9 @@ def write_rows(label: str, figures: dict[str, tuple[float, str]], begun: Origin)
 
 
 def alone(scenario: Scenario) -> tuple[float, FloatArray]:
-    """One flight in one process.
+    """Fly one flight in one process.
 
-    Aircraft-seconds per second, and rms of the true error at the ticks, (m,).
+    Returns aircraft-seconds per second, and the rms of the true error at the ticks, (m,).
     """
     begin = time.perf_counter()
     tape = simulate(scenario)
@@ -147,10 +151,11 @@ def alone(scenario: Scenario) -> tuple[float, FloatArray]:
 
 
 def integration_error(scenario: Scenario, count: int) -> tuple[float, FloatArray]:
-    """Largest relative difference of rms between a fleet and the same aircraft with the step FINE.
+    """Compare the rms of a fleet with that of the same aircraft with the step FINE.
 
-    The rms has the shape (m,). The first result is the speed of the simulation in one process at
-    the scenario's own step, aircraft-seconds per second.
+    Returns the speed of the simulation in one process at the scenario's own step, in
+    aircraft-seconds per second, and the largest relative difference of the rms of each output,
+    (m,).
     """
     definition = define(scenario, count, UNCERTAINTY, SEED, count)
     figures = fly_chunk_figures(definition.model_dump_json(), (0, 0)).figures

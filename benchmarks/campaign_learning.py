@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Campaign of aircraft that learn.
+"""Measure a campaign of aircraft that learn.
 
-Processor seconds an aircraft, and the share within 10 % of the true model.
+The figures are the processor seconds for each aircraft, and the share of the aircraft within 10 %
+of the true model.
 
 python -m benchmarks.campaign_learning  # 10 aircraft of osprey_learn for 64 s, five minutes
 
@@ -58,24 +59,24 @@ class _Knowing:
             self._next = LearnerResult(known, "the true model")
 
     def take(self, *_: object) -> None:
-        """Nothing is left to learn."""
+        """Do nothing, because nothing is left to learn."""
 
     def propose(self, *_: object) -> LearnerResult:
-        """The true model, once."""
+        """Propose the true model, once."""
         now = self._next
         self._next = LearnerResult(None, "")
         return now
 
 
 def knowing(scenario: Scenario) -> Learn:
-    """What makes a learner that knows the true model."""
+    """Return what makes a learner that knows the true model."""
     return lambda start: _Knowing(scenario, start)
 
 
 def score_of(scenario: Scenario, learn: Learn) -> float:
-    """Score of an aircraft from LEARNED on.
+    """Return the score of an aircraft from LEARNED on.
 
-    NaN for a flight that falls back to the law of the start.
+    It is NaN for a flight that falls back to the law of the start.
     """
     events: list[Event] = []
     tape = simulate(scenario, learn=learn, announce=events.append)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Counterexample to Theorem 1 as a rule for gains.
+"""The counterexample to Theorem 1 as a rule for gains.
 
-Plots docs/images/counterexample.png, prints the table of the theory page.
+Plots docs/images/counterexample.png, and prints the table of the theory page.
 
 python -m benchmarks.counterexample    # half a minute
 """
@@ -38,12 +38,12 @@ class Cycle(NamedTuple):
 
     @property
     def f_dot(self) -> FloatArray:
-        """BOUND sat(SLOPE e_dot / BOUND), shape (N,)."""
+        """Compute BOUND sat(SLOPE e_dot / BOUND), shape (N,)."""
         return np.clip(SLOPE * self.e_dot, -BOUND, BOUND)
 
     @property
     def gamma_2(self) -> float:
-        """The smallest gamma_2 of (40) on this flight, 1/s.
+        """Compute the smallest gamma_2 of (40) on this flight, 1/s.
 
         It is the ratio of the integrals of abs(e_dot) and abs(e).
         """
@@ -51,10 +51,10 @@ class Cycle(NamedTuple):
 
     @property
     def multipliers(self) -> FloatArray:
-        """Growth of a small deviation over half a period with f as a function of time, two moduli.
+        """Compute the growth of a small deviation over half a period, two moduli.
 
-        Between the crossings d_ddot + K d_dot + K LAMBDA d = 0; at a crossing d_dot jumps by -2
-        beta d / abs(e_dot).
+        f is a function of time. Between the crossings d_ddot + K d_dot + K LAMBDA d = 0; at a
+        crossing d_dot jumps by -2 beta d / abs(e_dot).
         """
         between = expm(np.array([[0.0, 1.0], [-K * LAMBDA, -K]]) * self.t[-1])
         crossing = np.array([[1.0, 0.0], [-2.0 * self.beta / abs(self.e_dot[-1]), 1.0]])
@@ -62,15 +62,18 @@ class Cycle(NamedTuple):
 
 
 def formula(beta: float) -> float:
-    """Largest abs(e) of the limit: 9 BOUND^2 / (8 K^2 beta), for a large beta and SLOPE."""
+    """Compute the largest abs(e) of the limit for a large beta and SLOPE.
+
+    9 BOUND^2 / (8 K^2 beta)
+    """
     return 9.0 * BOUND**2 / (8.0 * K**2 * beta)
 
 
 def half_period(speed: float, beta: float, acts: float = 1.0) -> Any:
-    """Solution of e_ddot + K e_dot + K LAMBDA e + beta sgn(e) = f_dot over half a period.
+    """Solve e_ddot + K e_dot + K LAMBDA e + beta sgn(e) = f_dot over half a period.
 
-    It goes from e = 0, e_dot = speed to the next e = 0. f_dot = BOUND sat(SLOPE e_dot / BOUND), or
-    0 with acts = 0. By symmetry the half period with e < 0 is the negative of it.
+    The solution goes from e = 0, e_dot = speed to the next e = 0. f_dot is BOUND sat(SLOPE e_dot /
+    BOUND), or 0 with acts = 0. By symmetry the half period with e < 0 is its negative.
     """
 
     def w_dot(_: float, w: FloatArray) -> list[float]:
@@ -97,7 +100,7 @@ def half_period(speed: float, beta: float, acts: float = 1.0) -> Any:
 
 
 def limit_cycle(beta: float) -> Cycle:
-    """The cycle: the speed at e = 0 that half a period reproduces.
+    """Find the cycle: the speed at e = 0 that half a period reproduces.
 
     It exists for beta > BOUND and SLOPE > K.
     """
@@ -114,7 +117,7 @@ def limit_cycle(beta: float) -> Cycle:
 
 
 def peaks(beta: float, acts: float) -> tuple[FloatArray, FloatArray]:
-    """Times and sizes of the peaks of abs(e) of a flight from e = 0, e_dot = 1.
+    """Return times and sizes of the peaks of abs(e) of a flight from e = 0, e_dot = 1.
 
     In the flight f is recorded.
     """
@@ -128,7 +131,7 @@ def peaks(beta: float, acts: float) -> tuple[FloatArray, FloatArray]:
 
 
 def plot(cycles: list[Cycle]) -> Figure:
-    """Two panels: peaks of abs(e) over time, with and without f, and their limit over beta.
+    """Plot two panels: peaks of abs(e) over time, with and without f, and their limit over beta.
 
     The formula is beside the limit.
     """

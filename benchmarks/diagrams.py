@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The drawings of the documentation: of topics, of a bridge, of packages, of laws, of flights.
+"""Draw the drawings of the documentation: topics, a bridge, packages, laws, flights.
 
 Each is drawn from what it shows: the tables of topics and of imports, a table of evidence, a
 flight. A drawing is an SVG whose title says what it shows.
@@ -36,14 +36,14 @@ Place = tuple[float, float]
 
 
 def save_drawing(figure: Figure, path: Path, shows: str) -> None:
-    """Write a figure as SVG with texts as text, and what it shows as the title."""
+    """Write a figure as SVG, with texts as text and with what it shows as the title."""
     with mpl.rc_context(STYLE):
         metadata = {"Title": shows, "Date": None, "Creator": None}
         figure.savefig(path, format="svg", metadata=metadata, facecolor="white")
 
 
 def board(width: float, height: float) -> tuple[Figure, Axes]:
-    """A figure without axes, in tenths of an inch, with the origin at the lower left."""
+    """Make a figure without axes, in tenths of an inch, with the origin at the lower left."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(width / 10.0, height / 10.0))
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -53,13 +53,13 @@ def board(width: float, height: float) -> tuple[Figure, Axes]:
 
 
 def box(axes: Axes, place: Place, text: str, fill: str = FILLS[0]) -> None:
-    """A text in a box around a place."""
+    """Draw a text in a box around a place."""
     style = {"boxstyle": "round,pad=0.7", "facecolor": fill, "edgecolor": QUIET}
     axes.text(*place, text, ha="center", va="center", color=INK, bbox=style, zorder=3)
 
 
 class Arrow(NamedTuple):
-    """An arrow from a place to a place, with a label beside its middle."""
+    """An arrow from one place to another, with a label beside its middle."""
 
     start: Place
     end: Place
@@ -112,7 +112,7 @@ LEFT_OUT = {"clocks", "/clock", "start", "recorded", "clock"}  # of lockstep, ti
 
 
 def node_topics() -> dict[tuple[str, str], list[str]]:
-    """The topics between two nodes of NODES, by publisher and subscriber."""
+    """Return the topics between two nodes of NODES, by publisher and subscriber."""
     found: dict[tuple[str, str], list[str]] = {}
     for topic in topics.TOPICS:
         for publisher in topic.publishers:
@@ -125,7 +125,7 @@ def node_topics() -> dict[tuple[str, str], list[str]]:
 
 
 def nodes() -> Figure:
-    """The nodes of a flight with the topics between them."""
+    """Draw the nodes of a flight with the topics between them."""
     figure, axes = board(94.0, 35.0)
     for name, place in NODES.items():
         box(axes, place, NODE_NAMES.get(name, name), FILLS[name == topics.EXTERNAL])
@@ -140,7 +140,7 @@ def nodes() -> Figure:
 
 
 def bridge() -> Figure:
-    """An autopilot behind a bridge, in place of the aircraft."""
+    """Draw an autopilot behind a bridge, in place of the aircraft."""
     figure, axes = board(94.0, 24.0)
     places: dict[str, Place] = {
         "guidance\nreference model": (11.0, 12.0),
@@ -168,7 +168,7 @@ def bridge() -> Figure:
 
 
 def levels(imports: Mapping[str, Sequence[str]]) -> list[list[str]]:
-    """The units of the stack by level: right above the highest of those that a unit imports."""
+    """Return the units of the stack by level, each right above the highest that it imports."""
     sorter = TopologicalSorter(imports)
     sorter.prepare()
     rows = []
@@ -179,7 +179,7 @@ def levels(imports: Mapping[str, Sequence[str]]) -> list[list[str]]:
 
 
 def packages() -> Figure:
-    """The units of the stack by level, of the table of imports."""
+    """Draw the units of the stack by level, from the table of imports."""
     rows = levels(yaml.safe_load(IMPORTS.read_text()))
     figure, axes = board(98.0, 6.0 * len(rows) + 1.0)
     for height, units in enumerate(rows):
@@ -195,7 +195,7 @@ def packages() -> Figure:
 
 
 def laws() -> Figure:
-    """The mean score of each law in gusts and in turbulence, the best first."""
+    """Draw the mean score of each law in gusts and in turbulence, the best first."""
     with LAWS.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     winds = {"gusts": BLUE, "turbulence": ORANGE}
@@ -227,7 +227,7 @@ LEG_FENCE = {"north": [-300.0, 1350.0, 1350.0, -300.0], "east": [-400.0, -400.0,
 
 
 def leg() -> Figure:
-    """The begin of a flown route: lines with numbers, a fillet, the fence."""
+    """Draw the beginning of a flown route: lines with numbers, a fillet, the fence."""
     scenario = find_scenario(LEG_ROUTE, LEG_SECONDS).vary(guidance={"fence": {"field": LEG_FENCE}})
     tape = simulate(scenario)
     (route,) = flown_routes(scenario, tape)
@@ -266,7 +266,7 @@ WING_SECONDS = 18.0  # s: commands of q, then of p
 
 
 def effectors() -> Figure:
-    """What the law commands of a flying wing, and the elevons that give it."""
+    """Draw what the law commands of a flying wing, and the elevons that give it."""
     scenario = find_scenario(WING, WING_SECONDS)
     tape = simulate(scenario)
     ticks = tape["internals"]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measures: each measurement writes its figures to docs/evidence/NAME.csv.
+"""Run measurements, each of which writes its figures to docs/evidence/NAME.csv.
 
 docs/evidence.md is the table of these files.
 
@@ -106,7 +106,7 @@ def row(
     at_most: float | None = None,
     at_least: float | None = None,
 ) -> Row:
-    """A row from a number, words, or None where the host could not measure."""
+    """Make a row from a number, from words, or from None if the host could not measure."""
     sign, limit = ("<=", at_most) if at_least is None else (">=", at_least)
     text = (
         "not measured"
@@ -119,19 +119,19 @@ def row(
 
 
 def goals_of(name: str) -> Mapping[str, str]:
-    """Goals of a measurement by the pattern of the end of a figure's name."""
+    """Return the goals of a measurement by the pattern of the end of a figure's name."""
     goals: Mapping[str, str] = MEASUREMENTS[name].get("goals", {})
     return goals
 
 
 def split(name: str) -> tuple[str, str]:
-    """A name and its unit: "late p99" and "ms" of "late p99 (ms)"."""
+    """Split a label into name and unit: "late p99" and "ms" from "late p99 (ms)"."""
     parts = re.fullmatch(r"(.+?) \(([^()]+)\)(.*)", name)
     return (parts[1] + parts[3], parts[2]) if parts else (name, "")
 
 
 def rows(result: Any, goals: Mapping[str, str], name: str = "") -> Iterator[Row]:
-    """The rows of a JSON result.
+    """Return the rows of a JSON result.
 
     The path of keys is the name, and the first goal whose pattern ends the name holds.
     """
@@ -150,7 +150,7 @@ def rows(result: Any, goals: Mapping[str, str], name: str = "") -> Iterator[Row]
 
 
 def _label(result: Any) -> str:
-    """The words of a JSON object, which tell it from its neighbours."""
+    """Return the words of a JSON object, which tell it from its neighbours."""
     return (
         ", ".join(value for value in result.values() if isinstance(value, str))
         if isinstance(result, dict)
@@ -159,7 +159,10 @@ def _label(result: Any) -> str:
 
 
 def compared(figure: Row, figures: Mapping[str, Row]) -> float:
-    """What the goal of a figure limits: the value, or the ratio to the baseline; NaN for words."""
+    """Return what the goal of a figure limits: the value, or the ratio to the baseline.
+
+    It is NaN for words.
+    """
     try:
         ratio = figure.goal.endswith(BASELINE)
         return float(figure.value) / (float(figures[figure.baseline].value) if ratio else 1.0)
@@ -168,7 +171,7 @@ def compared(figure: Row, figures: Mapping[str, Row]) -> float:
 
 
 def used(figure: Row, figures: Mapping[str, Row]) -> float:
-    """Share of the goal that a figure uses: above 1 the goal is not met."""
+    """Return the share of the goal that a figure uses; above 1 the goal is not met."""
     sign, limit = figure.goal.split()[:2]
     value = compared(figure, figures)
     low, high = (value, float(limit)) if sign == "<=" else (float(limit), value)
@@ -178,7 +181,7 @@ def used(figure: Row, figures: Mapping[str, Row]) -> float:
 
 
 def write(name: str, figures: Iterable[Row], origin: Origin) -> None:
-    """Write the CSV file of a measurement, and the page. Raises ValueError where a name repeats."""
+    """Write the CSV file of a measurement, and the page. Raises ValueError if a name repeats."""
     ordered = sorted(figures)
     if len({figure.name for figure in ordered}) < len(ordered):
         raise ValueError(f"{name}: found a name twice, expected names that differ")
@@ -236,14 +239,14 @@ def _line(path: Path, title: str) -> str:
 
 
 def origin(command: str) -> Origin:
-    """The origin of figures that a command begins to measure now on this host."""
+    """Return the origin of figures that a command begins to measure now on this host."""
     return Origin(command, revision(), host(), f"{datetime.now(UTC):%Y-%m-%d %H:%M UTC}")
 
 
 def revision(*paths: str) -> str:
-    """The commit, with DIRTY if any file but the evidence differs from the commit.
+    """Return the commit, with DIRTY if any file but the evidence differs from it.
 
-    Of `paths` it is the last that touched them.
+    With `paths` it is the last commit that touched them.
     """
     status = _git(
         "status", "--porcelain", "--", *(paths or (".", ":(exclude)docs/evidence*"))
@@ -262,7 +265,7 @@ def _git(*arguments: str) -> str:
 
 
 def host() -> str:
-    """Processor, cores, memory, system and Python of this host."""
+    """Describe processor, cores, memory, system and Python of this host."""
     cpuinfo = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
     model = re.search(r"^model name\s*: (.+)$", cpuinfo, re.MULTILINE)
     memory = round(psutil.virtual_memory().total / 2**30)
@@ -274,7 +277,10 @@ def host() -> str:
 
 
 def measure(name: str) -> int:
-    """Run a measurement and write its rows; the exit status, which is a goal where it is not 0."""
+    """Run a measurement and write its rows. Returns the exit status.
+
+    An exit status other than 0 is a goal that is not met.
+    """
     busy = psutil.cpu_percent(interval=2.0) / 100.0
     template = COMMANDS[name]
     start = origin(template)  # before the run: a commit meanwhile is not what runs

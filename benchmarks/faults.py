@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fault campaign of tests/ros/flight_bringup/faults, several times in a row, as a table.
+"""Run the fault campaign of tests/ros/flight_bringup/faults several times in a row, as a table.
 
     .venv/bin/python -m benchmarks.faults [--times 10] [--scenario osprey_observer] [--json FILE]
     [--only "killed or stopped"]
     .venv/bin/python -m benchmarks.faults --only roll-in --guided jsbsim_c172p_route
         # another aircraft under guidance
 
-Reaction: from the fault to its first detection by a node. Recovery: from the end of the fault (of a
-killed node: from ready) until the law flies again. An instant is the reception time of the message
-that shows the event. Host delay: the longest that a process of the flight, or the probe, waited for
-a processor; the times include it.
+The reaction is the time from the fault to its first detection by a node. The recovery is the time
+from the end of the fault, or for a killed node from when it is ready, until the law flies again. An
+instant is the reception time of the message that shows the event. The host delay is the longest
+time that a process of the flight, or the probe, waited for a processor; the other times include it.
 """
 
 import json
@@ -48,7 +48,7 @@ Row = dict[str, Any]
 def fly(times: int, seed: int, only: str, scenario: str, guided: str) -> tuple[list[Row], int]:
     """Inject every case `times` times in a row.
 
-    One row for each injection, and the exit status of the tests.
+    Returns one row for each injection, and the exit status of the tests.
     """
     options = [f"--faults-times={times}", f"--faults-seed={seed}", f"--timeout={120 * times}"]
     words = only.replace(",", " ").split() or ["test"]
@@ -59,10 +59,10 @@ def fly(times: int, seed: int, only: str, scenario: str, guided: str) -> tuple[l
 
 
 def run_campaign(options: Sequence[str], total: int | None = None) -> tuple[list[Row], int]:
-    """Run the tests with options of pytest; their rows, and the exit status.
+    """Run the tests with options of pytest. Returns their rows, and the exit status.
 
-    Exits where no test matches. `total` is the number of injections, for the progress bar; None
-    where it is unknown.
+    Exits if no test matches. `total` is the number of injections, for the progress bar, or None if
+    it is unknown.
     """
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "rows.jsonl"
@@ -91,7 +91,11 @@ def run_campaign(options: Sequence[str], total: int | None = None) -> tuple[list
 
 
 def summarise(rows: Sequence[Row]) -> list[Row]:
-    """One row for each case: injected, detected, passed, median and worst of each time in s."""
+    """Return one row for each case.
+
+    It has how many faults were injected, detected and passed, and median and worst of each time in
+    s.
+    """
     cases: dict[str, list[Row]] = {}
     for row in rows:
         cases.setdefault(row["case"], []).append(row)
@@ -116,12 +120,12 @@ def _summary(case: str, rows: Sequence[Row]) -> Row:
 
 
 def milliseconds(times: Mapping[str, float] | None) -> str:
-    """Median / worst of times in s."""
+    """Write times in s as median / worst in ms."""
     return "-" if times is None else f"{1e3 * times['median']:.0f} / {1e3 * times['worst']:.0f}"
 
 
 def to_table(summaries: Sequence[Row]) -> Table:
-    """The table for a terminal, ms."""
+    """Make the table for a terminal, in ms."""
     columns = (
         "fault",
         "injected",

@@ -1,17 +1,18 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Aircraft that fly out of a fence, in wind and turbulence: five shapes, four winds.
+"""Fly aircraft towards a fence, in wind and turbulence: five shapes, four winds.
 
-How many leave the fence, and how far.
+The figures say how many leave the fence, and how far.
 
     .venv/bin/python -m benchmarks.fence [--only osprey c172p f16 737] [--aircraft 20]
     .venv/bin/python -m benchmarks.fence --generated 60 [--seed 7]
 
-The figures go to docs/evidence/guidance-fence-*.csv, a row a shape and a wind. Of the osprey a
-fleet flies: every entry of A and B is off by up to 30 % (`aircraft_sim.uncertainty`). An aircraft
-of JSBSim flies as it is, once. The turbulence is light (MIL-F-8785C, 1.5 m/s), the steady wind a
-share of V0. The aircraft starts at the origin to the north, 2 to 3 least radii before the fence. No
-number belongs to an aircraft. Exit status 1: an aircraft left the fence, or was lost.
+The figures go to docs/evidence/guidance-fence-*.csv, with a row for each shape and wind. The osprey
+flies as a fleet, in which every entry of A and B is off by up to 30 % (`aircraft_sim.uncertainty`).
+An aircraft of JSBSim flies as it is, once. The turbulence is light (MIL-F-8785C, 1.5 m/s), and the
+steady wind is a share of V0. The aircraft starts at the origin to the north, 2 to 3 least radii
+before the fence. No number is tuned to an aircraft. Exit status 1: an aircraft left the fence, or
+was lost.
 
 `--generated N` makes fences round home: triangles, slots, holes near home and polygons smaller than
 a turn, until N are accepted. An osprey begins over home and flies a course of the seed; the figures
@@ -48,7 +49,7 @@ HOME = (-1.0, 0.0)  # radii
 
 
 def zones_of(rows: Sequence[Mapping[str, Any]]) -> tuple[Zone, ...]:
-    """Zones of the file of fences."""
+    """Return the zones of the file of fences."""
     zones = []
     for row in rows:
         corners = {axis: tuple(row[axis]) for axis in ("north", "east")}
@@ -95,7 +96,7 @@ class Row(NamedTuple):
     home: int  # flights within HOME_RADII at the end
 
     def figures(self) -> Iterator[evidence.Row]:
-        """The rows of evidence."""
+        """Return the rows of evidence."""
         about = f"{self.fence}, {self.wind}"
         yield evidence.row(f"{about}: flights", self.flights)
         yield evidence.row(f"{about}: flights outside", self.outside, at_most=0)
@@ -104,7 +105,7 @@ class Row(NamedTuple):
 
 
 def of_radius(zones: tuple[Zone, ...], radius: float) -> tuple[Zone, ...]:
-    """Zones in m."""
+    """Return zones in m."""
 
     def scaled(values: tuple[float, ...]) -> tuple[float, ...]:
         return tuple(radius * value for value in values)
@@ -121,9 +122,9 @@ def windy(
     home: tuple[float, float],
     radii: float = DURATION,
 ) -> tuple[Scenario, float]:
-    """A scenario in a wind, share of V0, without a route, that flies to the north.
+    """Return a scenario in a wind, a share of V0, without a route, that flies to the north.
 
-    The second result is the least radius, m. `home` in radii; `radii`: the duration, at V0.
+    Also returns the least radius, m. `home` is in radii, and so is `radii`, the duration at V0.
     """
     if scenario.guidance is None:
         raise ValueError(f"{scenario.name} has no guidance")
@@ -144,7 +145,7 @@ def windy(
 
 
 def at(place: tuple[float, float], radius: float) -> tuple[float, float]:
-    """A place in m."""
+    """Return a place in m."""
     return place[0] * radius, place[1] * radius
 
 
@@ -157,7 +158,7 @@ class Flight(NamedTuple):
 
 
 def fly_fleet(shape: str, wind: str, aircraft: int, seed: int) -> Row:
-    """The row of uncertain ospreys, which fly to the north one by one on all cores."""
+    """Return the row of uncertain ospreys, which fly to the north one by one on all cores."""
     scenario, radius = windy(find_scenario("osprey_route"), WINDS[wind], HOME)
     with ProcessPoolExecutor() as pool:
         underway = []
@@ -170,13 +171,13 @@ def fly_fleet(shape: str, wind: str, aircraft: int, seed: int) -> Row:
 
 
 def fly_alone(name: str, shape: str, wind: str) -> Row:
-    """The row of an aircraft of JSBSim, which flies to the north."""
+    """Return the row of an aircraft of JSBSim, which flies to the north."""
     prepared = windy(aircraft_of(name), WINDS[wind], HOME)
     return row_of(name, shape, wind, [fly(prepared, SHAPES[shape], 0.0)])
 
 
 def fly(prepared: tuple[Scenario, float], shape: tuple[Zone, ...], course: float) -> Flight:
-    """A flight on a course, rad, inside of zones in radii. `prepared`: of `windy`.
+    """Fly on a course, rad, inside of zones in radii; `prepared` comes from `windy`.
 
     Raises ParameterError for a fence that is refused.
     """
@@ -202,7 +203,7 @@ def fly(prepared: tuple[Scenario, float], shape: tuple[Zone, ...], course: float
 def polygon(
     rng: np.random.Generator, corners: int, radii: tuple[float, float], centre: float = 0.0
 ) -> Zone:
-    """A polygon round a place at the distance `centre`, radii, from the origin.
+    """Return a polygon round a place at the distance `centre`, radii, from the origin.
 
     Its corners are at random angles and distances, radii.
     """
@@ -214,7 +215,7 @@ def polygon(
 
 
 def generated(kind: str, rng: np.random.Generator) -> tuple[Zone, ...]:
-    """Zones of a kind of GENERATED round the origin, in radii."""
+    """Return zones of a kind of GENERATED round the origin, in radii."""
     if kind == "triangle":
         return (polygon(rng, 3, (2.0, 12.0)),)
     if kind == "smaller than a turn":
@@ -235,7 +236,7 @@ GENERATED = ("triangle", "slot", "hole near home", "smaller than a turn")
 
 
 def fly_generated(accepted: int, seed: int, show: Callable[[Row], Any]) -> bool:
-    """Fly in generated fences until so many are accepted; whether all flights stayed inside."""
+    """Fly in generated fences until so many are accepted. Returns whether all stayed inside."""
     rows_flown = list[Row]()
     refusals = dict.fromkeys(GENERATED, 0)
     for number, kind in enumerate(cycle(GENERATED)):
@@ -259,7 +260,7 @@ def fly_generated(accepted: int, seed: int, show: Callable[[Row], Any]) -> bool:
 
 
 def row_of(name: str, shape: str, wind: str, flights: Sequence[Flight]) -> Row:
-    """The row of some flights."""
+    """Return the row of some flights."""
     return Row(
         aircraft=name,
         fence=shape,

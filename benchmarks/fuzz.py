@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Coverage-guided fuzzing of all readers of external input (tests/fuzz/targets.py), with atheris.
+"""Fuzz all readers of external input (tests/fuzz/targets.py), coverage-guided, with atheris.
 
 python -m benchmarks.fuzz mcap --seconds 60          # or any other target of tests/fuzz/targets.py
 python -m benchmarks.fuzz all --seconds 60  # every target, a core each; prints statistics as JSON

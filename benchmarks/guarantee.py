@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guaranteed and found limits of the deviations of A and B: CSV on standard output.
+"""Print guaranteed and found limits of the deviations of A and B as CSV.
 
-For scenarios that ship and for the F-4C of the tutorial (f4c), with the flight of an unstable
-aircraft.
+The rows are scenarios that ship and the F-4C of the tutorial (f4c). An unstable aircraft is flown
+for each.
 
     python -m benchmarks.guarantee osprey_servo osprey_observer f4c
     python -m benchmarks.guarantee osprey_servo --corners 20000  # corners and samples at the limit
@@ -61,7 +61,7 @@ HEADINGS = (
 
 
 def loop_of(name: str) -> tuple[LinearLoop, Scenario | None]:
-    """The loop with its box, and the scenario that flies; None for the F-4C."""
+    """Return the loop with its box, and the scenario that flies; it is None for the F-4C."""
     if name == F4C:
         text = PAGE.read_text().split("cat > f4c.yaml <<'EOF'\n")[1].split("EOF")[0]
         frame = Airframe.validate_mapping(yaml.safe_load(text), F4C)
@@ -71,7 +71,7 @@ def loop_of(name: str) -> tuple[LinearLoop, Scenario | None]:
 
 
 def flight(scenario: Scenario, first: Unstable) -> str:
-    """The outcome of an aircraft FARTHER times as far off as the first unstable one."""
+    """Return the outcome of an aircraft FARTHER times as far off as the first unstable one."""
     factor = min(FARTHER, LARGEST / first.deviation)
     entries = {name: factor * part for name, part in first.entries.items()}
     frame = with_entries(load_airframe(scenario.aircraft.airframe), entries)
@@ -84,9 +84,9 @@ def flight(scenario: Scenario, first: Unstable) -> str:
 
 
 def beyond(linear: LinearLoop, stable: float, count: int) -> str:
-    """How many of `count` aircraft are unstable at a guaranteed limit.
+    """Count the unstable ones of `count` aircraft at a guaranteed limit.
 
-    A half are corners, a half uniform samples.
+    Half of them are corners, and half are uniform samples.
     """
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
@@ -104,7 +104,7 @@ def beyond(linear: LinearLoop, stable: float, count: int) -> str:
 
 
 def row(name: str, corners: int) -> list[str]:
-    """The figures of a scenario."""
+    """Return the figures of a scenario."""
     linear, scenario = loop_of(name)
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
@@ -137,7 +137,7 @@ def _percent(first: Unstable | None) -> str:
 
 
 def main() -> None:
-    """Print a row a scenario."""
+    """Print a row for each scenario."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scenarios", nargs="+")
     parser.add_argument("--corners", type=int, default=0)

@@ -1,16 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Acceptance of guidance: holds, a rectangle and an orbit, by rule alone.
+"""Test the acceptance of guidance: holds, a rectangle and an orbit, with numbers only by rule.
 
-In calm air and in turbulence of 1.5 m/s.
+The air is calm, or has turbulence of 1.5 m/s.
 
     .venv/bin/python -m benchmarks.guidance [--only osprey_servo c172p] [--manoeuvres heading orbit]
     [--seeds 5]
     .venv/bin/python -m benchmarks.guidance --route
         # another route, on aircraft that guidance was not built with
 
-The figures go to docs/evidence/guidance-*.csv, and docs/evidence.md is written from them. Flights
-in one process. Each row is a figure with its limit; in turbulence it is the worst of all seeds. The
+The figures go to docs/evidence/guidance-*.csv, and docs/evidence.md is written from them. All
+flights are in one process. Each row is a figure with its limit; in turbulence it is the worst of
+all seeds. The
 rectangle is flown without wind and with a wind of a fifth of the airspeed across its first leg. No
 number is tuned to an aircraft. The 737 is identified first, which takes some minutes.
 """
@@ -50,9 +51,9 @@ from flight_core.outcome import COMPLETED
 
 
 def prepared(scenario: Scenario) -> Scenario:
-    """A scenario with guidance by rule in calm air.
+    """Return a scenario with guidance by rule in calm air.
 
-    It is without the commands and the gusts of its own.
+    It lacks its own commands and gusts.
     """
     aircraft: dict[str, Any] = {"gusts": {}, "turbulence": None}
     if not scenario.aircraft.is_jsbsim:
@@ -64,7 +65,7 @@ def prepared(scenario: Scenario) -> Scenario:
 
 @cache
 def aircraft_of(name: str) -> Scenario:
-    """The scenario of an aircraft, with guidance.
+    """Return the scenario of an aircraft, with guidance.
 
     The stall speed is the one that `rise-di identify --guidance` writes.
     """
@@ -80,7 +81,7 @@ def aircraft_of(name: str) -> Scenario:
 
 @cache
 def original_of(name: str) -> Scenario:
-    """The scenario of an aircraft, with the commands and the gusts of its own."""
+    """Return the scenario of an aircraft, with its own commands and gusts."""
     if name == "osprey_servo":
         slower = {"rate": 100.0, "step": 0.005}  # as the law: four times faster than with 500 Hz
         return find_scenario(name).vary(aircraft=slower, reference_model={"rate": 100.0})
@@ -103,7 +104,7 @@ CONDITIONS: Mapping[str, tuple[float, float]] = {"737": (154.0, 6096.0), **OTHER
 
 
 def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure]:
-    """The figures of a flight."""
+    """Return the figures of a flight."""
     guidance = scenario.guidance
     if guidance is None:
         raise ValueError(f"{scenario.name} has no guidance")
@@ -149,7 +150,7 @@ def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure
 
 
 def turbulence(scenario: Scenario, seed: int) -> dict[str, Any]:
-    """The section `aircraft.turbulence`, with SIGMA."""
+    """Return the section `aircraft.turbulence`, with SIGMA."""
     altitude = scenario.aircraft.altitude or 0.0
     low = (
         {"altitude": LOW, "wind": LOW_WIND}
@@ -160,7 +161,7 @@ def turbulence(scenario: Scenario, seed: int) -> dict[str, Any]:
 
 
 def trim_pitch(scenario: Scenario) -> float:
-    """Pitch in trim, rad."""
+    """Return the pitch in trim, rad."""
     return float(simulate(scenario.vary(flight={"duration": 0.1}))["guidance"]["pose.theta"][0])
 
 
@@ -179,7 +180,7 @@ class Row(NamedTuple):
 
 
 class Job(NamedTuple):
-    """One flight: of a manoeuvre by its title, in the air that a row names."""
+    """One flight: a manoeuvre by its title, in the air that a row names."""
 
     title: str
     shown: str
@@ -187,7 +188,7 @@ class Job(NamedTuple):
 
 
 def jobs(manoeuvres: Mapping[str, Manoeuvre], seeds: int) -> Iterator[Job]:
-    """The flights of one aircraft, those of a row beside each other."""
+    """Return the flights of one aircraft, with those of a row beside each other."""
     for title, manoeuvre in manoeuvres.items():
         for across in manoeuvre.winds:
             wind = f", wind {across:g} V" if across else ""
@@ -199,7 +200,7 @@ def jobs(manoeuvres: Mapping[str, Manoeuvre], seeds: int) -> Iterator[Job]:
 
 
 def fly(scenario: Scenario, job: Job) -> list[Figure]:
-    """The figures of one flight."""
+    """Return the figures of one flight."""
     return list(flown(scenario, {**MANOEUVRES, **OTHER_ROUTE}[job.title], job.air))
 
 
@@ -209,9 +210,9 @@ def rows(
     seeds: int,
     over: Callable[..., Iterable[list[Figure]]] = map,
 ) -> Iterator[Row]:
-    """All rows of an aircraft, as they are flown by `over`.
+    """Return all rows of an aircraft, as `over` flies them.
 
-    `over` is `map` or that of a pool of processes.
+    `over` is `map`, or the `map` of a pool of processes.
     """
     several = list(jobs(manoeuvres, seeds))
     flights = zip(several, over(partial(fly, aircraft_of(name)), several), strict=True)
@@ -230,7 +231,7 @@ def rows(
 def main() -> None:
     """Fly, store the results and write the page.
 
-    Exit status 1 where a limit is not met or a point is lost.
+    Exit status 1 if a limit is not met or a point is lost.
     """
     parser = parser_of(__doc__)
     parser.add_argument("--only", nargs="*", choices=AIRCRAFT, default=AIRCRAFT, help="aircraft")
@@ -266,7 +267,7 @@ def main() -> None:
 
 
 def origin(options: str) -> evidence.Origin:
-    """The origin of figures that this program begins to measure with these options."""
+    """Return the origin of figures that this program begins to measure with these options."""
     return evidence.origin(f"python -m benchmarks.guidance {options}")
 
 
@@ -276,7 +277,7 @@ def store(name: str, figures: Iterable[evidence.Row], begun: evidence.Origin) ->
 
 
 def figure_row(about: str, flown: Row) -> evidence.Row:
-    """The row of evidence of a figure; a limit that is infinite is none."""
+    """Return the row of evidence of a figure; a limit that is infinite is left out."""
     name, unit = split(flown.figure.name)
     limit = None if flown.figure.limit == math.inf else flown.figure.limit
     return row(f"{about}, {flown.air}: {name}", float(flown.figure.value), unit, at_most=limit)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lateness and missed ticks without what host scheduling delays (steal time) explain; pure."""
+"""Compute lateness and missed ticks without what delays of the host's scheduler explain."""
 
 from collections.abc import Sequence
 
@@ -12,19 +12,19 @@ Intervals = Sequence[tuple[int, int]] | NDArray[np.int64]
 
 
 def missed_excluding_delays(skipped: Intervals, delays: Intervals, period_ns: int) -> int:
-    """Missed deadlines, excluding host delays.
+    """Count the missed deadlines that host delays do not explain.
 
-    `skipped`: from the first missed deadline to the next tick. The rest of each skip counts in
-    whole periods.
+    `skipped` are the times from the first missed deadline to the next tick. The rest of each counts
+    in whole periods.
     """
     return int(np.sum(excluding_delays(skipped, delays) // period_ns))
 
 
 def excluding_delays(intervals: Intervals, delays: Intervals) -> NDArray[np.int64]:
-    """Length of each interval outside of the host delays, ns, shape (N,).
+    """Return the length of each interval outside of the host delays, ns, shape (N,).
 
-    `delays`: when a core ran none of our processes; they may overlap. All cores count, since the
-    scheduler may run the process on any.
+    `delays` are times in which a core ran none of our processes; they may overlap. All cores count,
+    since the scheduler may run the process on any.
     """
     begin, end = np.asarray(intervals, dtype=np.int64).reshape(-1, 2).T
     origin = int(begin.min(initial=np.iinfo(np.int64).max))

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gains, margins and errors of the aircraft of JSBSim that trim: CSV on standard output.
+"""Print gains, margins and errors of the aircraft of JSBSim that trim, as CSV.
 
-Two speeds each, as `rise-di identify` finds them, and whether a random search refutes refusals.
+Each aircraft has two speeds. The gains are those that `rise-di identify` finds, and a random search
+tries to refute refusals.
 
 python -m benchmarks.jsbsim_gains c172p t6texan2
 
@@ -57,14 +58,14 @@ HEADINGS = (
 
 
 def verdict(selection: Selection) -> str:
-    """Whether a selection has the margins, or the bound that binds."""
+    """Say whether a selection has the margins, or name the bound that binds."""
     if not selection.engineering.unmet:
         return "found"
     return f"refused: {binding(selection).sentence(selection.chosen.outputs)}"
 
 
 def figures(identified: IdentifiedAircraft) -> list[str]:
-    """The margins of the nominal loop, and the errors of the flights."""
+    """Return the margins of the nominal loop, and the errors of the flights."""
     margins = identified.selection.engineering.margins
     if margins is None:
         return [""] * (3 + len(AIRS) * len(OUTPUTS))
@@ -81,7 +82,7 @@ def figures(identified: IdentifiedAircraft) -> list[str]:
 
 
 def searched(selection: Selection) -> str:
-    """What random factors find for a refused selection in SECONDS."""
+    """Return what random factors find for a refused selection in SECONDS."""
     build = gain_candidates(selection.study, selection.setting)
     generator = np.random.default_rng(1)
     m = len(selection.chosen.outputs)
@@ -107,7 +108,7 @@ def searched(selection: Selection) -> str:
 
 
 def main() -> None:
-    """Print a row a condition."""
+    """Print a row for each condition."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("aircraft", nargs="*", default=list(CONDITIONS))
     parser.add_argument("--phase-margin", type=float, default=60.0)

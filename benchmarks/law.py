@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Time of one tick: the law, the law with anti-windup and the whole tick.
+"""Measure the time of one tick: the law, the law with anti-windup and the whole tick.
 
-Relative to a NumPy multiply-add of the same size.
+The times are compared with a NumPy multiply-add of the same size.
 
 python -m benchmarks.speed --only law
 """
@@ -22,7 +22,7 @@ REPEATS = 20_000
 
 
 def percentiles(action: Callable[[int], object]) -> tuple[float, float, float]:
-    """Median, 99.9th percentile and maximum of one call in us, after a warm-up."""
+    """Return median, 99.9th percentile and maximum of one call in us, after a warm-up."""
     for k in range(500):
         action(k)
     gc.collect()
@@ -39,7 +39,7 @@ FLOOR = "NumPy a * x + b"
 
 
 def ticked(scenario: str, y: FloatArray, y_m: FloatArray) -> Callable[[int], object]:
-    """A whole tick after the engagement, with the k-th rows of y and y_m."""
+    """Return a whole tick after the engagement, with the k-th rows of y and y_m."""
     controller = find_scenario(scenario).controller
     tuned = controller.tuned_law()
     limits = controller.guard()
@@ -55,9 +55,9 @@ def ticked(scenario: str, y: FloatArray, y_m: FloatArray) -> Callable[[int], obj
 
 
 def measure() -> dict[str, tuple[float, float, float]]:
-    """Median, 99.9th percentile and maximum, us.
+    """Return median, 99.9th percentile and maximum, us.
 
-    Of a law step, a step with anti-windup, a tick, and the multiply-add.
+    They are of a law step, a step with anti-windup, a tick, and the multiply-add.
     """
     controller = find_scenario("osprey_gust").controller
     law = controller.law_params()
@@ -78,10 +78,13 @@ def measure() -> dict[str, tuple[float, float, float]]:
 
 
 def measure_observer() -> tuple[float, float, float]:
-    """Median, 99.9th percentile and maximum in us of a tick with feedforward and observer."""
+    """Measure a tick with feedforward and observer.
+
+    Returns median, 99.9th percentile and maximum in us.
+    """
     return percentiles(ticked("osprey_observer", *noise()))
 
 
 def noise() -> FloatArray:
-    """Rows of y and of y_m, shape (2, REPEATS, 4)."""
+    """Draw rows of y and of y_m, shape (2, REPEATS, 4)."""
     return 0.01 * np.random.default_rng(1).normal(size=(2, REPEATS, 4))

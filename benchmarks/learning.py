@@ -1,20 +1,20 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in the air: uncertain aircraft that learn in every air.
+"""Measure learning in the air: uncertain aircraft that learn in every air.
 
-They fly beside the law alone, the file's model and the true one.
+They are compared with the law alone, with the model of the file and with the true model.
 
     python -m benchmarks.learning  # every cell, 50 aircraft: at most 3 h on two idle cores
     python -m benchmarks.learning --aircraft 6  # with fewer; run again, it flies what is missing
     python -m benchmarks.learning --aircraft 20 --cell "rough prior"  # of one cell
 
-An aircraft learns for 64 s of osprey_learn. The model that flies then is frozen and flies the
-commands and the two gusts of osprey_observer, as the others do, and as the laws of `rise-di
-compare` do with their gains for the airframe file. A row an aircraft goes to build/learning.csv.
-The figures of the cells that were flown whole go to docs/evidence/learning.csv, and where the airs
-of both uncertainties were, the picture goes to docs/images/learning.png. An aircraft takes 2 to 3
-min of a core over all cells. For false alarms at most two aircraft fly 600 s without damage in each
-air, 2 min of a core each.
+An aircraft learns for 64 s of osprey_learn. The model that flies then is frozen, and flies the
+commands and the two gusts of osprey_observer. The others fly the same, and so do the laws of
+`rise-di compare` with their gains for the airframe file. A row for each aircraft goes to
+build/learning.csv. The figures of the cells that were flown whole go to docs/evidence/learning.csv.
+If the airs of both uncertainties are among them, the picture goes to docs/images/learning.png. An
+aircraft takes 2 to 3 min of a core over all cells. For false alarms at most two aircraft fly 600 s
+without damage in each air, which takes 2 min of a core each.
 """
 
 import csv
@@ -41,12 +41,12 @@ IMAGE = REPOSITORY / "docs" / "images" / "learning.png"
 
 
 def count(name: str, aircraft: int) -> int:
-    """The number of aircraft in a cell."""
+    """Return the number of aircraft in a cell."""
     return min(math.ceil(CELLS[name].share * aircraft), CELLS[name].most)
 
 
 def code() -> list[str]:
-    """The paths of the code that flies.
+    """Return the paths of the code that flies.
 
     They are this file, and the packages of this stack that it imports.
     """
@@ -64,9 +64,9 @@ def code() -> list[str]:
 
 
 def read(path: Path) -> list[Row]:
-    """The rows of a file of results.
+    """Return the rows of a file of results.
 
-    None of a file with other columns, which an earlier version wrote.
+    There are none if the file has other columns, because an earlier version wrote it.
     """
     if not path.exists():
         return []
@@ -108,7 +108,7 @@ def main(
 ) -> None:
     """Fly the aircraft that are missing in the results, and write the figures and the picture.
 
-    Rows that other code flew are flown again, and all where that code is not committed: the
+    Rows that other code flew are flown again, and so are all if that code is not committed. The
     revision of a row is the last one that touched the code that flies.
     """
     if unknown := [name for name in cell if name not in CELLS]:

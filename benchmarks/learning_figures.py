@@ -49,7 +49,7 @@ in the loop of osprey_servo. INDI measures the actuators too."""
 
 
 def figures(rows: Sequence[Row]) -> Iterator[evidence.Row]:
-    """The figures of every cell, with their goals."""
+    """Return the figures of every cell, with their goals."""
     for name, cell in CELLS.items():
         chosen = [each for each in rows if each.cell == name]
         if chosen:
@@ -70,7 +70,7 @@ def figures(rows: Sequence[Row]) -> Iterator[evidence.Row]:
 
 
 def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
-    """Scores beside those of the others."""
+    """Return scores beside those of the others."""
     yield from scores(name, chosen)
     known = [each for each in chosen if not math.isnan(each.true)]
     shares = {"learn": 0.95 if cell.uncertainty < 0.5 else 0.9, "turning": 0.75, "rough": 0.75}
@@ -107,7 +107,10 @@ def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evid
 
 
 def scores(name: str, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
-    """Lost flights, and mean and largest score of the flights to the end, of each."""
+    """Return the lost flights, and the scores of the flights to the end, of each.
+
+    The scores are mean and largest.
+    """
     for key, label in LABELS.items():
         values = np.array([getattr(each, key) for each in chosen])
         flown = values[~np.isnan(values)]
@@ -121,7 +124,7 @@ def scores(name: str, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
 
 
 def damage_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
-    """Scores from SETTLED on; whether a dead input was found in time."""
+    """Return scores from SETTLED on, and whether a dead input was found in time."""
     yield from scores(name, chosen)
     yield row(
         f"{name}: lost with the learner and not with the law alone",
@@ -152,14 +155,14 @@ def damage_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evi
 
 
 def window_figures(name: str, label: str, values: FloatArray) -> Iterator[evidence.Row]:
-    """Mean scores over WINDOWS of the flights to the end, of scores (N, W)."""
+    """Return mean scores over WINDOWS of the flights to the end, from scores (N, W)."""
     if len(whole := values[np.isfinite(values).all(axis=1)]):
         for (first, end), mean in zip(WINDOWS, whole.mean(axis=0), strict=True):
             yield row(f"{name}: score from {first:g} to {end:g} s, {label}", float(mean))
 
 
 def alarm_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
-    """Alarms without damage."""
+    """Count alarms without damage."""
     yield row(f"{name}: flight time", ALARM_FLIGHT / 60.0 * len(chosen), "min")
     yield row(
         f"{name}: false alarms",
@@ -183,7 +186,7 @@ CELL_FIGURES = {
 
 
 def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[evidence.Row]:
-    """Scores of the laws of RIVALS in the flight with gusts.
+    """Return the scores of the laws of RIVALS in the flight with gusts.
 
     The share that loses track there with u LATE is beside them. All aircraft have the same noise.
     Each law has its model and gains by the airframe file.
@@ -212,7 +215,7 @@ def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[eviden
 
 
 def plot(rows: Sequence[Row]) -> Figure:
-    """The score of every aircraft in the flight with gusts, a panel an uncertainty.
+    """Plot the score of every aircraft in the flight with gusts, a panel for each uncertainty.
 
     The bar is the mean.
     """

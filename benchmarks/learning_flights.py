@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The flights of benchmarks.learning: uncertain aircraft that learn, beside what does not learn."""
+"""The flights of benchmarks.learning: uncertain aircraft that learn, and others that do not."""
 
 import json
 import math
@@ -80,7 +80,7 @@ class Cell(NamedTuple):
 
 
 def untold(air: str, uncertainty: float = 0.3, **keys: Any) -> Cell:
-    """A cell with what neither controller nor learner is told."""
+    """Return a cell in which something differs that neither controller nor learner is told."""
     return Cell("untold", air, uncertainty, 0.25, untold=MappingProxyType(keys))
 
 
@@ -113,9 +113,9 @@ OSPREY = Cell("learn", "calm", 0.3)
 
 
 class Row(NamedTuple):
-    """One aircraft.
+    """One aircraft: its scores in the flight with gusts, or after damage.
 
-    Scores in the flight with gusts, or after damage; NaN for what was not flown.
+    A score is NaN if it was not flown.
     """
 
     cell: str
@@ -156,11 +156,11 @@ class Timed:
         self._own, self.steps = own, list[float]()
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
-        """Of the learner."""
+        """Take a tick, as the learner does."""
         self._own.take(stamp_ns, y, u, flown)
 
     def propose(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
-        """Of the learner."""
+        """Propose a model, as the learner does."""
         begin = time.process_time()
         proposal = self._own.propose(flown, given_up)
         self.steps.append(time.process_time() - begin)
@@ -168,9 +168,9 @@ class Timed:
 
 
 def learning(cell: Cell, number: int, duration: float, **changed: Any) -> Scenario:
-    """osprey_learn at 100 Hz with an aircraft, wind and noise of its own.
+    """Return osprey_learn at 100 Hz with an aircraft, wind and noise of its own.
 
-    Its commands come again and again.
+    Its commands repeat.
     """
     shipped = find_scenario("osprey_learn")
     seed = {"seed": 1000 + number}
@@ -196,9 +196,9 @@ def learning(cell: Cell, number: int, duration: float, **changed: Any) -> Scenar
 
 
 def evaluation(flown: Scenario) -> Scenario:
-    """osprey_observer, its commands and two gusts, with the aircraft of a flight that learned.
+    """Return osprey_observer with the aircraft of a flight that learned.
 
-    The noise is another one.
+    It has its own commands and two gusts. The noise differs from that of the flight.
     """
     shipped = find_scenario("osprey_observer")
     own = {
@@ -214,9 +214,9 @@ def evaluation(flown: Scenario) -> Scenario:
 def score(
     tape: Tape, first: float = 0.0, without: Sequence[str] = (), end: float = math.inf
 ) -> float:
-    """Sum over the outputs of the true rms error in units of a score.
+    """Sum the true rms errors of the outputs in units of a score.
 
-    Infinite for a flight that ended early.
+    It is infinite for a flight that ended early.
     """
     if tape.outcome != COMPLETED:
         return math.inf
@@ -237,7 +237,7 @@ def score(
 
 @cache
 def file_design() -> RiseDiConfig | None:
-    """The start of OSPREY with feedforward and observer of the file."""
+    """Return the start of OSPREY with feedforward and observer of the file."""
     chosen = learning(OSPREY, 0, LEARNED)
     return designed(start_of(chosen), chosen, load_airframe("osprey"), uncertain=True)
 
@@ -245,9 +245,9 @@ def file_design() -> RiseDiConfig | None:
 def designed(
     start: RiseDiConfig, scenario: Scenario, model: Airframe, *, uncertain: bool = False
 ) -> RiseDiConfig | None:
-    """The start with feedforward and observer of a model.
+    """Return the start with feedforward and observer of a model.
 
-    None where no relaxation has the margins.
+    It is None if no relaxation has the margins.
     """
     try:
         return selected_observer(start, scenario, model, MARGIN, uncertain=uncertain).controller
@@ -256,7 +256,7 @@ def designed(
 
 
 def is_unstable(controller: ControllerConfig, aircraft: Airframe) -> int:
-    """1 where the linear loop of an aircraft is unstable with u LATE, else 0."""
+    """Return 1 if the linear loop of an aircraft is unstable with u LATE, else 0."""
     rows, columns = law_order(aircraft, controller)
     plant = LinearPlant(
         aircraft.matrix_a() + aircraft.matrix_gravity(),
@@ -273,9 +273,9 @@ def is_unstable(controller: ControllerConfig, aircraft: Airframe) -> int:
 
 
 def margin_left(controller: RiseDiConfig, chosen: Scenario) -> float:
-    """The delay margin of the linear loop of the true aircraft with its lags, s.
+    """Return the delay margin of the linear loop of the true aircraft with its lags, s.
 
-    It is beyond the delays of u and y; -1 where the loop is unstable.
+    It is beyond the delays of u and y, or -1 if the loop is unstable.
     """
     aircraft = chosen.aircraft
     true = aircraft.sampled_airframe()
@@ -335,15 +335,16 @@ def fly(name: str, number: int, chosen: Scenario) -> Learned:
 
 
 def start_of(chosen: Scenario) -> RiseDiConfig:
-    """The controller of the start, without the section learn."""
+    """Return the controller of the start, without the section learn."""
     return chosen.rise_di().model_copy(update={"learn": None})
 
 
 @lru_cache(maxsize=4)
 def beside(uncertainty: float, number: int) -> dict[str, tuple[float, int]]:
-    """Score in the flight with gusts, and whether unstable with u late, of what does not learn.
+    """Fly what does not learn.
 
-    It is the same in every air.
+    Returns the score in the flight with gusts, and whether it is unstable with u late. It is the
+    same in every air.
     """
     chosen = learning(Cell("learn", "calm", uncertainty), number, LEARNED)
     flight = evaluation(chosen)
@@ -360,14 +361,14 @@ def beside(uncertainty: float, number: int) -> dict[str, tuple[float, int]]:
 def frozen(
     controller: RiseDiConfig | None, flight: Scenario, aircraft: Airframe
 ) -> tuple[float, int]:
-    """Score of a controller in a flight, and whether it is unstable with u late."""
+    """Return the score of a controller in a flight, and whether it is unstable with u late."""
     if controller is None:
         return math.nan, 0
     return score(simulate(flight.vary(controller=controller))), is_unstable(controller, aircraft)
 
 
 def learn(name: str, cell: Cell, number: int) -> Row:
-    """A learner beside what does not learn."""
+    """Fly a learner, and beside it what does not learn."""
     with TemporaryDirectory() as folder:
         chosen = learning(cell, number, LEARNED)
         others = (
@@ -410,7 +411,7 @@ def learn(name: str, cell: Cell, number: int) -> Row:
 
 
 def with_prior(chosen: Scenario, folder: str) -> Scenario:
-    """A scenario whose learner begins with the airframe of a file."""
+    """Return a scenario whose learner begins with the airframe of a file."""
     settings = chosen.rise_di().model_dump()["learn"] | {
         "prior": {"file": str(Path(folder, "prior.yaml"))}
     }
@@ -418,7 +419,7 @@ def with_prior(chosen: Scenario, folder: str) -> Scenario:
 
 
 def rough(number: int) -> Airframe:
-    """The osprey with every entry off by a factor exp(ROUGH N), those of C B by up to 30 %.
+    """Return the osprey with every entry off by a factor exp(ROUGH N), or up to 30 % for C B.
 
     Rows of angles stay.
     """
@@ -438,7 +439,7 @@ def rough(number: int) -> Airframe:
 
 
 def coupled(number: int) -> Airframe:
-    """The osprey with entries between its two parts.
+    """Return the osprey with entries between its two parts.
 
     They have up to COUPLING of the largest effect on the row, in units of motion.
     """
@@ -470,9 +471,9 @@ def coupled(number: int) -> Airframe:
 
 
 def damage(name: str, cell: Cell, number: int) -> Row:
-    """A learner beside the others when elevator and aileron lose half of their effect.
+    """Fly a learner and the others when elevator and aileron lose half of their effect.
 
-    Or one surface loses all of it.
+    In other cells one surface loses all of it.
     """
     inputs = tuple(load_airframe("osprey").inputs)
     surfaces = [key for key in inputs if key != "thrust"]
@@ -509,9 +510,9 @@ def damage(name: str, cell: Cell, number: int) -> Row:
 def over_windows(
     tapes: dict[str, Tape], chosen: Scenario, aircraft: Airframe
 ) -> dict[str, list[float]]:
-    """Scores over WINDOWS.
+    """Return scores over WINDOWS.
 
-    Those of the true model until the damage are with the model of the aircraft as it was.
+    Until the damage, those of the true model are with the model of the aircraft as it was.
     """
     found = {
         key: [score(tape, first, (), end) for first, end in WINDOWS] for key, tape in tapes.items()
@@ -527,7 +528,7 @@ def over_windows(
 
 
 def alarms(name: str, cell: Cell, number: int) -> Row:
-    """A learner in a long flight without any damage."""
+    """Fly a learner in a long flight without any damage."""
     return fly(name, number, learning(cell, number, ALARM_FLIGHT)).row
 
 
@@ -544,5 +545,5 @@ FLIGHTS = {
 
 
 def flown_rows(names: Sequence[str], number: int) -> list[Row]:
-    """The rows of an aircraft in some cells."""
+    """Return the rows of an aircraft in some cells."""
     return [FLIGHTS[CELLS[name].kind](name, CELLS[name], number) for name in names]

@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Speed of a lockstep flight, compared with a bare echo of the same message on the same host.
+"""Measure the speed of a lockstep flight.
 
-The scenario osprey_gust with aircraft and reference model at the 100 Hz of the controller
-(Runge-Kutta step 10 ms), recorded:
+It is compared with a bare echo of the same message on the same host.
+
+The flight is the scenario osprey_gust with aircraft and reference model at the 100 Hz of the
+controller (Runge-Kutta step 10 ms), recorded:
 
     four processes   aircraft, reference model, controller, recorder
     one process      the same four as objects in one process
@@ -42,9 +44,9 @@ FLOOR = "bare echo, to another process and back"
 
 
 def flight_steps_per_second(scenario: Scenario, run: Path, *, one_process: bool) -> float:
-    """Steps of the controller per second of a lockstep flight.
+    """Return the steps of the controller per second of a lockstep flight.
 
-    Between its first and its last u in the log.
+    They are counted between its first and its last u in the log.
     """
     outcome = fly_over_topics(
         scenario, run, lambda t, u: None, lockstep=True, one_process=one_process
@@ -63,14 +65,14 @@ def flight_steps_per_second(scenario: Scenario, run: Path, *, one_process: bool)
 
 
 def loop_steps_per_second(scenario: Scenario) -> float:
-    """Steps of the controller per second of the loop without ROS."""
+    """Return the steps of the controller per second of the loop without ROS."""
     begin = time.perf_counter()
     tape = simulate(scenario)
     return (len(tape["u"].stamp_ns) - 1) / (time.perf_counter() - begin)
 
 
 def echo_steps_per_second() -> float:
-    """Round trips per second of four channels to another process and back."""
+    """Return the round trips per second of four channels to another process and back."""
     encoder = Encoder(("q", "V", "p", "r"), "requester")
     values = np.zeros(4)
     with open_node("requester") as node, Child("polled_echo"):
@@ -87,9 +89,9 @@ def echo_steps_per_second() -> float:
 
 
 def measure(folder: Path, duration: float, repeat: int) -> dict[str, float]:
-    """Steps per second of the echo (FLOOR) and of each kind of flight.
+    """Return the steps per second of the echo (FLOOR) and of each kind of flight.
 
-    The median of `repeat` runs, interleaved.
+    They are the median of `repeat` runs, interleaved.
     """
     aircraft = {"rate": RATE, "step": 1.0 / RATE}
     model = {"rate": RATE}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A long guided flight over topics, round a triangle in turbulence.
+"""Fly a long guided flight over topics, round a triangle in turbulence.
 
 A client of the live page watches it.
 
@@ -69,9 +69,9 @@ MODES = {
 
 
 def triangle(minutes: float, *, observer: bool, rate: float | None = None) -> Scenario:
-    """The flight: laps round an equilateral triangle in turbulence, without wind.
+    """Return the flight: laps round an equilateral triangle in turbulence, without wind.
 
-    The scenario's own rates without `rate`.
+    If there is no `rate`, the scenario's own rates hold.
     """
     base = find_scenario("osprey_route" if observer else "jsbsim_c172p_route")
     if observer:
@@ -99,10 +99,10 @@ def triangle(minutes: float, *, observer: bool, rate: float | None = None) -> Sc
 
 
 def fly(scenario: Path, runs: Path, mode: str) -> tuple[dict[str, list[int]], int]:
-    """Fly, with a client of the page; the memory of each process by its command.
+    """Fly with a client of the page. Returns the memory of each process by its command.
 
-    It is taken until the nodes end, bytes every PERIOD. The second result is the most memory of
-    `rise-di fly` after that, while it writes the report, bytes.
+    It is taken until the nodes end, in bytes every PERIOD. The second result is the most memory of
+    `rise-di fly` after that, while it writes the report, in bytes.
     """
     prefix = real_time() if mode == "in real time" else ()
     command = [*prefix, RISE_DI, "fly", str(scenario), *MODES[mode], "--runs", str(runs)]
@@ -137,7 +137,7 @@ def fly(scenario: Path, runs: Path, mode: str) -> tuple[dict[str, list[int]], in
 
 
 def end(flight: psutil.Popen) -> None:
-    """End the flight where it goes on, with its processes."""
+    """End a flight that is still going on, with its processes."""
     if flight.poll() is None:
         flight.terminate()
         flight.wait()
@@ -146,10 +146,10 @@ def end(flight: psutil.Popen) -> None:
 def skips(
     tape: Tape, scenario: Scenario, *, real_time: bool
 ) -> dict[str, tuple[NDArray[np.int64], int]]:
-    """By topic, begin and end of each time without a sample in the flight, ns, and the period, ns.
+    """Return begin and end of each time without a sample in the flight, and the period, by topic.
 
-    What follows the flight is the end of the processes. In real time a late tick skips instants. It
-    is late by 0 to 1 period, so a skip ends half a period after the next stamp.
+    All are in ns. What follows the flight is the end of the processes. In real time a late tick
+    skips instants. It is late by 0 to 1 period, so a skip ends half a period after the next stamp.
     Each u carries the stamp of a y, and `figures_of_ticks` counts the ticks of the controller.
     """
     guidance = scenario.guidance
@@ -172,7 +172,10 @@ def skips(
 def missing(
     tape: Tape, scenario: Scenario, delays: Intervals | None, *, real_time: bool
 ) -> dict[str, dict[str, int]]:
-    """How many samples of each topic the log lacks, also excluding host delays where known."""
+    """Count the samples of each topic that the log lacks.
+
+    If host delays are known, they are also counted without those.
+    """
     skipped = skips(tape, scenario, real_time=real_time)
     return {
         words: {
@@ -188,10 +191,10 @@ def missing(
 
 
 def opened(report: Path) -> dict[str, float] | None:
-    """Times from the address to the figures drawn in a browser, s; None without a browser.
+    """Return the times from the address to the figures drawn in a browser, s, or None without one.
 
     The page draws the figures in view first, and then all others. The first time is that of a
-    reader who goes to the first figure at once, the second that of all figures, in view or not.
+    reader who goes to the first figure at once, the second is that of all figures, in view or not.
     """
     if CHROMIUM is None:
         return None
@@ -210,11 +213,11 @@ def opened(report: Path) -> dict[str, float] | None:
 def figures(
     run: Path, memory: Mapping[str, list[int]], delays: Intervals | None, *, real_time: bool
 ) -> dict[str, Any]:
-    """The figures of a flight from its run, SI.
+    """Return the figures of a flight from its run, SI.
 
-    Memory in bytes in the middle and at the end, ticks as `figures_of_ticks`. `delays` are those of
-    the host, by the clock of the stamps; None where unknown. Ticks are of flights in real time
-    alone: in lockstep they wait for their inputs.
+    They are the memory in bytes in the middle and at the end, and the ticks as `figures_of_ticks`
+    gives them. `delays` are those of the host, by the clock of the stamps, or None if unknown.
+    Ticks are only counted in real time: in lockstep they wait for their inputs.
     """
     begin = time.monotonic()
     write_report(run)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Plots docs/images/lyapunov.png: V1, V2, e and r of the small example.
+"""Plot docs/images/lyapunov.png: V1, V2, e and r of the small example.
 
 One beta meets (29), (30) and one does not.
 
@@ -22,7 +22,7 @@ COLOURS = ("#1f6f8b", "#c8553d")
 
 
 def flights() -> dict[str, Evidence]:
-    """The same flight under beta and under 0.05 beta.
+    """Fly the same flight with beta and with 0.05 beta.
 
     Both have the constant zeta_b of Lemma 2 for the first.
     """
@@ -40,9 +40,9 @@ def flights() -> dict[str, Evidence]:
 
 
 def plot(evidence_by_beta: dict[str, Evidence]) -> Figure:
-    """Four panels over time, a line a gain set.
+    """Plot four panels over time, with a line for each gain set.
 
-    V1 and the norms of e and r on log scales, V2 on a linear one.
+    V1 and the norms of e and r are on log scales, V2 is on a linear one.
     """
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The manoeuvres of `benchmarks.guidance`.
 
-The commands of a flight, and its figures with their limits.
+A manoeuvre has the commands of a flight, and its figures with their limits.
 """
 
 import math
@@ -70,14 +70,14 @@ class Figure(NamedTuple):
 
     @property
     def missed(self) -> bool:
-        """Whether the value is beyond the limit."""
+        """Return whether the value is beyond the limit."""
         return self.value > self.limit
 
 
 class Pose(NamedTuple):
     """How guidance receives pose.
 
-    `aircraft.pose` of the scenario, and a fault for `fault` s from FAULT on.
+    It has `aircraft.pose` of the scenario, and a fault for `fault` s from FAULT on.
     """
 
     measured: Mapping[str, Any] = MappingProxyType({})
@@ -114,7 +114,7 @@ class FaultyPose(Guidance):
 
 
 class Manoeuvre(NamedTuple):
-    """A manoeuvre: the section of guidance and the duration, s; and its figures."""
+    """A manoeuvre: the section of guidance, the duration, s, and the figures."""
 
     plan: Callable[[GuidanceConfig], tuple[dict[str, Any], float]]
     # the last: whether the air is calm
@@ -125,30 +125,30 @@ class Manoeuvre(NamedTuple):
 
 
 def program(**channels: float) -> dict[str, Any]:
-    """Commands from START on."""
+    """Return commands from START on."""
     return {name: {"start": [START], "value": [value]} for name, value in channels.items()}
 
 
 def after(tape: Tape, t: float, *names: str) -> tuple[FloatArray, ...]:
-    """Channels of `guidance` from t on."""
+    """Return channels of `guidance` from t on."""
     keep = tape.time("guidance") >= t
     return tuple(tape["guidance"][name][keep] for name in names)
 
 
 def settled(tape: Tape, name: str, target: float, band: float) -> float:
-    """Time from START until a channel stays within a band, s."""
+    """Return the time from START until a channel stays within a band, s."""
     t = tape.time("guidance")
     outside = np.abs(tape["guidance"][name] - target) > band
     return float(t[np.flatnonzero(outside)[-1]] - START) if outside.any() else 0.0
 
 
 def rms(values: FloatArray) -> float:
-    """Root mean square."""
+    """Compute the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
 def of_phi(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Overshoot and settling of a step of the bank; rms in turbulence."""
+    """Return overshoot and settling of a step of the bank, and the rms in turbulence."""
     if calm:
         yield Figure(
             "overshoot (%)", 100.0 * (tape["guidance"]["pose.phi"].max() / BANK - 1.0), 8.0
@@ -163,7 +163,7 @@ def of_phi(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
 
 
 def of_heading(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Overshoot of a turn, and what it costs in altitude and airspeed."""
+    """Return the overshoot of a turn, and what it costs in altitude and airspeed."""
     psi, altitude, V, commanded = after(tape, START, "pose.psi", "pose.altitude", "y.V", "target.V")
     yield Figure("overshoot (%)", 100.0 * (np.unwrap(psi).max() / TURN - 1.0), 2.0 if calm else 5.0)
     yield Figure("altitude (m)", np.abs(altitude - altitude[0]).max(), 5.0 if calm else 15.0)
@@ -171,7 +171,7 @@ def of_heading(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figu
 
 
 def of_pose(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Heading and altitude as received over the last 10 s, and the true bank then.
+    """Return heading and altitude as received over the last 10 s, and the true bank then.
 
     How long the wings were levelled is beside them.
     """
@@ -198,7 +198,7 @@ def of_pose(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]
 
 
 def of_altitude(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Overshoot of a climb and what it costs in airspeed."""
+    """Return the overshoot of a climb, and what it costs in airspeed."""
     altitude, V = after(tape, START, "pose.altitude", "y.V")
     start = tape["guidance"]["target.altitude"][0]
     yield Figure(
@@ -211,9 +211,9 @@ def of_altitude(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Fig
 
 
 def of_speed(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Overshoot of an acceleration and what it costs in altitude.
+    """Return the overshoot of an acceleration, and what it costs in altitude.
 
-    The rms of V in turbulence is over that of the wind.
+    The rms of V in turbulence is divided by that of the wind.
     """
     altitude, V = after(tape, START, "pose.altitude", "y.V")
     step = FASTER * section.speed
@@ -227,7 +227,10 @@ def of_speed(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure
 
 
 def of_route(waypoints: int, tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Largest cross-track error from 30 s on and before the last orbit, in s of flight."""
+    """Return the largest cross-track error, in s of flight.
+
+    It is taken from 30 s on and before the last orbit.
+    """
     leg, xtrack = after(tape, 30.0, "leg", "xtrack")
     leg_errors = np.abs(xtrack[leg < leg.max()])
     if leg.max() < 2.0 * waypoints - 3.0:  # lines, fillets between them, and the orbit
@@ -236,7 +239,7 @@ def of_route(waypoints: int, tape: Tape, section: GuidanceConfig, calm: bool) ->
 
 
 def of_orbit(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Rms of the cross-track error, in s of flight."""
+    """Return the rms of the cross-track error, in s of flight."""
     end = tape.time("guidance")[-1]
     yield Figure(
         "rms (s)",
@@ -246,9 +249,9 @@ def of_orbit(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure
 
 
 def of_switch(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Largest jump of u within 20 ms of a change of the mode.
+    """Return the largest jump of u within 20 ms of a change of the mode.
 
-    In percent of the range of each input.
+    It is in percent of the range of each input.
     """
     t = tape.time("u")
     u = tape["u"].values
@@ -268,9 +271,9 @@ RANGES: dict[str, float] = {}
 
 
 def of_limits(tape: Tape, section: GuidanceConfig, calm: bool, pose: Pose) -> Iterator[Figure]:
-    """How far the bank is beyond its limit, and the airspeed below nine tenths of the floor.
+    """Return how far the bank is beyond its limit, and the airspeed below nine tenths of the floor.
 
-    In any manoeuvre.
+    This holds for any manoeuvre.
     """
     phi = tape["truth"]["x.phi"]
     V = tape["guidance"]["y.V"]
@@ -285,16 +288,16 @@ def of_limits(tape: Tape, section: GuidanceConfig, calm: bool, pose: Pose) -> It
 
 
 def lap(section: GuidanceConfig) -> float:
-    """Time round the smallest orbit, s."""
+    """Return the time round the smallest orbit, s."""
     return 2.0 * math.pi * section.least_radius() / section.speed
 
 
 def round_route(
     places: Sequence[tuple[float, float, float]], section: GuidanceConfig
 ) -> tuple[dict[str, Any], float]:
-    """A route over places.
+    """Return a route over places.
 
-    North and east in least radii, which the fillets have, and altitude over that of trim, m.
+    North and east are in least radii, which the fillets have, and altitude is over that of trim, m.
     """
     radius = float(math.ceil(least_radius(section.speed, section.wind, section.bank)))
     north, east, altitude = np.transpose(places) * [[radius], [radius], [1.0]]
@@ -314,7 +317,7 @@ SWITCHES: tuple[dict[str, float], ...] = (
 
 
 def turn_round(section: GuidanceConfig) -> tuple[dict[str, Any], float]:
-    """A turn to the right onto the heading at which psi jumps, 180 deg."""
+    """Return a turn to the right onto the heading at which psi jumps, 180 deg."""
     duration = math.pi * section.speed / (GRAVITY * math.tan(section.bank)) + 40.0
     return {
         "program": {"heading": {"start": [START, START + 5.0], "value": [TURN, math.pi]}}
@@ -341,7 +344,7 @@ POSES: Mapping[str, Pose] = {
 
 
 def switching(section: GuidanceConfig) -> tuple[dict[str, Any], float]:
-    """A change of both modes every SWITCH_PERIOD."""
+    """Return a change of both modes every SWITCH_PERIOD."""
     steps: dict[str, dict[str, list[float]]] = {}
     for k, switch in enumerate(SWITCHES):
         for name, value in switch.items():

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the modes of a flight cost, beside the flight in one process without ROS in the same run.
+"""Measure what the modes of a flight cost, compared with a flight in one process without ROS.
 
-Processor time of all processes together, user and system, and of each; wall time of the command.
-A busy host takes wall time from all, so the modes are flown in turn, and the ratios count.
+The figures are the processor time, user and system, of each process and of all together, and the
+wall time of the command. A busy host takes wall time from all modes, so they are flown in turn in
+the same run, and only the ratios count.
 
     .venv/bin/python -m benchmarks.modes --duration 20 --repeat 3
 """
@@ -64,7 +65,7 @@ def fly(options: Sequence[str], duration: float) -> Cost:
 
 
 def _module(process: psutil.Process, command: int) -> str:
-    """The module that a process runs: that behind -m, or the command."""
+    """Return the module that a process runs: the one after -m, or the command."""
     words = process.cmdline()
     has_module = process.pid != command and "-m" in words[:-1]
     return words[words.index("-m") + 1] if has_module else "rise-di fly"

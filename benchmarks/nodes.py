@@ -19,7 +19,7 @@ from flight_ros.ticker import Tick, Ticker
 
 @contextlib.contextmanager
 def open_node(name: str) -> Iterator[Node]:
-    """A plain node of rclpy on the stack's transport.
+    """Open a plain node of rclpy on the stack's transport.
 
     It has a context of its own and no signal handlers.
     """
@@ -45,7 +45,7 @@ def ticks(hz: float) -> Iterator[Tick]:
 
 
 def termination() -> threading.Event:
-    """An event that SIGTERM and SIGINT set."""
+    """Return an event that SIGTERM and SIGINT set."""
     has_ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: has_ended.set())

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the blocks of the tutorials as they stand, those that the tests leave out included.
+"""Run the blocks of the tutorials as they stand, also those that the tests leave out.
 
     make pages                            # every page, half an hour on two cores
     make pages ARGS="landing campaign"    # these pages
 
-A page has an empty folder, in which its blocks run in their order. tests/docs/test_pages.py runs
+Each page has an empty folder, in which its blocks run in their order. tests/docs/test_pages.py runs
 most of them with fewer aircraft, samples and seconds. A block "by hand" needs what a host may lack,
 or changes the environment: its reason is printed. Exit status 1: a block failed.
 """
@@ -39,7 +39,10 @@ def run_page(page: Path, folder: Path) -> int:
 
 
 def passes(title: str, command: list[str], folder: Path) -> bool:
-    """Whether a command has exit status 0. Prints title and time, and the output of a failure."""
+    """Return whether a command has exit status 0.
+
+    Prints the title and the time, and the output of a failure.
+    """
     begin = time.monotonic()
     process = subprocess.run(  # noqa: S603 - the blocks of our own pages
         command, cwd=folder, env=environment(), capture_output=True, text=True, check=False

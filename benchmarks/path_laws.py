@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance with its path law, with L1, and with L1 behind the same lead of the curvature.
+"""Compare guidance with its path law, with L1, and with L1 and the same lead of the curvature.
 
 The osprey flies the same routes in the same loop.
 
@@ -48,16 +48,16 @@ class Cell(NamedTuple):
 
     @property
     def figures(self) -> Iterator[evidence.Row]:
-        """The rows of evidence."""
+        """Return the rows of evidence."""
         for law, value in self.values.items():
             yield evidence.row(f"{law}: {self.name}", round(value, 2), self.unit)
 
 
 def l1(error: PathError, course: Any, ground_speed: Any, params: PathParams) -> float:
-    """Acceleration to the right of ArduPilot's L1, m/s^2.
+    """Return the acceleration to the right of ArduPilot's L1, m/s^2.
 
-    Lines: K v^2 / L sin(nu), L = zeta P v / pi, K = 4 zeta^2. Circles: w^2 d + 2 zeta w d' +
-    v_t^2 / r, and outside at most that law towards the centre. Source: ArduPilot,
+    For lines it is K v^2 / L sin(nu), L = zeta P v / pi, K = 4 zeta^2. For circles it is w^2 d + 2
+    zeta w d' + v_t^2 / r, and outside at most that law towards the centre. Source: ArduPilot,
     libraries/AP_L1_Control.
     """
     e, track, kappa = map(float, error)
@@ -89,14 +89,14 @@ def _within(angle: float) -> float:
 def without_lead(
     error: PathError, entry: Any, entered: Any, slip: Any, pose: Any, speed: Any, params: Any
 ) -> Any:
-    """`lateral_modes.follow` with L1, without the lead and without the estimate of the slip."""
+    """Do as `lateral_modes.follow` with L1, but without the lead and the estimate of the slip."""
     acceleration = l1(error, *course_and_speed(pose), params.path)
     return bank_for(acceleration, path_angle(pose["climb"], speed), lateral_modes.STEEPEST)
 
 
 @contextmanager
 def flying(law: str) -> Iterator[None]:
-    """Guidance with one of LAWS."""
+    """Return guidance with one of LAWS."""
     if law == LAWS[0]:
         yield
         return
@@ -106,7 +106,10 @@ def flying(law: str) -> Iterator[None]:
 
 
 def osprey(wind: float, places: list[tuple[float, float]], start: float = 0.0) -> Scenario:
-    """The osprey in a steady wind of V0, on a route in radii, with a start to the east in radii."""
+    """Return the osprey in a steady wind, a share of V0, on a route in radii.
+
+    The start lies to the east, in radii.
+    """
     base = find_scenario("osprey_route").vary(
         reference_model={"rate": 100.0},
         aircraft={"turbulence": None, "rate": 100.0, "step": 0.005, "wind": [0.0, 0.0]},
@@ -123,7 +126,7 @@ def osprey(wind: float, places: list[tuple[float, float]], start: float = 0.0) -
 
 
 def rectangle(law: str, wind: float) -> float:
-    """Largest cross-track error on a rectangle, m."""
+    """Return the largest cross-track error on a rectangle, m."""
     scenario = osprey(wind, [(0, 0), (3, 0), (3, 3), (0, 3), (0, 0)])
     section = scenario.guidance
     assert section is not None  # noqa: S101 - of osprey
@@ -135,7 +138,7 @@ def rectangle(law: str, wind: float) -> float:
 
 
 def capture(law: str, offset: float) -> tuple[float, float]:
-    """Time to within WITHIN of a line from beside it, s, and the overshoot, m."""
+    """Return the time to within WITHIN of a line from beside it, s, and the overshoot, m."""
     scenario = osprey(0.0, [(0, 0), (60, 0)], offset).vary(flight={"duration": 25.0})
     with flying(law):
         tape = simulate(scenario)
@@ -146,7 +149,7 @@ def capture(law: str, offset: float) -> tuple[float, float]:
 
 
 def cells() -> Iterator[Cell]:
-    """The figures, flight by flight."""
+    """Return the figures, flight by flight."""
     for offset in OFFSETS:
         captures = {law: capture(law, offset) for law in LAWS}
         title = f"capture from {offset:g} radii"

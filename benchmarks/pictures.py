@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures of the documentation, drawn again from today's code.
+"""Draw the pictures of the documentation again from today's code.
 
 .venv/bin/python -m benchmarks.pictures                  # all; those of pages need a browser
 .venv/bin/python -m benchmarks.pictures report.png nodes.svg
@@ -58,7 +58,7 @@ class Picture(NamedTuple):
 
 
 def flown(scenario: Scenario, folder: Path, name: str) -> Path:
-    """A flight in one process, as a run."""
+    """Fly a scenario in one process, and return the run."""
     run = folder / name
     run.mkdir()
     write_run(simulate(scenario), run, attachments_for(scenario, run))
@@ -71,7 +71,8 @@ def flown(scenario: Scenario, folder: Path, name: str) -> Path:
 def save(shots: Sequence[str], path: Path, shows: str, figures: str = "") -> None:
     """Write screenshots, as base64, below each other, as a PNG of a third of their size.
 
-    `figures` of what it shows are kept as text, by which a test knows a picture of another flight.
+    `figures` of what it shows are kept as text, by which a test recognises a picture of another
+    flight.
     """
     parts = [Image.open(BytesIO(base64.b64decode(shot))).convert("RGB") for shot in shots]
     whole = Image.new("RGB", (parts[0].width, sum(part.height for part in parts)))
@@ -94,9 +95,9 @@ def save_view(
     at: str = "",
     clicks: Sequence[str] = (),
 ) -> None:
-    """Open the live page of runs, at an instant, click on elements, and save its picture.
+    """Open the live page of runs at an instant, click on elements, and save its picture.
 
-    It is saved once a condition holds, unless a failsafe tells that the host was too busy.
+    It is saved once a condition holds, unless a failsafe says that the host was too busy.
     """
     with (
         tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
@@ -119,7 +120,7 @@ def save_view(
 
 
 def report(path: Path, shows: str) -> None:
-    """The page of the default flight: the title, the table of errors, y over y_m."""
+    """Draw the page of the default flight: the title, the table of errors, y over y_m."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
         run = flown(find_scenario(shows), Path(temporary), shows)
         errors = write_report(run).flight.summary["errors"]
@@ -150,7 +151,7 @@ def report(path: Path, shows: str) -> None:
 
 
 def view_ghost(path: Path, shows: str) -> None:
-    """The default flight in its gust, and the same with half the gain as a ghost."""
+    """Draw the default flight in its gust, with half the gain as a ghost."""
     with tempfile.TemporaryDirectory() as folder:
         servo = find_scenario(shows)
         run = flown(servo, Path(folder), shows)
@@ -159,7 +160,7 @@ def view_ghost(path: Path, shows: str) -> None:
 
 
 def view_guided(path: Path, shows: str) -> None:
-    """A guided flight on its second leg, on the map."""
+    """Draw a guided flight on its second leg, on the map."""
     with tempfile.TemporaryDirectory() as folder:
         run = flown(find_scenario(shows), Path(folder), shows)
         clicks = ["[data-camera=map]"]
@@ -167,7 +168,10 @@ def view_guided(path: Path, shows: str) -> None:
 
 
 def view_live(path: Path, shows: str) -> None:
-    """The default flight over topics, in the air; in lockstep, which no other work disturbs."""
+    """Draw the default flight over topics, in the air.
+
+    It flies in lockstep, which no other work disturbs.
+    """
     with (
         tempfile.TemporaryDirectory() as folder,
         flying(Path(folder), LIVE_SECONDS, "--lockstep") as (flight, live),
@@ -180,7 +184,7 @@ def view_live(path: Path, shows: str) -> None:
 
 
 def drawing(name: str) -> Callable[[Path, str], None]:
-    """What writes a drawing of `benchmarks.diagrams`."""
+    """Return what writes a drawing of `benchmarks.diagrams`."""
 
     def draw(path: Path, shows: str) -> None:
         diagrams.save_drawing(getattr(diagrams, name)(), path, shows)
@@ -189,7 +193,7 @@ def drawing(name: str) -> Callable[[Path, str], None]:
 
 
 def plotted(main: Callable[[], object]) -> Callable[[Path, str], None]:
-    """What runs a program that plots its own picture."""
+    """Return what runs a program that plots its own picture."""
 
     def draw(path: Path, shows: str) -> None:
         main()

@@ -23,7 +23,7 @@ PRIORITY = 50  # SCHED_FIFO, as that of ros2_control
 class Child:
     """A role of benchmarks/speed_nodes.py, or a module (with a dot in its name), as a process.
 
-    A context manager.
+    It is a context manager.
     """
 
     def __init__(self, role: str, *arguments: str, within: Sequence[str] = ()) -> None:
@@ -46,7 +46,7 @@ class Child:
             self.popen.communicate()
 
     def cpu_ns(self) -> int:
-        """Processor time of its running threads, ns."""
+        """Return the processor time of its running threads, ns."""
         return threads_ns(self.popen.pid)
 
     def figures(self, timeout: float = 20.0) -> dict[str, Any]:
@@ -68,9 +68,9 @@ class Child:
 
 
 def threads_ns(pid: int) -> int:
-    """Processor time of the threads of a process, ns.
+    """Return the processor time of the threads of a process, ns.
 
-    From the kernel's schedstat: psutil resolves 10 ms only.
+    It comes from the kernel's schedstat, because psutil only resolves 10 ms.
     """
     total = 0
     for task in Path(f"/proc/{pid}/task").iterdir():
@@ -80,7 +80,7 @@ def threads_ns(pid: int) -> int:
 
 
 def real_time() -> tuple[str, ...]:
-    """What runs a command at real-time priority; empty where that is not permitted."""
+    """Return what runs a command at real-time priority; it is empty if that is not permitted."""
     prefix = (shutil.which("chrt") or "", "-f", str(PRIORITY))
     permitted = prefix[0] and not subprocess.run([*prefix, "true"], check=False).returncode  # noqa: S603
     return prefix if permitted else ()
@@ -88,9 +88,9 @@ def real_time() -> tuple[str, ...]:
 
 @contextlib.contextmanager
 def delay_monitors(allowed: bool) -> Iterator[Callable[[], Intervals] | None]:
-    """Host delays, measured by a process of the highest priority on each core, monotonic ns.
+    """Measure host delays with a process of the highest priority on each core, monotonic ns.
 
-    None if not allowed.
+    Yields None if that is not allowed.
     """
     if not allowed:
         yield None

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A campaign of random faults: all kinds, seeded and repeatable, a tenth of them two at a time.
+"""Inject random faults of all kinds, seeded and repeatable, a tenth of them two at a time.
 
     .venv/bin/python -m benchmarks.random_faults --count 1000 --lockstep 100 --seed 1 [--json FILE]
     .venv/bin/python -m benchmarks.random_faults --count 1 --seed 417    # one of them again
 
 It injects the cases of tests/ros/flight_bringup/faults in real time, and those of failures of the
-past (tests/ros/flight_bringup/faults/draws.py). A fault passes where the node that should detects
+past (tests/ros/flight_bringup/faults/draws.py). A fault passes if the node that should detects
 it, u responds as docs/faults.md states, no process ends or raises, the flight is steady again, and
-the log holds every message that was received. Two at a time: all but the response of u. In
-lockstep, where faults of messages do not exist, a killed node ends the flight with its name, and a
-stopped one changes no byte of the log.
+the log holds every message that was received. For two faults at a time the response of u does not
+count. In lockstep, where faults of messages do not exist, a killed node ends the flight with its
+name, and a stopped one changes no byte of the log.
 """
 
 import json

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Time of a receiver for one message of y that has arrived.
+"""Measure the time of a receiver for one message of y that has arrived.
 
-A right one taken by the controller, and refused ones.
+The controller takes a right message, and refuses others.
 
 python -m benchmarks.speed --only receiver
 """
@@ -33,13 +33,13 @@ TAKEOVER_NS = 10**15  # no publisher times out
 
 
 def long_message(sender: str, size: int) -> bytes:
-    """A message of this many bytes, or some less, of channels that the controller does not want."""
+    """Return a message of about this many bytes, of channels that the controller does not want."""
     count = (size - 100) // 20  # 12 bytes a name, 8 a value
     return Encoder([f"c{k:05}" for k in range(count)], sender).encode(0, np.zeros(count))
 
 
 def measure() -> dict[str, FloatArray]:
-    """Times of one message each, ns, of a right message and of refused ones."""
+    """Return the times of a right message and of refused ones, ns for each."""
     parameters = find_scenario("osprey_gust").controller
     controller = Controller(parameters)
     encoder = Encoder(parameters.outputs, OWN)

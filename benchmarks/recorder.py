@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""CPU time and losses of the recorder at 1 kHz on six topics.
+"""Measure CPU time and losses of the recorder at 1 kHz on six topics.
 
 The size of its file is compared with that of rosbags' Writer.
 
@@ -35,7 +35,7 @@ TOPICS = (Y, Y_M, U, U_M, INTERNALS, TRUTH)
 def publish(rate: float, duration: float) -> None:
     """Publish on each topic for the duration or until SIGTERM.
 
-    Print "matched" first and the number sent at the end.
+    Prints "matched" first, and the number of messages sent at the end.
     """
     tape = simulate(find_scenario("osprey_servo", 5.0))
     has_ended = termination()
@@ -77,7 +77,7 @@ def publish(rate: float, duration: float) -> None:
 
 
 def record(run: Path, rate: float, duration: float) -> tuple[dict[str, float], float]:
-    """The publisher's counts, and the processor time of the recorder, s.
+    """Return the publisher's counts, and the processor time of the recorder, s.
 
     The time is from the first message to the last.
     """
@@ -96,7 +96,7 @@ def record(run: Path, rate: float, duration: float) -> tuple[dict[str, float], f
 
 
 class Rewritten(NamedTuple):
-    """Messages of a run, written again by rosbags' Writer."""
+    """The messages of a run, written again by rosbags' Writer."""
 
     counts: Counter[str]  # by topic
     cpu: float  # us a message
@@ -128,7 +128,7 @@ def rewrite(run: Path, folder: Path, compression: CompressionMode) -> Rewritten:
 
 
 def mcap_size(folder: Path) -> int:
-    """Bytes of the MCAP files of a run or a bag."""
+    """Return the bytes of the MCAP files of a run or a bag."""
     return sum(path.stat().st_size for path in folder.rglob("*.mcap"))
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Every scenario flown in lockstep over topics and replayed from its log; prints JSON.
+"""Fly every scenario in lockstep over topics, replay it from its log, and print JSON.
 
 python -m benchmarks.replays
 """
@@ -16,7 +16,7 @@ from flight_analysis.closed_loop.scenario_library import scenarios
 
 
 def _run(*command: str) -> dict[str, Any]:
-    """The JSON that a command prints; without any, the figure that misses the goal."""
+    """Return the JSON that a command prints; without any, the figure that misses the goal."""
     process = subprocess.run(  # noqa: S603 - ours
         (RISE_DI, *command, "--json"), check=False, capture_output=True, text=True
     )

@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Routes by rule from where they are hard to begin, in wind, steep, and crossing themselves.
+"""Fly routes by rule that are hard to begin, windy, steep, or cross themselves.
 
 They are flown, missed or refused.
 
     .venv/bin/python -m benchmarks.routes [--only osprey_servo c172p 737 f16] [--cases behind helix]
 
-The figures go to docs/evidence/guidance-routes-*.csv, where all cases are flown. A row a flight in
-one process: the result, the largest cross-track error on the legs in seconds of flight at V0 and
-its limit, the largest error of the altitude. A leg or a circle that the aircraft joins, and the leg
-of the start, count from one radius beyond on, within which the start counts as reached. A refusal
-is a result, with the sentence. The wind is known as `guidance.wind`. No number is tuned to an
-aircraft. Exit status 1: an error beyond its limit, a missed leg, or an aircraft lost.
+The figures go to docs/evidence/guidance-routes-*.csv, if all cases are flown. Each flight is in one
+process and has a row: the result, the largest cross-track error on the legs in seconds of flight at
+V0, its limit, and the largest error of the altitude. A leg or a circle that the aircraft joins, and
+the leg of the start, count from one radius beyond their start on, within which the start counts as
+reached. A refusal is a result, with the sentence. The wind is known as `guidance.wind`. No number
+is tuned to an aircraft. Exit status 1: an error beyond its limit, a missed leg, or a lost aircraft.
 """
 
 import csv
@@ -46,7 +46,7 @@ SETTLE = 20.0
 
 
 class Case(NamedTuple):
-    """A route, by the least radius in m, and the air.
+    """A route, in least radii or in m, and the air.
 
     The aircraft starts at the origin and heads north.
     """
@@ -68,7 +68,7 @@ class Row(NamedTuple):
 
     @property
     def figure(self) -> evidence.Row:
-        """The row of evidence; words that are no refusal do not meet the limit."""
+        """Return the row of evidence; words that are no refusal do not meet the limit."""
         goal = None if self.result.startswith("refused") else self.limit
         value = self.xtrack if self.result == "flown" else self.result
         return evidence.row(
@@ -79,7 +79,7 @@ class Row(NamedTuple):
 def of_radii(
     *places: tuple[float, float], altitudes: tuple[float, ...] = ()
 ) -> Callable[[float], list[Waypoint]]:
-    """A route of places in radii to the north and to the east.
+    """Return a route of places in radii to the north and to the east.
 
     Its altitudes are over that of the start in m.
     """
@@ -95,12 +95,12 @@ def of_radii(
 
 
 def far(radius: float) -> list[Waypoint]:
-    """A line 20 km to the side."""
+    """Return a line 20 km to the side."""
     return [Waypoint(0.0, 20e3, 0.0), Waypoint(6.0 * radius, 20e3, 0.0)]
 
 
 def steep(_: float) -> list[Waypoint]:
-    """1000 m up within 500 m."""
+    """Return a climb of 1000 m within 500 m."""
     return [Waypoint(1000.0, 0.0, 0.0), Waypoint(1500.0, 0.0, 1000.0)]
 
 
@@ -122,7 +122,7 @@ CASES: Mapping[str, Case] = {
 
 
 def duration(route: Route, section: GuidanceConfig) -> float:
-    """Time to fly a route from the origin with the wind from ahead, s."""
+    """Return the time to fly a route from the origin with the wind from ahead, s."""
     climb, sink = section.climb_limits()
     slowest, (start, course), at = section.speed - section.wind, route.start(0), (0.0, 0.0)
     side = float(path.joining(start, course, route.radius, route.near(0), at, 0.0))
@@ -148,7 +148,7 @@ def duration(route: Route, section: GuidanceConfig) -> float:
 
 
 def fly(name: str, title: str, case: Case) -> Row:
-    """The result of a flight."""
+    """Return the result of a flight."""
     scenario = aircraft_of(name)
     limit = LIMIT if case.wind or case.turbulent else CALM_LIMIT
     try:
@@ -175,7 +175,7 @@ def fly(name: str, title: str, case: Case) -> Row:
 
 
 def planned(scenario: Scenario, name: str, case: Case) -> Scenario:
-    """The scenario of a case. Raises ParameterError where the route is refused."""
+    """Return the scenario of a case. Raises ParameterError if the route is refused."""
     if scenario.guidance is None:
         raise ValueError(f"{name} has no guidance")
     wind = case.wind * scenario.guidance.speed
@@ -195,7 +195,10 @@ def planned(scenario: Scenario, name: str, case: Case) -> Scenario:
 
 
 def errors(tape: Tape, route: Route) -> tuple[float, float]:
-    """Largest cross-track error and error of the altitude on the legs before the last orbit, m."""
+    """Return the largest cross-track error and error of the altitude, m.
+
+    They are taken on the legs before the last orbit.
+    """
     log = tape["guidance"]
     circles = [k for k, leg in enumerate(route.legs) if isinstance(leg, Arc) and leg.loiter]
     on_leg = (

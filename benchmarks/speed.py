@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Speed of the stack, each figure compared with a baseline.
+"""Measure the speed of the stack, with each figure compared with a baseline.
 
 The baseline is the least program that does the same on this host in one run.
 
     python -m benchmarks.speed [--only node] [--seconds 10] [--json FILE]
 
 Ratios carry over to other hosts, the figures do not. Neither is valid on a host that is busy with
-other work. The baselines (`floor`): one NumPy operation, a subscription of rclpy whose callback
+other work. The baselines (`floor`) are one NumPy operation, a subscription of rclpy whose callback
 publishes the message again (an echo), an empty timer of rclpy, a loop that only sleeps, a node of
 rclpy that only spins, the writer of rosbags, a right message.
 """
@@ -87,7 +87,7 @@ class Row:
 
 
 def us(values: Sequence[float] | FloatArray) -> dict[str, float]:
-    """Percentiles of times in ns as columns in us."""
+    """Return percentiles of times in ns as columns in us."""
     low, high = np.percentile(np.asarray(values) / 1e3, (50, 99))
     return {
         "p50 (us)": float(low),
@@ -166,7 +166,7 @@ class Driven:
     cpu_ns: int = 0  # processor time of the process
 
     def __add__(self, other: "Driven") -> "Driven":
-        """The answers of both; no two have the same stamp."""
+        """Return the answers of both; no two have the same stamp."""
         return Driven(
             self.start or other.start,
             self.sent + other.sent,
@@ -178,12 +178,12 @@ class Driven:
 
     @property
     def round_trips(self) -> list[int]:
-        """From y sent to u received, ns."""
+        """Return the times from y sent to u received, ns."""
         return [at - stamp for stamp, at in self.received.items()]
 
     @property
     def answers(self) -> list[float]:
-        """From the beginning of the tick to u received, ns."""
+        """Return the times from the beginning of the tick to u received, ns."""
         return [
             at - stamp - 1e9 * self.age[stamp]
             for stamp, at in self.received.items()
@@ -192,7 +192,7 @@ class Driven:
 
     @property
     def cpu_each(self) -> float:
-        """Processor time of the process for each answer, us."""
+        """Return the processor time of the process for each answer, us."""
         return 1e-3 * self.cpu_ns / max(len(self.received), 1)
 
 
@@ -200,7 +200,7 @@ class Driven:
 def controller_at(
     hz: float, folder: Path, role: str = "controller", scenario_name: str = SCENARIO
 ) -> Iterator[Child]:
-    """The process of the controller of a scenario at a rate."""
+    """Start the controller of a scenario at a rate as a process."""
     # at least as fast as the controller, as a scenario demands; they do not run here
     others = {"rate": max(hz, 500.0)}
     rates = {
@@ -216,14 +216,14 @@ def controller_at(
 
 
 def law_rows() -> Iterator[Row]:
-    """One step of the law, one inside its limits, one whole tick."""
+    """Measure one step of the law, one inside its limits, and one whole tick."""
     times = law.measure() | {"guard.tick of osprey_observer": law.measure_observer()}
     for name, (median, high, most) in times.items():
         yield Row(name, {"p50 (us)": median, "p99.9 (us)": high, "max (us)": most}, law.FLOOR)
 
 
 def receiver_rows() -> Iterator[Row]:
-    """A message of y that has arrived: a right one, and refused ones of any size."""
+    """Measure a message of y that has arrived: a right one, and refused ones of any size."""
     for name, times in receiver.measure().items():
         at_most = receiver.AT_MOST.get(name, 2.0)
         goals = () if name == receiver.RIGHT else (Goal("p50 (us)", at_most, of_floor=True),)
@@ -231,9 +231,9 @@ def receiver_rows() -> Iterator[Row]:
 
 
 def node_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """The controller's tick and an echo's callback.
+    """Measure the controller's tick and an echo's callback.
 
-    From a y that has arrived to the message published.
+    The time is from a y that has arrived to the message published.
     """
     length = min(seconds, 4.0)
     took: dict[str, list[dict[str, float]]] = {}
@@ -276,7 +276,10 @@ def _whole(figures: dict[str, float]) -> dict[str, float]:
 
 
 def latency_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """From y sent to u received, over DDS, and the processor time for each answer."""
+    """Measure the time from y sent to u received, over DDS.
+
+    The processor time for each answer is measured too.
+    """
     with open_node("peer") as node:
         peer = Peer(node)
         for hz in RATES:
@@ -313,7 +316,7 @@ def _latency(driven: Driven, values: Sequence[float]) -> dict[str, float]:
 
 
 def tick_rows(seconds: float) -> Iterator[Row]:
-    """Lateness of the ticks of an empty node of the stack, compared with rclpy's own timers."""
+    """Measure the lateness of ticks of an empty node of the stack, against rclpy's own timers."""
     short = min(seconds, FLOOR_SECONDS)
     prefix = real_time()
     for hz in RATES:
@@ -368,7 +371,7 @@ def _ticks(
 
 @contextlib.contextmanager
 def full_load() -> Iterator[None]:
-    """Every core busy with other work at ordinary priority."""
+    """Keep every core busy with other work at ordinary priority."""
     # Also where this program runs at real-time priority: else they would block the host.
     spin = (
         "import os\nos.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))\nwhile True: pass"
@@ -383,7 +386,7 @@ def full_load() -> Iterator[None]:
 
 
 def flight_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """CPU and memory of each process of a flight in real time."""
+    """Measure CPU and memory of each process of a flight in real time."""
     scenario = find_scenario(SCENARIO, seconds)
     run = folder / "flight"
     run.mkdir()
@@ -423,7 +426,7 @@ def _use(pids: Sequence[int], seconds: float) -> list[dict[str, float]]:
 
 
 def start_rows(folder: Path) -> Iterator[Row]:
-    """From the start of a process to its first u."""
+    """Measure the time from the start of a process to its first u."""
     floor = "python, import rclpy, rclpy.init"
     begin = time.perf_counter()
     for _ in range(5):
@@ -447,7 +450,7 @@ def start_rows(folder: Path) -> Iterator[Row]:
 
 
 def seconds_to_first_u() -> float:
-    """From the start of the command to the first u of its flight, s."""
+    """Return the time from the start of the command to the first u of its flight, s."""
     with open_node("subscriber") as node, tempfile.TemporaryDirectory() as runs:
         subscription = PolledSubscription(node, U, RECORD, raw=True)
         begin = time.time()
@@ -469,9 +472,9 @@ def seconds_to_first_u() -> float:
 
 
 def import_rows() -> Iterator[Row]:
-    """Processor time of an import, alone and with the start of Python, and of `rise-di --help`.
+    """Measure the processor time of an import, and of `rise-di --help`.
 
-    Medians.
+    The import is measured alone and with the start of Python. The figures are medians.
     """
     floor, ours, usage = "python, import numpy", "python, import rise_di", "rise-di --help"
     imports = (
@@ -504,14 +507,14 @@ def import_rows() -> Iterator[Row]:
 
 
 def lockstep_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """Steps a second of lockstep flights, over topics and without them."""
+    """Measure the steps a second of lockstep flights, over topics and without them."""
     for name, speed in lockstep.measure(folder, max(seconds, 10.0), 3).items():
         real_time = {} if name == lockstep.FLOOR else {"times real time": speed / lockstep.RATE}
         yield Row(name, {"steps/s": speed} | real_time, lockstep.FLOOR)
 
 
 def recorder_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """CPU time, losses and size of the recorder at 1 kHz on six topics.
+    """Measure CPU time, losses and size of the recorder at 1 kHz on six topics.
 
     They are compared with rosbags' writer fed from memory.
     """
@@ -534,7 +537,7 @@ def recorder_rows(seconds: float, folder: Path) -> Iterator[Row]:
 
 
 def evidence_rows(rows: Sequence[Row]) -> Iterator[evidence.Row]:
-    """The rows of evidence; counts, single outliers and shares have no baseline."""
+    """Return the rows of evidence; counts, single outliers and shares have no baseline."""
     by_name = {row.what: row.figures for row in rows}
     for row in rows:
         goals = {

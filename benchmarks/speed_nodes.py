@@ -44,7 +44,7 @@ MONITOR_PERIOD = 0.0005  # s
 
 
 def times(took_ns: list[int]) -> dict[str, float]:
-    """Median and 99th percentile of durations, us, without the warm-up."""
+    """Return median and 99th percentile of durations, us, without the warm-up."""
     took = np.array(took_ns[len(took_ns) // 20 :]) / 1e3
     return {
         "p50": float(np.percentile(took, 50)),
@@ -54,7 +54,7 @@ def times(took_ns: list[int]) -> dict[str, float]:
 
 
 def lateness(late_ns: list[int], missed: int) -> dict[str, float]:
-    """Percentiles of the lateness of ticks, us, without the warm-up."""
+    """Return percentiles of the lateness of ticks, us, without the warm-up."""
     late = times(late_ns)
     most = max(late_ns[len(late_ns) // 20 :]) / 1e3
     return {
@@ -67,17 +67,17 @@ def lateness(late_ns: list[int], missed: int) -> dict[str, float]:
 
 
 def executor_of(node: Node, kind: str) -> Any:
-    """An executor that spins the node."""
+    """Return an executor that spins the node."""
     executor = EXECUTORS[kind](context=node.context)
     executor.add_node(node)
     return executor
 
 
 def echo(kind: str, hz: float, *, timed: bool) -> dict[str, float]:
-    """A subscription to y whose callback publishes each message on u.
+    """Run a subscription to y whose callback publishes each message on u.
 
-    Timed: the executor spins once at a fixed rate, when a message has arrived, and the time to the
-    end of the callback is measured. Otherwise the executor spins as usual.
+    If it is timed, the executor spins once at a fixed rate, when a message has arrived, and the
+    time to the end of the callback is measured. Otherwise the executor spins as usual.
     """
     has_ended = termination()
     took: list[int] = []
@@ -107,7 +107,7 @@ def echo(kind: str, hz: float, *, timed: bool) -> dict[str, float]:
 
 
 def polled_echo() -> dict[str, float]:
-    """Publishes each message of y on u, by the stack's publisher and subscription."""
+    """Publish each message of y on u, by the stack's publisher and subscription."""
     has_ended = termination()
     with open_node("echo") as node:
         subscription = PolledSubscription(node, Y, LOCKSTEP, raw=True)
@@ -121,7 +121,7 @@ def polled_echo() -> dict[str, float]:
 
 
 def idle() -> dict[str, float]:
-    """A node that only spins."""
+    """Run a node that only spins."""
     has_ended = termination()
     with open_node("idle") as node:
         executor = executor_of(node, "single")
@@ -131,7 +131,7 @@ def idle() -> dict[str, float]:
 
 
 def timer(kind: str, hz: float, seconds: float) -> dict[str, float]:
-    """Lateness of the callback of an empty timer of rclpy on the steady clock."""
+    """Measure the lateness of an empty timer of rclpy on the steady clock."""
     has_ended = termination()
     period_ns = round(NANOSECONDS / hz)
     late: list[int] = []
@@ -155,7 +155,7 @@ def timer(kind: str, hz: float, seconds: float) -> dict[str, float]:
 
 
 def bare_loop(hz: float, seconds: float) -> dict[str, float]:
-    """A loop that only sleeps until the next deadline."""
+    """Run a loop that only sleeps until the next deadline."""
     late = []
     missed_count = 0
     end = time.monotonic() + seconds
@@ -168,7 +168,10 @@ def bare_loop(hz: float, seconds: float) -> dict[str, float]:
 
 
 def ticker_node(hz: float, seconds: float) -> dict[str, Any]:
-    """An empty node of the stack, with the services, diagnostics and graph checks of its loop."""
+    """Run an empty node of the stack.
+
+    It has the services, the diagnostics and the graph checks of its loop.
+    """
     late: list[int] = []
     # from the first missed deadline to the next tick, monotonic ns
     skipped: list[tuple[int, int]] = []
@@ -195,7 +198,7 @@ def ticker_node(hz: float, seconds: float) -> dict[str, Any]:
 
 
 def delay_monitor(core: int) -> dict[str, Any]:
-    """Host delays of one core, monotonic ns.
+    """Measure the host delays of one core, monotonic ns.
 
     They are intervals in which a process of the highest priority did not run. The kernel delays it
     or, in a virtual machine, its host (steal time).
@@ -219,9 +222,9 @@ def delay_monitor(core: int) -> dict[str, Any]:
 
 
 def controller() -> dict[str, float]:
-    """The controller's node.
+    """Run the controller's node.
 
-    Time from the beginning of a tick until u is published, and until its end.
+    The times are from the beginning of a tick until u is published, and until its end.
     """
     until_u: list[int] = []
     tick_times: list[int] = []

@@ -17,12 +17,12 @@ from flight_core.vectors import FloatArray
 
 
 def cells(values: FloatArray, factor: float = 1.0) -> str:
-    """Values with three digits, joined by slashes."""
+    """Join values with three digits by slashes."""
     return " / ".join(f"{value:.3g}" if abs(value) >= 5e-4 else "0" for value in values * factor)
 
 
 def new_table(title: str, columns: Sequence[str], texts: int) -> Table:
-    """A table whose first columns hold text, the others figures."""
+    """Return a table whose first columns hold text and the others figures."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index < texts else "right", no_wrap=True)
@@ -30,7 +30,7 @@ def new_table(title: str, columns: Sequence[str], texts: int) -> Table:
 
 
 def parser_of(text: str | None) -> argparse.ArgumentParser:
-    """A parser of options, with the docstring of the program as its help."""
+    """Return a parser of options, with the docstring of the program as its help."""
     return argparse.ArgumentParser(
         description=text, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The cost of watching a flight.
+"""Measure the cost of watching a flight.
 
-Opening a long log, the server beside a flight, delays to the screen, missed ticks.
+The figures are of opening a long log, of the server beside a flight, of delays to the screen and of
+missed ticks.
 
 .venv/bin/python -m benchmarks.view                      # all
 .venv/bin/python -m benchmarks.view open --hours 1       # `rise-di watch` of a log of that length
@@ -70,7 +71,7 @@ STARTED = 7.0  # s, for the start of the server, until its client has the flight
 def write_long_log(run: Path, hours: float) -> None:
     """Repeat a flight of PIECE s with moved stamps.
 
-    A chunk each 0.1 s, as the recorder writes them.
+    A chunk is written each 0.1 s, as by the recorder.
     """
     scenario = find_scenario(SCENARIO, PIECE)
     with tempfile.TemporaryDirectory() as folder:
@@ -97,9 +98,9 @@ def write_long_log(run: Path, hours: float) -> None:
 
 
 def moved(one: StoredMessage, now_ns: int) -> bytes:
-    """The message with another stamp.
+    """Return the message with another stamp.
 
-    Its t, where it has one, stays, as in one flight the first alone counts.
+    If it has a t, that stays, because in one flight only the first t counts.
     """
     seconds, rest = divmod(now_ns, NANOSECONDS)
     return (
@@ -111,7 +112,7 @@ def moved(one: StoredMessage, now_ns: int) -> bytes:
 
 
 def open_log(hours: float) -> dict[str, Any]:
-    """Times in s from the start of `rise-di watch` to answers about a long log.
+    """Return the times in s from the start of `rise-di watch` to answers about a long log.
 
     The memory of the server, in MB, is beside them. "first samples" is the first answer that has
     some, "whole log" the first one with the state "ended".
@@ -178,9 +179,9 @@ class Client(threading.Thread):
                 break
 
     def news(self) -> dict[str, Any]:
-        """The head of an answer with what the client lacks, which it knows then.
+        """Return the head of an answer with what the client lacks; the client then knows it.
 
-        Raises EOFError where the server has ended.
+        Raises EOFError if the server has ended.
         """
         client_state = {
             name: self._head.get(name, "") for name in ("epoch", "state", "described")
@@ -195,7 +196,10 @@ class Client(threading.Thread):
         return head
 
     def ask(self, query: str = "") -> bytes:
-        """What a client lacks that knows so much. Raises EOFError where the server has ended."""
+        """Return what a client lacks that knows so much.
+
+        Raises EOFError if the server has ended.
+        """
         return self._loop.run(self._ask(query))
 
     async def _ask(self, query: str) -> bytes:
@@ -220,7 +224,7 @@ class Client(threading.Thread):
 def flying(
     runs: Path, seconds: float, *options: str
 ) -> Iterator[tuple["subprocess.Popen[str]", Path]]:
-    """A flight over topics, in real time unless `options` say otherwise, and its folder."""
+    """Fly over topics, in real time unless `options` say otherwise, and yield the folder."""
     command = [
         RISE_DI,
         "fly",
@@ -243,7 +247,7 @@ def flying(
 
 @contextmanager
 def watching(*runs: Path) -> Iterator[tuple[psutil.Popen, str]]:
-    """The server of a run, or of a run and its ghost, and its address."""
+    """Serve a run, or a run and its ghost, and yield the address."""
     command = [RISE_DI, "watch", *map(str, runs), "--wait", "--port", "0"]
     server = psutil.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
@@ -268,9 +272,9 @@ MEASURE = """(start => {
 
 
 def live(seconds: float, *, browser: bool) -> dict[str, Any]:
-    """Processor share and memory (MB) of the server beside a flight.
+    """Measure processor share and memory (MB) of the server beside a flight.
 
-    Traffic, and delays to the screen.
+    Traffic and delays to the screen are measured too.
     """
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -311,9 +315,9 @@ def live(seconds: float, *, browser: bool) -> dict[str, Any]:
 
 
 def frozen(seconds: float = FREEZE) -> dict[str, Any]:
-    """A page whose process stops for so long.
+    """Measure a page whose process stops for so long.
 
-    The time from its going on until its delay is below RECOVERED again, s.
+    Returns the time from when it goes on until its delay is below RECOVERED again, s.
     """
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -352,19 +356,19 @@ def frozen(seconds: float = FREEZE) -> dict[str, Any]:
 
 
 def start_of(address: str) -> float:
-    """System time of t = 0, s, as the page has it."""
+    """Return the system time of t = 0, s, as the page has it."""
     content = Client(address).ask()
     size = int.from_bytes(content[:4], "little")
     return int(json.loads(content[4 : 4 + size])["epoch"].partition(".")[0]) / NANOSECONDS
 
 
 def flights(count: int, seconds: float) -> dict[str, Any]:
-    """Ticks of flights, for half of the time without and with a watching client.
+    """Compare the ticks of flights with and without a watching client, for half of the time each.
 
-    Missed, and late p99 in s. Client and server stop and go on in turns of TURN. So the phases of
-    the nodes' timers, which differ from flight to flight, are the same for both, and a drift of the
-    host cancels. "start included" counts also the start of the server, whose processor time is that
-    of any program that starts.
+    The figures are missed ticks, and late p99 in s. Client and server stop and go on in turns of
+    TURN. So the phases of the nodes' timers, which differ from flight to flight, are the same for
+    both, and a drift of the host cancels. "start included" also counts the start of the server,
+    whose processor time is that of any program that starts.
     """
     period_ns = nanoseconds(1.0 / find_scenario(SCENARIO).controller.rate)
     tables: dict[str, list[dict[str, float]]] = {"without": [], "with": [], "start included": []}
@@ -429,9 +433,9 @@ def figures_of_ticks(
     period_ns: int,
     windows: Intervals = ((0, 2**63 - 1),),
 ) -> dict[str, float]:
-    """Missed ticks and late p99 of the deadlines inside windows.
+    """Return missed ticks and late p99 of the deadlines inside windows.
 
-    Also excluding host delays where they are known.
+    If host delays are known, they are also given without those.
     """
     at = internals.stamp_ns + np.rint(internals["age"] * NANOSECONDS).astype(np.int64)
     due = at - np.rint(internals["late"] * NANOSECONDS).astype(np.int64)
@@ -457,19 +461,19 @@ def figures_of_ticks(
 
 
 def interval(differences: FloatArray) -> list[float]:
-    """The 95 % confidence interval of the median, by order statistics.
+    """Return the 95 % confidence interval of the median, by order statistics.
 
-    Of ten values from the second to the ninth.
+    For ten values it goes from the second to the ninth.
     """
     ends: list[float] = np.array(quantile_test(differences).confidence_interval(0.95)).tolist()
     return ends
 
 
 def probability(differences: FloatArray) -> float:
-    """Probability of a mean difference this large or larger by chance.
+    """Return the probability of a mean difference this large or larger by chance.
 
-    Where watching has no effect, all signs of the pairs are alike. Exact permutation test of paired
-    samples; Edgington, Randomization Tests, 4th edition, 5.
+    If watching has no effect, all signs of the pairs are equally likely. Exact permutation test of
+    paired samples; Edgington, Randomization Tests, 4th edition, 5.
     """
     signs = np.array(list(itertools.product((1.0, -1.0), repeat=len(differences))))
     return float(np.mean(signs @ differences >= np.sum(differences) - 1e-12))
