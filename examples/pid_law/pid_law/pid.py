@@ -47,7 +47,7 @@ class PidState(NamedTuple):
 
 
 def u_from_trim(state: PidState, params: PidParams) -> Array:
-    """Deviation of u from trim, shape (m,).
+    """Compute the deviation of u from trim, shape (m,).
 
     It is -input_scale D K (e - e_0 + Lambda integral of e + lead e_dot).
     """
@@ -65,7 +65,7 @@ def engage(measurements: Measurements, params: PidParams) -> PidState:
 def limited(
     state: PidState, measurements: Measurements, dt: Array, params: PidParams, limits: Limits
 ) -> tuple[PidState, Array, Array]:
-    """One tick inside the limits: u = u_trim + u_from_trim.
+    """Compute a tick inside the limits: u = u_trim + u_from_trim.
 
     e_dot      += (1 - exp(-dt / filter_time)) ((e - e_p) / dt - e_dot)
     integral_e += dt (e + e_p) / 2, or less of it where u is saturated and would move further
@@ -122,12 +122,12 @@ class PidConfig(ControllerConfig):
     )
 
     def check_law(self) -> None:
-        """One value for each channel."""
+        """Require one value for each channel."""
         for key in ("K", "Lambda", "lead", "filter_time"):
             require_length(key, getattr(self, key), self.outputs)
 
     def control_law(self) -> ControlLaw:
-        """PID control."""
+        """Return the functions of PID control."""
         return CONTROL_LAW
 
     def law_params(self) -> PidParams:

@@ -157,14 +157,14 @@ class Recorder(Controller):
         self._add(START)
 
     def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """As the controller does, unless y is silent."""
+        """Take y as the controller does, unless y is silent."""
         if "y" in self.silent:
             return None
         self._add(TAKE_Y, now_ns, sample.stamp_ns, y=sample.value)
         return self._note_refusal(super().take_y, sample, now_ns)
 
     def take_y_m(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """As the controller does, unless y_m is silent."""
+        """Take y_m as the controller does, unless y_m is silent."""
         if "y_m" in self.silent:
             return None
         self._add(TAKE_Y_M, now_ns, sample.stamp_ns, y_m=sample.value)
@@ -191,7 +191,7 @@ class Recorder(Controller):
         self.retune(self.sets[index])
 
     def restart(self) -> None:
-        """As the controller does."""
+        """Restart as the controller does."""
         self._add(RESTART)
         super().restart()
 

@@ -90,17 +90,14 @@ class LqiConfig(ControllerConfig):
 def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Build the nominal aircraft with the reference and the integral of e: F, G and E.
 
-    The model is sampled with u held over a period.
-
-    z+ = F z + G u; the cost is on E z, e and the integral of e. Shapes are (n + 3 m, n + 3 m), (n +
-    3
-    m, m) and (2 m, n + 3 m).
-
-        x_dot   = (A + gravity) x + B u      rows of angles: -LEAK angle, a measured disturbance
+        z+ = F z + G u
+        x_dot   = (A + gravity) x + B u
         y_m_dot = w - LEAK y_m,  w_dot = -fade w,  integral of e: C x - y_m
 
-    Angles integrate the controlled rates: with the true rows the integral of e would not be
-    controllable.
+    F is (n + 3 m, n + 3 m), G (n + 3 m, m) and E (2 m, n + 3 m). The model is sampled with u held
+    over a period, and the cost is on E z, which is e and the integral of e. The rows of angles are
+    -LEAK angle, a measured disturbance. Angles integrate the controlled rates: with the true rows
+    the integral of e would not be controllable.
     """
     n, m = model.B.shape
     free = 1.0 - model.kinematic[:, None]

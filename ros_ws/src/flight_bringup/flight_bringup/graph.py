@@ -260,7 +260,7 @@ def _stage_overrides(scenario: Scenario, *, lockstep: bool) -> dict[NodeSpec, Pa
 
 
 def _recording(scenario: Scenario, run: Path, autopilot: Autopilot | None) -> ParameterOverrides:
-    """Return the recorder's folder, and the topics beside those of every flight."""
+    """Return the recorder's folder, and the topics that not every flight has."""
     further: list[str] = []
     if scenario.guidance is not None:
         further += topics.recorded_with("guidance")

@@ -154,7 +154,10 @@ def comment(lines: Iterable[str]) -> str:
 
 
 def is_file(path: Path) -> bool:
-    """Whether the path is a file; False also for an invalid path, such as one that is too long."""
+    """Return whether the path is a file.
+
+    It is not if the path is invalid, such as one that is too long.
+    """
     return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises OSError and ValueError
 
 

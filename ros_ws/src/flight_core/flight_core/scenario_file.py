@@ -110,7 +110,10 @@ def names_node(content: bytes, path: Path, name: str, key: str, namespace: str) 
 
 
 def gives_all(content: bytes, path: Path, key: str) -> bool:
-    """Whether a section for all nodes has the parameter `key`. Raises as `names_node` does."""
+    """Return whether a section for all nodes has the parameter `key`.
+
+    Raises as `names_node` does.
+    """
     return any(
         pattern.rpartition("/")[2] in WILDCARDS and key in values
         for pattern, values in _all_sections(content, path).items()

@@ -101,7 +101,7 @@ class TargetChannels(NamedTuple):
     together: Mapping[Lateral, tuple[str, ...]]  # channels of a mode that come together
 
     def known(self) -> tuple[str, ...]:
-        """All of them."""
+        """Return all of these channels, in the order of TARGETS."""
         names = {*self.lateral, *self.vertical, *self.further}
         return tuple(name for name in TARGETS if name in names)
 

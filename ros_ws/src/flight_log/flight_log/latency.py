@@ -41,7 +41,7 @@ def latency(times: Mapping[str, Sequence[Times]]) -> Signal | None:
 
 
 def _last_of_each(times: Sequence[Times]) -> Times:
-    """Return the times in the order of the stamps, and the last time of equal stamps."""
+    """Return the times in the order of the stamps; of equal stamps only the last time stays."""
     stamp_ns, sent_ns = (np.concatenate(arrays)[::-1] for arrays in zip(*times, strict=True))
     unique_ns, place = np.unique(stamp_ns, return_index=True)
     return Times(unique_ns, sent_ns[place])

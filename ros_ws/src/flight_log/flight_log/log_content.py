@@ -126,7 +126,7 @@ class _Publisher:
             self.leads_ns = min(least, int(leads_ns.min())), max(largest, int(leads_ns.max()))
 
     def has_clock_of(self, other: "_Publisher") -> bool:
-        """Whether every stamp is by the clock of another publisher, as far as the log tells."""
+        """Return whether every stamp is by another publisher's clock, as far as the log tells."""
         if self is other or self.leads_ns is None or other.leads_ns is None:
             return True
         (least, largest), (least_of_other, largest_of_other) = self.leads_ns, other.leads_ns

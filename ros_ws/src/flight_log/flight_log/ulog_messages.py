@@ -87,7 +87,7 @@ class _Log:
     def _size(self, here: int, subscribed: int | None = None) -> int:
         """Return the size that the head of a message gives, bytes; 0 if no message has such a head.
 
-        `subscribed` is the number of data to which the message before subscribes.
+        `subscribed` is the number of the data to which the message before subscribes.
         """
         if here + MESSAGE.size + 2 > len(self._content):
             return 0

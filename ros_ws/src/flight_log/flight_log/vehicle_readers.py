@@ -349,7 +349,7 @@ class UlogContent(BytesIO):
     """
 
     def __init__(self, content: bytes) -> None:
-        """Permit more reads than messages and single steps over damaged bytes need."""
+        """Permit READS_PER_BYTE reads for each byte, which no readable log needs."""
         super().__init__(content)
         self._left = READS_PER_BYTE * len(content)
 

@@ -127,7 +127,10 @@ class FlightNode(Node, Generic[P]):
         return self._start_subscription is not None
 
     def has_time(self) -> bool:
-        """Whether the time of the ticks is known: in simulated time from the first /clock on."""
+        """Return whether the time of the ticks is known.
+
+        In simulated time it is known from the first /clock on.
+        """
         return self.host is not self.simulated or self.simulated.known()
 
     def start_ns(self) -> int | None:
@@ -415,7 +418,7 @@ class FlightNode(Node, Generic[P]):
         ]
 
     def runs_in_lockstep(self) -> bool:
-        """Whether the event loop calls `advance` in lockstep instead of `tick` in real time."""
+        """Return whether the event loop calls `advance` in lockstep instead of `tick`."""
         return self.parameters.lockstep
 
     def require_flight(self) -> None:

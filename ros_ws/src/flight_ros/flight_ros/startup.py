@@ -43,8 +43,9 @@ def start_nodes(
     `--print-parameters` prints the parameter file of a node, to be filled in: `parameters` are its
     name and the "module:class" of its set.
 
-    A signal during the start ends with exit status 0 too. `early`: create a DDS participant before
-    the imports. `lower_by`: levels of real-time priority, more for nodes of a longer period.
+    A signal during the start ends with exit status 0 too. With `early` a DDS participant is created
+    before the imports. The real-time priority falls by `lower_by` levels, more for nodes of a
+    longer period.
     """
     if {"--help", "-h"} & {*sys.argv[1:]}:
         print(USAGE.format(program=os.path.basename(sys.argv[0])))  # noqa: PTH119 - pathlib takes as long to import as the rest

@@ -246,7 +246,7 @@ def answer(
 ) -> bytes:
     """Encode the data that a browser lacks: a head, then the columns of each topic in the head.
 
-    `fleet` is the number under which the places of all aircraft are, or 0 without a fleet.
+    `fleet` is the number of the flight with the places of all aircraft, or 0 without a fleet.
 
     The head is its length as uint32, then JSON. It is little endian, and ends at a multiple of 8
     bytes. The columns of a topic with `count` rows are the flight time in s as float64, then the

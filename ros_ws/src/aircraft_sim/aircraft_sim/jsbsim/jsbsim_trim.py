@@ -464,7 +464,7 @@ def _set_unknowns(
 
 
 def _is_trimmed(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
-    """Whether the accelerations are within TOLERANCE and every command is inside the stops."""
+    """Return whether the accelerations are within TOLERANCE and all commands inside the stops."""
     _, lower, upper = commands_and_limits(fdm, condition.commands().values())
     inside = bool(np.all(lower <= 0.0) and np.all(upper >= 0.0))
     return inside and bool(np.all(np.abs(residuals(fdm)) <= TOLERANCE))

@@ -94,7 +94,7 @@ class Difference(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """Fact, and what it means."""
+        """The fact, and what it means for margins and guarantee."""
         return f"{self.fact}; {MEANING[self.standing]}"
 
 

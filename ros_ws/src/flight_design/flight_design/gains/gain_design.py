@@ -471,7 +471,7 @@ def selected_observer(
 
     The gains are those of the file `weights` if there is one. Otherwise they are those that
     `rise-di compare --tune` found in the scenario, or in a shipped one with the same airframe and
-    lags, provided that the model has the same states and no channel has SLOWER times the total lag.
+    lags, if the model has the same states and no total lag is SLOWER times the one of the search.
     If there are none, a rule derives them from the lags. From there the search for the least error
     begins, once for each gain set; gains of a file and those beside a sketch are only relaxed, if
     the margins need it. With `uncertain` the phase margin of uncertain aircraft counts too, with

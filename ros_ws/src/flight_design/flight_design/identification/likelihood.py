@@ -58,7 +58,7 @@ HELD_OUT = 3
 
 
 def span_length(recorded: FlightData) -> int:
-    """Return the periods of a span, which are whole blocks of the filters."""
+    """Return how many periods a span has: whole blocks of the filters, about SPAN s."""
     return HOLD * max(round(SPAN / recorded.period / HOLD), 1)
 
 

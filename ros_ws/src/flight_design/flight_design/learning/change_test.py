@@ -85,7 +85,7 @@ def change_test(
 
     with the normalised innovations e and their covariance S, as in `Search.fit`. A fault of an
     effector changes its column by a factor, so that a part has as many unknowns as inputs. A is
-    known. The winds and the angles at the begin are free in both J, which have the same winds.
+    known. The winds and the angles at the beginning are free in both J, which have the same winds.
 
     G is 0 while the losses are within LOSS. If a loss lies z standard deviations beyond, 2 G = z^2,
     by S. S. Wilks (Ann. Math. Statist. 9(1), 1938). An input with a loss of LOSS exceeds G = 12

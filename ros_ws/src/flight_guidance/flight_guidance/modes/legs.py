@@ -82,7 +82,7 @@ def has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) 
 
 
 def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
-    """Whether a position is beyond the end of a circle, and the aircraft flies the course there.
+    """Return whether a position is beyond the end of a circle, on the course there.
 
     `reach` is the largest distance from the end, m.
     """

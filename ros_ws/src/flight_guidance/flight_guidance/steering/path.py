@@ -199,7 +199,7 @@ def end_course(leg: Leg) -> float:
 
 
 def is_passed(leg: Leg, position: Point) -> bool:
-    """Whether a position lies beyond the half plane at the end of a leg, across the course there.
+    """Return whether a position lies beyond the end of a leg, across the course there.
 
     It never does for an orbit.
     """

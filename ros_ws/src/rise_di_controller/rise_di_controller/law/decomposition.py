@@ -246,7 +246,7 @@ def _square(Omega: ArrayLike) -> FloatArray:
 
 
 def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Scales (m,) and (m,) of rows and columns.
+    """Return scales of the rows and of the columns, (m,) each.
 
     The largest abs(Omega_ij) / (rows_i columns_j) is 1 in every row and column.
 
@@ -266,7 +266,7 @@ def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _eliminate(Omega: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """L, p, W and L^-1 of Omega = L diag(p) W without pivoting.
+    """Return L, p, W and L^-1 of Omega = L diag(p) W, without pivoting.
 
     L is unit lower and W unit upper triangular. p_k = (L^-1)_k Omega (W^-1)_k gives the certainty
     of the sign of p_k.

@@ -135,7 +135,10 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
 
 
 def _takes_columns(params: Any) -> bool:
-    """Whether the law is known to take columns side by side: RISE-DI, also under an observer."""
+    """Return whether the law is known to take columns side by side.
+
+    RISE-DI does, also with an observer.
+    """
     if isinstance(params, ObserverParams) and params.vanes is None:
         params = params.law
     return isinstance(params, LawParams)
@@ -288,5 +291,5 @@ def spectral_radius(matrix: FloatArray) -> float:
 
 
 def is_stable(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, extra: FloatArray) -> bool:
-    """Whether no eigenvalue of `closed_loop` lies outside the unit circle, up to rounding."""
+    """Return whether every eigenvalue of `closed_loop` is in the unit circle, up to rounding."""
     return spectral_radius(closed_loop(plant, law, loop, extra)) <= 1.0 + SPECTRAL_RADIUS_TOLERANCE

@@ -80,7 +80,7 @@ class Oscillations:
     """
 
     def __init__(self, least: FloatArray) -> None:
-        """`least`: mean squares below a divergence, (m,)."""
+        """Take the mean squares below which nothing diverges, (m,)."""
         # s, periods of the oscillations at the last test, (m,); 0 for none
         self.periods = np.zeros_like(least)
         self._least = HARMLESS**2 * least

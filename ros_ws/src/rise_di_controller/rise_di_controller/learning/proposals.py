@@ -103,7 +103,7 @@ class Fallback(NamedTuple):
     fallen: int  # digest of the parameters after
 
     def outlived_by(self, proposal: Proposal, digest: int) -> bool:
-        """Whether a proposal made beside the parameters before the fallback still holds after it.
+        """Return whether a proposal that was made before the fallback still holds after it.
 
         It does if all that it adds is another input held still because it has no effect.
         """
@@ -128,7 +128,10 @@ class Updates:
         self._last_ns = 0  # the last that was due, from the first tick on
 
     def due(self, now_ns: int) -> bool:
-        """Whether an identification or a test begins at this tick; ticks must come in order."""
+        """Return whether an identification or a test begins at this tick.
+
+        Ticks must come in order.
+        """
         self._first_ns = now_ns if self._first_ns is None else self._first_ns
         elapsed_ns = now_ns - self._first_ns
         is_planned = False
