@@ -306,6 +306,25 @@ def test_later_set_parameter_of_launch_reaches_no_node_of_flight(tmp_path: Path)
     assert restored(actions, context)["global_params"] == [("k_g", 2.0)]
 
 
+def test_node_that_is_matched_before_the_others_are_ready_does_not_hold_up_the_flight(
+    tmp_path: Path,
+) -> None:
+    """Aircraft and reference model are the user's, and have published before the controller."""
+    actions, context = started(
+        "fly", aircraft="false", reference_model="false", runs=tmp_path / "runs"
+    )
+    publish(actions, context, f"/controller#{PID}")
+    publish(actions, context, f"/controller#{PID}", "matched")
+    follow = publish(actions, context, f"/recorder#{PID}")
+    for already in every(OpaqueFunction, follow):
+        follow += already.function(context) or []
+    assert context.ros_node.published == []
+    publish(follow, context, f"/recorder#{PID}", "matched")
+    assert [topic for topic, _ in context.ros_node.published] == ["/start"]
+    (run,) = (tmp_path / "runs").glob("*-osprey_servo")
+    assert (tmp_path / "runs" / "latest").resolve() == run.resolve()
+
+
 def test_fleet_is_a_process_and_its_end_ends_launch(tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text("{composed: true, aircraft: {uav1: {}}}")
@@ -370,7 +389,7 @@ def test_end_of_any_node_ends_launch_with_error(
     number: int, status: int, case: Case, tmp_path: Path
 ) -> None:
     actions, context, first, then = case
-    left = [file.read_text() for file in tmp_path.glob("runs/*/outcome")]
+    left = [file.read_text() for file in tmp_path.glob("runs/2*/outcome")]
     assert left == ([INTERRUPTED.text()] if "recorder" in first else [])  # the outcome of Ctrl-C
     processes = {**nodes(actions), **nodes(all_ready(actions, context))}
     if number >= len(processes):
@@ -380,7 +399,7 @@ def test_end_of_any_node_ends_launch_with_error(
     with pytest.raises(RuntimeError, match=f"{executable}-1 ended before the flight did"):
         node.on_exit(ProcessExited(f"{executable}-1", status), context)
     if "recorder" in first:
-        text = next(tmp_path.glob("runs/*/outcome")).read_text()
+        text = next(tmp_path.glob("runs/2*/outcome")).read_text()
         sentence = ended_early(f"{executable}-1 ended before the flight did")
         assert parsed_outcome(text) == sentence
     for other in processes.values():  # which the flight, or the launch, has stopped
@@ -398,7 +417,7 @@ def test_landing_of_the_aircraft_ends_launch_without_error(case: Case, tmp_path:
     assert on_exit is not None
     done = on_exit(ProcessExited("aircraft-1", STATUS_LANDED), context)
     assert ends(done, *started.values())
-    left = [parsed_outcome(file.read_text()).end for file in tmp_path.glob("runs/*/outcome")]
+    left = [parsed_outcome(file.read_text()).end for file in tmp_path.glob("runs/2*/outcome")]
     assert left == ([End.LANDED] if "recorder" in first else [])
 
 
@@ -411,7 +430,7 @@ def test_node_of_first_stage_that_is_never_ready_ends_launch(case: Case, tmp_pat
         publish(actions, context, f"/{executable}#{PID}")
     with pytest.raises(RuntimeError, match=f"^never flew: {first[-1]} not ready after 20 s$"):
         require_ready.function(context)
-    left = [file.read_text() for file in tmp_path.glob("runs/*/outcome")]
+    left = [file.read_text() for file in tmp_path.glob("runs/2*/outcome")]
     sentence = never_flew(f"{first[-1]} not ready after 20 s").text()
     assert left == ([sentence] if "recorder" in first else [])
     publish(actions, context, f"/{first[-1]}#{PID}")
@@ -612,6 +631,8 @@ def test_flight_around_an_aircraft_and_a_reference_model_of_ones_own(tmp_path: P
     assert Path(overrides(nodes(actions)["recorder"])["scenario_file"]) == file  # what flies
     with refusing("aircraft: found false in lockstep, expected true"):
         started("fly", runs=tmp_path, aircraft="false", lockstep="true")
+    with refusing("found none, expected a section for a node in /uav2, as /uav2/controller"):
+        started("fly", runs=tmp_path, namespace="uav2", params_file=further)
 
 
 def test_rosbag2_is_not_for_lockstep(tmp_path: Path) -> None:

@@ -44,7 +44,10 @@ class Report:
     If there are several runs, the page compares them. A log that --repair has rebuilt holds every
     message that could be read, an index and, in the folder of a run, metadata.yaml. The damaged
     file is kept as *.damaged, an intact log stays as it is, and metadata.yaml of another program is
-    never replaced. Exit status: 0, 2 bad input, 4 a log is incomplete.
+    never replaced.
+
+    Exit status: that of the flight, as docs/outcomes.md has it, or of several the gravest; 2 bad
+    input.
     """
 
     runs: list[Path] | None = argument(

@@ -17,7 +17,7 @@ from flight_analysis.closed_loop.scenario import (
 )
 from flight_core.arguments import FilePath
 from flight_core.files import find_file, names_in, read_file, write_file, writing
-from flight_core.parameters import ParameterError
+from flight_core.parameters import ParameterError, require
 from flight_core.scenario_file import (
     A_SCENARIO,
     has_general,
@@ -119,6 +119,10 @@ def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
     """
     content = read_file(path, str(path), "a ROS parameter file")
     further = parse_sections(content, path, SCHEMAS, tuple(SCHEMAS), namespace, with_general=True)
+    nodes = (
+        f"a section for a node in {namespace or 'the root namespace'}, as {namespace}/controller"
+    )
+    require(bool(further), str(path), "none", nodes)
     sections = {}
     for name, changes in further.items():
         section = getattr(scenario, name)

@@ -45,6 +45,7 @@ class Flight:
     def __init__(self, context: LaunchContext) -> None:
         self.context = context
         self.run = Path()  # the folder of the run; Path() without a recorder
+        self.states: dict[str, str] = {}  # the last state of each node by its full name
         # A later SetParameter or SetRemap of the launch extends the list that it finds.
         self.configurations: dict[str, Any] = {
             name: [*value] if isinstance(value, list) else value

@@ -40,6 +40,7 @@ from flight_bringup.processes import (
     READY_TIMEOUT,
     leave_outcome,
 )
+from flight_core.files import link_latest
 from flight_core.outcome import (
     INTERRUPTED,
     STATUS_LANDED,
@@ -72,6 +73,7 @@ from launch import Event, EventHandler, LaunchContext
 
 BOOLEAN = ["true", "false"]
 SHUTDOWN_DELAY = 0.05  # s
+WAITED_FOR = "the lines of the nodes say what they wait for"
 
 
 class NodeStateEvent(Event):
@@ -285,10 +287,11 @@ def say_on_exit(event: ProcessExited, context: LaunchContext, flight: Flight) ->
 
 def on_state(
     flight: Flight, spec: NodeSpec, state: NodeState, then: Callable[[], Sequence[Action]]
-) -> RegisterEventHandler:
-    """Run the actions of `then` once, when a node of this launch reaches a state.
+) -> Action:
+    """Run the actions of `then` once, when a node of this launch reaches a state, or has already.
 
-    A later state counts too.
+    A later state counts too. A node can be matched before the stage in which we wait for that: if
+    its inputs are nodes of the user, these may have started before it.
     """
     node = f"{flight.namespace}/{spec.executable}"
     states = [*NodeState]
@@ -302,9 +305,10 @@ def on_state(
     def act(context: LaunchContext) -> list[Action]:
         return [] if flight.is_over else [*then()]
 
-    return RegisterEventHandler(
-        EventHandler(matcher=matches, entities=[OpaqueFunction(function=act)], handle_once=True)
-    )
+    run = OpaqueFunction(function=act)
+    if flight.states.get(node) in states_from:
+        return run
+    return RegisterEventHandler(EventHandler(matcher=matches, entities=[run], handle_once=True))
 
 
 def start_in_stages(
@@ -330,6 +334,8 @@ def start_in_stages(
     )
     _subscribe_states(flight)
     leave_outcome(flight.run, INTERRUPTED)  # until another outcome replaces it
+    if flight.run.name:
+        link_latest(flight.run)
     begin = time.monotonic() + DISCOVERY_TIME
     waiting = dict.fromkeys(first)  # in order
 
@@ -425,15 +431,14 @@ class _Begin:
         if not self._waiting:
             return None
         names = ", ".join(spec.executable for spec in self._waiting)
-        reason = "not ready, or with an input without a publisher, after"
-        return self._flight.fail(never_flew(f"{names} {reason} {READY_TIMEOUT:g} s"))
+        reason = f"not ready, or with an input without a publisher, after {READY_TIMEOUT:g} s"
+        return self._flight.fail(never_flew(f"{names} {reason}; {WAITED_FOR}"))
 
     def _require_flight(self, context: LaunchContext) -> Sequence[Action] | None:
         if self._flies:
             return None
         reason = "y did not reach the controller, or u did not reach the aircraft"
-        lines = "the lines of the nodes say what they wait for"
-        return self._flight.fail(never_flew(f"{reason}; {lines}"))
+        return self._flight.fail(never_flew(f"{reason}; {WAITED_FOR}"))
 
     def _give_up(self, context: LaunchContext) -> Sequence[Action]:
         held = (self._held_ns - self._start_ns) / NANOSECONDS
@@ -505,9 +510,12 @@ def _subscribe_states(flight: Flight) -> None:
     def receive(message: KeyValue) -> None:
         node, _, pid = message.key.rpartition("#")
         if pid.isdecimal() and _is_descendant(int(pid)) and not flight.is_over:
-            context.asyncio_loop.call_soon_threadsafe(
-                context.emit_event_sync, NodeStateEvent(node, message.value)
-            )
+            context.asyncio_loop.call_soon_threadsafe(reach, node, message.value)
+
+    def reach(node: str, state: str) -> None:
+        # In the thread of the launch: whoever asks for a state finds it here, or gets the event.
+        flight.states[node] = state
+        context.emit_event_sync(NodeStateEvent(node, state))
 
     context = flight.context
     transport.prepare()  # before the first rclpy.init of this process
