@@ -740,12 +740,14 @@ def check_constants(file: dict[str, Any]) -> None:
 
 
 def digest_of(file: dict[str, Any]) -> str:
-    """Return SHA-256 of the loop in 10 digits, for a box whose largest part is 1."""
+    """Return SHA-256 of names and of the loop in 10 digits, for a box whose largest part is 1."""
     size, law = np.max(file["part"]), [file["law"][key] for key in "ABCD"]
     loop = [*(file[key] for key in "ABC"), *law, *(file[key] for key in ("lag", "delay", "period"))]
     box = [np.array(file["part"]) / size, file["E"], *(np.array(file[key]) / size for key in "FG")]
     values = np.concatenate([np.ravel(array) for array in loop + box]) + 0.0
-    return hashlib.sha256(" ".join(f"{value:.9e}" for value in values).encode()).hexdigest()
+    names = json.dumps([file[key] for key in ("states", "outputs", "inputs", "effectors", "names")])
+    text = " ".join([names, *(f"{value:.9e}" for value in values)])
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def check(file: dict[str, Any]) -> int:

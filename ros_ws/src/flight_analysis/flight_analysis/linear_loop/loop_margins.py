@@ -6,6 +6,7 @@ They are computed for the nominal and for uncertain aircraft.
 """
 
 import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -82,17 +83,20 @@ class LinearLoop(NamedTuple):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the numbers of the nominal loop and of its box, to DIGITS digits.
+        """SHA-256 of the names and of the numbers, to DIGITS digits, of the loop and of its box.
 
         Of the box only the shape counts, because a guarantee finds the size.
         """
         loop = self.loop
         arrays = [*self.nominal, *self.law, loop.lag, loop.delay, loop.period]
+        names = [self.states, self.outputs, self.inputs]
         if self.box is not None:
             size = self.box.part.max()
             arrays += [self.box.part / size, self.box.E, self.box.F / size, self.box.G / size]
+            names += [self.box.effectors, self.box.names]
         values = np.concatenate([np.ravel(np.asarray(array)) for array in arrays]) + 0.0  # no -0
-        text = " ".join(f"{value:.{DIGITS - 1}e}" for value in values.tolist())
+        numbers = (f"{value:.{DIGITS - 1}e}" for value in values.tolist())
+        text = " ".join([json.dumps(names), *numbers])
         return hashlib.sha256(text.encode()).hexdigest()
 
 
