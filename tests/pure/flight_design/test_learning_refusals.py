@@ -51,7 +51,7 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: second_stage(find_scenario("osprey_learn"), bridge=True),
         r"controller\.learn: found a bridge, expected a simulated aircraft",
     ),
-    "`--learn` beside an observer": (
+    "`--learn` with an observer": (
         lambda: scenario_learner.that_learns(find_scenario("osprey_observer")),
         r"learn: found an observer, expected none: a scenario of the law alone",
     ),
