@@ -237,3 +237,16 @@ def test_next_publisher_counts_from_the_end_of_the_first() -> None:
     assert np.all(result.sender[:99] == 0)
     assert np.all(result.sender[101:] == 1)
     assert len(result.stamp_ns) == pytest.approx(300, abs=1)
+
+
+@pytest.mark.parametrize("duration", [None, END - 1.0])
+def test_ticks_before_t_0_are_neither_expected_nor_found(
+    duration: float | None, servo: Scenario
+) -> None:
+    """With y and y_m of a user's nodes the law can engage 1 s before t = 0: no tick is lost."""
+    topics = {"y": timer(100.0) - 1.0, "y_m": timer(500.0), "u": np.arange(-1.0, END, 0.01)}
+    tape = replace(flight(topics, ("controller",)), duration=duration)
+    result = account(tape, servo)
+    for name in ("u", "internals"):
+        assert result.topics[name].expected == result.topics[name].found, name
+    assert not [sentence for sentence in result.lacks if "u " in sentence]

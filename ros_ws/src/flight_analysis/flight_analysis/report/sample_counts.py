@@ -136,6 +136,8 @@ def _expected(
         first_ns = tape.start_ns
         if name in tape and (name in TICKS or not span.from_start):
             first_ns = int(tape[name].stamp_ns[0])
+            if span.from_start:
+                first_ns = max(first_ns, tape.start_ns)
         delay_ns = nanoseconds(delays.get(name, 0.0)) if is_of_stack else 0
         count = max((span.end_ns - delay_ns - first_ns) // step_ns + 1, 0)
         if name == "y" and is_of_stack and sensors.dropout:
@@ -146,7 +148,7 @@ def _expected(
         return expected
     guided_time = seconds(span.end_ns - tape.start_ns)
     if is_sent_by_stack(tape, "u"):
-        ticks, engaged_time = _ticks(tape, scenario, span.end_ns)
+        ticks, engaged_time = _ticks(tape, scenario, span)
         expected |= dict.fromkeys(TICKS, ticks)
         # In lockstep and in one process guidance flies whatever the mode of the controller is.
         if is_real_time(tape):
@@ -321,22 +323,27 @@ def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
     return 0 if was_sent else max(int(later_ns[-1]) // step_ns, 0)
 
 
-def _ticks(tape: Tape, scenario: Scenario, end_ns: int) -> tuple[int, float]:
+def _ticks(tape: Tape, scenario: Scenario, span: Span) -> tuple[int, float]:
     """Return the number of the controller's ticks up to the end, and the engaged time, s.
 
-    Each controller numbers its own ticks, so they are counted by publisher.
+    Each controller numbers its own ticks, so they are counted by publisher. If y and y_m come from
+    a user's nodes, it can fly before t = 0; these ticks do not count in an account from t = 0.
     """
+    end_ns = span.end_ns
     step_ns = period_ns(scenario.controller.rate, "controller.rate")
     begins = [
         int(tape[name].stamp_ns[0]) for name in TICKS if name in tape and len(tape[name].stamp_ns)
     ]
     if not begins:
         return max((end_ns - tape.start_ns) // step_ns + 1, 0), 0.0
-    begin_ns = min(begins)
+    first_ns = tape.start_ns if span.from_start else min(begins)
+    begin_ns = max(min(begins), first_ns)
     if "internals" not in tape or not {"number", "age", "mode"} <= set(tape["internals"].names):
         instants = max((end_ns - begin_ns) // step_ns + 1, 1)
         return instants, seconds(instants * step_ns)
     log = tape["internals"].until(end_ns)
+    is_early = log.stamp_ns < first_ns
+    log = log.where(~is_early)
     tick_ns = log.stamp_ns + np.round(log["age"] * NANOSECONDS).astype(np.int64)
     if tape.is_by_clock:
         step_ns = max(step_ns, period_of(tick_ns, 0, step_ns))
@@ -354,7 +361,7 @@ def _ticks(tape: Tape, scenario: Scenario, end_ns: int) -> tuple[int, float]:
         part for numbers in by_sender for part in np.split(numbers, controller_starts(numbers))
     ]
     missing = sum(float(np.ptp(numbers)) + 1.0 - len(numbers) for numbers in by_controller)
-    before = float(by_controller[0].min()) - 1.0
+    before = 0.0 if is_early.any() else float(by_controller[0].min()) - 1.0
     goes_on = int(tape["internals"].stamp_ns[-1]) > end_ns
     last_ns = int(tick_ns[-1])
     after = 0 if goes_on else max((end_ns - last_ns) // step_ns, 0) * count // instants
