@@ -23,6 +23,7 @@ pytestmark = pytest.mark.timeout(240)
 
 PAGE = (REPOSITORY / "docs" / "ros.md").read_text()
 SAMPLES = 400  # of y: 4 s at 100 Hz
+COMMAND = 0.1  # rad/s, abs of each pulse of q in osprey_servo
 FIRST_CHUNKS = 100_000  # bytes of a log; the readers need a whole chunk
 
 
@@ -100,11 +101,12 @@ def test_shells_of_page_run_to_the_last_command(
         return len(q), max(q), max(reference)
 
     def follows() -> bool:
-        # y_m rises for a second: in a log that ends on the rise y is still behind
+        # y_m rises for a second. In a log that ends on the rise y is still behind, and in one that
+        # ends before it the noise of q is all there is: so y_m has to have reached its command
         if sum(file.stat().st_size for file in log.glob("*.mcap")) < FIRST_CHUNKS:
             return False
         samples, q, reference = largest()
-        return samples > SAMPLES and q > 0.7 * reference > 0.0
+        return samples > SAMPLES and reference > 0.9 * COMMAND and q > 0.7 * reference
 
     until(follows, "a log with a command that y follows")
     recorder.send_signal(signal.SIGINT)
@@ -128,4 +130,5 @@ def test_shells_of_page_run_to_the_last_command(
         )
     samples, q, reference = largest()
     assert samples > SAMPLES
-    assert q > 0.5 * reference > 0.0  # without control q of the page's aircraft would stay 0
+    assert reference > 0.9 * COMMAND
+    assert q > 0.5 * reference  # without control q of the page's aircraft would stay 0
