@@ -126,6 +126,8 @@ class Outcome:
     shortfalls: tuple[Shortfall, ...] = ()
     # not a part of how the flight ended
     allowances: tuple[Allowance, ...] = field(default=(), compare=False)
+    # the worst part of each output beside what was allowed, as figures in SI
+    errors: tuple[Mapping[str, Any], ...] = field(default=(), compare=False)
 
     @property
     def has_reached_end(self) -> bool:
@@ -197,6 +199,7 @@ class Outcome:
                 {"sentence": each.sentence, "figures": dict(each.figures)}
                 for each in self.allowances
             ],
+            "errors": [dict(figures) for figures in self.errors],
             "sentence": str(self),
             "details": list(self.details),
             "status": self.status,

@@ -74,7 +74,7 @@ def judge(
             "guidance took no step; see the ages of pose and y against guidance.max_age"
         )
     if not outcome.has_reached_end and outcome.end is not End.UNKNOWN:
-        return replace(outcome, shortfalls=(), allowances=())
+        return replace(outcome, shortfalls=(), allowances=(), errors=())
     aircraft: AircraftConfig | None = None
     section: GuidanceConfig | None = None
     if scenario is not None:
@@ -101,7 +101,12 @@ def judge(
         *([] if says_nothing_of_path else of_path),
         *(_incomplete(lack) for lack in account.lacks if lack not in account.host_lacks),
     ]
-    judged = replace(outcome, shortfalls=tuple(shortfalls), allowances=tuple(verdict.allowances))
+    judged = replace(
+        outcome,
+        shortfalls=tuple(shortfalls),
+        allowances=tuple(verdict.allowances),
+        errors=tuple(excess._asdict() for excess in verdict.worst),
+    )
     is_excused = has_paused or verdict.is_excused or (says_nothing_of_path and bool(of_path))
     if not (is_excused or account.host_lacks):
         return judged

@@ -90,6 +90,8 @@ class TrackingVerdict(NamedTuple):
 
     shortfalls: list[Shortfall]
     allowances: list[Allowance]
+    # the worst part of each output, whether it is within what is allowed or not
+    worst: tuple[Excess, ...] = ()
     is_excused: bool = False  # an output is off where the host starved the flight, and only there
 
 
@@ -130,6 +132,7 @@ def _verdict(pair: ErrorPair, aircraft: AircraftConfig | None) -> TrackingVerdic
     units = {} if aircraft is None else aircraft.channels().outputs
     shortfalls = []
     allowances = []
+    worst_of_each = []
     if pair.not_numbers:
         sentence = f"{pair.not_numbers} ticks with an error that is not a number"
         shortfalls.append(Shortfall(aim=Aim.LOG, sentence=sentence))
@@ -141,13 +144,14 @@ def _verdict(pair: ErrorPair, aircraft: AircraftConfig | None) -> TrackingVerdic
         limits = _Limits(floor=_floor(pair, i, unit), most=_most(unit), drag=_drag(pair, i, speed))
         excesses = _excesses(pair, i, group, limits)
         worst = max(excesses, key=lambda excess: excess.rms / excess.allowed)
+        worst_of_each.append(worst)
         if worst.rms > worst.allowed:
             shortfalls.append(_shortfall(worst, pair, i, display_unit(unit)))
             continue
         excused = max(excesses, key=lambda excess: excess.rms - excess.allowed + excess.excuse)
         if excused.rms > excused.allowed - excused.excuse:
             allowances.append(_allowance(excused, display_unit(unit)))
-    return TrackingVerdict(shortfalls, allowances)
+    return TrackingVerdict(shortfalls, allowances, tuple(worst_of_each))
 
 
 class _Limits(NamedTuple):
