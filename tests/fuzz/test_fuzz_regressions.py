@@ -17,7 +17,7 @@ from tests.fuzz.targets import log, write_run
 from tests.joint_states import JOINT_STATE, vector
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report.html import script_json
+from flight_analysis.report.page import script_json
 from flight_analysis.report.run_folder import extract_scenario, read_flight
 from flight_core.files import parse_yaml
 from flight_core.parameters import ParameterError

@@ -24,6 +24,7 @@ setup(
             "layouts/*",
             "scenarios/*.yaml",
             "report/*.jinja",
+            "report/*.css",
             "report/*.js",
             "report/scene/*",
             "report/vendor/*",

@@ -176,12 +176,17 @@ def test_figures_of_flight_are_those_of_scenario(flight: RecordedFlight) -> None
     )
 
 
-def test_report_opens_with_track_of_numbered_legs_and_fence(
+def test_track_of_numbered_legs_and_fence_follows_outputs(
     flight: RecordedFlight, tmp_path: Path
 ) -> None:
     write_page(tmp_path / "page.html", [flight])
     page = (tmp_path / "page.html").read_text()
-    assert page.index("<h2>Ground track</h2>") < page.index("<table>")
+    places = [
+        page.index(f">{title}</h2>")
+        for title in ("Output y over the reference y_m", "Ground track")
+    ]
+    assert places == sorted(places)
+    assert places[-1] < page.index("<table>")
     fence = Fence(
         (
             Zone((0.0, 900.0, 900.0), (0.0, 0.0, 900.0)),

@@ -42,6 +42,7 @@ OUTPUTS = ("q", "V", "p", "r")
 INPUTS = ("elevator", "aileron", "rudder", "thrust")
 # headings on every page with a linear loop
 OF_LOOP = ("Bode plot of the loop", "Nyquist plot of the loop")
+TABLES = ("All figures", "Parameters other than the default, and those without one", "Words")
 DEG = np.pi / 180.0
 
 
@@ -117,7 +118,8 @@ def recorded(
 
 
 def headings(page: str) -> list[str]:
-    return [part.partition("</h2>")[0] for part in page.split("<h2>")[1:]]
+    """The headings of the blocks, in their order; those of tiles have no place of their own."""
+    return re.findall(r'<h2 id="[^"]*">([^<]*)</h2>', page)
 
 
 @pytest.mark.parametrize("columns", [2, 3, 4])
@@ -142,16 +144,18 @@ def test_a_simulated_flight_has_every_figure(
 ) -> None:
     assert headings(page_of(tmp_path, servo, complete)) == [
         "Output y over the reference y_m",
-        "Tracking error e = y - y_m",
         "Input u and the actuators",
+        "Tracking error e = y - y_m",
+        "What holds for this flight",
         "Wind",
         "States",
         "Integrals of the law",
         "Error of the sensors",
         "Spectrum of u",
+        *OF_LOOP,
         "Ticks of the controller",
         "Timing of the ticks",
-        *OF_LOOP,
+        *TABLES,
     ]
 
 
@@ -159,8 +163,8 @@ def test_flight_of_one_sample_has_report(tmp_path: Path, servo: Scenario) -> Non
     one = flight(
         1, u=held(1, **dict.fromkeys(INPUTS, 0.0)), internals=ticks(1), truth=held(1, x__q=0.0)
     )
-    # y, e, u, states, integrals: no wind, no late tick
-    assert len(headings(page_of(tmp_path, servo, one))) == 5 + len(OF_LOOP)
+    # y, u, e, claims, states, integrals: no wind, no late tick
+    assert len(headings(page_of(tmp_path, servo, one))) == 6 + len(OF_LOOP) + len(TABLES)
 
 
 def test_page_of_minute_of_noise_is_below_five_megabytes(tmp_path: Path, servo: Scenario) -> None:
@@ -187,7 +191,7 @@ def test_text_of_a_log_is_escaped(tmp_path: Path, servo: Scenario) -> None:
     page = page_of(
         tmp_path, servo, flight(), outcome=ended_early("ended: <script>alert(1)</script>")
     )
-    assert "ended: &lt;script&gt;alert(1)&lt;/script&gt;" in page
+    assert "nded: &lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert "<script>alert" not in page
 
 
@@ -316,9 +320,10 @@ def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> N
     assert "2 flights compared" in page
     assert '<td class="better">&times;0.500</td>' in page
     assert headings(page) == [
-        "Tracking error",
         "Output y over the reference y_m",
         "Tracking error e = y - y_m",
+        "All figures",
+        "Words",
     ]
 
 
@@ -431,7 +436,7 @@ def test_comparison_of_unlike_flights_begins_with_what_differs(
     assert {row.verdict(2) for row in rows} > {"same"}
     write_page(tmp_path / "comparison.html", unlike)
     page = (tmp_path / "comparison.html").read_text()
-    assert headings(page)[:2] == ["What differs", "Tracking error"]
+    assert headings(page)[:2] == ["What differs", "Output y over the reference y_m"]
     assert comparison.UNLIKE in page
 
 
@@ -475,7 +480,7 @@ def test_noise_floor_bounds_what_a_measured_error_tells_and_not_a_true_one(
     without_truth = {name: each for name, each in tape.signals.items() if name != "truth"}
     behind_sensors = replace(tape, signals=without_truth)
     for one, expected in (
-        (recorded("true", servo, tape), "the true error does not contain it"),
+        (recorded("true", servo, tape), "true error: y - y_m without the noise"),
         (recorded("measured", servo, behind_sensors), "a smaller measured error cannot be"),
     ):
         table = next(
@@ -513,9 +518,9 @@ def test_states_have_units_and_angles_are_in_degrees(servo: Scenario) -> None:
 def test_sentence_on_the_sign_stands_at_the_law(tmp_path: Path, servo: Scenario) -> None:
     """The first line is of the flight: aircraft and time flown."""
     page = page_of(tmp_path, servo, simulate(servo.vary(flight={"duration": 1.0})))
-    head, _, following = page.partition("<h2>")
+    head, _, following = page.partition("<nav")
     assert "softened sign" not in head
-    assert "osprey, 1.0 s flown" in head
+    assert "osprey, law rise_di · 1.0 s flown" in head
     law = following.partition("Integrals of the law</h2>")[2].partition("</section>")[0]
     assert "At 100 Hz with the softened sign" in law
 

@@ -26,7 +26,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="nee
 DRAWN = "Number(document.body?.dataset.drawn ?? 0)"  # counts the views of all figures
 # of a value on the page: plotting.MANTISSA, and float32
 RESOLUTION = 2.0**-15.9
-PLOTS = "[...document.querySelectorAll('figure > div')]"
+PLOTS = "[...document.querySelectorAll('figure [data-plot]')]"
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_the_page_draws_all_figures_without_errors(browser: Browser, page: Path)
     open_page(browser, page)
     assert browser.console == []
     headings = browser.run(
-        "[...document.querySelectorAll('section h2')].map(heading => heading.textContent)"
+        "[...document.querySelectorAll('section:has(> figure) > h2')].map(one => one.textContent)"
     )
     colours = browser.run(
         f"{PLOTS}.map(plot => plot.querySelectorAll('.scatterlayer .trace, .barlayer "
@@ -119,7 +119,8 @@ def test_page_of_guided_flight_in_wind_prints_without_errors(
     scenario = find_scenario("osprey_route", 5.0)
     write_page(tmp_path / "report.html", [recorded("route", scenario, simulate(scenario))])
     open_page(browser, tmp_path / "report.html")
-    assert browser.run(f"{PLOTS}[0].layout.annotations.some(each => each.showarrow)")
+    # after the outputs comes the track
+    assert browser.run(f"{PLOTS}[1].layout.annotations.some(each => each.showarrow)")
     browser.run("void dispatchEvent(new Event('beforeprint'))")
     headings = browser.run(
         f"{PLOTS}.map(plot => plot.closest('section').querySelector('h2').textContent)"
@@ -142,7 +143,7 @@ def test_zoom_shows_every_sample_in_all_figures(
     samples, _ = curve(browser, 0, "y")
     assert len(samples) < len(y.stamp_ns)
     zoom(browser, 2.0, 2.1)
-    for plot, name in ((0, "y"), (1, "measured")):
+    for plot, name in ((0, "y"), (2, "measured")):
         x, _ = curve(browser, plot, name)
         inside = [t for t in x if 2.0 <= t <= 2.1]
         assert inside == pytest.approx(np.arange(51) * 0.002 + 2.0, abs=1e-9)  # 500 Hz
@@ -165,7 +166,11 @@ def test_angles_are_shown_in_rad_by_choice(
 ) -> None:
     open_page(browser, page)
     zoom(browser, 2.0, 2.1)
-    table = "[...document.querySelectorAll('.tables td')].filter(one => one.offsetParent)"
+    browser.run("void (document.querySelector('details.block').open = true)")
+    table = (
+        "[...document.querySelectorAll('.tables tbody :is(th, td)')].filter(one => "
+        "one.checkVisibility())"
+    )
     first = f"{table}.slice(0, 2).map(one => one.textContent)"
     rms = servo.summary["errors"]["q"]["whole"]["rms"]
     assert browser.run(first) == ["q (deg/s)", f"{np.degrees(rms):#.3g}"]
@@ -188,6 +193,32 @@ def test_angles_are_shown_in_rad_by_choice(
     assert {title for title in titles if "deg" in title} == {"phase (deg)"}
     assert {"q (rad/s)", "alpha (rad)", "V - 25 (m/s)", "elevator (rad/√Hz)"} <= set(titles)
     assert browser.console == []
+
+
+def test_word_of_a_table_is_explained_by_keyboard_and_contents_open_what_is_folded(
+    browser: Browser, page: Path
+) -> None:
+    open_page(browser, page)
+    folded = "document.querySelector('details.block').open"
+    assert browser.run(folded) is False
+    browser.run("void (location.hash = '#all-figures')")
+    browser.wait_for(folded)
+    browser.run("void document.querySelector('.word[href=\"#word-settling-s\"]').focus()")
+    tip = "document.getElementById('tip')"
+    assert browser.run(f"{tip}.checkVisibility()")
+    assert "the time until the error stays" in browser.run(f"{tip}.textContent")
+    browser.run("void document.activeElement.blur()")
+    assert not browser.run(f"{tip}.checkVisibility()")
+    assert browser.console == []
+
+
+def test_whole_flight_comes_back_after_a_zoom(browser: Browser, page: Path) -> None:
+    open_page(browser, page)
+    zoom(browser, 2.0, 2.1)
+    before = browser.run(DRAWN)
+    browser.run("void document.getElementById('whole').click()")
+    browser.wait_for(f"{DRAWN} > {before}")
+    assert browser.run(f"{PLOTS}[2]._fullLayout.xaxis4.range") == [0.0, 7.0]
 
 
 def test_labels_of_intervals_are_apart_on_a_narrow_screen(

@@ -56,29 +56,6 @@ AIRS = (CALM, "wind", "shear", "turbulence", "microburst", UNKNOWN_AIR)
 engagement. UNKNOWN_AIR means that no simulated aircraft flew."""
 
 
-def parts_legend(air: str, *, is_guided: bool) -> str:
-    """Write the legend of the tables, which explains the parts of a flight.
-
-    The parts are "whole", `air`, "command" and "gust". In a guided flight, "turn" and "capture"
-    replace "command".
-    """
-    after = f"to {SETTLING_DWELL:g} s after its end"
-    others = f"{air}: all other times, except {SETTLING_DWELL:g} s after engagement"
-    if air == UNKNOWN_AIR:
-        others += "; the wind is not known"
-    if not is_guided:
-        return (
-            f"command: from an edge of a command {after}; gust: from the entry of a gust {after}; "
-            f"{others}"
-        )
-    return (
-        f"turn: a commanded bank above {math.degrees(TURN_BANK):.0f} deg; capture: outside of "
-        f"turns, a commanded path steeper than {math.degrees(CAPTURE_ANGLE):.0f} deg, a moving "
-        f"command of V, or a cross-track error above {CAPTURE_TIME:g} s of flight, each {after}; "
-        f"{others}, outside gusts"
-    )
-
-
 class Transient(NamedTuple):
     """An engagement, a command, a gust, a turn or a capture.
 
@@ -260,7 +237,7 @@ def live_commands(tape: Tape) -> list[Transient]:
 
 
 def guided_transients(tape: Tape) -> list[Transient]:
-    """Return the turns and captures of a guided flight, from `guidance`, as `parts_legend` says.
+    """Return the turns and captures of a guided flight, from `guidance`, as the glossary says.
 
     `u_m` never rests in such a flight. Transients of the same kind that are less than
     SETTLING_DWELL apart count as one.

@@ -25,13 +25,13 @@ from flight_analysis.report.display_units import (
     display_units,
 )
 from flight_analysis.report.figures import COLOURS
-from flight_analysis.report.html import Page, Section, TableGroup, TitleLine, page_html
 from flight_analysis.report.margin_figures import (
     LEAST_MARGINS,
     least_margins,
     margins_as_json,
 )
-from flight_analysis.report.plotting import SampleStore, set_layout
+from flight_analysis.report.page import Figures, Page, Section, TableGroup, page_html
+from flight_analysis.report.plotting import set_layout
 from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_analysis.report.summary import finite_or_null
 from flight_analysis.report.summary_rows import Column
@@ -251,10 +251,8 @@ def write_page(
     ]
     page = Page(
         title=title,
-        lines=[TitleLine(text)],
-        tables=[TableGroup(tables)],
-        sections=sections,
-        samples=SampleStore(),
+        lines=[text],
+        blocks=[Figures(groups=[TableGroup(tables)], title="Figures"), *sections],
     )
     write_file(path, page_html(page))
 

@@ -13,9 +13,10 @@ from rich.table import Table
 
 from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_analysis.report.display_units import display_unit
+from flight_analysis.report.glossary import legend
 from flight_analysis.report.margin_figures import (
     MARGIN_COLUMNS,
-    MARGIN_LEGEND,
+    MARGIN_WORDS,
     margin_rows,
     margins_as_json,
     modes_text,
@@ -147,7 +148,7 @@ def _show_margins(console: Console, study: Study, answers: dict[str, Assessment]
             print_table(console, table)
             say(console, modes_text(answer.margins))
         say(console, f"{name}: {_format_delay_margin(study, answer)}")
-    say(console, MARGIN_LEGEND, style="dim")
+    say(console, legend(MARGIN_WORDS), style="dim")
 
 
 def _show_verdicts(console: Console, result: GainSets) -> None:

@@ -24,7 +24,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import mask_spans
 from flight_analysis.report.display_units import DisplayUnit, display_unit
 from flight_analysis.report.figures import ERROR, GUST, PLANT
-from flight_analysis.report.html import Page, Section, TitleLine, page_html
+from flight_analysis.report.page import Page, Section, page_html
 from flight_analysis.report.plotting import (
     Curve,
     Interval,
@@ -495,12 +495,10 @@ def _innovation_page(identification: Identification, name: str) -> Page:
         f"{identification.before.log_likelihood:.4g} nominal, "
         f"{identification.after.log_likelihood:.4g} identified"
     )
-    line = TitleLine(f"log-likelihood of a held-out sample: {likelihoods}")
     return Page(
         title=f"Model of {identification.airframe.name} from {name}",
-        lines=[line],
-        tables=[],
-        sections=[section],
+        lines=[f"log-likelihood of a held-out sample: {likelihoods}"],
+        blocks=[section],
         samples=context.samples,
     )
 

@@ -22,9 +22,8 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
 from flight_analysis.linear_loop.loop_margins import LoopMargins, margins
-from flight_analysis.report.html import Page, TableGroup, TitleLine, page_html
 from flight_analysis.report.margin_figures import guarantee_text, margin_table
-from flight_analysis.report.plotting import SampleStore
+from flight_analysis.report.page import Figures, Page, TableGroup, page_html
 from flight_analysis.report.run_folder import remove_empty
 from flight_analysis.report.summary_rows import Column
 from flight_analysis.report.tables import MetricTable
@@ -483,13 +482,10 @@ def _page(tuned: _Tuned, log: str, autopilot: str) -> Page:
     if tuned.by_own is not None:
         own_margins = margin_table(tuned.by_own.margins)
         tables.append(own_margins._replace(caption="Margins of the own loop"))
-    lines = [TitleLine(sentence) for sentence in _what_to_do(tuned, autopilot)]
     return Page(
         title=f"Tuning of {identification.airframe.name} from {log}",
-        lines=lines,
-        tables=[TableGroup(tables)],
-        sections=[],
-        samples=SampleStore(),
+        lines=_what_to_do(tuned, autopilot),
+        blocks=[Figures(groups=[TableGroup(tables)])],
     )
 
 

@@ -93,6 +93,22 @@ def unlike_numbers(first: float, second: float) -> tuple[str, str]:
     return texts
 
 
+def aligned_numbers(first: float, second: float) -> tuple[str, str]:
+    """Return two numbers with the same decimals: two digits, or what tells them apart, up to 6.
+
+    Examples:
+        >>> aligned_numbers(1.0, 3.21), aligned_numbers(0.3012, 0.3021), aligned_numbers(9.0, 123.4)
+        (('1.0', '3.2'), ('0.301', '0.302'), ('9.0', '123.4'))
+    """
+    smallest = min(abs(first), abs(second))
+    exponent = math.floor(math.log10(smallest)) if 0.0 < smallest < math.inf else 0
+    written = []
+    for digits in range(2, 7):
+        places = max(digits - 1 - exponent, 0)
+        written.append((f"{first:.{places}f}", f"{second:.{places}f}"))
+    return next((texts for texts in written if texts[0] != texts[1]), written[0])
+
+
 STATES = {
     **dict.fromkeys(("alpha", "beta", "phi", "theta", "psi"), "rad"),
     **dict.fromkeys(("p", "q", "r"), "rad/s"),

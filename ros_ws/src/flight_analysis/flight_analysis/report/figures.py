@@ -21,8 +21,14 @@ from flight_analysis.metrics import (
     tracking_error,
     true_error,
 )
-from flight_analysis.report.display_units import NO_UNIT, DisplayUnit, in_order
+from flight_analysis.report.display_units import (
+    NO_UNIT,
+    QUANTITY_UNITS,
+    DisplayUnit,
+    in_order,
+)
 from flight_analysis.report.plotting import (
+    MIN_GAP_PERIODS,
     SHOWS_ANGLES,
     Curve,
     Figure,
@@ -44,13 +50,15 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.internals import Saturation
 
 PLANT = "#123c52"
-REFERENCE = "#f6a85f"
+REFERENCE = "#d97b1c"
 ERROR = "#8b1f4f"
-MEASURED = "#e3b6c9"
+MEASURED = "#c9799b"
 WIND = "#2a7f62"
 GUST = "#7f7f7f"
-END_STOP = "#bbbbbb"
+END_STOP = "#8c8c8c"
 LIMIT = "#444444"
+NO_SAMPLE = "#5f6b73"
+# Contrast of each line on its page: 3 to 1 at least, as WCAG 2.2 asks of graphics (1.4.11).
 # Okabe and Ito 2008, distinct to the colour blind too, without the orange that REFERENCE has;
 # lighter on a dark page
 FLIGHTS = {
@@ -64,11 +72,11 @@ COLOURS = tuple(FLIGHTS)
 """Colours of flights that are compared."""
 DARK = FLIGHTS | {
     PLANT: "#9edbff",
-    REFERENCE: "#8f5820",
+    REFERENCE: "#b8712b",
     ERROR: "#f285b3",
-    MEASURED: "#70405a",
+    MEASURED: "#9a6280",
     WIND: "#63cba6",
-    END_STOP: "#555c64",
+    END_STOP: "#737b84",
     LIMIT: "#b9c0c7",
 }
 """Colours of curves on a light page, with those that replace them on a dark page."""
@@ -89,6 +97,7 @@ HISTOGRAM_BINS = 80
 FREQUENCIES = [digit * 10.0**power for power, digit in product(range(-4, 4), (1, 2, 5))]
 # share of the axis, about two pixels: shorter intervals are lengthened
 MIN_VISIBLE_FRACTION = 1 / 500
+SHOWN_GAP = 0.1  # s without a sample of y
 MOST_MARKED = 100  # times of messages: plotly is slow with more shapes
 LIMIT_VIEW_RATIO = 3.0  # a limit is in view if it is at most this many times the largest u
 
@@ -112,6 +121,7 @@ def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
         intervals += gust_intervals(longest, gusts)
     if len(flights) == 1:
         intervals += mode_intervals(longest, end * MIN_VISIBLE_FRACTION)
+        intervals += gap_intervals(longest)
     of_one = flights[0].message_times if len(flights) == 1 else []
     return PlotContext(
         runs=runs_of(flights),
@@ -170,6 +180,24 @@ def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
             for start, stop in spans
         ]
     return intervals
+
+
+def gap_intervals(tape: Tape) -> list[Interval]:
+    """Return the intervals without a sample of y that a reader of the page should see."""
+    if "y" not in tape or len(tape["y"].stamp_ns) < 2:
+        return []
+    t = tape.time("y")
+    longest = max(MIN_GAP_PERIODS * float(np.median(np.diff(t))), SHOWN_GAP)
+    return [
+        Interval(
+            label="no sample of y",
+            start=float(t[before]),
+            stop=float(t[before + 1]),
+            colour=NO_SAMPLE,
+            labelled=False,
+        )
+        for before in np.flatnonzero(np.diff(t) > longest)
+    ]
 
 
 def _curves(
@@ -231,6 +259,14 @@ def tracking_figure(
     """
     y = _curves(context, "y", lambda tape: tape.signals.get("y"))
     return time_series_figure(context, _references(context) | y, labels=labels)
+
+
+def overlay_figure(context: PlotContext, topic: str) -> Figure | None:
+    """Draw a topic of several logs over each other, or return None if no log has it."""
+    curves = _curves(context, topic, lambda tape: tape.signals.get(topic))
+    if topic == "pose":
+        context = context._replace(units=QUANTITY_UNITS)
+    return time_series_figure(context, curves) if curves else None
 
 
 def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None) -> Figure:

@@ -30,18 +30,13 @@ MARGIN_COLUMNS = (
 ALONE = ".3g"  # format of a column that does not show the worst aircraft
 FORMATS = (".0f", ALONE, ".2g", ".2f", ".2f", ".0f")  # of MARGIN_COLUMNS
 ALL_INPUTS = "all inputs"
-MARGIN_LEGEND = (
-    "one input open, all others closed: phase margin and its frequency, gain margin, largest "
-    "sensitivity, balanced disk margin,"
-    " delay margin. all inputs: an independent disk of this size in each input at once, the "
-    "phase and gain that it guarantees,"
-    " the largest sensitivity under diagonal scaling, the delay in all inputs"
-)
+MARGIN_WORDS = ("phase", "gain", "largest S", "disk", "delay", ALL_INPUTS)
+"""Words of the glossary that explain margins."""
 SHOWN_DAMPING = 0.8  # slow modes with less damping are listed
 FREQUENCIES_SHOWN = 240  # of Bode and Nyquist plots
 LOWEST_SHOWN = 1e-3  # of pi / T, rad/s
 NYQUIST_RANGE = ((-3.0, 1.0), (-2.0, 2.0))  # around the point -1
-UNIT_CIRCLE = "#bbbbbb"
+UNIT_CIRCLE = "#8c8c8c"
 BOUND = "#444444"
 
 
@@ -160,13 +155,14 @@ def margin_table(
 
     `differences` are sentences on how the aircraft differs from what the controller was told.
     """
-    sentences = [*differences, MARGIN_LEGEND, modes_text(margins)]
+    sentences = [*differences, modes_text(margins)]
     sentences += [] if promise is None else guarantee_text(promise)
     return MetricTable(
         "Margins of the linear loop",
         MARGIN_COLUMNS,
         margin_rows(margins),
         ". ".join(sentences),
+        MARGIN_WORDS,
     )
 
 
@@ -186,14 +182,13 @@ def flown_margin_table(flown: FlownLoops) -> MetricTable:
         [loop.name or "law", loop.times, loop.aircraft, *least_margins(loop_margins(loop.loop))]
         for loop in flown.loops
     ]
-    legend = (
-        "the least margins of the inputs, one open and all others closed; disk and delay: all "
-        "inputs at once; damping: of slow modes. aircraft: that of the file, and the true one as "
-        "simulated before a drift"
+    note = (
+        "Phase, gain and S are those of the worst input, and disk and delay those of all inputs at "
+        "once. The aircraft is that of the file, or the true one as simulated before a drift"
     )
-    legend = ". ".join([*flown.sentences, legend])
+    note = ". ".join([*flown.sentences, note])
     return MetricTable(
-        "Margins of the linear loop, by the parameters that flew", columns, rows, legend
+        "Margins of the linear loop, by the parameters that flew", columns, rows, note
     )
 
 

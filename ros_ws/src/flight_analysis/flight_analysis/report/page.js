@@ -9,7 +9,7 @@ const DEGREE = Math.PI / 180; // rad
 const DARK = JSON.parse(document.getElementById("dark").textContent);
 const scheme = matchMedia("(prefers-color-scheme: dark)");
 const figures = [...document.querySelectorAll("figure")].map(node => ({
-  node, text: node.querySelector("script").textContent, inTime: "time" in node.dataset, plot: node.querySelector("div"), drawn: "",
+  node, text: node.querySelector("script").textContent, inTime: "time" in node.dataset, plot: node.querySelector("[data-plot]"), drawn: "",
 }));
 let range = null; // s, time range of all figures over time; null: the whole flight
 let turn = 0;
@@ -148,7 +148,8 @@ async function draw(figure, style) {
   if (range && figure.inTime) for (const axis of axes(layout)) layout[axis].range = [...range];
   figure.annotations = layout.annotations ?? [];
   if (figure.inTime) layout.annotations = labelled(figure, layout, layout.xaxis.range, figure.plot.clientWidth);
-  await Plotly.newPlot(figure.plot, data, layout, {displaylogo: false, responsive: true, doubleClick: "reset"});
+  layout.dragmode = document.getElementById("drag")?.value ?? "zoom";
+  await Plotly.newPlot(figure.plot, data, layout, {displayModeBar: false, responsive: true, doubleClick: "reset"});
   if (figure.inTime) figure.plot.on("plotly_relayout", change => moved(figure, change));
 }
 
@@ -205,6 +206,54 @@ function print() { // light colours, width of a sheet; synchronous, for the brow
   }
 }
 
+function whole() { // show the whole flight in all figures over time again
+  const figure = figures.find(one => one.inTime && one.plot.layout);
+  const {layout} = specification(figure, "light");
+  Plotly.relayout(figure.plot, {"xaxis.range": layout.xaxis.range});
+}
+
+function drag() { // what a drag of the mouse does, in every figure
+  for (const {plot} of figures) if (plot.layout) Plotly.relayout(plot, {dragmode: document.getElementById("drag").value});
+}
+
+// ---- Tables and words
+
+function folded() { // unfold for print, and where a link leads
+  for (const details of document.querySelectorAll("details")) details.open = true;
+}
+
+function reached() { // open the block that holds the place of the address
+  const place = document.getElementById(decodeURIComponent(location.hash.slice(1)));
+  const details = place?.closest("details");
+  if (details && !details.open) { details.open = true; place.scrollIntoView(); }
+}
+
+function scrollable() { // only what scrolls can be reached by keyboard
+  for (const box of document.querySelectorAll(".scrolled, .contents")) {
+    if (box.scrollWidth > box.clientWidth + 1) box.tabIndex = 0; else box.removeAttribute("tabindex");
+  }
+}
+
+function explain() { // the meaning of a word beside it: by mouse, keyboard and touch
+  const tip = document.getElementById("tip");
+  const hide = () => { tip.hidden = true; };
+  const show = word => {
+    tip.textContent = document.querySelector(`${word.getAttribute("href")} dd`).textContent;
+    tip.hidden = false;
+    const {left, top, bottom} = word.getBoundingClientRect(), {offsetWidth, offsetHeight} = tip;
+    tip.style.left = `${Math.max(Math.min(left, innerWidth - offsetWidth - 16), 16)}px`;
+    tip.style.top = `${top > offsetHeight + 8 ? top - offsetHeight - 6 : bottom + 6}px`;
+  };
+  for (const word of document.querySelectorAll(".word")) {
+    word.setAttribute("aria-describedby", "tip");
+    for (const on of ["mouseenter", "focus"]) word.addEventListener(on, () => show(word));
+    for (const off of ["mouseleave", "blur"]) word.addEventListener(off, hide);
+    word.addEventListener("click", event => { event.preventDefault(); show(word); });
+  }
+  addEventListener("keydown", event => { if (event.key === "Escape") hide(); });
+  addEventListener("scroll", hide, {passive: true});
+}
+
 async function run(id) { // a packed script
   const script = document.createElement("script");
   script.textContent = new TextDecoder().decode(await unpack(id));
@@ -212,11 +261,22 @@ async function run(id) { // a packed script
 }
 
 async function start() {
+  await read;
+  explain();
+  scrollable();
+  reached();
+  addEventListener("hashchange", reached);
+  addEventListener("resize", scrollable, {passive: true});
+  document.addEventListener("toggle", scrollable, true);
+  addEventListener("beforeprint", folded);
+  if (!figures.length) return;
   await run("library");
   await showAll();
   if (document.getElementById("replay-code")) await run("replay-code");
   scheme.addEventListener("change", showAll);
-  document.getElementById("angles")?.addEventListener("change", () => { document.body.dataset.in = angles(); showAll(); });
+  document.getElementById("angles")?.addEventListener("change", () => { document.body.dataset.in = angles(); showAll(); scrollable(); });
+  document.getElementById("whole")?.addEventListener("click", whole);
+  document.getElementById("drag")?.addEventListener("change", drag);
   addEventListener("resize", resized, {passive: true});
   addEventListener("beforeprint", print);
   addEventListener("afterprint", showAll);
@@ -224,7 +284,7 @@ async function start() {
 
 start().catch(error => {
   const message = document.createElement("p");
-  message.className = "note";
+  message.className = "notes";
   message.textContent = `The figures cannot be drawn: ${error}. They need a browser of 2023 or newer.`;
   document.querySelector("h1").after(message);
   throw error;

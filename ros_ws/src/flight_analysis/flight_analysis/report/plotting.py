@@ -186,6 +186,24 @@ class Curve(NamedTuple):
     start_ns: int | None = None  # where t is 0; None: the start of the flight of the page
 
 
+class Extent(NamedTuple):
+    """The smallest and the largest value of a curve in a subplot, as shown."""
+
+    place: int
+    name: str
+    low: float
+    high: float
+
+
+def _finite(values: Any) -> FloatArray:
+    """Return the finite values of a trace; none if it has something else than numbers."""
+    try:
+        array = np.asarray([] if values is None else values, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        return np.zeros(0)
+    return array[np.isfinite(array)]
+
+
 class Figure:
     """Subplots for plotly.js: the traces `data` and the `layout`.
 
@@ -212,13 +230,31 @@ class Figure:
             bottom = (self.rows - 1 - row) * (high + between)
             self.x.append({"anchor": axis("y", index), "domain": [left_edge, left_edge + wide]})
             self.y.append({"anchor": axis("x", index), "domain": [bottom, bottom + high]})
+        self.extents: list[Extent] = []
         self.layout: dict[str, Any] = {"shapes": [], "annotations": []}
         for letter, axes in (("x", self.x), ("y", self.y)):
             self.layout |= {axis(f"{letter}axis", index): value for index, value in enumerate(axes)}
 
-    def add(self, trace: dict[str, Any], index: int = 0) -> None:
-        """Add a trace to a subplot."""
+    def add(self, trace: dict[str, Any], index: int = 0, values: FloatArray | None = None) -> None:
+        """Add a trace to a subplot; `values` are those that it has on the page, if it has none."""
         self.data.append(trace | {"xaxis": axis("x", index), "yaxis": axis("y", index)})
+        shown = trace.get("y") if values is None else values
+        finite = _finite(shown)
+        if trace.get("name") and len(finite):
+            extent = Extent(index, trace["name"], float(finite.min()), float(finite.max()))
+            self.extents.append(extent)
+
+    @property
+    def text(self) -> str:
+        """Return the figure in words: from what to what each curve goes, by subplot."""
+        by_plot: dict[int, list[str]] = {}
+        for index, name, low, high in self.extents:
+            by_plot.setdefault(index, []).append(f"{name} from {low:.3g} to {high:.3g}")
+        parts = []
+        for index, ranges in sorted(by_plot.items()):
+            title = self.y[index].get("title", {}).get("text", "")
+            parts.append(f"{title}: {', '.join(dict.fromkeys(ranges))}".removeprefix(": "))
+        return "; ".join(parts)
 
     def add_scatter(
         self, name: str, x: Any, y: Any, index: int = 0, mode: str = "lines", **style: Any
@@ -255,6 +291,7 @@ def time_series_figure(
         for label, curve in curves.items():
             if channel in curve.signal.names:
                 trace = _trace(context, curve, channel, factor, MAX_POINTS // columns)
+                values = curve.signal[channel] * factor
                 in_legend = len(curves) > 1 and first_in_legend(figure, label)
                 trace |= {
                     "name": label,
@@ -263,7 +300,7 @@ def time_series_figure(
                     "showlegend": in_legend,
                     "hovertemplate": f"%{{y:.4g}} {unit}",
                 }
-                figure.add(trace, index)
+                figure.add(trace, index, values)
         title = labels.get(channel) or channel_label(channel, context.units)
         figure.y[index]["title"] = {"text": title}
         lowest = index + columns >= len(channels)

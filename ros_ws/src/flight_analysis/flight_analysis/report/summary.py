@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from aircraft_sim.params import AircraftConfig
-from flight_analysis import metrics
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.linear_loop.delay_margin import delay_margin
 from flight_analysis.linear_loop.told import FlightFacts
@@ -568,11 +567,3 @@ def finite_or_null(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [finite_or_null(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def summary_legend(summary: Mapping[str, Any]) -> str:
-    """Return the legend of the parts of a flight."""
-    is_guided = any("turn" in parts for parts in summary["errors"].values())
-    air = summary["air"] or UNKNOWN_AIR
-    meaning = ". ultimate bound: the largest error in calm" if air == CALM else ""
-    return f"{metrics.parts_legend(air, is_guided=is_guided)}{meaning}"

@@ -3,30 +3,20 @@
 """Build the tables of a flight's report page as data, which page.html.jinja turns into HTML."""
 
 from collections.abc import Mapping, Sequence
-from itertools import groupby, product
+from itertools import chain, groupby, product
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import (
-    MIN_BAND_NOISE_FLOORS,
-    SETTLING_BAND,
-    SETTLING_DWELL,
-    TRUE_ERROR,
-    Windows,
-)
+from flight_analysis.metrics import MEASURED_ERROR, TRUE_ERROR, Windows
 from flight_analysis.report import figures
 from flight_analysis.report.account import account_of_json
-from flight_analysis.report.display_units import (
-    QUANTITY_UNITS,
-    DisplayUnit,
-    format_seconds,
-    format_value,
-)
-from flight_analysis.report.guided import BANDS, landing_results, leg_results
-from flight_analysis.report.summary import summary_legend, taken_over, time_flown
+from flight_analysis.report.display_units import DisplayUnit, format_seconds, format_value
+from flight_analysis.report.glossary import legend, words_in
+from flight_analysis.report.guided import landing_results, leg_results
+from flight_analysis.report.summary import taken_over, time_flown
 from flight_analysis.report.summary_rows import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
@@ -49,39 +39,35 @@ from flight_core.text import sentences
 from flight_core.vectors import FloatArray
 from rise_di_controller.internals import Saturation
 
-ERROR_LEGEND = (
-    f"switches: of the sign term's direction. settling: time"
-    f" until the error stays for {SETTLING_DWELL:g} s within {SETTLING_BAND:.0%} of the largest "
-    f"y_m, or within {MIN_BAND_NOISE_FLOORS:g} noise floors if it is measured; the slowest"
-)
-NOISE_FLOOR_LEGEND = "noise floor: the rms that noise and rounding leave in y"
-UNDISTINGUISHED = "; a smaller measured error cannot be distinguished from noise or rounding"
-TRUE_BELOW = "; the true error does not contain it, and may be smaller"
-IMPORTED_LEGEND = (
-    "trim: the median; rate: mean abs of the derivative, in the unit of the row per second"
-)
-TICK_LEGEND = "jitter: how far the time between two ticks is from a whole number of periods"
-INPUT_LEGEND = "u about trim; rate: mean abs(u_dot), in the unit of the row per second"
-GUIDANCE_LEGEND = (
-    "a segment has the same modes, commands and leg of the route. overshoot: the largest error "
-    "beyond the command; settling: time until the error stays within "
-    + ", ".join(
-        f"{band * QUANTITY_UNITS[name].factor:g} {QUANTITY_UNITS[name].unit} of {name}"
-        for name, band in BANDS.items()
-    )
-    + f" for {SETTLING_DWELL:g} s; both where it begins outside"
-)
-MODEL_LEGEND = "start: the law of the start. Commands and wind of the spans differ"
-SATURATION_LEGEND = "; saturated: ticks with saturation by magnitude / by rate"
+MODEL_LEGEND = "Commands and wind of the spans differ"
+
+
+TIMES = ("jitter", "age of y", "age of u")  # words of the glossary
 
 
 class MetricTable(NamedTuple):
-    """A table whose first column has the names of the rows; `columns` follow."""
+    """A table whose first column has the names of the rows; `columns` follow.
+
+    `note` says what holds for this table. The glossary explains the headings that it has, and
+    `of_rows` are words in the names of the rows that it explains too.
+    """
 
     caption: str
     columns: Sequence[Column]
     rows: Sequence[Sequence[str]]
-    legend: str = ""
+    note: str = ""
+    of_rows: Sequence[str] = ()
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Return the words of this table that the glossary explains."""
+        headings = ((each.group, each.head, each.label) for each in self.columns)
+        return words_in([*chain.from_iterable(headings), *self.of_rows])
+
+    @property
+    def legend(self) -> str:
+        """Return what stands below the table in a terminal: its note and its words."""
+        return ". ".join(filter(None, (self.note, legend(self.words))))
 
     @property
     def groups(self) -> list[tuple[str, int]]:
@@ -201,7 +187,7 @@ def metric_tables(
             f"Inputs{taken_over(summary, 'inputs')}",
             inputs,
             input_rows(summary, units),
-            INPUT_LEGEND + SATURATION_LEGEND,
+            "u less its value at trim",
         ),
         _guidance_table(summary, units),
         model_table(summary["models"], units, taken_over(summary, "errors")),
@@ -242,48 +228,42 @@ def imported_tables(
         if key not in summary:
             continue
         columns = columns_of(INPUT_COLUMNS, summary[key])
+        rows = table_rows(summary[key], columns, units)
         caption = f"{title}, {format_seconds(summary['duration'])}"
-        tables.append(
-            MetricTable(caption, columns, table_rows(summary[key], columns, units), IMPORTED_LEGEND)
-        )
+        of_rows = ("measured error",) if key == "e" else ("trim",)
+        tables.append(MetricTable(caption, columns, rows, of_rows=of_rows))
     flight_account = account_of_json(summary)
-    rows = []
+    counts = []
     for name, topic in ({} if flight_account is None else flight_account.topics).items():
         length = (topic.last or 0.0) - (topic.first or 0.0)
         rate = (topic.found - 1) / length if length else None
-        rows.append([name, f"{topic.found}", format_value(rate), format_value(topic.gap)])
-    return [
-        *tables,
-        MetricTable(
-            "Topics", [Column("", head) for head in ("samples", "Hz", "longest gap (s)")], rows
-        ),
-    ]
+        counts.append([name, f"{topic.found}", format_value(rate), format_value(topic.gap)])
+    columns_of_topics = [Column("", head) for head in ("samples", "Hz", "longest gap (s)")]
+    return [*tables, MetricTable("Topics", columns_of_topics, counts)]
 
 
 def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> MetricTable:
-    columns = columns_of((*ERROR_COLUMNS, NOISE_FLOOR_COLUMN, SWITCH_COLUMN), summary["errors"])
+    is_true = summary["error"].startswith(TRUE_ERROR)
+    # The noise of y is not in the true error, which may be smaller.
+    floor = () if is_true else (NOISE_FLOOR_COLUMN,)
+    columns = columns_of((*ERROR_COLUMNS, *floor, SWITCH_COLUMN), summary["errors"])
     kinds = {transient["kind"] for transient in summary["transients"]}
     settling = [kind for kind in SETTLING_COLUMNS if kind in kinds]
     rows = table_rows(summary["errors"], columns, units)
     for channel, row in zip(summary["errors"], rows, strict=True):
         row.extend(slowest_settling(summary, channel, kind) for kind in settling)
     caption = f"Tracking error ({summary['error']}), {time_flown(summary)}"
-    is_true = summary["error"].startswith(TRUE_ERROR)
-    floor = NOISE_FLOOR_LEGEND + (TRUE_BELOW if is_true else UNDISTINGUISHED)
-    legend = f"{summary_legend(summary)}. {ERROR_LEGEND}. {floor}"
-    return MetricTable(
-        caption, (*columns, *(SETTLING_COLUMNS[kind] for kind in settling)), rows, legend
-    )
+    settling_columns = [SETTLING_COLUMNS[kind] for kind in settling]
+    word = TRUE_ERROR if is_true else MEASURED_ERROR
+    return MetricTable(caption, (*columns, *settling_columns), rows, of_rows=(word,))
 
 
 def _guidance_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> MetricTable:
     guidance = summary["guidance"] or {"segments": (), "legs": ()}
     columns, rows = segment_table(guidance["segments"], units)
     results = (landing_results(guidance.get("landing")), leg_results(guidance["legs"]))
-    legend = sentences(*results, GUIDANCE_LEGEND) if rows else ""
-    return MetricTable(
-        f"Guidance by segment{taken_over(summary, 'guidance')}", columns, rows, legend
-    )
+    caption = f"Guidance by segment{taken_over(summary, 'guidance')}"
+    return MetricTable(caption, columns, rows, sentences(*results), of_rows=("segment",))
 
 
 def model_table(
@@ -295,7 +275,9 @@ def model_table(
     """
     headings, rows = model_rows(models, units)
     columns = [Column("", head) for head in headings]
-    return MetricTable(f"Rms of the error by model{part}", columns, rows, MODEL_LEGEND)
+    return MetricTable(
+        f"Rms of the error by model{part}", columns, rows, MODEL_LEGEND, ("law of the start",)
+    )
 
 
 def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
@@ -304,8 +286,9 @@ def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
     for topic, label, text in timing_rows(summary):
         part = "" if topic == "ticks" else taken_over(summary, topic)
         rows.append((f"{label}{part}", text))
-    legend = TICK_LEGEND if any("jitter" in label for label, _ in rows) else ""
-    return MetricTable(caption, [Column("", "")], rows, legend)
+    labels = [label for label, _ in rows]
+    of_rows = [word for word in TIMES if any(label.startswith(word) for label in labels)]
+    return MetricTable(caption, [Column("", "")], rows, of_rows=of_rows)
 
 
 def _process_table(summary: Mapping[str, Any]) -> MetricTable:

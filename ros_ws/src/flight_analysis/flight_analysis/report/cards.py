@@ -1,0 +1,173 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Build the cards of a flight: a claim each, in plain words, and the command that checks it."""
+
+import math
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.linear_loop.certificate import kept_guarantee
+from flight_analysis.linear_loop.guarantee import Guarantee
+from flight_analysis.linear_loop.loop_margins import LinearLoop, LoopMargins, loop_margins
+from flight_analysis.report.display_units import format_seconds, format_value
+from flight_analysis.report.flight_head import run_argument, scenario_argument
+from flight_analysis.report.flown_models import FlownLoops
+from flight_analysis.report.margin_figures import MARGIN_WORDS, decibels, guarantee_text
+from flight_analysis.report.page import Card, Step
+from flight_analysis.report.summary import RecordedFlight
+
+
+def claims(flight: RecordedFlight, scenario: Scenario, flown: FlownLoops) -> list[Card]:
+    """Return the cards of a flight: margins, guarantee, learned models and replay."""
+    cards = []
+    if len(flown.loops) == 1:
+        loop = flown.loops[0].loop
+        cards = [
+            _margin_card(loop_margins(loop), scenario),
+            _guarantee_card(loop, kept_guarantee(loop), scenario),
+        ]
+    elif flown.loops:
+        cards = [_changed_card(flown)]
+    if flight.summary["models"]:
+        cards.append(_learned_card(flight))
+    if "internals" in flight.tape:
+        cards.append(_replay_card(flight))
+    return cards
+
+
+def _margin_card(margins: LoopMargins, scenario: Scenario) -> Card:
+    """Return how far the loop is from instability, at the input where it is nearest."""
+    step = Step(
+        sentence="Compute them again:", command=f"rise-di gains check {scenario_argument(scenario)}"
+    )
+    nominal = margins.nominal
+    if not nominal.stable:
+        return Card(title="Margins", sentences=["The linear loop is unstable."], step=step)
+    worst = int(nominal.phase.argmin())
+    phase = math.degrees(nominal.phase[worst])
+    gain = float(decibels(nominal.gain.min()))
+    gain_text = (
+        "any gain" if math.isinf(gain) else f"gains off by a factor of {10 ** (gain / 20):.2g}"
+    )
+    return Card(
+        title="Margins",
+        sentences=[
+            (
+                f"The linear loop is stable. At its worst input, {margins.inputs[worst]}, it "
+                f"stands {phase:.0f} deg more phase lag; at any input {gain_text}."
+            ),
+            (
+                f"If u came {1e3 * margins.delay:.0f} ms later in all inputs, it would be unstable."
+                if math.isfinite(margins.delay)
+                else "No delay of u makes it unstable."
+            ),
+        ],
+        step=step,
+        words=MARGIN_WORDS,
+    )
+
+
+def _guarantee_card(loop: LinearLoop, promise: Guarantee | None, scenario: Scenario) -> Card:
+    """Return what is guaranteed for aircraft other than that of the file."""
+    name = scenario_argument(scenario)
+    title = "Guarantee"
+    if promise is None:
+        return Card(
+            title=title,
+            sentences=[
+                "No guarantee has been computed for this loop, or none holds for its aircraft."
+            ],
+            step=Step(sentence="Compute one:", command=f"rise-di gains guarantee {name}"),
+        )
+    if promise.stable == 0.0:
+        return Card(title=title, sentences=guarantee_text(promise))
+    stable = math.floor(1e3 * promise.stable) / 10.0
+    first = promise.unstable
+    found = (
+        "No unstable aircraft was found within 99 %."
+        if first is None
+        else f"The first unstable aircraft that was found has entries that differ by "
+        f"{math.ceil(1e3 * first.deviation) / 10.0:.1f} %."
+    )
+    sentences = [
+        (
+            "Each number of the aircraft's model, A and B, may be wrong: the linear loop is proved "
+            f"stable for every aircraft whose entries differ by up to {stable:.1f} % from those "
+            "of the file."
+        ),
+        found,
+        (
+            "Entries that are 0 in the file are taken as 0, and lags, delay and period as exact: "
+            "the proof is of small deviations, without limits of the actuators."
+        ),
+    ]
+    step = Step(
+        sentence="Write the proof, which another program checks:",
+        command=f"rise-di gains guarantee {name} --certificate certificate.json",
+    )
+    if promise.certificate:
+        sentences.append(f"Its certificate is {promise.certificate}.")
+    return Card(title=title, sentences=sentences, step=step, words=("linear loop",))
+
+
+def _changed_card(flown: FlownLoops) -> Card:
+    """Return the card of a flight with several parameter sets, or with a true aircraft."""
+    is_stable = [bool(loop_margins(each.loop).nominal.stable) for each in flown.loops]
+    count = len(flown.loops)
+    sentence = (
+        f"All {count} linear loops of this flight are stable."
+        if all(is_stable)
+        else f"{is_stable.count(False)} of the {count} linear loops of this flight are unstable."
+    )
+    return Card(
+        title="Margins",
+        sentences=[
+            sentence,
+            "The table of margins under All figures has each. A guarantee is of one loop.",
+        ],
+        words=("linear loop",),
+    )
+
+
+def _learned_card(flight: RecordedFlight) -> Card:
+    """Return which learned models flew, and what became of the error."""
+    spans = flight.summary["models"]
+    learned = spans[1:]
+    if not learned:
+        return Card(
+            title="Learned models",
+            sentences=["No learned model flew: the law of the start flew to the end."],
+        )
+    changes = []
+    for name, before in spans[0]["rms"].items():
+        after = learned[-1]["rms"].get(name)
+        if before is not None and after is not None:
+            unit, factor = flight.units[name]
+            values = (format_value(before, factor), format_value(after, factor))
+            changes.append(f"{name} {values[0]} to {values[1]} {unit}")
+    sentences = [
+        (
+            f"{len(learned)} learned model{'s' if len(learned) > 1 else ''} flew, the first from "
+            f"t = {format_seconds(learned[0]['start'])} on."
+        )
+    ]
+    if changes:
+        sentences.append(
+            f"Rms error under the law of the start, and under the last model: {', '.join(changes)}."
+            " Commands and wind of the two differ."
+        )
+    return Card(title="Learned models", sentences=sentences, words=("law of the start",))
+
+
+def _replay_card(flight: RecordedFlight) -> Card:
+    """Return how to check that the log holds all that the controller computed with."""
+    ticks = len(flight.tape["internals"].stamp_ns)
+    return Card(
+        title="Replay",
+        sentences=[
+            (
+                f"The log has what the controller computed with in its {ticks} ticks, so that "
+                "each can be computed again and compared bit by bit. This page has not done so."
+            )
+        ],
+        step=Step(sentence="Do it:", command=f"rise-di replay {run_argument(flight)}"),
+    )

@@ -1,0 +1,205 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Build the head of a flight's page: its name and time, what came of it, and a tile an output."""
+
+import shlex
+from collections.abc import Mapping
+from datetime import datetime
+from typing import Any
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import scenarios
+from flight_analysis.report import guided
+from flight_analysis.report.display_units import (
+    NO_UNIT,
+    DisplayUnit,
+    aligned_numbers,
+    format_seconds,
+    in_order,
+    plain_number,
+)
+from flight_analysis.report.page import Colour, Step, Tile, Verdict
+from flight_analysis.report.sample_counts import is_simulated
+from flight_analysis.report.summary import RecordedFlight, command_results, time_flown
+from flight_core.outcome import STATUS_HOST, Aim, End
+from flight_log.clock import SINCE_EPOCH_NS
+
+# ---- Title
+
+
+def title_of(flight: RecordedFlight) -> str:
+    """Return the name of a flight in words: its scenario, or the log that it was imported from."""
+    if flight.scenario is not None:
+        return flight.scenario.name
+    return str(flight.summary["source"]["log"])
+
+
+def meta_lines(flight: RecordedFlight, scenario: Scenario) -> list[str]:
+    """Return when a flight was flown and how: airframe, law, length, speed and pace."""
+    is_known = is_simulated(flight.tape) or "engagements" in flight.summary
+    aircraft = scenario.aircraft.airframe if is_known else "an aircraft outside of the scenario"
+    parts = [f"{aircraft}, law {scenario.controller.law}", time_flown(flight.summary)]
+    distance = guided.distance(flight.tape)
+    if distance is not None:
+        parts.append(f"{distance / 1e3:.2f} km over ground")
+    # The trim speed is that of the aircraft in the scenario.
+    speed = guided.top_speed(flight.tape, scenario.aircraft.channels().speed)
+    if speed is not None and is_known:
+        parts.append(f"at most {speed:.1f} m/s")
+    parts.append(pace(flight))
+    when = started(flight)
+    return [" · ".join([*([when] if when else []), *parts]), f"run {flight.name}"]
+
+
+def about_trim(scenario: Scenario) -> dict[str, str]:
+    """Return what stands in place of V in a figure of y: the airspeed less that of trim."""
+    channels = scenario.aircraft.channels()
+    return {"V": f"V - {channels.speed:g} (m/s)"} if "V" in channels.outputs else {}
+
+
+def started(flight: RecordedFlight) -> str:
+    """Return the time of day at which a flight began, in words; "" if the log does not say it."""
+    start = (flight.summary["flight"] or {}).get("started")
+    try:
+        return f"{datetime.fromisoformat(start):%-d %b %Y, %H:%M} UTC" if start else ""
+    except ValueError:
+        return ""
+
+
+def pace(flight: RecordedFlight) -> str:
+    """Return in which time a flight was flown."""
+    if flight.tape.is_by_clock:
+        return "by /clock"
+    if flight.tape.start_ns > SINCE_EPOCH_NS:
+        return "in real time"
+    has_nodes = bool((flight.summary["account"] or {}).get("processes"))
+    return "in lockstep" if has_nodes else "in one process, without topics"
+
+
+# ---- Verdict
+
+NEXT = {
+    Aim.ERROR: "Ask whether its loop is stable, and with what margins:",
+    Aim.LOG: "Fly it in lockstep, where no message is late or lost:",
+}
+"""What to do about the gravest shortfall. For any other one, see the flight again."""
+
+
+def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
+    """Return what came of a flight, in the colour of what it is about, and what to do next."""
+    outcome = flight.summary["outcome"]
+    sentence = f"{outcome['sentence'][:1].upper()}{outcome['sentence'][1:]}."
+    injected = _injected(scenario)
+    texts = [injected, command_results(flight.summary)]
+    name = scenario_argument(scenario)
+    if outcome["status"] == STATUS_HOST:
+        headline = "No finding about the law."
+        texts.insert(0, sentence)
+        colour = Colour.HOST
+        step = Step(
+            sentence="Fly the same without the clock:", command=f"rise-di fly {name} --lockstep"
+        )
+    elif outcome["status"] == 0:
+        headline = sentence
+        if outcome["errors"]:
+            texts.insert(0, "The error of every output stayed within what is allowed.")
+        colour = Colour.GOOD
+        step = Step(
+            sentence="Compute every tick again, and compare it with the log:",
+            command=f"rise-di replay {run_argument(flight)}",
+        )
+    else:
+        # What is wrong comes first: a flight that completed may still fall short of much.
+        end, _, worst = sentence.partition("; ")
+        headline = worst.removeprefix("worst: ") or sentence
+        headline = f"{headline[:1].upper()}{headline[1:]}"
+        if worst:
+            texts.insert(0, end)
+        colour = Colour.BAD
+        step = Step(
+            sentence="See the flight again:", command=f"rise-di watch {run_argument(flight)}"
+        )
+        if not injected:
+            step = _next_step(outcome, name, step)
+    return Verdict(
+        headline=headline,
+        colour=colour,
+        text=" ".join(f"{text.rstrip('.')}." for text in texts if text),
+        details=outcome["details"],
+        step=step,
+    )
+
+
+def _next_step(outcome: Mapping[str, Any], scenario: str, otherwise: Step) -> Step:
+    """Return what to do about a flight that falls short, by its gravest shortfall."""
+    order = list(Aim)
+    aims = sorted((Aim(each["aim"]) for each in outcome["shortfalls"]), key=order.index)
+    gravest = aims[0] if aims else None
+    if gravest is Aim.ERROR:
+        return Step(sentence=NEXT[gravest], command=f"rise-di gains check {scenario}")
+    if gravest is Aim.LOG:
+        return Step(sentence=NEXT[gravest], command=f"rise-di fly {scenario} --lockstep")
+    if outcome["end"] == End.NEVER_FLEW:
+        return Step(sentence="See what the nodes say:", command=f"rise-di fly {scenario} --verbose")
+    return otherwise
+
+
+def _injected(scenario: Scenario) -> str:
+    """Return the faults that the scenario injects, since they explain an error."""
+    faults = scenario.aircraft.actuators.read_faults()
+    parts = [
+        f"{fault.subject}{f' ({fault.extent})' if fault.extent else ''} at t = {fault.at:g} s"
+        for fault in faults
+    ]
+    return f"The scenario injects: {', '.join(parts)}" if parts else ""
+
+
+def scenario_argument(scenario: Scenario) -> str:
+    """Return how a command names the scenario: by its name, or by the path of its file."""
+    is_known = scenario.name in scenarios()
+    return scenario.name if is_known else shlex.quote(str(scenario.path))
+
+
+def run_argument(flight: RecordedFlight) -> str:
+    """Return how a command names the run in the folder where flights are recorded."""
+    return shlex.quote(f"runs/{flight.name}")
+
+
+# ---- Tiles
+
+
+def tiles_of(flight: RecordedFlight) -> list[Tile]:
+    """Return a tile an output.
+
+    It has the worst part of the flight beside what was allowed there. If the errors were not
+    judged, as in a flight that ended early, it has the error over the whole flight.
+    """
+    units = flight.units
+    worst = {figures["output"]: figures for figures in flight.summary["outcome"].get("errors", ())}
+    if worst:
+        return [
+            _judged_tile(worst[name], units.get(name, NO_UNIT)) for name in in_order(worst, units)
+        ]
+    tiles = []
+    for name, parts in (flight.summary["errors"] or flight.summary.get("e", {})).items():
+        unit = units.get(name, NO_UNIT)
+        rms = parts["whole"]["rms"]
+        if rms is not None:
+            value = plain_number(rms * unit.factor, 3)
+            text = f"rms over {format_seconds(flight.summary['duration'])}, not judged"
+            tiles.append(Tile(name=name, value=value, unit=unit.unit, text=text))
+    return tiles
+
+
+def _judged_tile(figures: Mapping[str, Any], unit: DisplayUnit) -> Tile:
+    rms, allowed = aligned_numbers(figures["rms"] * unit.factor, figures["allowed"] * unit.factor)
+    length = figures["stop"] - figures["start"]
+    when = f"t = {figures['start']:.1f} to {figures['stop']:.1f} s"
+    return Tile(
+        name=f"error of {figures['output']}, worst {length:.0f} s",
+        value=rms,
+        unit=f"{unit.unit} rms",
+        text=f"{allowed} allowed; {when}",
+        part=figures["rms"] / figures["allowed"],
+        has_limit=True,
+    )

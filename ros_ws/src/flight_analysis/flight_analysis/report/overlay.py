@@ -1,0 +1,116 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Compare the signals that logs have in common, whatever wrote them.
+
+The difference of a signal is taken at the instants of the first log, where the other log has
+samples before and after: y and pose are linear between two samples, and u is held. Each signal has
+a tolerance, by default TOLERANCE of the largest absolute value in the first log.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_analysis.report.display_units import (
+    NO_UNIT,
+    QUANTITY_UNITS,
+    DisplayUnit,
+    channel_label,
+    format_value,
+    in_order,
+)
+from flight_analysis.report.summary import RecordedFlight, labels
+from flight_analysis.report.summary_rows import Column
+from flight_analysis.report.tables import MetricTable
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
+
+TOPICS = ("y", "u", "pose")
+HELD = ("u",)  # topics whose values are held until the next sample
+ANGLES = ("phi", "theta", "psi")  # rad, of a pose: they differ by at most pi
+TOLERANCE = 0.02
+
+
+class Difference(NamedTuple):
+    """How a signal differs from that of the first log, SI."""
+
+    rms: float
+    most: float
+    at: float  # s, where the difference is largest
+    tolerance: float
+    outside: float  # part of the compared instants
+
+
+def difference(first: Tape, second: Tape, topic: str, name: str) -> Difference | None:
+    """Return how a channel of two logs differs, or None if they have no time in common."""
+    t, before = _samples(first, topic, name)
+    instants, values = _samples(second, topic, name)
+    if not (len(t) and len(instants)):
+        return None
+    is_common = (t >= instants[0]) & (t <= instants[-1])
+    if not is_common.any():
+        return None
+    t, before = t[is_common], before[is_common]
+    if topic in HELD:
+        after = values[np.searchsorted(instants, t, side="right") - 1]
+    else:
+        after = np.interp(t, instants, values)
+    change = after - before
+    if topic == "pose" and name in ANGLES:
+        change = np.angle(np.exp(1j * change))
+    tolerance = TOLERANCE * float(np.max(np.abs(before)))
+    size = np.abs(change)
+    worst = int(np.argmax(size))
+    return Difference(
+        rms=float(np.sqrt(np.mean(change**2))),
+        most=float(size[worst]),
+        at=float(t[worst]),
+        tolerance=tolerance,
+        outside=float(np.mean(size > tolerance)),
+    )
+
+
+def _samples(tape: Tape, topic: str, name: str) -> tuple[FloatArray, FloatArray]:
+    """Return the instants, s from the start of the log, and the finite values of a channel."""
+    signal: Signal = tape[topic]
+    values = signal[name]
+    is_finite = np.isfinite(values)
+    t = (signal.stamp_ns - tape.start_ns) / NANOSECONDS
+    return t[is_finite], values[is_finite]
+
+
+def difference_table(
+    flights: Sequence[RecordedFlight], units: Mapping[str, DisplayUnit]
+) -> MetricTable:
+    """Return the differences of each later log from the first, a row for each common signal."""
+    first, *others = flights
+    rows = []
+    for label, other in zip(labels(flights)[1:], others, strict=True):
+        for topic in TOPICS:
+            if topic not in first.tape or topic not in other.tape:
+                continue
+            known = QUANTITY_UNITS if topic == "pose" else units
+            common = [name for name in first.tape[topic].names if name in other.tape[topic].names]
+            for name in in_order(common, known):
+                found = difference(first.tape, other.tape, topic, name)
+                if found is not None:
+                    unit = known.get(name, NO_UNIT)
+                    title = f"{topic} {channel_label(name, known)}"
+                    of_log = f"{label}: {title}" if len(others) > 1 else title
+                    rows.append([of_log, *_cells(found, unit)])
+    heads = ("rms", "largest", "at (s)", "tolerance", "outside, %")
+    note = (
+        f"The tolerance is {100 * TOLERANCE:g} % of the largest value in the first log. Outside is "
+        "the part of its instants in which the difference is larger"
+    )
+    return MetricTable("", [Column("", head) for head in heads], rows, note)
+
+
+def _cells(found: Difference, unit: DisplayUnit) -> list[str]:
+    """Return the cells of a row, in the unit of the signal."""
+    rms, most, tolerance = (
+        format_value(value, unit.factor) for value in (found.rms, found.most, found.tolerance)
+    )
+    return [rms, most, f"{found.at:.2f}", tolerance, f"{100 * found.outside:.1f}"]

@@ -1,0 +1,326 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Describe a page as records, and write it as HTML that needs no network.
+
+A page leads with its head: title, verdicts and tiles. Blocks follow in their order: figures, a
+replay, cards, messages and tables. A line of contents names the blocks that have a short name.
+"""
+
+import base64
+import json
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from flight_analysis.report import figures, plotting
+from flight_analysis.report.comparison import ComparisonTable
+from flight_analysis.report.display_units import format_value
+from flight_analysis.report.glossary import GLOSSARY
+from flight_analysis.report.plotting import Figure, SampleStore, pack
+from flight_analysis.report.replay_scene import Replay
+from flight_analysis.report.summary import finite_or_null
+from flight_analysis.report.tables import MetricTable
+from flight_core.vectors import FloatArray
+
+HERE = Path(__file__).parent
+
+# ---- Head
+
+
+class Colour(StrEnum):
+    """The colour of a verdict, by what it is about."""
+
+    GOOD = "good"  # green: nothing is wrong
+    HOST = "host"  # amber: the host was too busy, and nothing is wrong with the aircraft
+    BAD = "bad"  # red: the flight falls short of something
+    PLAIN = "plain"  # nothing was judged
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step:
+    """What to do next: a sentence, and the command to type."""
+
+    sentence: str
+    command: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What came of a flight: a sentence in bold, more of it, details to unfold, and a next step.
+
+    In a comparison it has the label and the colour of its flight.
+    """
+
+    headline: str
+    colour: Colour
+    text: str = ""
+    details: Sequence[str] = ()
+    step: Step | None = None
+    label: str = ""
+    line: str = ""  # colour of the flight in figures
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tile:
+    """The error of an output beside what was allowed, as text, and as a part of the bar.
+
+    Without a limit the tile has no bar, because the error was not judged.
+    """
+
+    name: str
+    value: str
+    unit: str
+    text: str
+    part: float = 0.0  # of what was allowed
+    has_limit: bool = False
+
+    @property
+    def is_within(self) -> bool:
+        """Return whether the error is one that is allowed."""
+        return self.part <= 1.0
+
+    @property
+    def length(self) -> float:
+        """Return the length of the bar in percent; what is allowed is half of it."""
+        return min(50.0 * self.part, 100.0)
+
+
+# ---- Blocks
+
+
+def anchor(title: str) -> str:
+    """Return the name of a place on the page, made of its title."""
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+
+
+class Section(NamedTuple):
+    """A figure with a heading. If there is no figure, the section is left out."""
+
+    title: str
+    hint: str
+    figure: Figure | None
+    over_time: bool = True  # all figures over time are zoomed together
+    contents: str = ""  # its name in the line of contents; "": not there
+
+    @property
+    def kind(self) -> str:
+        """Return the kind of block, by which the template draws it."""
+        return "figure"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Card:
+    """A claim about a flight: what holds, within what, and how to check it.
+
+    `words` of the glossary explain it.
+    """
+
+    title: str
+    sentences: Sequence[str]
+    step: Step | None = None
+    words: Sequence[str] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cards:
+    """Cards beside each other under one heading."""
+
+    kind: ClassVar[str] = "cards"
+    title: str
+    cards: Sequence[Card]
+    contents: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayBlock:
+    """The replay of a flight in three dimensions."""
+
+    kind: ClassVar[str] = "replay"
+    replay: Replay
+    title: str = "Replay"
+    contents: str = "Replay"
+
+
+class MessageLine(NamedTuple):
+    """A message of the log as text."""
+
+    time: str
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Messages:
+    """The messages of a log."""
+
+    kind: ClassVar[str] = "messages"
+    lines: Sequence[MessageLine]
+    title: str = "Messages of the log"
+    contents: str = "Messages"
+
+
+Tables = Sequence[MetricTable] | Sequence[ComparisonTable]
+
+
+class TableGroup(NamedTuple):
+    """Tables that stand together, and the same in radians.
+
+    Tables of a comparison have the `colours` of the flights.
+    """
+
+    tables: Tables
+    title: str = ""
+    note: str = ""
+    colours: Sequence[str] = ()
+    in_radians: Tables = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figures:
+    """Groups of tables, which a page with a flight folds."""
+
+    kind: ClassVar[str] = "tables"
+    groups: Sequence[TableGroup]
+    is_folded: bool = False
+    title: str = "All figures"
+    contents: str = "All figures"
+    # words that the glossary explains, apart from those of the tables
+    words: Sequence[str] = ()
+
+
+Block = Section | Cards | ReplayBlock | Messages | Figures
+
+
+class Page(NamedTuple):
+    """The content of a page."""
+
+    title: str
+    blocks: Sequence[Block]
+    lines: Sequence[str] = ()  # below the title
+    verdicts: Sequence[Verdict] = ()
+    tiles: Sequence[Tile] = ()
+    notes: Sequence[str] = ()
+    samples: SampleStore | None = None  # None: no figure has long curves
+
+    @property
+    def shown(self) -> list[Block]:
+        """Return the blocks that have something to show."""
+        return [block for block in self.blocks if _has_content(block)]
+
+    @property
+    def contents(self) -> list[tuple[str, str]]:
+        """Return the line of contents: the anchor and the name of each block that has one."""
+        entries = [(anchor(block.title), block.contents) for block in self.shown if block.contents]
+        return [*entries, *([("words", "Words")] if self.words else [])]
+
+    @property
+    def words(self) -> dict[str, str]:
+        """Return the words on the page that the glossary explains, in its order."""
+        used: set[str] = set()
+        for block in self.shown:
+            if isinstance(block, Cards):
+                used.update(*(card.words for card in block.cards))
+            elif isinstance(block, Figures):
+                used.update(block.words)
+                tables = [table for group in block.groups for table in group.tables]
+                used.update(*(each.words for each in tables if isinstance(each, MetricTable)))
+        if self.tiles:
+            used |= {"worst", "allowed"} if self.tiles[0].has_limit else {"rms"}
+        return {word: meaning for word, meaning in GLOSSARY.items() if word in used}
+
+    @property
+    def replay(self) -> Replay | None:
+        """Return the replay, or None if the page has none."""
+        for block in self.blocks:
+            if isinstance(block, ReplayBlock):
+                return block.replay
+        return None
+
+    @property
+    def has_figures(self) -> bool:
+        """Return whether the page has a figure."""
+        return any(isinstance(block, Section) for block in self.shown)
+
+    @property
+    def has_times(self) -> bool:
+        """Return whether the page has figures over time, which are zoomed together."""
+        return any(isinstance(block, Section) and block.over_time for block in self.shown)
+
+    @property
+    def has_angles(self) -> bool:
+        """Return whether the page can show its angles both in deg and in rad."""
+        groups = [
+            group for block in self.blocks if isinstance(block, Figures) for group in block.groups
+        ]
+        return any(group.in_radians for group in groups)
+
+
+def _has_content(block: Block) -> bool:
+    if isinstance(block, Section):
+        return block.figure is not None
+    if isinstance(block, Cards):
+        return bool(block.cards)
+    if isinstance(block, Messages):
+        return bool(block.lines)
+    return not isinstance(block, Figures) or any(group.tables for group in block.groups)
+
+
+# ---- HTML
+
+
+def page_html(page: Page) -> str:
+    """Return the page as HTML, with plotly, the script and the samples inside."""
+    return "".join(page_parts(page))
+
+
+def page_parts(page: Page) -> Iterator[str]:
+    """Return the text of a page in parts: the page of a long flight has some 100 MB."""
+    environment = Environment(
+        loader=FileSystemLoader(HERE),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "script_json": script_json,
+        "ratio": format_ratio,
+        "css": Markup,
+        "anchor": anchor,
+    }
+    return environment.get_template("page.html.jinja").generate(
+        page=page,
+        dark=plotting.DARK | figures.DARK,
+        library=pack((HERE / "vendor" / "plotly-basic.min.js").read_bytes()),
+        style=Markup((HERE / "page.css").read_text(encoding="utf-8")),  # noqa: S704 - our own file
+        script=Markup((HERE / "page.js").read_text(encoding="utf-8")),  # noqa: S704 - our own file
+    )
+
+
+def script_json(value: Any) -> Markup:
+    """Write JSON for a script element: "<" occurs only in strings, as an escape."""
+    content = finite_or_null(
+        {"data": value.data, "layout": value.layout} if isinstance(value, Figure) else value
+    )
+    text = json.dumps(content, default=_typed_array, allow_nan=False, separators=(",", ":"))
+    return Markup(text.replace("<", "\\u003c"))  # noqa: S704
+
+
+def _typed_array(array: FloatArray | NDArray[np.float32]) -> dict[str, str]:
+    """Return an array for plotly.js: type "f8" or "f4", and bytes, little endian."""
+    return {"dtype": array.dtype.str[1:], "bdata": base64.b64encode(array.tobytes()).decode()}
+
+
+def format_ratio(ratio: float | None) -> Markup:
+    """Write a ratio with three digits, or as a whole number from 100 on."""
+    if ratio is None:
+        return Markup()
+    return Markup("&times;{}").format(format_value(ratio) if ratio < 100.0 else f"{ratio:.0f}")
