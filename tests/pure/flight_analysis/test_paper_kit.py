@@ -46,7 +46,7 @@ def test_svg_keeps_text_and_rows(flight: RecordedFlight, tmp_path: Path) -> None
     assert float(root.attrib["width"].removesuffix("pt")) == pytest.approx(
         180.0 / 25.4 * 72.0, abs=0.1
     )
-    for label in ("V (m/s)", "e of q (deg/s)", "elevator (deg)", "t (s)", "y_m"):
+    for label in ("V - 25 (m/s)", "true error of q (deg/s)", "elevator (deg)", "t (s)", "y_m"):
         assert label in text
     first = (tmp_path / "fig.svg").read_bytes()
     write_figure(tmp_path / "fig.svg", [flight], "180mm", ["V", "e.q", "elevator"])

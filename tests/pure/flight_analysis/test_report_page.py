@@ -171,7 +171,7 @@ def test_angles_are_shown_in_rad_by_choice(
         "[...document.querySelectorAll('.tables tbody :is(th, td)')].filter(one => "
         "one.checkVisibility())"
     )
-    first = f"{table}.slice(0, 2).map(one => one.textContent)"
+    first = f"{table}.slice(0, 2).map(one => one.textContent.trim())"
     rms = servo.summary["errors"]["q"]["whole"]["rms"]
     assert browser.run(first) == ["q (deg/s)", f"{np.degrees(rms):#.3g}"]
     before = browser.run(DRAWN)

@@ -136,13 +136,16 @@ def test_two_runs_are_compared(
         "osprey_gust",
         "osprey_servo",
     ]
-    first = runs[0].parent / "comparison.html"
+    (first,) = runs[0].parent.glob("*-comparison*/comparison.html")
     page = first.read_bytes()
     Report(runs=[*runs]).execute()
     # The page of an earlier comparison stays.
     assert first.read_bytes() == page
-    assert capsys.readouterr().out.splitlines()[-1].endswith("comparison-2.html")
-    assert first.with_name("comparison-2.html").is_file()
+    pages = sorted(runs[0].parent.glob("*-comparison*/comparison.html"))
+    assert len(pages) == 2
+    last = Path(capsys.readouterr().out.splitlines()[-1].partition("report:")[2].strip())
+    assert last.resolve() in [each.resolve() for each in pages]
+    assert last.resolve() != first.resolve()
 
 
 @pytest.mark.parametrize("option", ["html", "csv"])

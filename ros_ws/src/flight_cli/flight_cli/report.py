@@ -54,7 +54,7 @@ class Report:
         "Folder of a run; by default runs/latest. Several runs are compared with the first."
     )
     html: Path | None = rare_option(
-        "Page of a comparison; by default a new comparison.html beside the first run.", "--page"
+        "Page of a comparison; by default in a new folder beside the first run.", "--page"
     )
     output: Path | None = rare_option(
         "Folder for the report of one run; by default that of its log. Use it for archives."

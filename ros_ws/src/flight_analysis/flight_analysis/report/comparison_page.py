@@ -7,7 +7,8 @@ from dataclasses import replace
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report import comparison, display_units, figures, guided_figures
-from flight_analysis.report.flight_head import about_trim, meta_lines, title_of, verdict_of
+from flight_analysis.report.display_units import about_trim
+from flight_analysis.report.flight_head import meta_lines, title_of, verdict_of
 from flight_analysis.report.glossary import words_in
 from flight_analysis.report.overlay import difference_table
 from flight_analysis.report.page import Colour, Figures, Page, Section, TableGroup, Verdict

@@ -22,6 +22,7 @@ class DisplayUnit(NamedTuple):
 
 
 NO_UNIT = DisplayUnit("", 1.0)  # for a channel whose unit is unknown: it stays in SI
+UNITLESS = DisplayUnit("no unit", 1.0)  # an input of an imported log, as the autopilot sends it
 
 
 QUANTITY_UNITS = {
@@ -58,6 +59,12 @@ def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
     }
     first = (*scenario.controller.outputs, *scenario.controller.inputs)
     return {name: units[name] for name in first if name in units} | units
+
+
+def about_trim(scenario: Scenario) -> dict[str, str]:
+    """Return what stands in place of V in a figure of y: the airspeed less that of trim."""
+    channels = scenario.aircraft.channels()
+    return {"V": f"V - {channels.speed:g} (m/s)"} if "V" in channels.outputs else {}
 
 
 def in_radians(units: Mapping[str, DisplayUnit]) -> dict[str, DisplayUnit]:
@@ -116,6 +123,13 @@ STATES = {
     **dict.fromkeys(("north", "east", "altitude"), "m"),
 }
 """SI units of the states of an aircraft without an airframe file."""
+
+
+POSE_UNITS = {
+    name: display_unit(unit)
+    for name, unit in {**STATES, **dict.fromkeys(("v_north", "v_east", "climb"), "m/s")}.items()
+}
+"""Units in which we show the channels of a pose."""
 
 
 def state_units(scenario: Scenario) -> dict[str, DisplayUnit]:

@@ -23,7 +23,7 @@ from flight_analysis.metrics import (
 )
 from flight_analysis.report.display_units import (
     NO_UNIT,
-    QUANTITY_UNITS,
+    POSE_UNITS,
     DisplayUnit,
     in_order,
 )
@@ -265,7 +265,7 @@ def overlay_figure(context: PlotContext, topic: str) -> Figure | None:
     """Draw a topic of several logs over each other, or return None if no log has it."""
     curves = _curves(context, topic, lambda tape: tape.signals.get(topic))
     if topic == "pose":
-        context = context._replace(units=QUANTITY_UNITS)
+        context = context._replace(units=POSE_UNITS)
     return time_series_figure(context, curves) if curves else None
 
 

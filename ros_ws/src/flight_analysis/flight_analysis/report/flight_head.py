@@ -51,12 +51,6 @@ def meta_lines(flight: RecordedFlight, scenario: Scenario) -> list[str]:
     return [" · ".join([*([when] if when else []), *parts]), f"run {flight.name}"]
 
 
-def about_trim(scenario: Scenario) -> dict[str, str]:
-    """Return what stands in place of V in a figure of y: the airspeed less that of trim."""
-    channels = scenario.aircraft.channels()
-    return {"V": f"V - {channels.speed:g} (m/s)"} if "V" in channels.outputs else {}
-
-
 def started(flight: RecordedFlight) -> str:
     """Return the time of day at which a flight began, in words; "" if the log does not say it."""
     start = (flight.summary["flight"] or {}).get("started")

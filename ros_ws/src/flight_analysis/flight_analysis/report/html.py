@@ -21,9 +21,14 @@ from flight_analysis.report import (
 )
 from flight_analysis.report.cards import claims
 from flight_analysis.report.comparison_page import comparison_page
-from flight_analysis.report.display_units import QUANTITY_UNITS, format_seconds, state_units
-from flight_analysis.report.flight_head import (
+from flight_analysis.report.display_units import (
+    POSE_UNITS,
+    QUANTITY_UNITS,
     about_trim,
+    format_seconds,
+    state_units,
+)
+from flight_analysis.report.flight_head import (
     meta_lines,
     tiles_of,
     title_of,
@@ -95,7 +100,7 @@ def _imported_page(flight: RecordedFlight) -> Page:
     pose = None
     if "pose" in tape:
         of_pose = {"pose": Curve(tape["pose"], figures.PLANT)}
-        in_units = context._replace(units=QUANTITY_UNITS)
+        in_units = context._replace(units=POSE_UNITS)
         pose = time_series_figure(in_units, of_pose, columns=2)
     outputs = {"y": Curve(tape["y"], figures.PLANT)}
     if "y_m" in tape:

@@ -14,7 +14,7 @@ import numpy as np
 
 from flight_analysis.report.display_units import (
     NO_UNIT,
-    QUANTITY_UNITS,
+    POSE_UNITS,
     DisplayUnit,
     channel_label,
     format_value,
@@ -91,7 +91,7 @@ def difference_table(
         for topic in TOPICS:
             if topic not in first.tape or topic not in other.tape:
                 continue
-            known = QUANTITY_UNITS if topic == "pose" else units
+            known = POSE_UNITS if topic == "pose" else units
             common = [name for name in first.tape[topic].names if name in other.tape[topic].names]
             for name in in_order(common, known):
                 found = difference(first.tape, other.tape, topic, name)

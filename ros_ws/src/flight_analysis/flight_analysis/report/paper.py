@@ -7,7 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flight_analysis.metrics import best_error
-from flight_analysis.report.display_units import NO_UNIT, channel_label
+from flight_analysis.report.display_units import (
+    NO_UNIT,
+    about_trim,
+    channel_label,
+    in_order,
+)
 from flight_analysis.report.figures import GUST, REFERENCE, flight_end, gust_intervals, runs_of
 from flight_analysis.report.summary import RecordedFlight, common_units
 from flight_core.arguments import as_names
@@ -104,13 +109,18 @@ def write_figure(
 
 
 def channels_by_title(flights: Sequence[RecordedFlight]) -> dict[str, list[str]]:
-    """Return the names of outputs, errors ("e.NAME") and inputs of all flights, by title."""
+    """Return the names of outputs, errors ("e.NAME") and inputs of all flights, by title.
+
+    Their order is that of the controller, so that the n-th of each belong together.
+    """
     names: dict[str, dict[str, None]] = {"y": {}, "y_m": {}, "u": {}}
     for flight in flights:
         for topic in names.keys() & flight.tape.signals.keys():
             names[topic] |= dict.fromkeys(flight.tape[topic].names)
-    errors = [f"e.{name}" for name in names["y"] if names["y_m"]]
-    return {"y, over y_m": [*names["y"]], "e = y - y_m": errors, "u": [*names["u"]]}
+    units = common_units(flights)
+    outputs = in_order(names["y"], units)
+    errors = [f"e.{name}" for name in outputs if names["y_m"]]
+    return {"y, over y_m": outputs, "e = y - y_m": errors, "u": in_order(names["u"], units)}
 
 
 def last_instant(flights: Sequence[RecordedFlight]) -> float:
@@ -135,7 +145,7 @@ def draw_channel(
         )
 
     for gust in gust_intervals(first.tape, first.gusts):
-        axes.axvspan(gust.start, gust.stop, color=GUST, alpha=0.2, linewidth=0)
+        axes.axvspan(gust.start, gust.stop, color=GUST, alpha=0.2, linewidth=0, label=gust.label)
     if is_output and not is_error and "y_m" in first.tape and channel in first.tape["y_m"].names:
         plot(
             first.tape, first.tape["y_m"], color=REFERENCE, linewidth=3.0 * line_width, label="y_m"
@@ -153,6 +163,11 @@ def draw_channel(
         if len(flights) == 1:
             legend = "y" if is_output and not is_error else ""
         plot(tape, signal, color=colour, linewidth=line_width, label=legend, **style)
-    axes.set_ylabel(("e of " if is_error else "") + channel_label(channel, units))
+    label = channel_label(channel, units)
+    if is_error:
+        label = f"{best_error(first.tape)[0]} of {label}"
+    elif is_output and first.scenario is not None:
+        label = about_trim(first.scenario).get(channel, label)
+    axes.set_ylabel(label)
     axes.grid(alpha=0.3, linewidth=0.4)
     axes.spines[["top", "right"]].set_visible(False)

@@ -3,6 +3,8 @@
 """Report recorded runs: write the page of a run or of a comparison, and data for others to read."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
@@ -19,6 +21,7 @@ from flight_core.parameters import require
 from flight_log.open_log import A_RUN
 
 A_FILE = "the path of a file"
+COMPARISON = "comparison.html"
 
 
 class File(NamedTuple):
@@ -57,12 +60,13 @@ def report(
 ) -> Report:
     """Write the report page of a recorded run, or of a comparison of several runs.
 
-    Several runs are compared with the first, as `rise-di report` does.
+    Several runs are compared with the first, as `rise-di report` does. If one of them is an
+    imported log, the signals that have a name in common are laid over each other.
 
     Args:
         runs: Folders of runs, or MCAP files.
-        html: Page of a comparison; None: comparison.html beside the first run, or where that
-            exists comparison-2.html and so on. With one run: its page alone.
+        html: Page of a comparison; None: comparison.html in a new folder beside the first run.
+            With one run: its page alone.
         output: Folder for the report of one run; None: the folder of the log.
         png: File for y over y_m, e and u as one figure.
         csv: File for all signals, one row an instant, one column a channel.
@@ -123,26 +127,23 @@ def report(
         flights = [result.flight]
     else:
         flights = [read_one(folder) for folder in folders]
-        _require_comparable(folders, flights)
-        page = _unused_page(folders[0].absolute().parent) if html is None else Path(html)
         if html is None:
+            page = _comparison_folder(folders[0]) / COMPARISON
             files.insert(0, File("html", page, write_page))
+        else:
+            page = Path(html)
     for file in files:
         with writing(file.key, file.path, A_FILE):
             file.write(file.path, flights)
     return Report(page, flights)
 
 
-def _unused_page(folder: Path) -> Path:
-    """Return comparison.html in a folder, or comparison-2.html and so on where that exists."""
-    names = chain(["comparison.html"], (f"comparison-{number}.html" for number in count(2)))
-    return next(page for name in names if not (page := folder / name).exists())
-
-
-def _require_comparable(folders: Sequence[Path], flights: Sequence[RecordedFlight]) -> None:
-    """Raise ParameterError if an imported log is one of several runs."""
-    expected = "a flight of the stack: a comparison is of tracking errors"
-    for folder, flight in zip(folders, flights, strict=True):
-        # A single log is not compared, so it may be imported.
-        is_comparable = len(flights) == 1 or flight.scenario is not None
-        require(is_comparable, str(folder), "an imported log", expected)
+def _comparison_folder(first: Path) -> Path:
+    """Create a folder for a comparison, beside the first run: a new one each time."""
+    folder = first.absolute().parent
+    stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-comparison"
+    for name in chain([stem], (f"{stem}-{number}" for number in count(2))):
+        with writing("runs", folder, "a folder that can"), suppress(FileExistsError):
+            (folder / name).mkdir()
+            return folder / name
+    raise AssertionError("the names go on for ever")  # for mypy

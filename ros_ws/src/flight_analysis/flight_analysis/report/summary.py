@@ -41,6 +41,7 @@ from flight_analysis.report.account import (
     account_of_json,
 )
 from flight_analysis.report.display_units import (
+    UNITLESS,
     DisplayUnit,
     display_unit,
     display_units,
@@ -137,7 +138,9 @@ class RecordedFlight(NamedTuple):
     def units(self) -> dict[str, DisplayUnit]:
         """Return the units of tables and figures by channel of y and u."""
         if self.scenario is None:
-            return {name: display_unit(unit) for name, unit in self.si_units.items()}
+            known = {name: display_unit(unit) for name, unit in self.si_units.items()}
+            inputs = self.tape["u"].names if "u" in self.tape else ()
+            return {**known, **{name: UNITLESS for name in inputs if name not in known}}
         return display_units(self.scenario)
 
     @property
@@ -435,6 +438,11 @@ def taken_over(summary: Mapping[str, Any], table: str) -> str:
     truth = ("truth",) if table == "errors" and summary["error"] == TRUE_ERROR else ()
     part = "" if flight_account is None else flight_account.over(*truth, *FIGURES[table])
     return f", {part}" if part else ""
+
+
+def is_in_host_time(summary: Mapping[str, Any]) -> bool:
+    """Return whether a flight was flown in the time of its host, so that its delays are known."""
+    return bool(summary["flight"]) and summary["flight"]["start_ns"] > SINCE_EPOCH_NS
 
 
 def time_flown(summary: Mapping[str, Any]) -> str:

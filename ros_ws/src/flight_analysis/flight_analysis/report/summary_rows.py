@@ -172,13 +172,15 @@ def table_rows(
     return rows
 
 
-def timing_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def timing_rows(summary: Mapping[str, Any], *, is_timed: bool) -> list[tuple[str, str, str]]:
     """Return the timing of the controller, a row for all metrics with the same heading.
 
-    A row has the topic of the summary, the heading with its unit, and the values.
+    A row has the topic of the summary, the heading with its unit, and the values. Unless the flight
+    `is_timed` by its host, there are no times.
     """
     rows = []
-    for group, metrics in groupby(TIMING_COLUMNS, key=lambda column: column.group):
+    shown = [column for column in TIMING_COLUMNS if is_timed or column.unit is not MILLISECONDS]
+    for group, metrics in groupby(shown, key=lambda column: column.group):
         columns = [column for column in metrics if column.value(summary) is not None]
         if columns:
             unit = columns[0].unit or NO_UNIT

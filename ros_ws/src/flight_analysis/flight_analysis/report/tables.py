@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Build the tables of a flight's report page as data, which page.html.jinja turns into HTML."""
 
+import re
 from collections.abc import Mapping, Sequence
 from itertools import chain, groupby, product
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from flight_analysis.report.account import account_of_json
 from flight_analysis.report.display_units import DisplayUnit, format_seconds, format_value
 from flight_analysis.report.glossary import legend, words_in
 from flight_analysis.report.guided import landing_results, leg_results
-from flight_analysis.report.summary import taken_over, time_flown
+from flight_analysis.report.summary import is_in_host_time, taken_over, time_flown
 from flight_analysis.report.summary_rows import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
@@ -70,6 +71,14 @@ class MetricTable(NamedTuple):
         return ". ".join(filter(None, (self.note, legend(self.words))))
 
     @property
+    def aligned(self) -> list[list[str]]:
+        """Return the rows with the decimal points of each column below each other."""
+        if not self.rows:
+            return []
+        first, *columns = zip(*self.rows, strict=True)
+        return [list(row) for row in zip(first, *map(aligned, columns), strict=True)]
+
+    @property
     def groups(self) -> list[tuple[str, int]]:
         """Return the headings that neighbouring columns share, each with their number."""
         return [
@@ -85,6 +94,27 @@ class MetricTable(NamedTuple):
             not group or group != before
             for group, before in zip(groups, [None, *groups], strict=False)
         ]
+
+
+FIGURE_SPACE = "\N{FIGURE SPACE}"  # as wide as a digit
+PUNCTUATION_SPACE = "\N{PUNCTUATION SPACE}"  # as wide as a point
+NUMBER = re.compile(r"[-+>\s]*\d+(?:\.(\d+))?")
+
+
+def aligned(cells: Sequence[str]) -> list[str]:
+    """Return the cells of a column, in which spaces stand for decimals that a number has not.
+
+    In a column that is aligned right, the decimal points then stand below each other. Cells that
+    are no number stay.
+    """
+    numbers = [NUMBER.fullmatch(cell) for cell in cells]
+    decimals = [len(number[1] or "") if number else 0 for number in numbers]
+    most = max(decimals, default=0)
+    texts = []
+    for cell, number, count in zip(cells, numbers, decimals, strict=True):
+        point = PUNCTUATION_SPACE if most and not count else ""
+        texts.append(f"{cell}{point}{FIGURE_SPACE * (most - count)}" if number else cell)
+    return texts
 
 
 class EventInterval(NamedTuple):
@@ -281,9 +311,10 @@ def model_table(
 
 
 def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
+    """Return the timing of the controller; in simulated time only how many ticks there were."""
     caption = f"Ticks of the controller{taken_over(summary, 'ticks')}"
     rows = []
-    for topic, label, text in timing_rows(summary):
+    for topic, label, text in timing_rows(summary, is_timed=is_in_host_time(summary)):
         part = "" if topic == "ticks" else taken_over(summary, topic)
         rows.append((f"{label}{part}", text))
     labels = [label for label, _ in rows]
@@ -294,15 +325,16 @@ def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
 def _process_table(summary: Mapping[str, Any]) -> MetricTable:
     flight_account = account_of_json(summary)
     processes = {} if flight_account is None else flight_account.processes
-    # In lockstep it is not known when a process was ready.
-    is_timed = any(process.ready is not None for process in processes.values())
+    # In lockstep we do not know when a process was ready, and all of them run to the end.
+    if not is_in_host_time(summary):
+        processes = {}
     columns = [
-        *((Column("", "ready (s)"),) if is_timed else ()),
+        Column("", "ready (s)"),
         *(Column("output", head) for head in ("first (s)", "last (s)", "samples")),
     ]
     rows = []
     for name, process in processes.items():
-        times = (process.ready, process.first, process.last)[not is_timed :]
+        times = (process.ready, process.first, process.last)
         cells = ["" if time is None else f"{time:.3f}" for time in times]
         rows.append([name, *cells, "" if process.samples is None else f"{process.samples}"])
     return MetricTable("Processes", columns, rows)
