@@ -18,8 +18,8 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.flown_reference import (
     NotCompared,
     ReferenceErrors,
+    reason_not_compared,
     reference_errors,
-    reference_notes,
     reference_shortfalls,
 )
 from flight_core.outcome import COMPLETED, Aim
@@ -60,7 +60,7 @@ def test_y_m_of_a_healthy_flight_is_computed_again_to_the_bit(name: str) -> None
     errors = reference_errors(tape, tape.scenario)
     assert isinstance(errors, ReferenceErrors)
     assert not errors.error.any()
-    assert reference_notes(tape, tape.scenario) == []
+    assert reason_not_compared(tape, tape.scenario) is None
 
 
 Fault = Callable[[int, list[FloatArray]], FloatArray]
@@ -209,14 +209,30 @@ def test_u_m_that_acts_after_its_age_limit_is_told() -> None:
     assert shortfall.aim is Aim.REFERENCE
 
 
-def test_reference_model_of_a_user_is_not_compared_and_that_is_said() -> None:
-    tape = replace(
+def with_reference_model_of_a_user() -> Tape:
+    return replace(
         flown("servo"), scenario=None, processes={"/my_reference": Process(None, 0, 0, 2001)}
     )
+
+
+def test_reference_model_of_a_user_is_not_compared_and_that_is_said() -> None:
+    tape = with_reference_model_of_a_user()
     assert reference_errors(tape, servo()) is NotCompared.FOREIGN
     assert reference_shortfalls(tape, servo()) == []
-    (note,) = reference_notes(tape, servo())
-    assert note.startswith("y_m is not compared with the commands of the scenario: ")
+    notes = rise_di.summarise(tape, servo())["notes"]
+    assert sum(note.startswith("y_m is not compared with the commands") for note in notes) == 1
+
+
+def test_reference_model_of_a_user_flies_no_command_of_the_scenario() -> None:
+    """They are not counted, do not split the errors, and nothing settles after them."""
+    of_stack = rise_di.summarise(flown("servo"), servo())
+    own = rise_di.summarise(with_reference_model_of_a_user(), servo())
+    assert of_stack["account"]["commands"]["given"] > 0
+    assert own["account"]["commands"]["given"] == own["account"]["commands"]["flown"] == 0
+    assert {transient["kind"] for transient in own["transients"]} <= {"engagement", "gust"}
+    for name, parts in own["errors"].items():
+        assert parts["command"]["rms"] is None
+        assert parts["whole"] == of_stack["errors"][name]["whole"]
 
 
 def test_reference_model_that_was_started_by_itself_begins_at_its_first_sample() -> None:

@@ -142,12 +142,12 @@ def reference_shortfalls(tape: Tape, scenario: Scenario) -> list[Shortfall]:
     return [Shortfall(aim=Aim.REFERENCE, sentence=sentence, brief=brief, figures=figures)]
 
 
-def reference_notes(tape: Tape, scenario: Scenario) -> list[str]:
-    """Return a note if y_m cannot be compared with the scenario."""
+def reason_not_compared(tape: Tape, scenario: Scenario) -> NotCompared | None:
+    """Return why y_m cannot be compared with the scenario, or None if it can."""
     if _is_planned(tape) and is_sent_by_stack(tape, "y_m"):
-        return []
+        return None
     errors = reference_errors(tape, scenario)
-    return [errors.note()] if isinstance(errors, NotCompared) else []
+    return errors if isinstance(errors, NotCompared) else None
 
 
 def _is_whole(tape: Tape) -> bool:

@@ -49,7 +49,7 @@ from flight_analysis.report.display_units import (
     in_order,
 )
 from flight_analysis.report.flown_models import FlownController
-from flight_analysis.report.flown_reference import reference_notes
+from flight_analysis.report.flown_reference import reason_not_compared
 from flight_analysis.report.guided import guidance_notices, guidance_summary
 from flight_analysis.report.model_spans import errors_by_model
 from flight_analysis.report.sample_counts import WHOLE, ends_last, is_simulated
@@ -88,11 +88,12 @@ def command_edges(scenario: Scenario) -> list[Transient]:
     return sorted(edges, key=lambda edge: edge.start)
 
 
-def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
+def transients(scenario: Scenario, tape: Tape, *, follows_scenario: bool = True) -> list[Transient]:
     """Return engagements, commands and gusts.
 
     From the first live command on, live commands replace those of the scenario. In a guided flight,
-    turns and captures replace commands.
+    turns and captures replace commands. Unless y_m `follows_scenario`, its commands are none of the
+    flight.
     """
     windows = scenario.gust_windows() if is_simulated(tape) else {}
     gusts = [Transient("gust", name, *window) for name, window in windows.items()]
@@ -100,9 +101,10 @@ def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
         return [*engagements(tape), *guided_transients(tape), *gusts]
     live = live_commands(tape)
     until = float(tape.time("u_m")[0]) if live else math.inf
+    edges = command_edges(scenario) if follows_scenario else []
     return [
         *engagements(tape),
-        *(edge for edge in command_edges(scenario) if edge.start < until),
+        *(edge for edge in edges if edge.start < until),
         *live,
         *gusts,
     ]
@@ -204,7 +206,8 @@ def summarise(
     outcome = tape.outcome if outcome is None else outcome
     _require_topics(tape)
     flight_account = account(tape, scenario, outcome) if flight_account is None else flight_account
-    events = transients(scenario, tape)
+    not_compared = reason_not_compared(tape, scenario)
+    events = transients(scenario, tape, follows_scenario=not_compared is None)
     air = scenario.air() if is_simulated(tape) else UNKNOWN_AIR
     flight_account = flight_account._replace(commands=_commands(tape, events, flight_account.end))
     ticks = None
@@ -240,7 +243,7 @@ def summarise(
             *late_u(scenario, age),
             *(note for note in tape.notes if note != busy),
             *saturation_notes(tape),
-            *reference_notes(tape, scenario),
+            *([] if not_compared is None else [not_compared.note()]),
             *mode_notes(tape, flight_account.over(*FIGURES["ticks"])),
             *vane_notes(tape),
             *guidance_notices(tape, scenario.guidance),
