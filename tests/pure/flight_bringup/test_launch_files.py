@@ -6,6 +6,7 @@ Checked: the arguments, the start order of the processes by their `node_state`, 
 and the effect of their end.
 """
 
+import re
 import runpy
 import subprocess
 import sys
@@ -33,7 +34,12 @@ from tests.launch_stand_in import (
 from tests.maps import MAP_FILES
 
 from autopilot_bridge.params import LIBRARY, BridgeConfig, load_map
-from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, parse_scenario_sections
+from flight_analysis.closed_loop.scenario import (
+    SCHEMAS,
+    Scenario,
+    load_scenario,
+    parse_scenario_sections,
+)
 from flight_analysis.closed_loop.simulate import simulate
 from flight_cli.cli import COMMANDS, application
 from flight_core.environment import PROFILE_VARIABLE
@@ -628,7 +634,14 @@ def test_flight_around_an_aircraft_and_a_reference_model_of_ones_own(tmp_path: P
     file = Path(nodes(actions)["controller"].parameters[0])
     sections = parse_scenario_sections(file.read_bytes(), file)
     assert (sections["controller"]["k_g"], sections["controller"]["delay"]) == (2.5, 0.01)
-    assert Path(overrides(nodes(actions)["recorder"])["scenario_file"]) == file  # what flies
+    recorder = overrides(nodes(actions)["recorder"])
+    assert Path(recorder["scenario_file"]) == file  # what flies
+    attached = {Path(each).name: Path(each) for each in recorder["attach"]}
+    parameters = attached["parameters.yaml"]
+    unflown = re.findall(r"^# did not fly: (\w+); ", parameters.read_text(), re.MULTILINE)
+    assert unflown == ["aircraft", "reference_model"]
+    assert attached["airframe.yaml"].read_text().startswith("# did not fly: aircraft; ")
+    assert load_scenario(parameters).controller.delay == 0.01  # it can fly again
     with refusing("aircraft: found false in lockstep, expected true"):
         started("fly", runs=tmp_path, aircraft="false", lockstep="true")
     with refusing("found none, expected a section for a node in /uav2, as /uav2/controller"):

@@ -191,6 +191,7 @@ def parameter_overrides(
     lockstep: bool,
     use_sim_time: bool = False,
     autopilot: Autopilot | None = None,
+    replaced: Collection[NodeSpec] = (),
 ) -> ParameterOverrides:
     """Return what a process gets beside its section of the scenario file.
 
@@ -206,6 +207,8 @@ def parameter_overrides(
     - With an autopilot the bridge gets the channel map, the recorder the topics of the
       autopilot, and the controller starts inactive.
     - With `use_sim_time` every node ticks by /clock.
+
+    Nodes of the user fly in place of those that are `replaced`.
     """
     clock: ParameterOverrides = {"use_sim_time": True} if use_sim_time else {}
     if spec is BRIDGE:
@@ -224,7 +227,7 @@ def parameter_overrides(
         overrides[AIRCRAFT]["recorded"] = not one_process
     if spec in (RECORDER, ONE_PROCESS):
         sections = {node.executable: values for node, values in overrides.items()}
-        overrides[RECORDER] |= _attachments(scenario, run, sections, autopilot)
+        overrides[RECORDER] |= _attachments(scenario, run, sections, autopilot, replaced)
     if not lockstep:
         for node in (*SECOND_STAGE, GUIDANCE) if GUIDANCE in overrides else SECOND_STAGE:
             overrides[node]["start_time"] = start_time
@@ -294,10 +297,13 @@ def _attachments(
     run: Path,
     overrides: dict[str, ParameterOverrides],
     autopilot: Autopilot | None,
+    replaced: Collection[NodeSpec],
 ) -> ParameterOverrides:
     """Write the files that the recorder attaches to the log, and return their paths."""
     maps = () if autopilot is None else (autopilot.map_path,)
-    files = attachments_for(scenario, run, overrides, maps)
+    others = replaced if autopilot is None else (AIRCRAFT,)
+    names = [spec.executable for spec in others]
+    files = attachments_for(scenario, run, overrides, maps, names)
     return {
         "scenario_file": str(files.scenario),
         "attach": [str(path) for path in files.files],

@@ -9,6 +9,7 @@ early with exit status 1. When another launch file includes this one, it ends on
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import yaml
@@ -16,6 +17,7 @@ from launch.action import Action
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import (
     as_flown,
     find_scenario,
@@ -103,13 +105,9 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _fly(context: LaunchContext) -> list[Action]:
-    scenario = find_scenario(
-        argument(context, "scenario"), yaml.safe_load(argument(context, "duration"))
-    )
     flight = Flight(context)
+    scenario = _scenario(context, flight.namespace)
     further = argument(context, "params_file")
-    if further:
-        scenario = with_parameters(scenario, Path(further), flight.namespace)
     others = [spec for spec in OPTIONAL if argument(context, spec.executable) == "false"]
     value = argument(context, "lockstep")
     lockstep = value == "true" or (value == "" and scenario.flight.lockstep)
@@ -127,9 +125,12 @@ def _fly(context: LaunchContext) -> list[Action]:
     first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
     then = tuple(spec for spec in second_stage(scenario) if spec not in others)
 
+    overrides = partial(
+        parameter_overrides, scenario=scenario, run=run, lockstep=lockstep, replaced=others
+    )
+
     def node(spec: NodeSpec, start_time: float = ON_START) -> Node:
-        overrides = parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep)
-        return flight_node(spec, scenario, overrides, flight)
+        return flight_node(spec, scenario, overrides(spec, start_time=start_time), flight)
 
     def follow(lead: float, start_time: float) -> Sequence[Action]:
         duration = scenario.flight.duration
@@ -151,8 +152,7 @@ def _fly(context: LaunchContext) -> list[Action]:
 
     recorders: list[Action] = []
     if by_rosbag2:
-        overrides = parameter_overrides(RECORDER, scenario, run, ON_START, lockstep=False)
-        recorders.append(rosbag2(flight, scenario, overrides))
+        recorders.append(rosbag2(flight, scenario, overrides(RECORDER, start_time=ON_START)))
     published = {topic for spec in (*first, *then) for topic in published_by(spec.executable)}
     stages = start_in_stages(
         flight,
@@ -162,6 +162,14 @@ def _fly(context: LaunchContext) -> list[Action]:
         publishes=published,
     )
     return watch_page(flight) + stages
+
+
+def _scenario(context: LaunchContext, namespace: str) -> Scenario:
+    """Return the scenario of the arguments, with the values of a `params_file`."""
+    duration = yaml.safe_load(argument(context, "duration"))
+    scenario = find_scenario(argument(context, "scenario"), duration)
+    further = argument(context, "params_file")
+    return with_parameters(scenario, Path(further), namespace) if further else scenario
 
 
 def _require_possible(

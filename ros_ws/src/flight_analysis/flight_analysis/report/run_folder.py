@@ -47,7 +47,7 @@ from flight_analysis.report.summary import (
 )
 from flight_core.arguments import FilePath
 from flight_core.channels import RATES_AND_SPEED
-from flight_core.files import dump_yaml, link_latest, read_file, write_file, writing
+from flight_core.files import comment, dump_yaml, link_latest, read_file, write_file, writing
 from flight_core.outcome import End, Outcome, parsed_outcome, read_outcome
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
@@ -128,17 +128,24 @@ def attachments_for(
     run: Path,
     overrides: Mapping[str, ParameterOverrides] | None = None,
     further: Sequence[Path] = (),
+    replaced: Sequence[str] = (),
 ) -> LogAttachments:
     """Return what is attached to the log of a flight.
 
     This is the scenario, the airframe or the user's own model of JSBSim, every parameter after
     validation, the `further` files, and the provenance. What is not a file yet is written into the
     folder of the run. `overrides` are parameters of the scenario's nodes by the name of the node,
-    or None for a flight without nodes. Raises ParameterError if a file cannot be written.
+    or None for a flight without nodes. Other nodes fly in place of those that are `replaced`, and
+    the files say so. Raises ParameterError if a file cannot be written.
     """
-    attached = [_write(run / PARAMETERS, scenario_yaml(scenario, overrides)), *further]
+    unflown = {
+        name: comment([f"did not fly: {name}; another node took its place"]) for name in replaced
+    }
+    parameters = "".join(unflown.values()) + scenario_yaml(scenario, overrides)
+    attached = [_write(run / PARAMETERS, parameters), *further]
     if not scenario.aircraft.is_jsbsim:
-        attached.append(_write(run / AIRFRAME, as_yaml(scenario.aircraft.sampled_airframe())))
+        airframe = as_yaml(scenario.aircraft.sampled_airframe())
+        attached.append(_write(run / AIRFRAME, unflown.get("aircraft", "") + airframe))
     elif (model := Path(scenario.aircraft.flight_condition().name)).is_absolute():
         attached.append(_write(run / AIRCRAFT, model_files(model).archive()))
     notes = _write(run / PROVENANCE, dump_yaml(provenance(), flow=False))
