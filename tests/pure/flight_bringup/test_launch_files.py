@@ -8,6 +8,7 @@ and the effect of their end.
 
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 import time
@@ -33,6 +34,7 @@ from tests.launch_stand_in import (
 )
 from tests.maps import MAP_FILES
 
+from aircraft_sim.airframes.airframe import LIBRARY as AIRFRAMES
 from autopilot_bridge.params import LIBRARY, BridgeConfig, load_map
 from flight_analysis.closed_loop.scenario import (
     SCHEMAS,
@@ -644,8 +646,30 @@ def test_flight_around_an_aircraft_and_a_reference_model_of_ones_own(tmp_path: P
     assert load_scenario(parameters).controller.delay == 0.01  # it can fly again
     with refusing("aircraft: found false in lockstep, expected true"):
         started("fly", runs=tmp_path, aircraft="false", lockstep="true")
-    with refusing("found none, expected a section for a node in /uav2, as /uav2/controller"):
-        started("fly", runs=tmp_path, namespace="uav2", params_file=further)
+
+
+def test_refused_params_file_is_named_with_what_it_holds(tmp_path: Path) -> None:
+    further = tmp_path / "mine.yaml"
+    given = {"runs": str(tmp_path), "params_file": str(further)}
+    further.write_text("{/uav1/controller: {ros__parameters: {k_g: 2.5}}}\n")
+    with refusing(
+        f"{further}: found sections for /uav1/controller, expected a section for a node in /uav2, "
+        "as /uav2/controller"
+    ):
+        started("fly", namespace="uav2", **given)
+    further.write_text("{/uav1/controller: {ros__parameters: {kg: 2.5}}}\n")
+    with refusing("mine.yaml: controller.kg: unknown key, expected "):
+        started("fly", namespace="uav1", **given)
+
+
+def test_airframe_beside_the_params_file_flies(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    shutil.copy(AIRFRAMES / "osprey.yaml", tmp_path / "mine" / "hawk.yaml")
+    further = tmp_path / "mine" / "mine.yaml"
+    further.write_text("{/**/aircraft: {ros__parameters: {airframe: hawk.yaml}}}\n")
+    actions, _ = started("fly", runs=tmp_path / "runs", params_file=further)
+    file = Path(nodes(actions)["controller"].parameters[0])
+    assert load_scenario(file).aircraft.airframe == str(tmp_path / "mine" / "hawk.yaml")
 
 
 def test_rosbag2_is_not_for_lockstep(tmp_path: Path) -> None:

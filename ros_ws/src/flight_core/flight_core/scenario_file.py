@@ -120,6 +120,11 @@ def gives_all(content: bytes, path: Path, key: str) -> bool:
     )
 
 
+def section_names(content: bytes, path: Path) -> list[str]:
+    """Return the full names of the nodes that have a section, in order. Raises as `names_node`."""
+    return list(_all_sections(content, path))
+
+
 def has_general(content: bytes, path: Path) -> bool:
     """Return whether there is a section for all nodes. Raises as `names_node` does."""
     return any(pattern.rpartition("/")[2] in WILDCARDS for pattern in _all_sections(content, path))

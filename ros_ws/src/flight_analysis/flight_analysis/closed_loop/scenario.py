@@ -266,20 +266,28 @@ def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]
 def parse_scenario_sections(content: bytes, path: Path, namespace: str | None = None) -> Sections:
     """Parse the sections of a scenario file, without validating them. Raises ParameterError.
 
-    `namespace` is that of the nodes, as in `parse_sections`. A path of an airframe or of a recorded
-    command that names no file from the working folder is tried from the scenario's folder, and then
-    by its file name in that folder.
+    `namespace` is that of the nodes, as in `parse_sections`, and paths are found by `find_files`.
     """
     sections = parse_sections(content, path, SCHEMAS, OPTIONAL, namespace)
-    recorded = sections["reference_model"].get("recorded")
+    find_files(sections, path)
+    return sections
+
+
+def find_files(sections: Sections, path: Path) -> None:
+    """Find the files that the sections of a parameter file name.
+
+    A path of an airframe or of a recorded command that names no file from the working folder is
+    tried from the folder of the parameter file, and then by its file name in that folder.
+    """
+    recorded = sections.get("reference_model", {}).get("recorded")
     signals = recorded.values() if isinstance(recorded, Mapping) else ()
-    files = [(sections["aircraft"], "airframe", ".yaml"), *((part, "file", "") for part in signals)]
+    aircraft = sections.get("aircraft", {})
+    files = [(aircraft, "airframe", ".yaml"), *((part, "file", "") for part in signals)]
     for part, key, ending in files:
         file = part.get(key) if isinstance(part, dict) else None
         if isinstance(file, str) and file.endswith(ending) and not is_file(Path(file)):
             candidates = (path.parent.absolute() / name for name in (file, Path(file).name))
             part[key] = str(next(filter(is_file, candidates), file))
-    return sections
 
 
 def guidance_by_rule(

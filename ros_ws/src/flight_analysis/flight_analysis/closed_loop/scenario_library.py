@@ -11,6 +11,7 @@ from typing import Any
 from flight_analysis.closed_loop.scenario import (
     SCHEMAS,
     Scenario,
+    find_files,
     load_scenario,
     parse_scenario_sections,
     scenario_yaml,
@@ -23,6 +24,7 @@ from flight_core.scenario_file import (
     has_general,
     join_parameters,
     parse_sections,
+    section_names,
 )
 from flight_guidance.feasibility import speeds
 from flight_guidance.routes.route_file import Waypoint
@@ -115,14 +117,18 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
 def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
     """Add to the scenario what else a parameter file says to the nodes in a namespace.
 
-    Its values replace those of the same names. Raises ParameterError.
+    Its values replace those of the same names. Raises ParameterError with the name of the file,
+    because the scenario alone is valid.
     """
     content = read_file(path, str(path), "a ROS parameter file")
     further = parse_sections(content, path, SCHEMAS, tuple(SCHEMAS), namespace, with_general=True)
-    nodes = (
-        f"a section for a node in {namespace or 'the root namespace'}, as {namespace}/controller"
+    require(
+        bool(further),
+        str(path),
+        f"sections for {', '.join(section_names(content, path)) or 'no node'}",
+        f"a section for a node in {namespace or 'the root namespace'}, as {namespace}/controller",
     )
-    require(bool(further), str(path), "none", nodes)
+    find_files(further, path)
     sections = {}
     for name, changes in further.items():
         section = getattr(scenario, name)
@@ -132,7 +138,10 @@ def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
             sections[name] = values
         elif name in parse_sections(content, path, SCHEMAS, tuple(SCHEMAS), namespace):
             sections[name] = changes
-    return scenario.vary(**sections)
+    try:
+        return scenario.vary(**sections)
+    except ParameterError as error:
+        raise ParameterError(f"{path.name}: {error}") from None
 
 
 def _reaches_nodes(path: Path, namespace: str) -> bool:
