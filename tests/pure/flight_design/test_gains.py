@@ -8,6 +8,7 @@ Further tests are of refusals, and of the predicted delay margin.
 
 import json
 import math
+import re
 from collections import deque
 from itertools import product
 from pathlib import Path
@@ -25,6 +26,7 @@ from typer.testing import Result
 from aircraft_sim.airframes.airframe import LIBRARY, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.linear_loop.delay_margin import delay_margin
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
@@ -34,6 +36,7 @@ from flight_design.gains.channel_signs import signs_of_pairing
 from flight_design.gains.gain_conditions import Bounds, GainCondition, GainSet
 from flight_design.gains.gain_design import select_gains
 from flight_design.gains.gain_selection import GainAssessment, LoopSetting
+from flight_design.gains.gain_yaml import selection_yaml
 from flight_design.gains.ideal_control import ChannelPairing, Study
 from rise_di_controller.law.decomposition import decompose
 from rise_di_controller.law.law import LawParams, Sign, engage, step, tuned
@@ -507,3 +510,29 @@ def test_command_shows_the_airframe_of_a_file(tmp_path: Path) -> None:
     poles = sorted((real, abs(imaginary)) for real, imaginary in facts["poles"])
     # A is printed to 3 digits
     assert_allclose(poles[::2], [(-2.51, 2.59), (-0.017, 0.213)], atol=0.021)
+
+
+def test_gains_for_actuators_without_lag_say_from_which_delay_on_they_chatter() -> None:
+    lags = [0.0] * len(AIRFRAME.inputs)
+    chosen = select_gains("osprey", lag=lags, samples=1)
+    latest, told = map(float, re.findall(r"([\d.]+) ms(?: late|: if)", selection_yaml(chosen)))
+    assert told == 1e3 * chosen.chosen.delay
+    fastest = {"rate": 1000.0, "step": 0.0005, "gusts": {}, "sensors": {}}
+
+    def reversals(delay: float) -> float:
+        """Part of the steps of thrust that go back on the step before."""
+        actuators = {"lag": lags, "delay": delay}
+        flight = simulate(
+            find_scenario("osprey_servo", duration=4.0).vary(
+                controller=chosen.chosen,
+                reference_model={"rate": 1000.0},
+                aircraft={**fastest, "actuators": actuators},
+            )
+        )
+        steps = np.diff(flight["u"]["thrust"][100:])
+        return float(np.mean(steps[1:] * steps[:-1] < 0.0))
+
+    # A delay of the simulation is whole milliseconds. The linear loop is on the safe side, by less
+    # than one more.
+    assert reversals(1e-3 * math.floor(latest)) < 0.02
+    assert reversals(1e-3 * (math.ceil(latest) + 1)) > 0.1

@@ -218,7 +218,9 @@ class Select(_Gains):
         answers = {"theorem": selection.theorem, "engineering": selection.engineering}
         if self.observer:
             answers = {"observer": selection.engineering}
-        sentences = [selection.origin, origin]
+        written = selection.theorem if self.theorem else selection.engineering
+        chatter = gain_yaml.chatter_sentence(written.controller, written.margins)
+        sentences = [selection.origin, origin, chatter]
         self._show(GainSets(answers, selection), sentences, gains=self.write)
 
 

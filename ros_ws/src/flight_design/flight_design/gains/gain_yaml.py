@@ -232,13 +232,13 @@ def below_requirement(unmet: Sequence[GainCondition], outputs: Sequence[str]) ->
 def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) -> str:
     """Write the margins of a loop in a sentence: nominal and worst phase margins.
 
-    Returns "" if the loop has no softened sign or is unstable.
+    With the implicit sign it is the sentence of `chatter_sentence`. Returns "" if the loop has the
+    literal sign or is unstable.
     """
-    implicit = (
-        isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT
-    )
-    if margins is None or implicit or not margins.nominal.stable:
+    if margins is None or not margins.nominal.stable:
         return ""
+    if chatter := chatter_sentence(controller, margins):
+        return chatter
     each = zip(margins.inputs, np.degrees(margins.nominal.phase).tolist(), strict=True)
     phases = ", ".join(f"{name} {phase:.0f}" for name, phase in each)
     largest = float(margins.nominal.sensitivity.max())
@@ -250,6 +250,20 @@ def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) 
     return (
         f"Phase margins {phases} deg{worst}; largest sensitivity {largest:.2f}, damping "
         f"{damping:.2f}."
+    )
+
+
+def chatter_sentence(controller: ControllerConfig, margins: LoopMargins | None) -> str:
+    """Say from which delay on an implicit sign may chatter; "" for any other sign."""
+    if margins is None or not isinstance(controller, RiseDiConfig):
+        return ""
+    if controller.sampled_sign()[0] is not Sign.IMPLICIT:
+        return ""
+    latest, delay = (1e3 * value for value in (controller.delay + margins.delay, controller.delay))
+    return (
+        f"The implicit sign may chatter if u acts more than {latest:.1f} ms late, and the gains "
+        f"are made for {delay:.1f} ms: if an actuator lags, or u comes later, select them with "
+        "this lag and delay."
     )
 
 
