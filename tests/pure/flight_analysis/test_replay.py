@@ -501,8 +501,11 @@ def test_command_finds_one_bit_of_one_gain_in_scenario_of_log(tape: Tape, tmp_pa
     assert re.match(r"201 ticks, \d+ differ, the last at t = .* s; u_free in \d+, u in \d+", count)
     assert note.startswith(
         "note: 201 ticks, from tick 1 at t = 0 s on, flew with other parameters than the log "
-        "holds: changed in"
+        "holds: the controller got another file than the recorder (with its file: `rise-di replay "
+        "RUN --scenario FILE`)"
     )
+    mended = command(str(run), "--scenario", str(busy_scenario(tmp_path)))
+    assert (mended.exit_code, mended.stdout) == (0, "201 ticks, every bit equal\n")
     # the same by --set, on the log with the right ones, and as JSON
     right = write_run(tape, tmp_path / "right", LogAttachments(busy_scenario(tmp_path))).parent
     result = command(str(right), "--set", f"controller.Lambda={gains}", "--json")

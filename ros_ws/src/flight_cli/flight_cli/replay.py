@@ -134,10 +134,18 @@ class Shown(NamedTuple):
         rows = np.flatnonzero(result.other_parameters)
         if not self.open_loop and len(rows):
             begin = f"from tick {result.number[rows[0]]} at t = {result.t[rows[0]]:.6g} s on"
-            why = (
-                "changed in flight (`ros2 param set`), set on the command line of the node, or "
-                "of a revision of the stack with other keys (rise_di_revision of the log)"
-            )
+            if rows[0]:
+                why = (
+                    "they were changed in flight (`ros2 param set`), or the controller began again "
+                    "with others"
+                )
+            else:
+                why = (
+                    "the controller got another file than the recorder (with its file: `rise-di "
+                    "replay RUN --scenario FILE`), or values on its command line or before it "
+                    "engaged, or is of a revision of the stack with other keys (rise_di_revision "
+                    "of the log)"
+                )
             notes.append(
                 f"{len(rows)} ticks, {begin}, flew with other parameters than the log holds: {why}"
             )
