@@ -4,10 +4,12 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from tests.conftest import refusing
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -17,8 +19,10 @@ from flight_analysis.report.summary import empty_summary
 from flight_bringup.fly import fly_in_process
 from flight_cli.report import Report
 from flight_cli.runs import Runs
-from flight_core.outcome import COMPLETED, ended_early
+from flight_core.outcome import COMPLETED, STATUS_ENDED_EARLY, UNKNOWN, ended_early
+from flight_core.rates import NANOSECONDS
 from flight_log.engagements import Engagement
+from flight_log.log_messages import LogMessage
 from flight_log.tape_reader import read_run
 
 pytestmark = pytest.mark.slow
@@ -146,6 +150,32 @@ def test_two_runs_are_compared(
     last = Path(capsys.readouterr().out.splitlines()[-1].partition("report:")[2].strip())
     assert last.resolve() in [each.resolve() for each in pages]
     assert last.resolve() != first.resolve()
+
+
+def test_flight_that_hung_before_y_m_is_told_with_its_cause(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As of nodes started by hand, whose log has no outcome: `rise-di runs` knows it from then."""
+    log = read_run(run)
+    waits = "uav7.controller: waiting for /uav7/y_m: no sample of its publisher arrives"
+    messages = (
+        LogMessage(0, "warning", "uav7.controller: waiting for /uav7/y: no publisher"),
+        *(LogMessage(k * NANOSECONDS, "warning", waits) for k in (2, 4, 6)),
+    )
+    tape = replace(log.tape, signals={"y": log.tape["y"]}, outcome=UNKNOWN)
+    monkeypatch.setattr(
+        run_folder, "read_run", lambda *_: log._replace(tape=tape, messages=messages)
+    )
+    with pytest.raises(typer.Exit) as end:
+        Report(runs=[run]).execute()
+    assert end.value.exit_code == STATUS_ENDED_EARLY
+    error = capsys.readouterr().err.strip()
+    assert error.startswith(f"error: {run}: the log: found no sample of y_m, expected ")
+    assert error.endswith(f"; {waits}")
+    assert "no publisher" not in error  # y came later
+    Runs(folder=run.parent, as_json=True).execute()
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["outcome"].startswith("never flew: the controller never engaged; uav7.controller")
 
 
 @pytest.mark.parametrize("option", ["html", "csv"])

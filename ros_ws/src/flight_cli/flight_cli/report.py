@@ -14,6 +14,7 @@ from flight_analysis.report import comparison
 from flight_analysis.report.export import signal_table
 from flight_analysis.report.paper import WIDTH
 from flight_analysis.report.report import report as write_report
+from flight_analysis.report.run_folder import UnflownError
 from flight_analysis.report.summary import RecordedFlight, labels, taken_over
 from flight_analysis.report.summary_rows import ERROR_COLUMNS
 from flight_cli.log_options import REMAP, log_namespace, log_scenario, remaps_of, scenario_file
@@ -30,9 +31,9 @@ from flight_cli.output import (
     stdout_for,
 )
 from flight_cli.repair import repair_log
-from flight_cli.words import argument, json_option, option, rare_option, values_of
+from flight_cli.words import argument, json_option, option, rare_option, values_of, warn
 from flight_core.files import display_path
-from flight_core.outcome import SEVEREST
+from flight_core.outcome import SEVEREST, STATUS_SHORTFALL
 
 FILES = ("html", "output", "png", "parquet", "figure")
 
@@ -94,13 +95,17 @@ class Report:
             for run in runs:
                 repair_log(run)
             return
-        page, flights = write_report(
-            *runs,
-            **values_of(self, *FILES, "width", "channels", "namespace"),
-            csv=None if self.csv == STDOUT else self.csv,
-            scenario=scenario_file(self.scenario),
-            remaps=remaps_of(self.remap),
-        )
+        try:
+            page, flights = write_report(
+                *runs,
+                **values_of(self, *FILES, "width", "channels", "namespace"),
+                csv=None if self.csv == STDOUT else self.csv,
+                scenario=scenario_file(self.scenario),
+                remaps=remaps_of(self.remap),
+            )
+        except UnflownError as error:
+            warn(f"error: {error}")
+            raise typer.Exit(error.outcome.status or STATUS_SHORTFALL) from None
         if self.csv == STDOUT:
             print(signal_table(flights).write_csv(), end="")
         with stdout_for(self.csv):

@@ -47,10 +47,18 @@ from flight_analysis.report.summary import (
 )
 from flight_core.arguments import FilePath
 from flight_core.channels import RATES_AND_SPEED
-from flight_core.files import comment, dump_yaml, link_latest, read_file, write_file, writing
-from flight_core.outcome import End, Outcome, parsed_outcome, read_outcome
+from flight_core.files import (
+    comment,
+    display_path,
+    dump_yaml,
+    link_latest,
+    read_file,
+    write_file,
+    writing,
+)
+from flight_core.outcome import End, Outcome, never_flew, parsed_outcome, read_outcome
 from flight_core.parameters import ParameterError, require
-from flight_core.rates import NANOSECONDS
+from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.scenario_file import A_SCENARIO
 from flight_core.tape import Tape
 from flight_core.text import printable
@@ -89,6 +97,18 @@ class UnwrittenReportError(ParameterError):
     def __init__(self, sentence: str, result: FlightResult) -> None:
         super().__init__(sentence)
         self.result = result
+
+
+class UnflownError(ParameterError):
+    """A log has no y or no y_m, so the `outcome` is all that can be reported of the flight."""
+
+    def __init__(self, sentence: str, outcome: Outcome) -> None:
+        super().__init__(sentence)
+        self.outcome = outcome
+
+
+LAST_WORDS = 3.0
+"""s, the end of a log in which a node that still waits has said so, as it does every 2 s."""
 
 
 def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
@@ -252,7 +272,11 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
     engaged_part = _engaged(tape, engagements or [])
     # An engagement may be shorter than a sample.
     has_figures = {"y", "y_m"} <= set(engaged_part.signals)
-    summary = summarise(engaged_part if has_figures else tape, scenario, outcome, flight_account)
+    part = engaged_part if has_figures else tape
+    try:
+        summary = summarise(part, scenario, outcome, flight_account)
+    except ParameterError as error:
+        raise _with_cause(error, recorded, run, outcome) from None
     summary["flight"] = _identity(recorded)
     if engagements is not None:
         summary["engagements"] = [_engagement(tape, engagement) for engagement in engagements]
@@ -270,6 +294,20 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
         later_aircraft=later_aircraft(recorded, scenario),
         messages=recorded.messages,
     )
+
+
+def _with_cause(
+    error: ParameterError, recorded: RecordedRun, run: Path, outcome: Outcome
+) -> ParameterError:
+    """Return an UnflownError, with what the nodes said at the end, if the log lacks y or y_m."""
+    if {"y", "y_m"} <= set(recorded.tape.signals):
+        return error
+    said = [each for each in recorded.messages if each.kind in {"warning", "error"}]
+    end_ns = max((each.stamp_ns for each in said), default=0) - nanoseconds(LAST_WORDS)
+    causes = list(dict.fromkeys(each.text for each in said if each.stamp_ns > end_ns))
+    if causes and outcome == NEVER_ENGAGED:
+        outcome = never_flew(f"{outcome.reason}; {causes[0]}")
+    return UnflownError(f"{display_path(run)}: {'; '.join([str(error), *causes])}", outcome)
 
 
 def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedFlight:
@@ -403,21 +441,29 @@ def write_report(
     `output`. If no outcome is given, the report of an old run is written again and runs/latest
     stays. A `scenario` that replaces the one in the log is not written. Raises ParameterError as
     `read_flight` does, before any file is written, and UnwrittenReportError if a file cannot be
-    written.
+    written. Of an old run without y or y_m summary.json has the outcome, before UnflownError is
+    raised.
     """
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
 
     recorded = read_run(run, namespace, scenario, remaps)
-    flight = _flight(recorded, run, outcome)
     folder = output or _folder(run)
+    try:
+        flight = _flight(recorded, run, outcome)
+    except UnflownError as error:
+        if outcome is None:
+            summary = empty_summary(_scenario_in(recorded, run), error.outcome)
+            with writing("", folder, "a folder that can"):
+                folder.mkdir(parents=True, exist_ok=True)
+                _write_summary(folder, summary)
+        raise
     result = FlightResult(flight, min(bag_files(run), default=folder), folder / REPORT)
-    summary = json.dumps(flight.summary, indent=2, allow_nan=False) + "\n"
     try:
         with writing("", folder, "a folder that can"):
             folder.mkdir(parents=True, exist_ok=True)
             if scenario is None and flight.scenario is not None:
                 _write_scenario(recorded, folder / flight.scenario.path.name)
-            write_file(folder / SUMMARY, summary)
+            _write_summary(folder, flight.summary)
             write_page(folder / REPORT, [flight])
         if outcome is not None:
             link_latest(folder)
@@ -433,9 +479,14 @@ def write_empty_summary(run: Path, scenario: Scenario, outcome: Outcome) -> dict
     """
     summary = empty_summary(scenario, outcome)
     with writing("", run, "a folder that can"):
-        write_file(run / SUMMARY, json.dumps(summary, indent=2) + "\n")
+        _write_summary(run, summary)
     link_latest(run)
     return summary
+
+
+def _write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
+    """Write summary.json. Raises OSError."""
+    write_file(folder / SUMMARY, json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
 
 def _folder(run: Path) -> Path:
