@@ -248,9 +248,13 @@ class InWorld:
         """A client of the world."""
         return Client(self.world, self.resolve_service_name(service))
 
-    def count_publishers(self, topic: str) -> int:
-        """Publishers of a topic by its full name."""
-        return len(self.world.publishers(topic))
+    def count_publishers(self: Any, topic: str) -> int:
+        """Publishers of a topic."""
+        return len(self.world.publishers(self.resolve_topic_name(topic)))
+
+    def count_subscribers(self: Any, topic: str) -> int:
+        """Subscriptions of a topic."""
+        return len(self.get_subscriptions_info_by_topic(self.resolve_topic_name(topic)))
 
     def get_publishers_info_by_topic(self, topic: str) -> list[Endpoint]:
         """Of a topic by its full name."""

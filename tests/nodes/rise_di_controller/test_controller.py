@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
@@ -27,6 +28,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_ros.messages import Encoder, to_message
+from flight_ros.topics import STATE
 from rise_di_controller.node import ControllerNode
 
 PERIOD, MAX_AGE = 0.01, 0.1  # s, of the ticks, and of y and y_m, as in the default scenario
@@ -562,6 +564,20 @@ def test_waiting_for_y_is_told_with_its_cause(
     flight.world.run(2.0, meanwhile)
     # every 2 s
     assert sum(line.startswith("[WARNING] waiting for /y: ") for line in flight.node.log.lines) == 2
+
+
+@pytest.mark.parametrize("is_sent", [False, True])
+def test_node_of_a_user_that_waits_for_the_topic_start_in_vain_is_named(
+    flight: Flight, *, is_sent: bool
+) -> None:
+    """Nobody publishes `start` beside nodes that a user starts by hand."""
+    flight.world.publisher(JointState, "/y")
+    flight.world.subscribe(Time, "/start", STATE, "/my_aircraft", raw=False)
+    if is_sent:
+        flight.world.publisher(Time, "/start")
+    flight.world.run(3.5)
+    (line,) = [line for line in flight.node.log.lines if "waiting for /y: no sample" in line]
+    assert line.endswith("; a node waits for the topic start, which nobody publishes") != is_sent
 
 
 @pytest.mark.parametrize("rate, named", [(9.0, True), (20.0, True), (50.0, False), (200.0, False)])

@@ -47,8 +47,9 @@ def checkout(tmp_path: Path) -> Path:
     """
     for name in (".venv", "ros_ws"):
         (tmp_path / name).symlink_to(REPOSITORY / name)
-    program, *_ = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
-    (tmp_path / "my_aircraft.py").write_text(program)
+    programs = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    for name, program in zip(("my_aircraft.py", "my_reference.py"), programs, strict=False):
+        (tmp_path / name).write_text(program)
     return tmp_path
 
 
@@ -62,11 +63,23 @@ def shell(checkout: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
         process.wait()
 
 
-@pytest.mark.parametrize("section", ["Nodes one by one", "Your own aircraft"])
+@pytest.mark.parametrize(
+    "section, replaced",
+    [
+        ("Nodes one by one", ""),
+        ("Your own aircraft", ""),
+        ("Your own aircraft", "reference_model.main"),
+    ],
+)
 def test_shells_of_page_run_to_the_last_command(
-    section: str, checkout: Path, shell: list[subprocess.Popen[bytes]]
+    section: str, replaced: str, checkout: Path, shell: list[subprocess.Popen[bytes]]
 ) -> None:
+    """In place of the command `replaced` runs that of the section on a reference model."""
     common, commands = shells(section)
+    if replaced:
+        _, (own,) = shells("Your own reference model")
+        commands = [own if replaced in command else command for command in commands]
+        assert own in commands
     nodes = [command for command in commands if "rise-di " not in command]
     after = [command for command in commands if command not in nodes]
     assert "recorder" in nodes[-1]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The launch file of docs/ros.md around an aircraft of one's own, by the official launch.
+"""The launch file of docs/ros.md around nodes of one's own, by the official launch.
 
 launch and launch_ros are not on PyPI: .ci/ros has them.
 """
@@ -35,10 +35,13 @@ sys.exit(service.run())
 """
 
 
-def test_launch_file_of_page_flies_an_aircraft_of_ones_own(tmp_path: Path) -> None:
-    aircraft, launch = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
-    (tmp_path / "my_aircraft.py").write_text(aircraft)
-    (tmp_path / "my.launch.py").write_text(launch)
+def test_launch_file_of_page_flies_an_aircraft_and_a_reference_model_of_ones_own(
+    tmp_path: Path,
+) -> None:
+    programs = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    names = ("my_aircraft.py", "my_reference.py", "my.launch.py")
+    for name, program in zip(names, programs, strict=True):
+        (tmp_path / name).write_text(program)
     (parameters,) = re.findall(r"^    (printf .* > my_params\.yaml)$", PAGE, re.MULTILINE)
     subprocess.run(["/bin/bash", "-c", parameters], cwd=tmp_path, check=True)
     packages = ":".join(map(str, (REPOSITORY / "ros_ws" / "install").glob("*/")))
@@ -54,7 +57,7 @@ def test_launch_file_of_page_flies_an_aircraft_of_ones_own(tmp_path: Path) -> No
     try:
         until(lambda: "flight completed" in (tmp_path / "out.txt").read_text(), "a flight")
         until(lambda: "messages in" in (tmp_path / "out.txt").read_text(), "a closed log")
-        assert process.poll() is None  # the aircraft is not the flight's
+        assert process.poll() is None  # the nodes are not the flight's
     finally:
         process.send_signal(signal.SIGINT)
         process.wait(timeout=30)
@@ -62,5 +65,7 @@ def test_launch_file_of_page_flies_an_aircraft_of_ones_own(tmp_path: Path) -> No
     recorded = read_run(run)
     assert recorded.namespace == "/uav7"
     assert b"delay: 0.02" in recorded.scenario_file().content
+    # The reference model began at the t = 0 of the flight, which lasted 5 s from there.
+    assert recorded.tape.time("y_m")[-1] == pytest.approx(5.0, abs=0.5)
     q, reference = (abs(recorded.tape[topic]["q"]).max() for topic in ("y", "y_m"))
     assert q > 0.7 * reference > 0.0  # without control q would stay 0

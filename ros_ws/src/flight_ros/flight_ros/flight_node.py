@@ -289,7 +289,8 @@ class FlightNode(Node, Generic[P]):
         """Warn of a topic without a publisher, at each tick without a sample.
 
         The warning is logged after 3 s, then every 2 s. `lack` is the cause where the topic has no
-        publisher.
+        publisher. A publisher of the user may be silent because it waits for `start`, as it does in
+        a flight by a launch file.
         """
         now_ns = time.monotonic_ns()
         last_ns, log_ns = self._waiting.get(subscription.name, (0, 0))
@@ -304,6 +305,8 @@ class FlightNode(Node, Generic[P]):
         cause = self.refusals.since(subscription, now_ns - NO_PUBLISHER_WARNING_NS)
         if cause is None and self.count_publishers(subscription.name):
             lack = "no sample of its publisher arrives"
+            if self.count_subscribers(START.name) and not self.count_publishers(START.name):
+                lack += f"; a node waits for the topic {START.name}, which nobody publishes"
             cause = joined(self.endpoints.mismatches(subscription))
         self.get_logger().warning(f"waiting for {subscription.name}: {cause or lack}")
 
