@@ -12,6 +12,7 @@ import pytest
 import typer
 from tests.conftest import refusing
 
+from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report import run_folder
 from flight_analysis.report.run_folder import new_run, read_flight, write_report
@@ -170,6 +171,8 @@ def test_flight_that_hung_before_y_m_is_told_with_its_cause(
         Report(runs=[run]).execute()
     assert end.value.exit_code == STATUS_ENDED_EARLY
     error = capsys.readouterr().err.strip()
+    with refusing(f"{run}: found no sample of internals among .*; {waits}"):
+        replay(log._replace(tape=tape, messages=messages))
     assert error.startswith(f"error: {run}: the log: found no sample of y_m, expected ")
     assert error.endswith(f"; {waits}")
     assert "no publisher" not in error  # y came later

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from rosbags.serde.errors import SerdeError
 
+from flight_core.rates import NANOSECONDS
 from flight_core.text import printable
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE
 from flight_log.flight_processes import LOG, ROSOUT
@@ -19,6 +20,7 @@ CONTROL = "control"  # name of the node that carries out the requests of a page
 PARAMETER = "parameter"
 MAX_TEXT = 400  # characters of a text from the log
 CUT = " ..."  # end of a longer text
+LAST_NS = 3 * NANOSECONDS  # end of a log: a node that waits says so every 2 s
 MAX_VALUES = 16  # most values of a parameter that are shown: one per channel, but not a matrix
 
 
@@ -94,6 +96,13 @@ def log_messages(texts: Iterable[StoredText], namespace: str, first_ns: int) -> 
         if message is not None and message.namespace in {None, namespace}:
             messages.append(message._replace(text=bounded(message.text)))
     return sorted(messages, key=lambda message: message.stamp_ns)
+
+
+def last_words(messages: Iterable[LogMessage]) -> list[str]:
+    """Return the warnings and errors at the end of a log, each once, in order."""
+    said = [each for each in messages if each.kind in {"warning", "error"}]
+    end_ns = max((each.stamp_ns for each in said), default=0) - LAST_NS
+    return list(dict.fromkeys(each.text for each in said if each.stamp_ns > end_ns))
 
 
 def shown(value: Any) -> str:

@@ -42,7 +42,7 @@ from flight_log.flight_processes import (
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import latency
 from flight_log.log_content import ROUTE, LogContent, StoredFile, TopicSamples, read_content
-from flight_log.log_messages import LogMessage, log_messages
+from flight_log.log_messages import LogMessage, last_words, log_messages
 from flight_log.named_vectors import (
     JOINT_STATE,
     flight_start_ns,
@@ -90,7 +90,9 @@ class RecordedRun(NamedTuple):
         return self.tape.account
 
     def require(self, *names: str) -> None:
-        """Raise ParameterError if the log has no sample of a topic, with the topics that it has.
+        """Raise ParameterError if the log has no sample of a topic.
+
+        The sentence has the topics of the log, and what its nodes said at the end.
 
         Args:
             names: Topics that need a sample; none means at least one topic of a flight.
@@ -105,7 +107,8 @@ class RecordedRun(NamedTuple):
             lack = (
                 f"no sample of {', '.join(missing) or 'a flight'}{f' among {has}' if has else ''}"
             )
-            raise ParameterError(f"{where}: found {lack}, expected {A_FLIGHT}")
+            cause = "".join(f"; {text}" for text in last_words(self.messages))
+            raise ParameterError(f"{where}: found {lack}, expected {A_FLIGHT}{cause}")
 
     def scenario_file(self) -> StoredFile:
         """Return the scenario in the log. Raises ParameterError for a log without one."""

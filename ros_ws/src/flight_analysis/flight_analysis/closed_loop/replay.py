@@ -223,6 +223,7 @@ def replay(
     if isinstance(run, Tape):
         return _replay(run, parameters, others, changes)
     log = _as_run(run)
+    log.require("internals")
     arithmetic = recorded_arithmetic(log.metadata)
     require(
         arithmetic == ARITHMETIC,

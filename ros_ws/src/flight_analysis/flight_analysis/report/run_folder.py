@@ -58,13 +58,14 @@ from flight_core.files import (
 )
 from flight_core.outcome import End, Outcome, never_flew, parsed_outcome, read_outcome
 from flight_core.parameters import ParameterError, require
-from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_core.rates import NANOSECONDS
 from flight_core.scenario_file import A_SCENARIO
 from flight_core.tape import Tape
 from flight_core.text import printable
 from flight_guidance.guidance_log import require_channels
 from flight_log.bag import CHANNEL_UNITS, IMPORTED, OUTCOME_FILE, LogAttachments
 from flight_log.engagements import Engagement
+from flight_log.log_messages import last_words
 from flight_log.provenance import FLIGHT, provenance
 from flight_log.rosbag2_metadata import bag_files
 from flight_log.tape_reader import AIRCRAFT_TOPICS, PARAMETERS, RecordedRun, read_run
@@ -105,10 +106,6 @@ class UnflownError(ParameterError):
     def __init__(self, sentence: str, outcome: Outcome) -> None:
         super().__init__(sentence)
         self.outcome = outcome
-
-
-LAST_WORDS = 3.0
-"""s, the end of a log in which a node that still waits has said so, as it does every 2 s."""
 
 
 def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
@@ -302,12 +299,12 @@ def _with_cause(
     """Return an UnflownError, with what the nodes said at the end, if the log lacks y or y_m."""
     if {"y", "y_m"} <= set(recorded.tape.signals):
         return error
-    said = [each for each in recorded.messages if each.kind in {"warning", "error"}]
-    end_ns = max((each.stamp_ns for each in said), default=0) - nanoseconds(LAST_WORDS)
-    causes = list(dict.fromkeys(each.text for each in said if each.stamp_ns > end_ns))
+    causes = last_words(recorded.messages)
     if causes and outcome == NEVER_ENGAGED:
         outcome = never_flew(f"{outcome.reason}; {causes[0]}")
-    return UnflownError(f"{display_path(run)}: {'; '.join([str(error), *causes])}", outcome)
+    return UnflownError(
+        f"{display_path(run.resolve())}: {'; '.join([str(error), *causes])}", outcome
+    )
 
 
 def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedFlight:
