@@ -62,6 +62,7 @@ from flight_analysis.report.summary import RecordedFlight
 from flight_analysis.report.summary_rows import Column
 from flight_core.files import replacing
 
+ABOUT_V = "V is the airspeed; its value at trim is subtracted."
 MOST_MESSAGES = 500  # messages of a log on a page
 
 
@@ -152,12 +153,32 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
 def _blocks(
     flight: RecordedFlight, scenario: Scenario, context: PlotContext, flown: FlownLoops
 ) -> list[Block]:
-    """Return what stands below the head: first what the aircraft did, then why."""
+    """Return what stands below the head: what the aircraft did, why, and all of it in tables."""
+    return [
+        *_motion(flight, scenario, context),
+        Cards(
+            title="What holds for this flight",
+            cards=claims(flight, scenario, flown),
+            contents="Claims",
+        ),
+        *_causes(flight, scenario, context, flown),
+        Messages(lines=_message_lines(flight)),
+        _flight_figures(flight, scenario, flown),
+        Figures(
+            groups=[TableGroup([_parameter_table(scenario)])],
+            is_folded=True,
+            title="Parameters other than the default, and those without one",
+            contents="Parameters",
+        ),
+    ]
+
+
+def _motion(flight: RecordedFlight, scenario: Scenario, context: PlotContext) -> list[Block]:
+    """Return what the aircraft did: outputs, track, replay, inputs and errors."""
     trim = about_trim(scenario)
-    about = "V is the airspeed; its value at trim is subtracted." if trim else ""
+    about = ABOUT_V if trim else ""
     floors = {name: metrics["floor"] or 0.0 for name, metrics in flight.summary["errors"].items()}
     replay = replay_of(flight, context)
-    spectrum = figures.spectrum_figure(context)
     return [
         Section(
             "Output y over the reference y_m",
@@ -181,11 +202,17 @@ def _blocks(
             figures.error_figure(context, floors),
             contents="Errors",
         ),
-        Cards(
-            title="What holds for this flight",
-            cards=claims(flight, scenario, flown),
-            contents="Claims",
-        ),
+    ]
+
+
+def _causes(
+    flight: RecordedFlight, scenario: Scenario, context: PlotContext, flown: FlownLoops
+) -> list[Block]:
+    """Return why the aircraft did it: models, wind, states, the law, its loop and its ticks."""
+    trim = about_trim(scenario)
+    about = ABOUT_V if trim else ""
+    spectrum = figures.spectrum_figure(context)
+    return [
         Section(
             "What was learned",
             "A and B as identified, SI, with bars of two standard deviations; open marks: no "
@@ -216,14 +243,6 @@ def _blocks(
             contents="Timing",
         ),
         Section("Timing of the ticks", "", figures.timing_figure(context), over_time=False),
-        Messages(lines=_message_lines(flight)),
-        _flight_figures(flight, scenario, flown),
-        Figures(
-            groups=[TableGroup([_parameter_table(scenario)])],
-            is_folded=True,
-            title="Parameters other than the default, and those without one",
-            contents="Parameters",
-        ),
     ]
 
 
