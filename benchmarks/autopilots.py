@@ -138,7 +138,7 @@ def identified(
     channel_map = place / f"{Path(map_name).stem}.yaml"
     command = (
         "identify",
-        "--bridge",
+        "bridge",
         str(channel_map),
         "--speed",
         f"{speed:g}",
@@ -195,7 +195,7 @@ def own_log() -> dict[str, Any]:
                 else plane.mavlink_map(narrower)
             )
             folder = plane.folder / "found"
-            command = ("identify", "--bridge", channel_map, "--speed", f"{FASTER * TRUE:g}")
+            command = ("identify", "bridge", channel_map, "--speed", f"{FASTER * TRUE:g}")
             plane.experiment(*command, "--write", str(folder)).succeed(300.0)
             run = (REPOSITORY / "runs" / "latest").resolve()
             log = plane.folder / "experiment.BIN"
@@ -301,7 +301,7 @@ def observed() -> dict[str, Any]:
     controller = plain.rise_di()
     model = controller.feedforward
     if model is None:
-        sys.exit(f"error: {folder}: found no feedforward, expected a scenario of identify --bridge")
+        sys.exit(f"error: {folder}: found no feedforward, expected a scenario of identify bridge")
     rows = [model.states.index(name) for name in controller.outputs]
     Omega = np.reshape(model.B, (len(model.states), -1))[rows]
     size = unit_sizes("m/s" if name == "V" else "rad/s" for name in controller.outputs)

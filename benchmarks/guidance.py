@@ -67,7 +67,7 @@ def prepared(scenario: Scenario) -> Scenario:
 def aircraft_of(name: str) -> Scenario:
     """Return the scenario of an aircraft, with guidance.
 
-    The stall speed is the one that `rise-di identify --guidance` writes.
+    The stall speed is the one that `rise-di identify jsbsim --guidance` writes.
     """
     scenario = prepared(original_of(name))
     if name not in CONDITIONS:

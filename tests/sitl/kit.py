@@ -288,7 +288,7 @@ class Autopilot:
         request.succeed()
 
     def experiment(self, *command: str) -> Process:
-        """Fly the experiment of `identify --bridge` to its end in the air.
+        """Fly the experiment of `identify bridge` to its end in the air.
 
         The arguments are those of the command.
         """

@@ -47,10 +47,10 @@ from flight_core.parameters import ParameterError
             ),
         ),
         (
-            ["identify", "runs/none"],
+            ["identify", "log", "runs/none", "--airframe", "osprey"],
             (
-                "runs/none: found no such file or folder, expected the folder of a run, an MCAP "
-                "file, or jsbsim:NAME"
+                "runs/none: found no such file or folder, expected the folder of a run, or an "
+                "MCAP file"
             ),
         ),
     ],

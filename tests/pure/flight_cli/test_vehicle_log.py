@@ -486,7 +486,7 @@ def test_imported_log_is_read_with_the_map_of_its_import_alone(
     content = named_map("ardupilot").model_dump(mode="json", exclude_unset=True)
     content["inputs"]["elevator"]["trim"] = 0.01  # measured at each engagement
     require_map_of_import(ChannelMap.validate_mapping(content, "map"), read_run(bag))
-    identify = [str(bag), "--speed", "25", "--write", str(tmp_path / "found")]
+    identify = ["--run", str(bag), "--speed", "25", "--write", str(tmp_path / "found")]
     for key, value in (("sign", -1), ("scale", 0.4), ("positive", "nose down")):
         path = tmp_path / f"{key}.yaml"
         inputs = content["inputs"]
@@ -496,7 +496,7 @@ def test_imported_log_is_read_with_the_map_of_its_import_alone(
         )
         for arguments in (
             ["check", str(path), "--run", str(bag)],
-            ["identify", "--bridge", str(path), *identify],
+            ["identify", "bridge", str(path), *identify],
         ):
             refused = str(invoke(*arguments).exception)
             assert f"found inputs.elevator.{key} " in refused
@@ -509,7 +509,7 @@ def test_gains_from_imported_log_state_for_which_link_they_are(
     flight: Flight, tmp_path: Path
 ) -> None:
     bag = imported_bag(tmp_path, flight)
-    identify = ["identify", str(bag), "--bridge", "ardupilot", "--speed", "25", "--accept"]
+    identify = ["identify", "bridge", "ardupilot", "--run", str(bag), "--speed", "25", "--accept"]
     result = invoke(*identify, "--write", tmp_path / "found")
     assert "for 50 ms of further delay over the link (link_delay)" in result.output
     assert result.exit_code == 0

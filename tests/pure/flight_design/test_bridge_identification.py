@@ -354,7 +354,7 @@ def test_a_refused_experiment_leaves_no_folder(tmp_path: Path) -> None:
         (str(MAP_FILES["ardupilot_2024"]), new, "map ardupilot_2024: envelope: found none of"),
         ("ardupilot", below_file, f"--write: {below_file} cannot be written (Not a directory)"),
     ):
-        arguments = ["identify", "--bridge", name, "--speed", "25", "--write", str(folder)]
+        arguments = ["identify", "bridge", name, "--speed", "25", "--write", str(folder)]
         result = invoke(*arguments)
         assert isinstance(result.exception, ParameterError)
         assert str(result.exception).startswith(sentence)

@@ -117,14 +117,14 @@ def test_guidance_turns_and_climbs(cessna: IdentifiedAircraft) -> None:
 
 
 def rise_di(*arguments: str) -> Result:
-    """`rise-di identify` in this process."""
-    return invoke("identify", *arguments)
+    """`rise-di identify jsbsim` in this process."""
+    return invoke("identify", "jsbsim", *arguments)
 
 
 @pytest.mark.parametrize(
     "airframe, sentence",
     [
-        ("osprey", "aircraft: found 'osprey', expected an aircraft of JSBSim, jsbsim:NAME"),
+        ("f61", "aircraft: found 'f61', expected jsbsim:f16 perhaps, or jsbsim:PATH "),
         (
             "jsbsim:f61",
             "aircraft: found 'jsbsim:f61', expected jsbsim:f16 perhaps, or jsbsim:PATH ",
@@ -148,7 +148,8 @@ def test_aircraft_that_does_not_trim_gives_one_sentence(tmp_path: Path) -> None:
         "-m",
         "flight_cli.cli",
         "identify",
-        "jsbsim:dr1",
+        "jsbsim",
+        "dr1",
         "--speed",
         "46",
         "--altitude",
@@ -166,7 +167,7 @@ def test_aircraft_that_does_not_trim_gives_one_sentence(tmp_path: Path) -> None:
 def test_file_is_overwritten_only_if_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "jsbsim_c172p.yaml").write_text("mine\n")
-    error = rise_di("jsbsim:c172p", "--speed", "46", "--altitude", "900").exception
+    error = rise_di("c172p", "--speed", "46", "--altitude", "900").exception
     assert isinstance(error, ParameterError)
     assert "jsbsim_c172p.yaml exists" in str(error)
     assert (tmp_path / "jsbsim_c172p.yaml").read_text() == "mine\n"

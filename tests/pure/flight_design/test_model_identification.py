@@ -467,7 +467,7 @@ def run_folder(folder: Path) -> Path:
 
 
 def command(*arguments: Any) -> Any:
-    return invoke("identify", *arguments)
+    return invoke("identify", "log", *arguments)
 
 
 def test_command_writes_airframe_and_page_of_innovations(tmp_path: Path) -> None:

@@ -106,7 +106,7 @@ COMMANDS = {
     "watch": ["watch", "--text"],
     "play": ["play"],
     "repair": ["report", "--repair"],
-    "identify": ["identify", "--airframe", "osprey"],
+    "identify": ["identify", "log", "--airframe", "osprey"],
     "check": ["check", "ardupilot", "--run"],
 }
 

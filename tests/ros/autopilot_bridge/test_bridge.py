@@ -306,7 +306,7 @@ def test_identify_excites_autopilot_and_writes_what_flies_it(
     options = ("--speed", "25", "--amplitude", "0.3", "--write", "found", "--json")
     # 0.3 in place of 0.2: on a busy host, whose messages are late, it found Omega within 25 % and
     # refused it.
-    identify = start("flight_cli.cli", "identify", "--bridge", setup.map, *options)
+    identify = start("flight_cli.cli", "identify", "bridge", setup.map, *options)
     setup.peer.until(lambda: setup.peer.received["bridge/would_send"], "a u through the bridge")
     setup.command(None).succeed()
     setup.peer.until(lambda: identify.popen.poll() is not None, "the end of the command")

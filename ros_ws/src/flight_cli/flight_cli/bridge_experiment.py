@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The part of `rise-di identify` that excites the aircraft behind a channel map.
+"""What `rise-di identify bridge` does: excite the aircraft behind a channel map.
 
 It writes a scenario that flies this aircraft.
 """
@@ -178,7 +178,7 @@ class BridgeExperiment:
         """
         airframe = str((self.folder / "airframe.yaml").resolve())
         flyable = flying_scenario(channel_map, channels, self.speed, airframe, self.needed)
-        expected = "the margins, or --accept beside --bridge"
+        expected = "the margins, or --accept"
         require(self.accept or flyable.lack is None, "identify", flyable.lack, expected)
         return flyable
 

@@ -61,8 +61,8 @@ GROUPS = MappingProxyType(
             "make one of your own that flies.",
             "gains": "Select gains for an airframe, check those of a scenario, or bound them for "
             "every aircraft.",
-            "identify": "Identify an aircraft of JSBSim and write a scenario for it, or identify "
-            "the model of an airframe from a log.",
+            "identify": "Identify an aircraft of JSBSim or behind a bridge, and write a scenario "
+            "for it, or identify an airframe from a log.",
             "learn": "Run the learner again on the log of a flight, with other settings if you "
             "like, and write the model.",
             "tune": "Identify an aircraft from the log of its autopilot, and export a module with "
@@ -92,6 +92,12 @@ VERBS = MappingProxyType(
             "select": "Select gains by Theorem 1 and by the engineering procedure.",
             "check": "Check the gains of a scenario, of any law: margins and conditions.",
             "guarantee": "Bound what holds for every aircraft within --uncertainty.",
+        },
+        "identify": {
+            "jsbsim": "Linearise an aircraft of JSBSim, and write a scenario that flies it.",
+            "log": "Identify A and B of an airframe from the log of a flight.",
+            "bridge": "Excite the aircraft behind a channel map, and write a scenario that flies "
+            "it.",
         },
     }
 )

@@ -159,7 +159,7 @@ class Select(_Gains):
         "Write a feedforward, an observer, and gains for them (an extension).", default=False
     )
     model: str | None = rare_option(
-        "Airframe that is the model of the observer, as rise-di identify RUN writes it."
+        "Airframe that is the model of the observer, as rise-di identify log RUN writes it."
     )
     margin: float = rare_option(
         "Least delay margin that the nominal loop with the observer must have, s.", default=0.03

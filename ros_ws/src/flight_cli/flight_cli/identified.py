@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of an aircraft of JSBSim that `rise-di identify` has linearised."""
+"""Tables of an aircraft of JSBSim that `rise-di identify jsbsim` has linearised."""
 
 from pathlib import Path
 from typing import Any

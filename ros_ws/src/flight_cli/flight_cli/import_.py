@@ -37,7 +37,7 @@ class Import:
     """Make a bag of y, u and pose from the log of an autopilot that the stack did not fly.
 
     By default it takes the longest stretch in the air; u from the sticks needs MANUAL. `check
-    --run`, `identify --bridge`, `report` and `watch` read the bag. u is the deviation from the
+    --run`, `identify bridge`, `report` and `watch` read the bag. u is the deviation from the
     median of the stretch, and `commands` is the whole command. With --scenario, `replay` computes
     each tick of the module again.
 

@@ -543,7 +543,7 @@ def _heading(linear: Linearization, selection: Selection, stall: float | None) -
         gain_yaml.below_requirement(assessed.unmet, assessed.controller.outputs),
         f"JSBSim's {condition.name} at {at}: {flight}, {air}.",
         (
-            f"Written by: rise-di identify {condition.title} --speed {condition.speed:.6g} "
+            f"Written by: rise-di identify jsbsim {condition.name} --speed {condition.speed:.6g} "
             f"--altitude {condition.altitude:.6g}{options}"
         ),
         f"Commands in trim: {', '.join(f'{name} {value:.3g}' for name, value in trims)}.",
