@@ -56,7 +56,8 @@ AIRS = (CALM, "wind", "shear", "turbulence", "microburst", UNKNOWN_AIR)
 engagement. UNKNOWN_AIR means that no simulated aircraft flew."""
 
 
-class Transient(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Transient:
     """An engagement, a command, a gust, a turn or a capture.
 
     The span is from the first to the last instant, in s of flight time.
@@ -209,7 +210,10 @@ def engagements(tape: Tape) -> list[Transient]:
         return []
     is_engaged = tape["internals"]["mode"] == Mode.ENGAGED
     begins = is_engaged & ~np.concatenate([[False], is_engaged[:-1]])
-    return [Transient("engagement", "", float(t), float(t)) for t in tape.time("internals")[begins]]
+    return [
+        Transient(kind="engagement", name="", start=float(t), stop=float(t))
+        for t in tape.time("internals")[begins]
+    ]
 
 
 def live_commands(tape: Tape) -> list[Transient]:
@@ -229,7 +233,7 @@ def live_commands(tape: Tape) -> list[Transient]:
         instants = t[is_change]
         groups = np.split(instants, np.flatnonzero(np.diff(instants) > SETTLING_DWELL) + 1)
         commands += [
-            Transient("command", name, float(group[0]), float(group[-1]))
+            Transient(kind="command", name=name, start=float(group[0]), stop=float(group[-1]))
             for group in groups
             if len(group)
         ]
@@ -255,8 +259,11 @@ def guided_transients(tape: Tape) -> list[Transient]:
         "turn": mask_spans(t, turns, SETTLING_DWELL),
         "capture": mask_spans(t, captures & ~turns, SETTLING_DWELL),
     }
-    transients = [Transient("turn", "", *span) for span in spans["turn"]]
-    transients += [Transient("capture", "", *span) for span in spans["capture"]]
+    transients = [
+        Transient(kind=kind, name="", start=start, stop=stop)
+        for kind, of_kind in spans.items()
+        for start, stop in of_kind
+    ]
     return sorted(transients, key=lambda transient: transient.start)
 
 

@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from csv import writer as csv_writer
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -194,7 +194,7 @@ def _difference(first: ReplayDifference) -> str:
 
 def _guidance_as_json(replay_of_guidance: GuidanceReplay) -> dict[str, Any]:
     first = replay_of_guidance.first
-    difference = None if first is None else {**first._asdict(), "ulps": first.ulps}
+    difference = None if first is None else {**asdict(first), "ulps": first.ulps}
     return {
         "steps": replay_of_guidance.steps,
         "checked": replay_of_guidance.checked,
@@ -289,7 +289,7 @@ def _as_json(answer: Shown, notes: Sequence[str], settings: list[str]) -> dict[s
         "other_parameters": int(result.other_parameters.sum()),
         "differing": int(result.different().any(axis=1).sum()),
         "differing_by_group": _count_by_group(result),
-        "first": None if first is None else {**first._asdict(), "ulps": first.ulps},
+        "first": None if first is None else {**asdict(first), "ulps": first.ulps},
         "u_difference": _u_figures(result, answer.inputs),
         "notes": list(notes),
         "expected": answer.ticks,

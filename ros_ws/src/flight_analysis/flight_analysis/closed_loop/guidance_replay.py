@@ -172,5 +172,10 @@ class _Comparison:
         column = int(columns[0])
         published = (f"published.{name}" for name in (*self._outputs, *ATTITUDE))
         channel = (*self._names, *published)[column]
-        values = float(recorded[column]), float(computed[column])
-        return ReplayDifference(k + 1, float(self._t[k]), channel, *values)
+        return ReplayDifference(
+            number=k + 1,
+            t=float(self._t[k]),
+            channel=channel,
+            recorded=float(recorded[column]),
+            computed=float(computed[column]),
+        )

@@ -7,6 +7,7 @@ The inputs come from the log, and every tick is compared bit by bit.
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,7 +40,8 @@ U_PREFIXES = ("u.", "published.")
 OPEN_LOOP = "open loop: the recorded aircraft did not fly this u"
 
 
-class ReplayDifference(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class ReplayDifference:
     """A channel of a tick whose recorded and computed values differ."""
 
     number: int  # number of the tick's sample in `internals`

@@ -260,7 +260,8 @@ def cross_track_figure(context: PlotContext) -> Figure | None:
     for leg in np.unique(legs[legs >= 0.0]):
         colour = END_STOP if leg % 2 else "#ffffff"
         spans += [
-            Interval(f"{int(leg)}", *span, colour, True) for span in mask_spans(t, legs == leg)
+            Interval(label=f"{int(leg)}", start=start, stop=stop, colour=colour, labelled=True)
+            for start, stop in mask_spans(t, legs == leg)
         ]
     return time_series_figure(context._replace(intervals=[*context.intervals, *spans]), {"": error})
 

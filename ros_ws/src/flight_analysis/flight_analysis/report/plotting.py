@@ -12,6 +12,7 @@ import base64
 import zlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from hashlib import blake2b
 from itertools import chain, product
 from types import MappingProxyType
@@ -54,7 +55,8 @@ DARK = {PAPER: "#1b1f24", INK: "#d3d9df", GRID: "#2c323a", ZERO: "#4b545e"}
 """Colours of the frame on a light page, with those that replace them on a dark page."""
 
 
-class Instants(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Instants:
     """The instants at which a curve is drawn."""
 
     # since the start of the flight, with one more at the start of each gap; two of each bin
@@ -136,7 +138,8 @@ def pack(content: bytes | NDArray[Any], width: int = 1) -> str:
     return base64.b64encode(zlib.compress(shuffled, LEVEL)).decode()
 
 
-class Interval(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Interval:
     """An interval of time, s, that is shaded."""
 
     label: str
@@ -412,10 +415,10 @@ def _drawn(
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Return instants and values of a channel times a factor, with a NaN where a gap begins."""
     start_ns = context.tape.start_ns if curve.start_ns is None else curve.start_ns
-    t_ns, gaps, width = context.samples.instants(curve.signal.stamp_ns, start_ns, steps=curve.steps)
+    drawn = context.samples.instants(curve.signal.stamp_ns, start_ns, steps=curve.steps)
     values = curve.signal[channel] * factor
-    values = np.insert(values, gaps, np.nan) if len(gaps) else values
-    return t_ns, values if width == 1 else _extremes_of_bins(values, width)
+    values = np.insert(values, drawn.gaps, np.nan) if len(drawn.gaps) else values
+    return drawn.t_ns, values if drawn.width == 1 else _extremes_of_bins(values, drawn.width)
 
 
 def _extremes_of_bins(values: FloatArray, width: int) -> FloatArray:
@@ -446,7 +449,7 @@ def _instants(t_ns: NDArray[np.int64], steps: bool) -> Instants:
         t_ns = np.insert(t_ns, before + 1, t_ns[before]) if len(before) else t_ns
     width = -(-len(t_ns) // (MAX_STORED // 2)) if len(t_ns) > MAX_STORED else 1
     stamps = t_ns if width == 1 else _bins(t_ns, width)[:, [0, width // 2]].ravel()
-    return Instants(stamps, before + 1, width)
+    return Instants(t_ns=stamps, gaps=before + 1, width=width)
 
 
 def _shade_intervals(figure: Figure, intervals: Sequence[Interval], columns: int) -> None:

@@ -80,7 +80,7 @@ def command_edges(scenario: Scenario) -> list[Transient]:
     These are the edges of its pulses, doublets and ramps.
     """
     edges = [
-        Transient("command", name, edge.start, edge.stop)
+        Transient(kind="command", name=name, start=edge.start, stop=edge.stop)
         for name, of_channel in scenario.reference_model.edges().items()
         for edge in of_channel
         if edge.change != 0.0
@@ -96,7 +96,10 @@ def transients(scenario: Scenario, tape: Tape, *, follows_scenario: bool = True)
     flight.
     """
     windows = scenario.gust_windows() if is_simulated(tape) else {}
-    gusts = [Transient("gust", name, *window) for name, window in windows.items()]
+    gusts = [
+        Transient(kind="gust", name=name, start=start, stop=stop)
+        for name, (start, stop) in windows.items()
+    ]
     if "guidance" in tape:
         return [*engagements(tape), *guided_transients(tape), *gusts]
     live = live_commands(tape)
@@ -226,7 +229,7 @@ def summarise(
         "errors": _in_order(_errors(tape, events, air), scenario),
         "inputs": _in_order(_inputs(tape, events, air), scenario),
         "transients": [
-            settling.transient._asdict() | {"until": settling.until, "settling": settling.time}
+            asdict(settling.transient) | {"until": settling.until, "settling": settling.time}
             for settling in settling_times(tape, events)
         ],
         "ticks": _finite(ticks),
