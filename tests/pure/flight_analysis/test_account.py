@@ -297,7 +297,11 @@ def foreign_flight(rate: float, ticks_held: slice) -> Tape:
         "internals": Signal(u_ns, ("number", "age", "mode"), internals),
     }
     recording = {name: Recording(len(signal.stamp_ns), lost=0) for name, signal in signals.items()}
-    processes = {"my_aircraft": Process(EPOCH, EPOCH, int(stamp_ns[-1]), len(stamp_ns))}
+    processes = {
+        "my_aircraft": Process(
+            ready_ns=EPOCH, first_ns=EPOCH, last_ns=int(stamp_ns[-1]), samples=len(stamp_ns)
+        )
+    }
     return Tape(signals, EPOCH, recording=recording, processes=processes)
 
 
@@ -482,17 +486,23 @@ def test_process_has_ready_time_of_its_own_start() -> None:
         ("/controller", 40 * second),
     ]
     spans = {
-        "/controller#9": SampleSpan(10 * second, 30 * second, 2000),
-        "/controller#4": SampleSpan(41 * second, 60 * second, 1900),
-        "": SampleSpan(0, 1, 2),  # of ros2 topic pub
+        "/controller#9": SampleSpan(first_ns=10 * second, last_ns=30 * second, samples=2000),
+        "/controller#4": SampleSpan(first_ns=41 * second, last_ns=60 * second, samples=1900),
+        "": SampleSpan(first_ns=0, last_ns=1, samples=2),  # of ros2 topic pub
     }
     assert flight_processes(spans, ready, "") == {
-        "/controller#9": Process(3 * second, 10 * second, 30 * second, 2000),
-        "/controller#4": Process(40 * second, 41 * second, 60 * second, 1900),
-        "/recorder": Process(1, None, None),
-        "a publisher without a name": Process(None, 0, 1, 2),
+        "/controller#9": Process(
+            ready_ns=3 * second, first_ns=10 * second, last_ns=30 * second, samples=2000
+        ),
+        "/controller#4": Process(
+            ready_ns=40 * second, first_ns=41 * second, last_ns=60 * second, samples=1900
+        ),
+        "/recorder": Process(ready_ns=1, first_ns=None, last_ns=None),
+        "a publisher without a name": Process(ready_ns=None, first_ns=0, last_ns=1, samples=2),
     }
-    assert flight_processes({"": SampleSpan(0, 1, 2)}, [], "") == {}  # in one process
+    assert (
+        flight_processes({"": SampleSpan(first_ns=0, last_ns=1, samples=2)}, [], "") == {}
+    )  # in one process
 
 
 def test_processes_of_a_lockstep_flight_have_their_samples_and_no_time_of_day(
@@ -501,13 +511,15 @@ def test_processes_of_a_lockstep_flight_have_their_samples_and_no_time_of_day(
     """Nodes in lockstep have no process id. Nothing is said of a recorder, which sends nothing."""
     ready = [("/recorder", EPOCH), ("/controller", EPOCH), ("/aircraft", EPOCH)]
     spans = {
-        "/controller": SampleSpan(0, 2 * NANOSECONDS, 402),
-        "/aircraft": SampleSpan(0, 2 * NANOSECONDS, 1001),
-        "/stray": SampleSpan(0, 1, 3),
+        "/controller": SampleSpan(first_ns=0, last_ns=2 * NANOSECONDS, samples=402),
+        "/aircraft": SampleSpan(first_ns=0, last_ns=2 * NANOSECONDS, samples=1001),
+        "/stray": SampleSpan(first_ns=0, last_ns=1, samples=3),
     }
     processes = flight_processes(spans, ready, "")
-    assert processes["/controller"] == Process(EPOCH, 0, 2 * NANOSECONDS, 402)
-    assert processes["/recorder"] == Process(EPOCH, None, None)
+    assert processes["/controller"] == Process(
+        ready_ns=EPOCH, first_ns=0, last_ns=2 * NANOSECONDS, samples=402
+    )
+    assert processes["/recorder"] == Process(ready_ns=EPOCH, first_ns=None, last_ns=None)
     flight = read_flight(whole)
     tape = replace(flight.tape, processes=processes)
     found = account(tape, find_scenario("osprey_gust")).processes
@@ -527,7 +539,7 @@ def test_processes_of_a_lockstep_flight_have_their_samples_and_no_time_of_day(
 def test_recorder_in_the_hosts_time_has_no_number_of_samples() -> None:
     """It sends none: a zero would say that nothing was sent that should be."""
     ready = [("/recorder", EPOCH), ("/controller", EPOCH)]
-    spans = {"/controller#7": SampleSpan(EPOCH, EPOCH + NANOSECONDS, 200)}
+    spans = {"/controller#7": SampleSpan(first_ns=EPOCH, last_ns=EPOCH + NANOSECONDS, samples=200)}
     processes = flight_processes(spans, ready, "")
     assert processes["/recorder"].samples is None
     assert processes["/controller#7"].samples == 200
@@ -627,7 +639,7 @@ def test_fleet_says_the_share_of_the_ticks_engaged(
     monkeypatch.setenv("COLUMNS", "200")
     assert half.scenario is not None
     member = MemberFlight(Member("two", half.scenario), tmp_path, COMPLETED)
-    show_fleet("pair", [member], {"two": FleetResult(half.summary, 0.9365)})
+    show_fleet("pair", [member], {"two": FleetResult(summary=half.summary, engaged=0.9365)})
     assert "93.65 %, over 49 % of internals" in capsys.readouterr().out
 
 

@@ -370,7 +370,9 @@ def test_rate_of_another_aircraft_is_that_of_its_log(tape: Tape, osprey_gust: Sc
         name: type(signal)(signal.stamp_ns + EPOCH, signal.names, signal.values)
         for name, signal in signals.items()
     }
-    processes = {"/controller#7": Process(None, EPOCH, EPOCH, 201)}
+    processes = {
+        "/controller#7": Process(ready_ns=None, first_ns=EPOCH, last_ns=EPOCH, samples=201)
+    }
     flight = Tape(
         moved, tape.start_ns + EPOCH, duration=2.0, recording=shifted, processes=processes
     )
@@ -487,8 +489,8 @@ def test_note_on_another_controller_names_the_process(recorded: Path) -> None:
     values[100:, column] -= 100.0
     begin_ns = int(signal.stamp_ns[100])
     processes = {
-        "/controller#4": Process(0, 0, begin_ns - 1, 100),
-        "/controller#9": Process(0, begin_ns, begin_ns + 1, 101),
+        "/controller#4": Process(ready_ns=0, first_ns=0, last_ns=begin_ns - 1, samples=100),
+        "/controller#9": Process(ready_ns=0, first_ns=begin_ns, last_ns=begin_ns + 1, samples=101),
     }
     ticks = type(signal)(signal.stamp_ns, signal.names, values)
     tape = Tape({**run.tape.signals, "internals": ticks}, run.tape.start_ns, processes=processes)

@@ -171,7 +171,9 @@ def in_real_time(
         tape,
         signals={"y_m": y_m, "u_m": sent},
         start_ns=EPOCH_NS,
-        processes={"/reference_model#7": Process(None, 0, 0, len(rows))},
+        processes={
+            "/reference_model#7": Process(ready_ns=None, first_ns=0, last_ns=0, samples=len(rows))
+        },
     )
 
 
@@ -211,7 +213,9 @@ def test_u_m_that_acts_after_its_age_limit_is_told() -> None:
 
 def with_reference_model_of_a_user() -> Tape:
     return replace(
-        flown("servo"), scenario=None, processes={"/my_reference": Process(None, 0, 0, 2001)}
+        flown("servo"),
+        scenario=None,
+        processes={"/my_reference": Process(ready_ns=None, first_ns=0, last_ns=0, samples=2001)},
     )
 
 
@@ -243,7 +247,9 @@ def test_reference_model_that_was_started_by_itself_begins_at_its_first_sample()
         tape,
         scenario=None,
         signals=dict(tape.signals) | {"y_m": replace(y_m, stamp_ns=y_m.stamp_ns + 3_000_000_000)},
-        processes={"/reference_model#7": Process(None, 0, 0, 2001)},
+        processes={
+            "/reference_model#7": Process(ready_ns=None, first_ns=0, last_ns=0, samples=2001)
+        },
     )
     errors = reference_errors(alone, servo())
     assert isinstance(errors, ReferenceErrors)

@@ -68,7 +68,10 @@ def flight(
         name: Recording(len(each.stamp_ns), lost=missing.get(name, 0))
         for name, each in signals.items()
     }
-    processes = {f"/{node}#7": Process(None, start_ns, start_ns, 9) for node in nodes}
+    processes = {
+        f"/{node}#7": Process(ready_ns=None, first_ns=start_ns, last_ns=start_ns, samples=9)
+        for node in nodes
+    }
     return Tape(
         signals,
         start_ns,

@@ -68,7 +68,10 @@ def in_real_time(
         start_ns=start_ns,
         recording=recording,
         duration=T,
-        processes={node: Process(None, start_ns, start_ns, 1) for node in NODES},
+        processes={
+            node: Process(ready_ns=None, first_ns=start_ns, last_ns=start_ns, samples=1)
+            for node in NODES
+        },
     )
 
 

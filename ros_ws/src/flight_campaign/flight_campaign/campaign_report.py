@@ -267,7 +267,7 @@ def _guarantees(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Me
         cells.append(None if first is None else first["deviation"])
         rows.append([label, *(NO_VALUE if x is None else f"{100.0 * x:.1f}" for x in cells)])
     heads = ("stable for every aircraft within, %", "first unstable aircraft found, %")
-    columns = [Column("", head) for head in heads]
+    columns = [Column(group="", head=head) for head in heads]
     return MetricTable("Guarantee of the linear loop", columns, rows, GUARANTEE_LEGEND)
 
 
@@ -292,7 +292,7 @@ def overview(
     rows = [[name, *cells] for name, *cells in zip(names, *columns, strict=True)]
     return MetricTable(
         "Score and margins",
-        [Column("", label) for label in _labels(definition)],
+        [Column(group="", head=label) for label in _labels(definition)],
         rows,
         OVERVIEW_LEGEND,
     )
@@ -330,8 +330,10 @@ def _labels(definition: Definition) -> list[str]:
 
 def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> MetricTable:
     columns = [
-        Column(*pair)
-        for pair in product(("diverged", "loss of track"), ("aircraft", "%", "95 % interval"))
+        Column(group=group, head=head)
+        for group, head in product(
+            ("diverged", "loss of track"), ("aircraft", "%", "95 % interval")
+        )
     ]
     rows = []
     for label, case in zip(labels, cases, strict=True):
@@ -354,14 +356,14 @@ def _without_model(labels: Sequence[str], tallies: Sequence[Tally]) -> MetricTab
     ]
     return MetricTable(
         "Aircraft that learn",
-        [Column("", "without a model"), Column("", "of")],
+        [Column(group="", head="without a model"), Column(group="", head="of")],
         rows,
         LEARNER_LEGEND,
     )
 
 
 def _figures(label: str, tally: Tally, units: Mapping[str, DisplayUnit]) -> MetricTable:
-    columns = [Column("", head) for head in FIGURE_HEADINGS]
+    columns = [Column(group="", head=head) for head in FIGURE_HEADINGS]
     return MetricTable(
         label,
         columns,
@@ -399,7 +401,7 @@ def _label(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:
 
 
 def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> MetricTable:
-    columns = [Column("", head) for head in ("aircraft", "score", "fly it again")]
+    columns = [Column(group="", head=head) for head in ("aircraft", "score", "fly it again")]
     rows = []
     for label, case in zip(labels, cases, strict=True):
         for flight in case["fly_again"]:
@@ -434,7 +436,10 @@ def influence_table(label: str, case: Mapping[str, Any]) -> MetricTable:
         legend += f"; below {ranked['chance']:.2f} it may be chance"
     if ranked["command"] is not None:
         legend += f". The worst corner flies by {ranked['command']}"
-    columns = [Column("", head) for head in ("rank correlation", "worst aircraft", "worst corner")]
+    columns = [
+        Column(group="", head=head)
+        for head in ("rank correlation", "worst aircraft", "worst corner")
+    ]
     return MetricTable(f"Drawn entries: {label}", columns, rows, legend)
 
 

@@ -4,9 +4,9 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -69,7 +69,8 @@ def fly_fleet_file(fleet: Fleet, runs: Sequence[Path], *, as_json: bool) -> int:
     return max(statuses, key=SEVEREST.index)
 
 
-class _AircraftResult(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class _AircraftResult:
     """The summary of an aircraft, and the share of its ticks with the controller ENGAGED.
 
     The share is None without ticks. `track` is where the aircraft was, or None without a pose.
@@ -100,7 +101,7 @@ def _unreported(flight: MemberFlight) -> _AircraftResult:
     outcome = flight.outcome.as_json()
     outcome["sentence"] = f"{flight.outcome}, no report: rise-di report writes it"
     return _AircraftResult(
-        {"outcome": outcome, "duration": None, "ticks": None, "account": None}, None
+        summary={"outcome": outcome, "duration": None, "ticks": None, "account": None}, engaged=None
     )
 
 
@@ -121,14 +122,14 @@ def _report(member_flight: MemberFlight) -> _AircraftResult:
         except ParameterError as unwritten:
             warn(f"error: {member_flight.member.name}: no summary: {unwritten}")
             return _unreported(replace(member_flight, outcome=outcome))
-        return _AircraftResult(summary, None)
+        return _AircraftResult(summary=summary, engaged=None)
     internals = flight.tape.signals.get("internals")
     guidance = member_flight.member.scenario.guidance
     place = place_of(flight.tape)
     return _AircraftResult(
-        flight.summary,
-        None if internals is None else float(np.mean(internals["mode"] == Mode.ENGAGED)),
-        None
+        summary=flight.summary,
+        engaged=None if internals is None else float(np.mean(internals["mode"] == Mode.ENGAGED)),
+        track=None
         if place is None or not len(place.stamp_ns)
         else Track(flight.tape.start_ns, place, None if guidance is None else guidance.origin),
     )
@@ -142,15 +143,16 @@ def _show(
     table = new_table(f"Fleet {name}", headings, ("aircraft", "outcome"), ("outcome",))
     lines = []
     for each in flights:
-        summary, engaged_share, _ = results[each.member.name]
+        result = results[each.member.name]
+        summary = result.summary
         ticks = summary["ticks"]
         table.add_row(
             each.member.name,
             "-" if summary["duration"] is None else f"{summary['duration']:.1f}",
             "-" if ticks is None else str(ticks["ticks"]),
             "-"
-            if engaged_share is None
-            else f"{100.0 * engaged_share:.4g} %{taken_over(summary, 'ticks')}",
+            if result.engaged is None
+            else f"{100.0 * result.engaged:.4g} %{taken_over(summary, 'ticks')}",
             summary["outcome"]["sentence"],
         )
         lines.append(f"{each.member.name}: {display_path(each.run)}")

@@ -458,7 +458,11 @@ def _page(tuned: _Tuned, log: str, autopilot: str) -> Page:
     identification = tuned.identification
     entries = MetricTable(
         f"Identified from {log}",
-        [Column("nominal", "SI"), Column("identified", "SI"), Column("deviation", "%")],
+        [
+            Column(group="nominal", head="SI"),
+            Column(group="identified", head="SI"),
+            Column(group="deviation", head="%"),
+        ],
         [
             [
                 entry.name,
@@ -473,7 +477,11 @@ def _page(tuned: _Tuned, log: str, autopilot: str) -> Page:
     own = "no parameters of it in the log" if tuned.own is None else tuned.own.source
     errors = MetricTable(
         "Predicted rms of the error along the commands of the scenario",
-        [Column("RISE-DI", "mrad/s"), Column("own loop", "mrad/s"), Column("ratio", "")],
+        [
+            Column(group="RISE-DI", head="mrad/s"),
+            Column(group="own loop", head="mrad/s"),
+            Column(group="ratio", head=""),
+        ],
         _error_rows(tuned),
         f"with the noise of the log's gyro, without wind. Own loop: {own}",
     )

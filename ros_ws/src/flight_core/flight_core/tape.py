@@ -144,7 +144,8 @@ class Recording(NamedTuple):
     pauses_ns: tuple[int, ...] = ()
 
 
-class Process(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Process:
     """A process of a flight. Stamps in ns; None: unknown, or without samples."""
 
     ready_ns: int | None  # when its event loop began

@@ -7,10 +7,10 @@ Values are converted to SI once, when they are loaded; the code uses SI and radi
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from math import pi
 from types import MappingProxyType
-from typing import NamedTuple
 
 from flight_core.parameters import ParameterError, one_of
 
@@ -20,7 +20,8 @@ POUND = 0.45359237  # kg, exact: the international pound of 1959
 POUND_FORCE = POUND * 9.80665  # N
 
 
-class Quantity(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Quantity:
     """A unit: the SI value of 1, and the exponents of angle, length, time and mass."""
 
     si: float
@@ -32,7 +33,7 @@ class Quantity(NamedTuple):
     @property
     def dimension(self) -> tuple[int, int, int, int]:
         """Exponents of angle, length, time and mass."""
-        return self[1:]
+        return self.angle, self.length, self.time, self.mass
 
 
 DIMENSIONLESS = (0, 0, 0, 0)
@@ -43,31 +44,31 @@ ANGULAR_RATE = (1, 0, -1, 0)
 
 BASE_UNITS: Mapping[str, Quantity] = MappingProxyType(
     {
-        "1": Quantity(1.0),
-        "%": Quantity(0.01),
-        "rad": Quantity(1.0, angle=1),
-        "deg": Quantity(pi / 180.0, angle=1),
-        "crad": Quantity(0.01, angle=1),
-        "mrad": Quantity(0.001, angle=1),
-        "m": Quantity(1.0, length=1),
-        "km": Quantity(1000.0, length=1),
-        "cm": Quantity(0.01, length=1),
-        "mm": Quantity(0.001, length=1),
-        "ft": Quantity(FOOT, length=1),
-        "in": Quantity(FOOT / 12.0, length=1),
-        "mi": Quantity(5280.0 * FOOT, length=1),
-        "nmi": Quantity(1852.0, length=1),
-        "s": Quantity(1.0, time=1),
-        "min": Quantity(60.0, time=1),
-        "h": Quantity(3600.0, time=1),
-        "kt": Quantity(1852.0 / 3600.0, length=1, time=-1),
-        "mph": Quantity(5280.0 * FOOT / 3600.0, length=1, time=-1),
-        "kg": Quantity(1.0, mass=1),
-        "lb": Quantity(POUND, mass=1),
-        "slug": Quantity(POUND_FORCE / FOOT, mass=1),
-        "N": Quantity(1.0, length=1, time=-2, mass=1),
-        "kN": Quantity(1000.0, length=1, time=-2, mass=1),
-        "lbf": Quantity(POUND_FORCE, length=1, time=-2, mass=1),
+        "1": Quantity(si=1.0),
+        "%": Quantity(si=0.01),
+        "rad": Quantity(si=1.0, angle=1),
+        "deg": Quantity(si=pi / 180.0, angle=1),
+        "crad": Quantity(si=0.01, angle=1),
+        "mrad": Quantity(si=0.001, angle=1),
+        "m": Quantity(si=1.0, length=1),
+        "km": Quantity(si=1000.0, length=1),
+        "cm": Quantity(si=0.01, length=1),
+        "mm": Quantity(si=0.001, length=1),
+        "ft": Quantity(si=FOOT, length=1),
+        "in": Quantity(si=FOOT / 12.0, length=1),
+        "mi": Quantity(si=5280.0 * FOOT, length=1),
+        "nmi": Quantity(si=1852.0, length=1),
+        "s": Quantity(si=1.0, time=1),
+        "min": Quantity(si=60.0, time=1),
+        "h": Quantity(si=3600.0, time=1),
+        "kt": Quantity(si=1852.0 / 3600.0, length=1, time=-1),
+        "mph": Quantity(si=5280.0 * FOOT / 3600.0, length=1, time=-1),
+        "kg": Quantity(si=1.0, mass=1),
+        "lb": Quantity(si=POUND, mass=1),
+        "slug": Quantity(si=POUND_FORCE / FOOT, mass=1),
+        "N": Quantity(si=1.0, length=1, time=-2, mass=1),
+        "kN": Quantity(si=1000.0, length=1, time=-2, mass=1),
+        "lbf": Quantity(si=POUND_FORCE, length=1, time=-2, mass=1),
     }
 )
 """The units by name. Products, quotients and powers of these, such as ft/s^2, slug*ft^2 and deg/s,
@@ -84,7 +85,7 @@ def quantity(unit: str, key: str = "unit") -> Quantity:
 
     Raises ParameterError with `key` if the unit is not known.
     """
-    total = Quantity(1.0)
+    total = Quantity(si=1.0)
     for part in re.findall(r"[*/]?[^*/]*", unit)[:-1] or [""]:
         factor = re.fullmatch(r"[*/]?([^^]*)(?:\^(-?[1-9]))?", part)
         name, power = factor.groups() if factor else (part, None)
@@ -95,7 +96,11 @@ def quantity(unit: str, key: str = "unit") -> Quantity:
         base = BASE_UNITS[name]
         si = total.si / base.si**-exponent if exponent < 0 else total.si * base.si**exponent
         total = Quantity(
-            si, *(a + exponent * b for a, b in zip(total.dimension, base.dimension, strict=True))
+            si=si,
+            angle=total.angle + exponent * base.angle,
+            length=total.length + exponent * base.length,
+            time=total.time + exponent * base.time,
+            mass=total.mass + exponent * base.mass,
         )
     return total
 

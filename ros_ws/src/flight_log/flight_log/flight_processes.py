@@ -7,7 +7,8 @@ When a process was ready follows from its line on /rosout, how long it lived fro
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from rosbags.serde.errors import SerdeError
@@ -25,7 +26,8 @@ UNNAMED = "a publisher without a name"
 INSTANCE = re.compile(r"(/.+)#\d+")  # node and process id
 
 
-class SampleSpan(NamedTuple):
+@dataclass(frozen=True, kw_only=True, order=True)
+class SampleSpan:
     """First and last stamp of the samples of a publisher, ns, and their number."""
 
     first_ns: int
@@ -35,9 +37,9 @@ class SampleSpan(NamedTuple):
     def joined(self, later: "SampleSpan") -> "SampleSpan":
         """Join two spans."""
         return SampleSpan(
-            min(self.first_ns, later.first_ns),
-            max(self.last_ns, later.last_ns),
-            self.samples + later.samples,
+            first_ns=min(self.first_ns, later.first_ns),
+            last_ns=max(self.last_ns, later.last_ns),
+            samples=self.samples + later.samples,
         )
 
 
@@ -75,22 +77,34 @@ def flight_processes(
             waiting.setdefault(node, []).append(time_ns)
     has_stack = any(INSTANCE.fullmatch(name) or name in waiting for name in spans)
     processes = {}
-    for name, (first_ns, last_ns, samples) in sorted(spans.items(), key=lambda span: span[1]):
+    for name, span in sorted(spans.items(), key=lambda item: item[1]):
         if (instance := INSTANCE.fullmatch(name)) is not None:
             before = [
                 time_ns
                 for time_ns in waiting.get(instance[1], [])
-                if time_ns <= first_ns + NANOSECONDS
+                if time_ns <= span.first_ns + NANOSECONDS
             ]
-            processes[name] = Process(before[-1] if before else None, first_ns, last_ns, samples)
+            processes[name] = Process(
+                ready_ns=before[-1] if before else None,
+                first_ns=span.first_ns,
+                last_ns=span.last_ns,
+                samples=span.samples,
+            )
             waiting[instance[1]] = [
                 time_ns for time_ns in waiting.get(instance[1], []) if time_ns not in before
             ]
         elif has_stack:
             ready_ns = max(waiting.pop(name, []), default=None)
-            processes[name or UNNAMED] = Process(ready_ns, first_ns, last_ns, samples)
+            processes[name or UNNAMED] = Process(
+                ready_ns=ready_ns,
+                first_ns=span.first_ns,
+                last_ns=span.last_ns,
+                samples=span.samples,
+            )
     return processes | {
-        node: Process(times[-1], None, None) for node, times in waiting.items() if times
+        node: Process(ready_ns=times[-1], first_ns=None, last_ns=None)
+        for node, times in waiting.items()
+        if times
     }
 
 

@@ -200,7 +200,9 @@ class TopicSamples:
                 )
                 if not len(stamp_ns):
                     continue
-                span = SampleSpan(int(stamp_ns.min()), int(stamp_ns.max()), len(stamp_ns))
+                span = SampleSpan(
+                    first_ns=int(stamp_ns.min()), last_ns=int(stamp_ns.max()), samples=len(stamp_ns)
+                )
                 self.spans[sender] = (
                     span.joined(self.spans[sender]) if sender in self.spans else span
                 )
@@ -319,7 +321,7 @@ class TopicSamples:
     def overlap(self) -> bool:
         """Return whether publishers with samples sent at the same time."""
         spans = sorted(self.spans.values())
-        return any(before[1] >= after[0] for before, after in pairwise(spans))
+        return any(before.last_ns >= after.first_ns for before, after in pairwise(spans))
 
     def recording(self, signal: Signal | None = None) -> Recording:
         """Return the stamps of the flight's publishers as recorded; call `signal` first."""

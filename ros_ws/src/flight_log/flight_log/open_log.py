@@ -223,11 +223,16 @@ def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
     if not len(batch.data) or batch.data[0, :4].tobytes() != ZSTD_MAGIC:
         yield batch
         return
-    columns = (batch.log_ns, batch.publish_ns, batch.sequence)
     begin = 0
     for table in tables(plain_message(row.tobytes()) for row in batch.data):
         end = begin + len(table)
-        yield MessageBatch(batch.channel_id, table, *(column[begin:end] for column in columns))
+        yield MessageBatch(
+            channel_id=batch.channel_id,
+            data=table,
+            log_ns=batch.log_ns[begin:end],
+            publish_ns=batch.publish_ns[begin:end],
+            sequence=batch.sequence[begin:end],
+        )
         begin = end
 
 

@@ -13,6 +13,7 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
 from itertools import chain, pairwise
@@ -123,7 +124,8 @@ class FilePart(NamedTuple):
     end: int  # place behind the record and its message indexes
 
 
-class MessageBatch(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class MessageBatch:
     """N successive messages of equal channel and length in a chunk or in successive chunks."""
 
     channel_id: int

@@ -6,8 +6,8 @@ Source: PX4 guide, ULog file format: before a message are its size, 16 bits, and
 """
 
 import struct
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import NamedTuple
 
 from flight_log.vehicle_tables import Loss
 
@@ -26,7 +26,8 @@ APPENDED = slice(HEAD + MESSAGE.size + 16, HEAD + MESSAGE.size + 40)  # offsets,
 TAIL = 528  # bytes: with fewer at its end a log counts as whole, cut inside a message
 
 
-class Messages(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Messages:
     """The messages of a ULog as a ULog without other bytes, and the loss."""
 
     content: bytes
@@ -40,7 +41,7 @@ def whole_messages(content: bytes) -> Messages:
     name.
     """
     if any(content[APPENDED]) and content[HEAD + 2 : HEAD + 3] == b"B":
-        return Messages(content, None)
+        return Messages(content=content, loss=None)
     log = _Log(content)
     parts = [content[:HEAD]]
     lost: list[tuple[int, int, int]] = []  # first byte, end, and the stamp before, us
@@ -58,11 +59,11 @@ def whole_messages(content: bytes) -> Messages:
     if lost and lost[-1][1] == len(content) and lost[-1][1] - lost[-1][0] < TAIL:
         lost.pop()
     if not lost:
-        return Messages(content, None)
+        return Messages(content=content, loss=None)
     count = sum(end - start for start, end, _ in lost)
     places = f" at {len(lost)} places" if len(lost) > 1 else ""
     what = f"{count} of {len(content)} bytes{places} hold no message"
-    return Messages(b"".join(parts), Loss(what, 1000 * lost[0][2], 1000 * lost[-1][2]))
+    return Messages(content=b"".join(parts), loss=Loss(what, 1000 * lost[0][2], 1000 * lost[-1][2]))
 
 
 class _Log:

@@ -294,10 +294,11 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
 
     if path.stat().st_size < ULOG_HEAD:
         raise ValueError("its head is cut")
-    content, loss = whole_messages(path.read_bytes())
+    messages = whole_messages(path.read_bytes())
+    loss = messages.loss
     try:
-        _require_short(ULog(UlogContent(content), parse_header_only=True).message_formats)
-        log = ULog(UlogContent(content))
+        _require_short(ULog(UlogContent(messages.content), parse_header_only=True).message_formats)
+        log = ULog(UlogContent(messages.content))
     except (ULogException, EOFError) as error:
         raise ValueError(error) from None
     if log.file_corruption:

@@ -216,12 +216,12 @@ def _processes(tape: Tape) -> dict[str, ProcessAccount]:
     since_epoch = tape.start_ns > SINCE_EPOCH_NS
     processes = {
         name: ProcessAccount(
-            flight_time(ready_ns) if since_epoch else None,
-            flight_time(first),
-            flight_time(last),
-            samples,
+            flight_time(process.ready_ns) if since_epoch else None,
+            flight_time(process.first_ns),
+            flight_time(process.last_ns),
+            process.samples,
         )
-        for name, (ready_ns, first, last, samples) in tape.processes.items()
+        for name, process in tape.processes.items()
     }
     unknown = ProcessAccount(None, None, None)
     return {name: process for name, process in processes.items() if process != unknown}

@@ -132,7 +132,7 @@ def _conditions(flights: Sequence[RecordedFlight], labels: Sequence[str]) -> lis
     rows = comparison.conditions(flights)
     if not rows:
         return []
-    columns = [Column("", label) for label in labels]
+    columns = [Column(group="", head=label) for label in labels]
     table = MetricTable("", columns, [(row.key, *row.texts) for row in rows])
     note = "" if all(comparison.has_same_conditions(flights)) else comparison.UNLIKE
     return [TableGroup([table], "", note)]

@@ -268,7 +268,7 @@ def _message_lines(flight: RecordedFlight) -> list[MessageLine]:
 
 
 def _parameter_table(scenario: Scenario) -> tables.MetricTable:
-    columns = [Column("", head) for head in ("flown", "default")]
+    columns = [Column(group="", head=head) for head in ("flown", "default")]
     return tables.MetricTable("", columns, parameter_rows(scenario))
 
 

@@ -20,12 +20,12 @@ from flight_analysis.report.tables import MetricTable
 from flight_core.vectors import FloatArray
 
 MARGIN_COLUMNS = (
-    Column("phase", "deg"),
-    Column("at", "rad/s"),
-    Column("gain", "dB"),
-    Column("largest", "S"),
-    Column("disk", ""),
-    Column("delay", "ms"),
+    Column(group="phase", head="deg"),
+    Column(group="at", head="rad/s"),
+    Column(group="gain", head="dB"),
+    Column(group="largest", head="S"),
+    Column(group="disk", head=""),
+    Column(group="delay", head="ms"),
 )
 ALONE = ".3g"  # format of a column that does not show the worst aircraft
 FORMATS = (".0f", ALONE, ".2g", ".2f", ".2f", ".0f")  # of MARGIN_COLUMNS
@@ -169,14 +169,14 @@ def margin_table(
 def flown_margin_table(flown: FlownLoops) -> MetricTable:
     """Return the least margins of the loops of a flight, a row for each."""
     columns = [
-        Column("flown", "from to (s)"),
-        Column("", "aircraft"),
-        Column("phase", "deg"),
-        Column("gain", "dB"),
-        Column("largest", "S"),
-        Column("disk", ""),
-        Column("damping", ""),
-        Column("delay", "ms"),
+        Column(group="flown", head="from to (s)"),
+        Column(group="", head="aircraft"),
+        Column(group="phase", head="deg"),
+        Column(group="gain", head="dB"),
+        Column(group="largest", head="S"),
+        Column(group="disk", head=""),
+        Column(group="damping", head=""),
+        Column(group="delay", head="ms"),
     ]
     rows = [
         [loop.name or "law", loop.times, loop.aircraft, *least_margins(loop_margins(loop.loop))]

@@ -105,7 +105,7 @@ def difference_table(
         f"The tolerance is {100 * TOLERANCE:g} % of the largest value in the first log. Outside is "
         "the part of its instants in which the difference is larger"
     )
-    return MetricTable("", [Column("", head) for head in heads], rows, note)
+    return MetricTable("", [Column(group="", head=head) for head in heads], rows, note)
 
 
 def _cells(found: Difference, unit: DisplayUnit) -> list[str]:

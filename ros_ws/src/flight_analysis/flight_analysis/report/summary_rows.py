@@ -6,8 +6,9 @@ Each metric has its place in the summary, a heading, a unit and a number of digi
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any, NamedTuple
+from typing import Any
 
 from flight_analysis.metrics import AIRS, CALM
 from flight_analysis.report.display_units import (
@@ -22,7 +23,8 @@ from flight_analysis.report.display_units import (
 MILLISECONDS = DisplayUnit("ms", 1e3)
 
 
-class Column(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Column:
     """A column of a table, or a metric.
 
     `head` is its heading, `group` the heading above that neighbouring columns share, and `path`
@@ -57,54 +59,54 @@ class Column(NamedTuple):
 
 
 RMS_COLUMNS = (
-    Column("rms", "whole", ("whole", "rms")),
-    *(Column("rms", air, (air, "rms")) for air in AIRS),
-    Column("rms", "command", ("command", "rms")),
-    Column("rms", "capture", ("capture", "rms")),
-    Column("rms", "turn", ("turn", "rms")),
-    Column("rms", "gust", ("gust", "rms")),
+    Column(group="rms", head="whole", path=("whole", "rms")),
+    *(Column(group="rms", head=air, path=(air, "rms")) for air in AIRS),
+    Column(group="rms", head="command", path=("command", "rms")),
+    Column(group="rms", head="capture", path=("capture", "rms")),
+    Column(group="rms", head="turn", path=("turn", "rms")),
+    Column(group="rms", head="gust", path=("gust", "rms")),
 )
 
 
 ERROR_COLUMNS = (
     *RMS_COLUMNS,
-    *(Column("max", air, (air, "max")) for air in AIRS if air != CALM),
-    Column("max", "command", ("command", "max")),
-    Column("max", "capture", ("capture", "max")),
-    Column("max", "turn", ("turn", "max")),
-    Column("max", "gust", ("gust", "max")),
-    Column("ultimate", "bound", ("bound",)),
+    *(Column(group="max", head=air, path=(air, "max")) for air in AIRS if air != CALM),
+    Column(group="max", head="command", path=("command", "max")),
+    Column(group="max", head="capture", path=("capture", "max")),
+    Column(group="max", head="turn", path=("turn", "max")),
+    Column(group="max", head="gust", path=("gust", "max")),
+    Column(group="ultimate", head="bound", path=("bound",)),
 )
 """Columns that a table of errors may have; `columns_of` chooses those of a flight."""
 
 
-NOISE_FLOOR_COLUMN = Column("noise", "floor", ("floor",))
+NOISE_FLOOR_COLUMN = Column(group="noise", head="floor", path=("floor",))
 
 
-SWITCH_COLUMN = Column("switches", "(1/s)", ("sign_switches",), NO_UNIT)
+SWITCH_COLUMN = Column(group="switches", head="(1/s)", path=("sign_switches",), unit=NO_UNIT)
 
 
 INPUT_COLUMNS = (
     *RMS_COLUMNS,
-    Column("", "max", ("whole", "max")),
-    Column("rate", "whole", ("whole", "rate")),
-    *(Column("rate", air, (air, "rate")) for air in AIRS),
+    Column(group="", head="max", path=("whole", "max")),
+    Column(group="rate", head="whole", path=("whole", "rate")),
+    *(Column(group="rate", head=air, path=(air, "rate")) for air in AIRS),
 )
 """Columns that a table of inputs may have before SATURATION_COLUMN; `columns_of` chooses those of a
 flight."""
 
 
-SATURATION_COLUMN = Column("saturated", "%")
+SATURATION_COLUMN = Column(group="saturated", head="%")
 
 
-SETTLING_COLUMNS = {kind: Column("settling (s)", kind) for kind in ("command", "gust")}
+SETTLING_COLUMNS = {kind: Column(group="settling (s)", head=kind) for kind in ("command", "gust")}
 
 
 HELD_COLUMNS = (
-    Column("", "rms", ("rms",)),
-    Column("", "max", ("max",)),
-    Column("", "overshoot", ("overshoot",)),
-    Column("", "settling (s)", ("settling",), NO_UNIT),
+    Column(group="", head="rms", path=("rms",)),
+    Column(group="", head="max", path=("max",)),
+    Column(group="", head="overshoot", path=("overshoot",)),
+    Column(group="", head="settling (s)", path=("settling",), unit=NO_UNIT),
 )
 """Errors of a quantity that guidance held over a segment."""
 
@@ -200,10 +202,13 @@ def segment_table(
     The units are `units` or, if these have none for a quantity, QUANTITY_UNITS.
     """
     units = {**QUANTITY_UNITS, **units}
-    columns = [Column("", head) for head in ("from (s)", "to (s)")]
+    columns = [Column(group="", head=head) for head in ("from (s)", "to (s)")]
     for group in ("lateral", "vertical"):
-        columns += [Column(group, "held"), *(each._replace(group=group) for each in HELD_COLUMNS)]
-    columns += [each._replace(group="V (m/s)") for each in HELD_COLUMNS[:2]]
+        columns += [
+            Column(group=group, head="held"),
+            *(replace(each, group=group) for each in HELD_COLUMNS),
+        ]
+    columns += [replace(each, group="V (m/s)") for each in HELD_COLUMNS[:2]]
     rows = []
     for segment in segments:
         name = segment["lateral"]["quantity"] if segment["leg"] is None else f"leg {segment['leg']}"

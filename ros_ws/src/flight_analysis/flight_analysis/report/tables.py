@@ -232,7 +232,7 @@ def flight_tables(
     event_list: Sequence[EventInterval],
 ) -> list[MetricTable]:
     """Return the tables of metrics, and those of events and processes."""
-    times = [Column("", head) for head in ("from (s)", "to (s)", "")]
+    times = [Column(group="", head=head) for head in ("from (s)", "to (s)", "")]
     rows = [
         (event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent)
         for event in event_list
@@ -268,7 +268,9 @@ def imported_tables(
         length = (topic.last or 0.0) - (topic.first or 0.0)
         rate = (topic.found - 1) / length if length else None
         counts.append([name, f"{topic.found}", format_value(rate), format_value(topic.gap)])
-    columns_of_topics = [Column("", head) for head in ("samples", "Hz", "longest gap (s)")]
+    columns_of_topics = [
+        Column(group="", head=head) for head in ("samples", "Hz", "longest gap (s)")
+    ]
     return [*tables, MetricTable("Topics", columns_of_topics, counts)]
 
 
@@ -304,7 +306,7 @@ def model_table(
     `part` says what the log has of the flight, after a comma.
     """
     headings, rows = model_rows(models, units)
-    columns = [Column("", head) for head in headings]
+    columns = [Column(group="", head=head) for head in headings]
     return MetricTable(
         f"Rms of the error by model{part}", columns, rows, MODEL_LEGEND, ("law of the start",)
     )
@@ -319,7 +321,7 @@ def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
         rows.append((f"{label}{part}", text))
     labels = [label for label, _ in rows]
     of_rows = [word for word in TIMES if any(label.startswith(word) for label in labels)]
-    return MetricTable(caption, [Column("", "")], rows, of_rows=of_rows)
+    return MetricTable(caption, [Column(group="", head="")], rows, of_rows=of_rows)
 
 
 def _process_table(summary: Mapping[str, Any]) -> MetricTable:
@@ -329,8 +331,8 @@ def _process_table(summary: Mapping[str, Any]) -> MetricTable:
     if not is_in_host_time(summary):
         processes = {}
     columns = [
-        Column("", "ready (s)"),
-        *(Column("output", head) for head in ("first (s)", "last (s)", "samples")),
+        Column(group="", head="ready (s)"),
+        *(Column(group="output", head=head) for head in ("first (s)", "last (s)", "samples")),
     ]
     rows = []
     for name, process in processes.items():
