@@ -30,20 +30,26 @@ def line(level: int, text: str) -> bytes:
 def test_log_tells_warnings_changes_and_learning_of_its_aircraft() -> None:
     def changed(node: str, stamp: int) -> StoredText:
         data = parameter_event(stamp * SECOND, node, {"k_g": 2.5, "A": [0.5] * 64})
-        return StoredText(PARAMETER_EVENTS, PARAMETER_EVENT, stamp * SECOND, data)
+        return StoredText(
+            topic=PARAMETER_EVENTS, type_name=PARAMETER_EVENT, sent_ns=stamp * SECOND, data=data
+        )
 
     learned = learning_message(7 * SECOND, "model", "flies model 1", warns=False)
     texts = [
-        StoredText("/one/learning", DIAGNOSTIC_ARRAY, 7 * SECOND, learned),
-        StoredText("/two/learning", DIAGNOSTIC_ARRAY, 7 * SECOND, learned),
+        StoredText(
+            topic="/one/learning", type_name=DIAGNOSTIC_ARRAY, sent_ns=7 * SECOND, data=learned
+        ),
+        StoredText(
+            topic="/two/learning", type_name=DIAGNOSTIC_ARRAY, sent_ns=7 * SECOND, data=learned
+        ),
         changed("/one/controller", 6),
         changed("/two/controller", 6),
-        StoredText(ROSOUT, LOG, 5 * SECOND, line(30, "y is late")),
-        StoredText(ROSOUT, LOG, 5 * SECOND, line(20, "ready")),
-        StoredText(ROSOUT, LOG, 5 * SECOND, b"\0\1damaged"),
+        StoredText(topic=ROSOUT, type_name=LOG, sent_ns=5 * SECOND, data=line(30, "y is late")),
+        StoredText(topic=ROSOUT, type_name=LOG, sent_ns=5 * SECOND, data=line(20, "ready")),
+        StoredText(topic=ROSOUT, type_name=LOG, sent_ns=5 * SECOND, data=b"\0\1damaged"),
     ]
     messages = log_messages(texts, "/one", first_ns=4 * SECOND)
-    assert [message[:3] for message in messages] == [
+    assert [(message.stamp_ns, message.kind, message.text) for message in messages] == [
         (5 * SECOND, "warning", "controller: y is late"),
         (6 * SECOND, "parameter", "controller: k_g = 2.5, A = 64 values"),
         (7 * SECOND, "learning", "flies model 1"),
@@ -53,8 +59,10 @@ def test_log_tells_warnings_changes_and_learning_of_its_aircraft() -> None:
 def test_page_has_messages_beside_figures(tmp_path: Path) -> None:
     scenario = find_scenario("osprey_servo", 1.0)
     tape = simulate(scenario)
-    warning = LogMessage(tape.start_ns + SECOND // 2, "warning", "controller: <y> is late")
-    after = LogMessage(tape.start_ns + 9 * SECOND, "error", "recorder: ends")
+    warning = LogMessage(
+        stamp_ns=tape.start_ns + SECOND // 2, kind="warning", text="controller: <y> is late"
+    )
+    after = LogMessage(stamp_ns=tape.start_ns + 9 * SECOND, kind="error", text="recorder: ends")
     flight = RecordedFlight(
         name="run",
         scenario=scenario,

@@ -316,7 +316,7 @@ def test_events_of_another_aircraft_are_not_shown(tmp_path: Path) -> None:
             )
     flight = Flight(tmp_path / "run")
     flight.update()
-    assert sorted(event[1:3] for event in flight.events) == [
+    assert sorted((event.kind, event.text) for event in flight.events) == [
         ("bridge", "ENGAGED one"),
         ("parameter", "controller: k_g = 2.5"),
     ]

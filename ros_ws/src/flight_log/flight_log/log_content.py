@@ -390,7 +390,12 @@ class LogContent:
             )
         if holds_texts(topic, type_name):
             return lambda batch: self.texts.extend(
-                StoredText(topic, type_name, self._time_of_stamps(sent_ns), data)
+                StoredText(
+                    topic=topic,
+                    type_name=type_name,
+                    sent_ns=self._time_of_stamps(sent_ns),
+                    data=data,
+                )
                 for sent_ns, data in zip(batch.sent_ns, map(bytes, batch.data), strict=True)
             )
         return None

@@ -3,7 +3,8 @@
 """What a log says in words: warnings, errors, parameter changes, learning and a bridge."""
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 from rosbags.serde.errors import SerdeError
 
@@ -24,7 +25,8 @@ LAST_NS = 3 * NANOSECONDS  # end of a log: a node that waits says so every 2 s
 MAX_VALUES = 16  # most values of a parameter that are shown: one per channel, but not a matrix
 
 
-class LogMessage(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class LogMessage:
     """A message of a flight. `stamp_ns` is as in the samples, or by the clock of the host.
 
     `kind` is "warning", "error", "control", "parameter", "learning" or "bridge"; on the live page
@@ -37,7 +39,8 @@ class LogMessage(NamedTuple):
     namespace: str | None = None
 
 
-class StoredText(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class StoredText:
     """A message that may be a LogMessage, as stored."""
 
     topic: str  # in full
@@ -65,36 +68,46 @@ def log_message(
     if type_name == LOG:
         if message.level >= WARN:
             kind = "warning" if message.level == WARN else "error"
-            return LogMessage(sent_ns, kind, f"{message.name}: {message.msg}")
+            return LogMessage(stamp_ns=sent_ns, kind=kind, text=f"{message.name}: {message.msg}")
         if message.name.rpartition(".")[2] == CONTROL:
-            return LogMessage(sent_ns, CONTROL, message.msg.removeprefix(f"{CONTROL}: "))
+            return LogMessage(
+                stamp_ns=sent_ns, kind=CONTROL, text=message.msg.removeprefix(f"{CONTROL}: ")
+            )
         return None
     if type_name == PARAMETER_EVENT:
         entries = (*(message.new_parameters if has_begun else []), *message.changed_parameters)
         changes = {entry.name: parameter_value(entry.value) for entry in entries}
         text = ", ".join(f"{name} = {shown(value)}" for name, value in changes.items())
         namespace, _, node = message.node.rpartition("/")
-        return LogMessage(sent_ns, PARAMETER, f"{node}: {text}", namespace) if text else None
+        told = f"{node}: {text}"
+        change = LogMessage(stamp_ns=sent_ns, kind=PARAMETER, text=told, namespace=namespace)
+        return change if text else None
     if type_name == DIAGNOSTIC_ARRAY:
         stamp_ns, sentence = stamped_sentence(message)
-        return LogMessage(stamp_ns, LEARNING, sentence)
-    return LogMessage(sent_ns, "bridge", f"{message.key} {message.value}".strip())
+        return LogMessage(stamp_ns=stamp_ns, kind=LEARNING, text=sentence)
+    return LogMessage(
+        stamp_ns=sent_ns, kind="bridge", text=f"{message.key} {message.value}".strip()
+    )
 
 
 def log_messages(texts: Iterable[StoredText], namespace: str, first_ns: int) -> list[LogMessage]:
     """Return the messages of an aircraft in a log by stamp; `first_ns` is its first sample's."""
     messages = []
-    for topic, type_name, sent_ns, data in texts:
-        is_shared = topic in {ROSOUT, PARAMETER_EVENTS}
-        if not is_shared and topic not in {f"{namespace}/{LEARNING}", f"{namespace}{ENGAGEMENT}"}:
+    for stored in texts:
+        is_shared = stored.topic in {ROSOUT, PARAMETER_EVENTS}
+        if not is_shared and stored.topic not in {
+            f"{namespace}/{LEARNING}",
+            f"{namespace}{ENGAGEMENT}",
+        }:
             continue
         try:
-            decoded = typestore().deserialize_cdr(data, type_name)
+            decoded = typestore().deserialize_cdr(stored.data, stored.type_name)
         except SerdeError:
             continue
-        message = log_message(decoded, type_name, sent_ns, has_begun=sent_ns >= first_ns)
+        has_begun = stored.sent_ns >= first_ns
+        message = log_message(decoded, stored.type_name, stored.sent_ns, has_begun=has_begun)
         if message is not None and message.namespace in {None, namespace}:
-            messages.append(message._replace(text=bounded(message.text)))
+            messages.append(replace(message, text=bounded(message.text)))
     return sorted(messages, key=lambda message: message.stamp_ns)
 
 

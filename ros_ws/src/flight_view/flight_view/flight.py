@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -453,9 +453,9 @@ class Flight:
             is_mode = number in set(Mode)
             self._add_event(
                 LogMessage(
-                    int(stamp_ns[k]),
-                    "mode",
-                    Mode(int(number)).name if is_mode else f"mode {number:g}",
+                    stamp_ns=int(stamp_ns[k]),
+                    kind="mode",
+                    text=Mode(int(number)).name if is_mode else f"mode {number:g}",
                 )
             )
         self._mode = modes[-1]
@@ -500,11 +500,13 @@ class Flight:
             # Guidance says in the log that it refuses it.
             return
         self.described += 1
-        self._add_event(LogMessage(sent_ns, ROUTE, f"{len(waypoints)} waypoints"))
+        self._add_event(
+            LogMessage(stamp_ns=sent_ns, kind=ROUTE, text=f"{len(waypoints)} waypoints")
+        )
 
     def _add_event(self, event: LogMessage) -> None:
         if len(self.events) < MAX_EVENTS:
-            self.events.append(event._replace(text=bounded(event.text)))
+            self.events.append(replace(event, text=bounded(event.text)))
         else:
             self._note(f"events after the first {MAX_EVENTS} are left out")
 
