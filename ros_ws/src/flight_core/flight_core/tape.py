@@ -154,6 +154,14 @@ class Process:
     samples: int | None = None  # on the topics of the aircraft
 
 
+@dataclass(frozen=True, kw_only=True)
+class LostPart:
+    """A part of a flight that its log lost: a file, the end of one, or a leap of the clock."""
+
+    sentence: str
+    is_end: bool = False  # of a truncated file; a planned end shows this too
+
+
 @dataclass(frozen=True)
 class Tape:
     """A flight: signals by topic name.
@@ -162,7 +170,8 @@ class Tape:
     flight of `simulate` also has its `scenario`, and the `changes` of the controller's parameters
     in flight. A log has the `recording` by topic, the `duration` of the whole flight, s, if it is
     known, the `processes` by name, how many samples of a topic were `refused`, whether the flight
-    followed the simulated time of /clock (`is_by_clock`), and the `account` of `rise_di.read_run`.
+    followed the simulated time of /clock (`is_by_clock`), the `lost_parts`, of which the `notes`
+    tell as well, and the `account` of `rise_di.read_run`.
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
@@ -182,6 +191,7 @@ class Tape:
     refused: Mapping[str, int] = field(default_factory=dict)
     account: Any = None
     is_by_clock: bool = False
+    lost_parts: tuple[LostPart, ...] = ()
 
     def __getitem__(self, topic: str) -> Signal:
         """Return the signal of a topic, or raise ParameterError with the list of topics."""

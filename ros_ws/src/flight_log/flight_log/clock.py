@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_core.rates import NANOSECONDS, seconds
-from flight_core.tape import Recording, Signal
+from flight_core.tape import LostPart, Recording, Signal
 
 STEP_NS = NANOSECONDS // 10  # ns, step back of a clock; late samples are less late than this
 LEAP_NS = NANOSECONDS // 4  # ns, step forth of a clock, compared with the time of the recording
@@ -232,7 +232,6 @@ class Leap(NamedTuple):
 
 
 LOOP = ("y", "y_m", "u", "internals", "truth")  # topics that all have a leap of the clock
-LEAPS = "the clock of all stamps leaps forth by "  # in a note
 
 
 def without_leaps(
@@ -309,7 +308,12 @@ def _has_gap(signal: Signal, leap: Leap) -> bool:
     return bool(signal.stamp_ns[after] - signal.stamp_ns[after - 1] >= leap.by_ns)
 
 
-def leap_note(leap: Leap, start_ns: int) -> str:
-    """Write the sentence about a leap of the clock."""
+def lost_in_leap(leap: Leap, start_ns: int) -> LostPart:
+    """Say which part of the flight a leap of the clock hides."""
     times = f"{seconds(leap.by_ns):.3f} s at t = {seconds(leap.at_ns - start_ns):.3f} s"
-    return f"{LEAPS}{times}: later times are by the clock before the leap"
+    return LostPart(sentence=f"the clock of all stamps leaps forth by {times}")
+
+
+def leap_note(lost: LostPart) -> str:
+    """Write the note about a leap of the clock."""
+    return f"{lost.sentence}: later times are by the clock before the leap"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from flight_core.files import is_file, is_folder
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, seconds
-from flight_core.tape import Recording, Signal
+from flight_core.tape import LostPart, Recording, Signal
 from flight_core.text import printable
 from flight_log.age_of_u import DIAGNOSTICS, IN_MESSAGE
 from flight_log.bag import (
@@ -360,6 +360,7 @@ class LogContent:
         self.metadata: dict[str, Mapping[str, str]] = {}
         self.attachments: list[StoredFile] = []
         self.truncated: list[str] = []  # names of the truncated files
+        self.missing: LostPart | None = None  # the files that are not there
         self.last_ns = 0  # log time of the last message
         self.known_end_ns = 0  # the latest log time in any index or metadata
         self.sent = defaultdict[str, list[Times]](list)  # of y and u by full topic name
@@ -435,15 +436,17 @@ class LogContent:
             else:
                 self.attachments.append(StoredFile(name, record.data))
 
+    def truncated_at(self, end: float | None) -> list[LostPart]:
+        """Return the lost ends; `end` is the flight time of the last sample, s, or None."""
+        where = "" if end is None else f", t = {end:.3f} s"
+        text = f"is truncated: read up to its last complete chunk{where}"
+        return [LostPart(sentence=f"{name} {text}", is_end=True) for name in self.truncated]
+
     def notes_at(self, end: float | None) -> list[str]:
         """Return the notes; `end` is the flight time of the last sample, s, or None."""
-        where = "" if end is None else f", t = {end:.3f} s"
         missing = seconds(self.known_end_ns - self.last_ns)
         more = f"; {missing:.3f} s are missing after it" if missing > 0 and self.last_ns else ""
-        truncated = [
-            f"{name} is truncated: read up to its last complete chunk{where}{more}"
-            for name in self.truncated
-        ]
+        truncated = [f"{lost.sentence}{more}" for lost in self.truncated_at(end)]
         losses = [
             f"{topic}: the recorder lost {count} messages"
             for topic, count in self.metadata.get(LOST_MESSAGES, {}).items()
@@ -487,9 +490,8 @@ def _add_metadata(folder: Path, log: LogContent) -> None:
         log.notes.append(f"{METADATA} {fault}{mend}")
     if missing := missing_parts(bag_files(folder), information):
         evidence = f"named in {METADATA}" if information else "a number before the last"
-        log.notes.append(
-            f"{', '.join(missing)}: {evidence} and missing; the log is a part of the recording"
-        )
+        log.missing = LostPart(sentence=f"{', '.join(missing)}: {evidence} and missing")
+        log.notes.append(f"{log.missing.sentence}; the log is a part of the recording")
 
 
 def _read_file(file: Path, log: LogContent) -> None:

@@ -27,7 +27,14 @@ from flight_log.bag import (
     SIMULATED_TIME,
     full_names,
 )
-from flight_log.clock import SINCE_EPOCH_NS, Leap, leap_note, recording_note, without_leaps
+from flight_log.clock import (
+    SINCE_EPOCH_NS,
+    Leap,
+    leap_note,
+    lost_in_leap,
+    recording_note,
+    without_leaps,
+)
 from flight_log.engagements import ENGAGEMENT, Engagement, engagements_of
 from flight_log.flight_processes import (
     INSTANCE,
@@ -225,9 +232,15 @@ def _tape(
         for name, samples in samples_by_name.items()
     }
     refusals = {name: count for name, count in counts.items() if count}
+    lost_in_leaps = [lost_in_leap(leap, start_ns) for leap in leaps]
+    lost_parts = [
+        *log.truncated_at(end),
+        *([] if log.missing is None else [log.missing]),
+        *lost_in_leaps,
+    ]
     notes = [
         *log.notes_at(end),
-        *(leap_note(leap, start_ns) for leap in leaps),
+        *map(leap_note, lost_in_leaps),
         *(refusal_note(name, count) for name, count in refusals.items()),
         *(recording_note(name, clock, start_ns) for name, clock in recording.items()),
         *_publisher_notes({name: topics[name] for name in filled}, of_flight),
@@ -245,6 +258,7 @@ def _tape(
         processes={printable(name): process for name, process in processes.items()},
         refused=refusals,
         is_by_clock=SIMULATED_TIME in log.metadata or _is_before_epoch(start_ns, spans),
+        lost_parts=tuple(replace(lost, sentence=printable(lost.sentence)) for lost in lost_parts),
     )
 
 

@@ -3,8 +3,7 @@
 """Account for a flight: what its log lacks, its processes, its commands and its legs."""
 
 import math
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,11 +25,10 @@ from flight_analysis.report.starvation import Starvation, starvation
 from flight_core.outcome import COMPLETED, End, Outcome
 from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Recording, Signal, Tape
-from flight_log.clock import LEAPS, SINCE_EPOCH_NS
+from flight_log.clock import SINCE_EPOCH_NS
 
 REPEATS = 0.01  # share of repeated stamps in a topic, up to which we do not name them
 STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight interrupts
-PARTS = (" and missing", LEAPS, " is truncated: ")  # in notes of a log on its parts and its clock
 
 
 class ProcessAccount(NamedTuple):
@@ -68,6 +66,7 @@ class Account(NamedTuple):
     late: float | None = None
     starved: tuple[tuple[float, float], ...] = ()  # s, spans in which the host starved the nodes
     host_lacks: tuple[str, ...] = ()  # those of `lacks` that are the host's
+    lost_parts: tuple[str, ...] = ()  # those of `lacks` that the notes of the tape tell
 
     @property
     def starvation(self) -> Starvation:
@@ -86,14 +85,14 @@ class Account(NamedTuple):
 
     def notes(self) -> tuple[str, ...]:
         """Return the sentences that a user of the log should read."""
-        # The notes of the tape already tell of these.
-        lacks = [lack for lack in self.lacks if not any(part in lack for part in PARTS)]
+        lacks = [lack for lack in self.lacks if lack not in self.lost_parts]
         busy = (self.busy,) if self.busy else ()
         return (*busy, *(f"the log lacks {lack}" for lack in lacks))
 
     def as_json(self) -> dict[str, Any]:
         """Return the account as `summary.json` holds it."""
         content = self._asdict()
+        del content["lost_parts"]  # they are among the lacks
         content["topics"] = {
             name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()
         }
@@ -175,7 +174,8 @@ def account(
         and topic.is_of_stack
         and not topic.holds(topic.expected - topic.unsent)
     ]
-    parts = lost_log_parts(tape.notes, planned=planned_ns is not None)
+    # A planned end shows a truncated end too.
+    parts = [lost.sentence for lost in tape.lost_parts if planned_ns is None or not lost.is_end]
     return Account(
         end=end,
         topics=topics,
@@ -186,6 +186,7 @@ def account(
         late=first if first is not None and first > end / 2.0 else None,
         starved=starved.spans,
         host_lacks=tuple(host_lacks),
+        lost_parts=tuple(parts),
     )
 
 
@@ -229,20 +230,6 @@ def _processes(tape: Tape) -> dict[str, ProcessAccount]:
 
 def _too_busy(parts: Sequence[str]) -> str:
     return f"this host is too busy: {', '.join(parts)}; see docs/faults.md" if parts else ""
-
-
-def lost_log_parts(notes: Iterable[str], *, planned: bool) -> list[str]:
-    """Return the parts of a bag that are missing, and the leaps of the clock.
-
-    A truncated end counts only if no planned end is known, which would show it too.
-    """
-    kinds = PARTS if not planned else PARTS[:2]
-    missing = re.compile("|".join(map(re.escape, kinds)))
-    return [
-        note.partition(";")[0].partition(": later times")[0]
-        for note in notes
-        if missing.search(note)
-    ]
 
 
 def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:

@@ -5,7 +5,7 @@
 from dataclasses import replace
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report.account import lost_log_parts, planned_end_ns
+from flight_analysis.report.account import planned_end_ns
 from flight_analysis.report.sample_counts import LATE_TICK_NS, SILENCE, TICKS
 from flight_core.outcome import COMPLETED, UNKNOWN, Outcome, log_ends_at, never_flew
 from flight_core.rates import nanoseconds, seconds
@@ -26,7 +26,7 @@ def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcom
     missing, in the scenario. If only a part of the flight is in the log, its outcome is UNKNOWN. An
     autopilot may end the last engagement, and u with it, before the end.
     """
-    is_part = bool(lost_log_parts(tape.notes, planned=False)) or any(
+    is_part = bool(tape.lost_parts) or any(
         recording.step_ns for recording in tape.recording.values()
     )
     if simulated and not has_ticks(tape):
