@@ -10,11 +10,12 @@ import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from io import BytesIO
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -151,7 +152,8 @@ def _true_airspeed(tables: Mapping[str, MessageTable]) -> None:
             tables[name].fields[field][:] *= np.where(np.isfinite(ratio), ratio, 1.0)
 
 
-class Received(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Received:
     """A message of an autopilot in a tlog."""
 
     name: str
@@ -182,7 +184,9 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
                     autopilots.setdefault(system, (message.autopilot, message.type))
                 stamp_ns = min(round(NANOSECONDS * message._timestamp), LARGEST)
                 messages.setdefault(system, []).append(
-                    Received(name, message.get_seq(), stamp_ns, message)
+                    Received(
+                        name=name, sequence=message.get_seq(), arrival_ns=stamp_ns, content=message
+                    )
                 )
     system, choices = _flown_system(
         {number: messages[number] for number in autopilots}, choice.system
@@ -259,7 +263,8 @@ def _dated(messages: list[Received]) -> Iterator[Sample]:
     # Sequences and stamps; None of a message that came before.
     recent = deque[tuple[int, int | None]](maxlen=RECENT)
     arrivals: dict[tuple[str, int], int] = {}  # by name and time
-    for name, sequence, arrival_ns, content in messages:
+    for message in messages:
+        name, content, arrival_ns = message.name, message.content, message.arrival_ns
         stamp_ns: int | None
         if by_arrival:
             stamp_ns = newest_ns = arrival_ns
@@ -271,10 +276,12 @@ def _dated(messages: list[Received]) -> Iterator[Sample]:
                 arrivals[name, boot_ms] = arrival_ns
             stamp_ns = None if repeated else offset_ns + 1_000_000 * boot_ms
             newest_ns = newest_ns if stamp_ns is None else stamp_ns
-            recent.appendleft((sequence, stamp_ns))
+            recent.appendleft((message.sequence, stamp_ns))
         else:
             link = min(
-                recent, key=lambda place: (sequence - place[0]) % 256, default=(0, newest_ns)
+                recent,
+                key=lambda place: (message.sequence - place[0]) % 256,
+                default=(0, newest_ns),
             )
             stamp_ns = link[1]
         if name == "PARAM_VALUE":
