@@ -327,7 +327,7 @@ def proposing(*proposals: RiseDiConfig) -> Callable[[Scenario], Learn]:
     def learner(_: Scenario) -> Learn:
         def made(_: RiseDiConfig) -> Any:
             # Nothing is known at the first tick.
-            results = [LearnerResult(None, ""), LearnerResult(next(each), "given")]
+            results = [LearnerResult(None, None), LearnerResult(next(each), "given")]
             return SimpleNamespace(take=lambda *_: None, propose=Mock(side_effect=results))
 
         return made

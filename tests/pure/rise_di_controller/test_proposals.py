@@ -281,9 +281,9 @@ def test_second_and_late_proposals_are_refused() -> None:
 def test_empty_proposal_of_a_test_delays_and_refuses_nothing() -> None:
     """The learner tests the aircraft every 2 s, also while a model is certified."""
     flight = Flight()
-    flight.receive({}, sentence="")
+    flight.receive({}, sentence=None)
     flight.receive()  # 0 s later: a proposal would be too soon
-    flight.receive({}, sentence="")  # while that is certified
+    flight.receive({}, sentence=None)  # while that is certified
     flight.step()
     assert flight.sentences == ["flies model"]
 
@@ -302,7 +302,7 @@ def test_simulated_time_waits_for_each_proposal_that_is_due_and_takes_it_after_l
     acts_ns = END_NS + nanoseconds(4.0)
     flight.learning.ticked(flight.controller, 0)
     assert flight.learning.waits(nanoseconds(4.0))
-    flight.receive({}, stamp_ns=0, sentence="")  # of the first tick, without a rough model
+    flight.receive({}, stamp_ns=0, sentence=None)  # of the first tick, without a rough model
     for now_ns in range(NANOSECONDS, acts_ns + 1, NANOSECONDS):
         flight.learning.ticked(flight.controller, now_ns)
         assert flight.learning.waits(now_ns) is (now_ns >= acts_ns)
@@ -454,7 +454,7 @@ def test_law_of_the_start_flies_where_all_parts_oscillate() -> None:
     )
     assert flight.sentences == [sentence]
     flight.now_ns += 10 * NANOSECONDS
-    flight.receive({}, sentence="")  # nothing to say
+    flight.receive({}, sentence=None)  # nothing to say
     assert flight.sentences == [sentence]
     flight.controller.tick(flight.now_ns + NANOSECONDS, active=False)
     flight.step(1)

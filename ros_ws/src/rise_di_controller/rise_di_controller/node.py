@@ -366,7 +366,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
                 start=start,
                 flown=flown,
                 change=change,
-                sentence=report.sentence,
+                sentence=report.sentence or None,
             ),
             self._controller,
             now_ns,

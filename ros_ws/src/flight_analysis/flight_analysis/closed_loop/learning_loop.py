@@ -25,7 +25,7 @@ class LearnerResult(NamedTuple):
     """The result of an identification in flight: parameters to fly, or why there are none."""
 
     controller: RiseDiConfig | None
-    sentence: str
+    sentence: str | None  # None if nothing was due
 
 
 class Learner(Protocol):

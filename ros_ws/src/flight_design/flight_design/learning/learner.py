@@ -203,7 +203,7 @@ class Learner:
 
         The last RECORD seconds are tested for a loss of effect. If an input has no effect any more,
         its part flies the law of the start without it. After a loss, the older record is left out
-        and the flown model is the prior. If nothing is due, the sentence is empty.
+        and the flown model is the prior. If nothing is due, there is no sentence.
 
         While the rough model flies, the first model of a part is only on trial. The next
         identification proposes one if the samples since then show an advantage over the rough one.
@@ -230,19 +230,19 @@ class Learner:
         # A proposal does not act if the law fell back from the parameters that it was made beside.
         has_fallen = self._record.fell_back(self._proposed_ns, self._proposals)
         if lost and end_ns < self._proposed_ns + self._latency_ns and not has_fallen:
-            return LearnerResult(None, "")  # the last proposal has yet to act
+            return LearnerResult(None, None)  # the last proposal has yet to act
         self._distrust(lost=lost)
         if is_within(self._controller.outputs, chain.from_iterable(self._dead)) and not lost:
             ended, self._has_ended = self._has_ended, True
             none_left = "each part flies the law of the start from now on: no part is left to learn"
-            return LearnerResult(None, "" if ended else none_left)
+            return LearnerResult(None, None if ended else none_left)
         if changes := self._changes(end_ns):
             return self._damaged(changes, end_ns)
         if not self._is_due(end_ns, lost=lost):
             doubts = [
                 f"{name} may have no effect, by one test" for name in self._suspected.values()
             ]
-            return LearnerResult(None, "; ".join(doubts))
+            return LearnerResult(None, "; ".join(doubts) or None)
         return self._learned(end_ns, lost=lost)
 
     def _learned(self, end_ns: int, *, lost: bool) -> LearnerResult:

@@ -69,7 +69,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
         )
         self._publish, self._publish_learned = self.advertise(PROPOSAL), self.advertise(LEARNED)
         self._search: threading.Thread | None = None
-        self._proposal = LearnerResult(None, "")
+        self._proposal = LearnerResult(None, None)
         self._end_ns = 0
         self._flown = 0
         self._given_up: tuple[str, ...] = ()
@@ -109,12 +109,16 @@ class LearnerNode(FlightNode[LearnerConfig]):
             proposal = as_received(self._proposal, self._start, self._end_ns, self._flown)
             values = {"start": proposal.start, "flown": proposal.flown, **proposal.change}
             report = Report(
-                self._end_ns, self.instance, proposal.sentence, values, warns=not proposal.change
+                self._end_ns,
+                self.instance,
+                proposal.sentence or "",
+                values,
+                warns=not proposal.change,
             )
             self._publish(reports.encode(report, "proposal"))
             if (found := self._identifications.next(self._proposal)) is not None:
                 self._publish_learned(self.encoder(found.names).encode(self._end_ns, found.values))
-            if proposal.sentence:
+            if proposal.sentence is not None:
                 self._said = f"{'proposes' if proposal.change else 'no model:'} {proposal.sentence}"
                 self.get_logger().info(self._said)
             advanced = True

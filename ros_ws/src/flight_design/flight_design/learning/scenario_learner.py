@@ -283,7 +283,7 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
             proposed = proposed if proposal.controller is None else proposal.controller.digest()
             t = (now_ns - tape.start_ns) / NANOSECONDS
             # The rough model is proposed before there is a record, and teaches nothing.
-            if proposal.sentence and now_ns > begin_ns:
+            if proposal.sentence is not None and now_ns > begin_ns:
                 steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
     first = f"{settings.updates[0]:g} s or more, the first of learn.updates"
     length = f"at most {longest_ns / NANOSECONDS:.3g} s of ticks of an active controller"

@@ -69,7 +69,7 @@ class Proposal(NamedTuple):
     flown: int  # digest of the parameters that flew at the end of the window
     # all of DESIGNED by dotted name, None for what is gone; empty where no model is proposed
     change: Mapping[str, Any]
-    sentence: str  # what was learned, or why there is no model
+    sentence: str | None  # what was learned, or why there is no model; None if nothing was due
 
 
 class Event(NamedTuple):
@@ -203,7 +203,7 @@ class Learning:
 
     def receive(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         """Take a proposal, or refuse it with an event."""
-        if not (self._simulated or proposal.change or proposal.sentence):
+        if not (self._simulated or proposal.change) and proposal.sentence is None:
             return  # a test without a change: nothing to certify or to say
         if refusal := self._reason_against(proposal, now_ns, controller):
             self._refuse(refusal, proposal, now_ns)
@@ -352,7 +352,7 @@ class Learning:
                 proposal,
                 _certificate(controller.parameters, proposal.change, self.start),
             )
-        elif proposal.sentence:
+        elif proposal.sentence is not None:
             self._announce(Event(now_ns, EventKind.NO_MODEL, {}, f"no model: {proposal.sentence}"))
 
     def _certify(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
@@ -377,7 +377,7 @@ class Learning:
             if refusal is None:
                 bare_outputs = ", ".join(outputs_without(end.value.parameters))
                 exception = f", without {bare_outputs}" if bare_outputs else ""
-                what = f"flies {proposal.sentence}{exception}"
+                what = f"flies {proposal.sentence or 'the proposal'}{exception}"
                 self._take(controller, now_ns, end.value, EventKind.FLIES, what)
                 return controller.parameters
         except ArithmeticError as error:
@@ -425,7 +425,7 @@ class Learning:
 
     def _refuse(self, refusal: Refusal, proposal: Proposal, now_ns: int) -> None:
         # the sentence says which input has no effect, and that stays true
-        proposed = f"; proposed: {proposal.sentence}" if proposal.sentence else ""
+        proposed = "" if proposal.sentence is None else f"; proposed: {proposal.sentence}"
         self._announce(Event(now_ns, EventKind.REFUSED, {}, f"refused: {refusal}{proposed}"))
 
 
