@@ -417,12 +417,22 @@ def test_ticks_of_another_controller_do_not_count_among_those_of_the_flight(
         signal = tape[name]
         parts = [
             Samples(
-                signal.names, signal.stamp_ns + EPOCH, signal.values, nodes.get(name, "/aircraft#9")
+                names=signal.names,
+                stamp_ns=signal.stamp_ns + EPOCH,
+                values=signal.values,
+                sender=nodes.get(name, "/aircraft#9"),
             )
         ]
         if name in {"u", "internals"}:
             later_ns = signal.stamp_ns[:40] + EPOCH + NANOSECONDS + 1_000_000
-            parts.append(Samples(signal.names, later_ns, signal.values[:40], "/controller#10"))
+            parts.append(
+                Samples(
+                    names=signal.names,
+                    stamp_ns=later_ns,
+                    values=signal.values[:40],
+                    sender="/controller#10",
+                )
+            )
         for part in parts:
             rows = zip(part.stamp_ns.tolist(), encoded(part), strict=True)
             messages += [

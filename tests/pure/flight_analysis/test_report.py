@@ -282,7 +282,7 @@ def test_modes_of_guidance_and_controller_differ_in_colour() -> None:
 
 def test_spectrum_of_commanded_sine_has_peak_there() -> None:
     u = held(1001, elevator=np.sin(2.0 * np.pi * 5.0 * np.arange(1001) / 100.0), thrust=0.0)
-    units = {"elevator": DisplayUnit("deg", 1 / DEG)}
+    units = {"elevator": DisplayUnit(unit="deg", factor=1 / DEG)}
     figure = figures.spectrum_figure(context(flight(u=u), units))
     assert titles(figure) == ["elevator (deg/√Hz)", "thrust (/√Hz)"]
     elevator = drawn(figure).data[0]

@@ -160,8 +160,12 @@ def test_flight_that_hung_before_y_m_is_told_with_its_cause(
     log = read_run(run)
     waits = "uav7.controller: waiting for /uav7/y_m: no sample of its publisher arrives"
     messages = (
-        LogMessage(0, "warning", "uav7.controller: waiting for /uav7/y: no publisher"),
-        *(LogMessage(k * NANOSECONDS, "warning", waits) for k in (2, 4, 6)),
+        LogMessage(
+            stamp_ns=0,
+            kind="warning",
+            text="uav7.controller: waiting for /uav7/y: no publisher",
+        ),
+        *(LogMessage(stamp_ns=k * NANOSECONDS, kind="warning", text=waits) for k in (2, 4, 6)),
     )
     tape = replace(log.tape, signals={"y": log.tape["y"]}, outcome=UNKNOWN)
     monkeypatch.setattr(

@@ -549,7 +549,12 @@ def test_samples_of_two_publishers_at_same_time_noted(tmp_path: Path) -> None:
         later = 4 if topic == "/y" else 10
         for sender, stamps in ((first, np.arange(0, 10)), (second, np.arange(later, later + 3))):
             for data in encoded(
-                Samples(("q",), stamps * NANOSECONDS + 1, np.zeros((len(stamps), 1)), sender)
+                Samples(
+                    names=("q",),
+                    stamp_ns=stamps * NANOSECONDS + 1,
+                    values=np.zeros((len(stamps), 1)),
+                    sender=sender,
+                )
             ):
                 bag.write(channel, 1, 1, 1, data.tobytes())
     bag.close()
@@ -569,7 +574,11 @@ def test_without_truth_flight_time_counts_from_first_y_m(tmp_path: Path) -> None
     for name, first in (("y", 3), ("y_m", 5)):
         channel = bag.add_topic(f"/{name}", JOINT_STATE, "")
         stamps = np.arange(first, 9) * NANOSECONDS
-        samples = encoded(Samples(("q",), stamps, np.zeros((len(stamps), 1)), "/node#1"))
+        samples = encoded(
+            Samples(
+                names=("q",), stamp_ns=stamps, values=np.zeros((len(stamps), 1)), sender="/node#1"
+            )
+        )
         for stamp_ns, data in zip(stamps.tolist(), samples, strict=True):
             bag.write(channel, stamp_ns, stamp_ns, 1, data.tobytes())
     bag.close()

@@ -96,7 +96,7 @@ class Report:
                 repair_log(run)
             return
         try:
-            page, flights = write_report(
+            report = write_report(
                 *runs,
                 **values_of(self, *FILES, "width", "channels", "namespace"),
                 csv=None if self.csv == STDOUT else self.csv,
@@ -107,18 +107,18 @@ class Report:
             warn(f"error: {error}")
             raise typer.Exit(error.outcome.status or STATUS_SHORTFALL) from None
         if self.csv == STDOUT:
-            print(signal_table(flights).write_csv(), end="")
+            print(signal_table(report.flights).write_csv(), end="")
         with stdout_for(self.csv):
             if self.as_json:
-                summaries = [flight.summary for flight in flights]
-                print_json(summaries[0] if len(flights) == 1 else summaries)
+                summaries = [flight.summary for flight in report.flights]
+                print_json(summaries[0] if len(summaries) == 1 else summaries)
             else:
-                _show(flights)
-                print(f"report:  {display_path(page)}")
+                _show(report.flights)
+                print(f"report:  {display_path(report.page)}")
         is_looked_at = has_desktop() and not self.as_json and self.csv != STDOUT
         if is_looked_at if self.opens is None else self.opens:
-            webbrowser.open(page.absolute().as_uri())
-        statuses = [flight.summary["outcome"]["status"] for flight in flights]
+            webbrowser.open(report.page.absolute().as_uri())
+        statuses = [flight.summary["outcome"]["status"] for flight in report.flights]
         if status := max(statuses, key=SEVEREST.index):
             raise typer.Exit(status)
 

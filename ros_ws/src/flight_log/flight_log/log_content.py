@@ -190,9 +190,11 @@ class TopicSamples:
             return
         decoded = self._decode(table)
         publisher.refused += decoded.unreadable
-        for sample_names, stamps, unordered, sender in decoded.samples:
-            if unordered.shape[1] == len({*sample_names}) == len(sample_names):
-                names, values = self._ordered(sample_names, unordered)
+        for samples in decoded.samples:
+            stamps, sender = samples.stamp_ns, samples.sender
+            count = samples.values.shape[1]
+            if count == len({*samples.names}) == len(samples.names):
+                names, values = self._ordered(samples.names, samples.values)
                 finite = np.isfinite(values).all(axis=1)
                 publisher.refused += int(np.count_nonzero(~finite))
                 stamp_ns, values = (

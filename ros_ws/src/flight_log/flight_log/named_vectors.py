@@ -8,6 +8,7 @@ layout together.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
 from itertools import groupby
 from types import MappingProxyType
@@ -43,7 +44,8 @@ BYTE_ORDERS: Mapping[bytes, Literal["big", "little"]] = MappingProxyType(
 MAX_FLIGHT_TIME = 1e9  # s; a larger value is not a flight time
 
 
-class Samples(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Samples:
     """N samples with the same k channels."""
 
     names: tuple[str, ...]
@@ -209,7 +211,9 @@ def decode_routes(table: Table) -> Decoded:
         points = [stamped_pose.pose.position for stamped_pose in route.poses]
         if points:
             rows = np.array([(k, point.y, point.x, point.z) for k, point in enumerate(points)])
-            samples.append(Samples(WAYPOINT, np.full(len(rows), stamp_in(message)), rows))
+            samples.append(
+                Samples(names=WAYPOINT, stamp_ns=np.full(len(rows), stamp_in(message)), values=rows)
+            )
     return Decoded(samples, unreadable)
 
 
@@ -233,7 +237,11 @@ class _JointStateDecoder:
         if has_layout.any():
             rows = table if has_layout.all() else table[has_layout]
             values = np.ascontiguousarray(rows[:, self._values]).view("<f8")
-            samples.append(Samples(self._names, stamps_of(rows), values, self._sender))
+            samples.append(
+                Samples(
+                    names=self._names, stamp_ns=stamps_of(rows), values=values, sender=self._sender
+                )
+            )
         unreadable = 0
         unknown = [bytes(message) for message in table[~has_layout]]
         for message in unknown:
@@ -247,7 +255,12 @@ class _JointStateDecoder:
             stamp = vector.header.stamp
             stamps = np.array([stamp.sec * NANOSECONDS + stamp.nanosec])
             samples.append(
-                Samples(tuple(vector.name), stamps, vector.position[None], vector.header.frame_id)
+                Samples(
+                    names=tuple(vector.name),
+                    stamp_ns=stamps,
+                    values=vector.position[None],
+                    sender=vector.header.frame_id,
+                )
             )
         if unknown:
             self._learn(unknown[-1])

@@ -238,11 +238,11 @@ def _start_ns(messages: Iterable[StoredMessage], otherwise: int) -> int:
     decode = None if truth is None else decoder(truth.type_name)
     if truth is None or decode is None:
         return otherwise
-    for names, stamp_ns, values, _ in decode(next(tables([truth.data]))).samples:
-        if (
-            "t" in names
-            and (start_ns := flight_start_ns(int(stamp_ns[0]), float(values[0, names.index("t")])))
-            is not None
-        ):
+    for samples in decode(next(tables([truth.data]))).samples:
+        if "t" not in samples.names:
+            continue
+        t = float(samples.values[0, samples.names.index("t")])
+        start_ns = flight_start_ns(int(samples.stamp_ns[0]), t)
+        if start_ns is not None:
             return start_ns
     return otherwise

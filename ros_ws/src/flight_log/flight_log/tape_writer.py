@@ -104,7 +104,14 @@ class TapeWriter:
             if topic not in self._channels:
                 self._channels[topic] = self._bag.add_topic(f"/{topic}", JOINT_STATE, "")
         messages = [
-            encoded(Samples(part.names, part.stamp_ns, part.values, "in_process"))
+            encoded(
+                Samples(
+                    names=part.names,
+                    stamp_ns=part.stamp_ns,
+                    values=part.values,
+                    sender="in_process",
+                )
+            )
             for part in signals.values()
         ]
         channels = [self._channels[topic] for topic in signals]

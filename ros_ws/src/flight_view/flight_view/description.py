@@ -4,6 +4,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -87,7 +88,7 @@ def scenario_description(scenario: Scenario) -> dict[str, Any]:
     return {
         "scenario": controller.summary(),
         "duration": scenario.flight.duration,
-        "units": {name: unit._asdict() for name, unit in display_units(scenario).items()},
+        "units": {name: asdict(unit) for name, unit in display_units(scenario).items()},
         "positive": scenario.aircraft.channels().positive,
         "limits": {name: [*map(_finite_or_none, pair)] for name, *pair in bounds},
         "gusts": [[name, *window] for name, window in scenario.gust_windows().items()],

@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -315,9 +315,7 @@ class Flight:
                     self._note(f"{topic}: the recorder lost {count} messages")
             elif record.name == CHANNEL_UNITS and "units" not in self.description:
                 units = {name: display_unit(unit) for name, unit in record.metadata.items()}
-                self.description |= {
-                    "units": {name: unit._asdict() for name, unit in units.items()}
-                }
+                self.description |= {"units": {name: asdict(unit) for name, unit in units.items()}}
                 self.described += 1
         elif record.media_type == SCENARIO_MEDIA_TYPE and "units" not in self.description:
             self._take_scenario(record.data)
@@ -357,7 +355,7 @@ class Flight:
                 self._take_samples(topic, samples)
 
     def _take_samples(self, topic: _Topic, decoded: Samples) -> None:
-        names, stamp_ns, values, _ = decoded
+        names, stamp_ns, values = decoded.names, decoded.stamp_ns, decoded.values
         # A pose has the channels that a bridge has received so far. Poses with fewer channels than
         # the widest pose are left out.
         if topic.name == POSE and set(names) > set(topic.names):

@@ -106,7 +106,7 @@ def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
     Only those of the means are written if the others follow from them, as in `tightened_at`.
     """
     count = len(scaling.t) if scaling.g[entries:].any() else entries
-    t, g = ([float(f"{x:.{DIGITS}g}") for x in values[:count]] for values in scaling)
+    t, g = ([float(f"{x:.{DIGITS}g}") for x in values[:count]] for values in (scaling.t, scaling.g))
     return {"t": t, "g": g}
 
 

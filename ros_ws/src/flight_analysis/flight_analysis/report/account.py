@@ -4,6 +4,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,7 +44,8 @@ class ProcessAccount(NamedTuple):
     samples: int | None = None  # on the topics of the aircraft
 
 
-class Commands(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Commands:
     """The commands of a flight, without the legs of a route."""
 
     given: int  # edges of the scenario's commands and of u_m
@@ -97,7 +99,7 @@ class Account(NamedTuple):
             name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()
         }
         content["processes"] = {name: each._asdict() for name, each in self.processes.items()}
-        content["commands"] = None if self.commands is None else self.commands._asdict()
+        content["commands"] = None if self.commands is None else asdict(self.commands)
         return content
 
 

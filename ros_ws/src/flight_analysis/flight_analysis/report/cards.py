@@ -141,9 +141,9 @@ def _learned_card(flight: RecordedFlight) -> Card:
     for name, before in spans[0]["rms"].items():
         after = learned[-1]["rms"].get(name)
         if before is not None and after is not None:
-            unit, factor = flight.units[name]
-            values = (format_value(before, factor), format_value(after, factor))
-            changes.append(f"{name} {values[0]} to {values[1]} {unit}")
+            unit = flight.units[name]
+            values = (format_value(before, unit.factor), format_value(after, unit.factor))
+            changes.append(f"{name} {values[0]} to {values[1]} {unit.unit}")
     sentences = [
         (
             f"{len(learned)} learned model{'s' if len(learned) > 1 else ''} flew, the first from "

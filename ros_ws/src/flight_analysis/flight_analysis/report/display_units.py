@@ -4,7 +4,7 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from dataclasses import dataclass
 
 from aircraft_sim.airframes.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
@@ -14,19 +14,22 @@ from flight_core.units import si_per_unit
 NO_VALUE = "-"
 
 
-class DisplayUnit(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class DisplayUnit:
     """A unit of tables and figures: displayed value = SI value * factor."""
 
     unit: str
     factor: float
 
 
-NO_UNIT = DisplayUnit("", 1.0)  # for a channel whose unit is unknown: it stays in SI
-UNITLESS = DisplayUnit("no unit", 1.0)  # an input of an imported log, as the autopilot sends it
+NO_UNIT = DisplayUnit(unit="", factor=1.0)  # for a channel whose unit is unknown: it stays in SI
+UNITLESS = DisplayUnit(unit="no unit", factor=1.0)  # an input of an imported log
 
 
 QUANTITY_UNITS = {
-    name: DisplayUnit("deg", 180.0 / math.pi) if unit == "rad" else DisplayUnit(unit, 1.0)
+    name: DisplayUnit(unit="deg", factor=180.0 / math.pi)
+    if unit == "rad"
+    else DisplayUnit(unit=unit, factor=1.0)
     for name, unit in UNITS.items()
 }
 """Units in which we show the quantities that guidance holds."""
@@ -48,7 +51,7 @@ def display_unit(unit: str) -> DisplayUnit:
     Radians are shown in deg, and rad/s in deg/s. Any other unit stays.
     """
     shown = DEGREES.get(unit, unit)
-    return DisplayUnit(shown, 1.0 / si_per_unit(shown))
+    return DisplayUnit(unit=shown, factor=1.0 / si_per_unit(shown))
 
 
 def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
@@ -70,7 +73,7 @@ def about_trim(scenario: Scenario) -> dict[str, str]:
 def in_radians(units: Mapping[str, DisplayUnit]) -> dict[str, DisplayUnit]:
     """Return the units with rad in place of deg, also in deg/s."""
     return {
-        name: DisplayUnit(shown.unit.replace("deg", "rad"), 1.0)
+        name: DisplayUnit(unit=shown.unit.replace("deg", "rad"), factor=1.0)
         if shown.unit.startswith("deg")
         else shown
         for name, shown in units.items()

@@ -137,7 +137,7 @@ def runs_of(flights: Sequence[RecordedFlight]) -> dict[str, Run]:
     """Return the flights of figures by label, each in its colour."""
     colours = cycle(COLOURS) if len(flights) > 1 else (PLANT,)
     return {
-        label: Run(flight.tape, flight.period_ns, colour)
+        label: Run(tape=flight.tape, period_ns=flight.period_ns, colour=colour)
         for label, flight, colour in zip(labels(flights), flights, colours, strict=False)
     }
 
@@ -392,9 +392,13 @@ def integral_figure(context: PlotContext) -> Figure | None:
     units: dict[str, DisplayUnit] = {}
     for name in outputs:
         channels |= {f"{label} {name}": f"{group}.{name}" for group, label in INTEGRALS.items()}
-        unit, factor = context.units.get(name, NO_UNIT)
-        integrated = unit.removesuffix("/s") if unit.endswith("/s") else f"{unit} s".strip()
-        units |= {f"∫e {name}": DisplayUnit(integrated, factor), f"Pi {name}": NO_UNIT}
+        unit = context.units.get(name, NO_UNIT)
+        text = unit.unit
+        integrated = text.removesuffix("/s") if text.endswith("/s") else f"{text} s".strip()
+        units |= {
+            f"∫e {name}": DisplayUnit(unit=integrated, factor=unit.factor),
+            f"Pi {name}": NO_UNIT,
+        }
     values = np.stack([internals[channel] for channel in channels.values()]).T
     curve = Curve(Signal(internals.stamp_ns, tuple(channels), values), PLANT)
     return time_series_figure(context._replace(units=units), {"": curve}, columns=2, height=120)
@@ -421,14 +425,16 @@ def spectrum_figure(context: PlotContext) -> Figure | None:
     for label, run in runs.items():
         frequency, densities = spectra(run.tape["u"], run.period_ns)
         for name, density in densities.items():
-            unit, factor = units.get(name, NO_UNIT)
+            unit = units.get(name, NO_UNIT)
             style: dict[str, Any] = {
                 "line": {"color": run.colour, "width": 1.4},
                 "legendgroup": label,
                 "showlegend": len(runs) > 1 and first_in_legend(figure, label),
-                "hovertemplate": f"%{{y:.3g}} {unit}/√Hz at %{{x:.3g}} Hz",
+                "hovertemplate": f"%{{y:.3g}} {unit.unit}/√Hz at %{{x:.3g}} Hz",
             }
-            figure.add_scatter(label, frequency, density * factor, channels.index(name), **style)
+            figure.add_scatter(
+                label, frequency, density * unit.factor, channels.index(name), **style
+            )
     for name, x, y in zip(channels, figure.x, figure.y, strict=True):
         title = {"text": f"{name} ({units.get(name, NO_UNIT).unit}/√Hz)"}
         y |= {"type": "log", "dtick": 1, "exponentformat": "power", "title": title}
@@ -498,7 +504,7 @@ def wind_figure(context: PlotContext) -> Figure | None:
     wind = _nonzero_group(context.tape, "gust")
     if not wind.names:
         return None
-    units = dict.fromkeys(wind.names, DisplayUnit("m/s", 1.0))
+    units = dict.fromkeys(wind.names, DisplayUnit(unit="m/s", factor=1.0))
     return time_series_figure(context._replace(units=units), {"wind": Curve(wind, WIND)})
 
 
@@ -541,7 +547,7 @@ def tick_figure(context: PlotContext) -> Figure | None:
     if not (ticks["late"].any() or ticks["age"].any() or np.unique(steps).size > 1):
         return None
     signal = Signal(ticks.stamp_ns, channels, np.stack([ticks[name] for name in channels]).T)
-    units = dict.fromkeys(channels, DisplayUnit("ms", 1e3))
+    units = dict.fromkeys(channels, DisplayUnit(unit="ms", factor=1e3))
     return time_series_figure(
         context._replace(units=units), {"ticks": Curve(signal, PLANT, 1.0)}, height=100
     )

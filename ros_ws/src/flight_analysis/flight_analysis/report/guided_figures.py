@@ -225,7 +225,7 @@ def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figur
     )
     commands = {"altitude": commanded, AIRSPEED: log["V_c"]}
     values = {"altitude": log["pose.altitude"], AIRSPEED: flown_speed(context.tape, speed)}
-    units = {**context.units, AIRSPEED: DisplayUnit("m/s", 1.0)}
+    units = {**context.units, AIRSPEED: DisplayUnit(unit="m/s", factor=1.0)}
     limits = {**bounds, AIRSPEED: bounds["V"]} if "V" in bounds else bounds
     return _over_commands(context._replace(units=units), commands, values, limits)
 

@@ -150,11 +150,11 @@ def draw_channel(
         plot(
             first.tape, first.tape["y_m"], color=REFERENCE, linewidth=3.0 * line_width, label="y_m"
         )
-    for label, (tape, _, colour) in runs_of(flights).items():
+    for label, run in runs_of(flights).items():
         if is_error:
-            signal: Signal | None = best_error(tape)[1]
+            signal: Signal | None = best_error(run.tape)[1]
         else:
-            signal = tape.signals.get("y" if is_output else "u")
+            signal = run.tape.signals.get("y" if is_output else "u")
         if signal is None or channel not in signal.names:
             continue
         style = {} if is_output else {"drawstyle": "steps-post"}
@@ -162,7 +162,7 @@ def draw_channel(
         legend = label
         if len(flights) == 1:
             legend = "y" if is_output and not is_error else ""
-        plot(tape, signal, color=colour, linewidth=line_width, label=legend, **style)
+        plot(run.tape, signal, color=run.colour, linewidth=line_width, label=legend, **style)
     label = channel_label(channel, units)
     if is_error:
         label = f"{best_error(first.tape)[0]} of {label}"

@@ -149,7 +149,8 @@ class Interval:
     labelled: bool  # with a label over the interval, else in the legend
 
 
-class Run(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Run:
     """A flight of a figure."""
 
     tape: Tape
@@ -290,18 +291,18 @@ def time_series_figure(
     figure = Figure(len(channels), columns, height)
     followed = (figure.rows - 1) * columns
     for index, channel in enumerate(channels):
-        unit, factor = context.units.get(channel, NO_UNIT)
+        unit = context.units.get(channel, NO_UNIT)
         for label, curve in curves.items():
             if channel in curve.signal.names:
-                trace = _trace(context, curve, channel, factor, MAX_POINTS // columns)
-                values = curve.signal[channel] * factor
+                trace = _trace(context, curve, channel, unit.factor, MAX_POINTS // columns)
+                values = curve.signal[channel] * unit.factor
                 in_legend = len(curves) > 1 and first_in_legend(figure, label)
                 trace |= {
                     "name": label,
                     # If a legend has one group, plotly stacks its entries.
                     "legendgroup": label if len(curves) > 1 else "",
                     "showlegend": in_legend,
-                    "hovertemplate": f"%{{y:.4g}} {unit}",
+                    "hovertemplate": f"%{{y:.4g}} {unit.unit}",
                 }
                 figure.add(trace, index, values)
         title = labels.get(channel) or channel_label(channel, context.units)

@@ -4,6 +4,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from itertools import chain, count
@@ -32,7 +33,8 @@ class File(NamedTuple):
     write: Callable[[Path, Sequence[RecordedFlight]], object]
 
 
-class Report(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Report:
     """A report that has been written.
 
     Attributes:
@@ -135,7 +137,7 @@ def report(
     for file in files:
         with writing(file.key, file.path, A_FILE):
             file.write(file.path, flights)
-    return Report(page, flights)
+    return Report(page=page, flights=flights)
 
 
 def _comparison_folder(first: Path) -> Path:

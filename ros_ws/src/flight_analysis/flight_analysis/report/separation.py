@@ -3,6 +3,7 @@
 """Find how near the aircraft of a fleet came to each other."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
@@ -29,7 +30,8 @@ class Track(NamedTuple):
     origin: tuple[float, ...] | None = None  # of the map
 
 
-class Approach(NamedTuple):
+@dataclass(frozen=True, kw_only=True, order=True)
+class Approach:
     """The least distance of two aircraft, m, and its stamp."""
 
     distance: float
@@ -69,7 +71,7 @@ def approach(first: Signal, second: Signal) -> Approach | None:
     nearest = np.append(np.linalg.norm(d[:-1] + part[:, None] * v, axis=1), np.linalg.norm(d[-1]))
     k = int(np.argmin(nearest))
     at_ns = int(stamps[k]) + (round(part[k] * float(t[k + 1] - t[k])) if k < len(part) else 0)
-    return Approach(float(nearest[k]), at_ns)
+    return Approach(distance=float(nearest[k]), at_ns=at_ns)
 
 
 def _at(signal: Signal, t: FloatArray, begin_ns: int) -> FloatArray:
@@ -92,15 +94,16 @@ def separation_shortfalls(tracks: Mapping[str, Track], least: float) -> dict[str
                 near.setdefault(name, {})[companion] = found
     shortfalls = {}
     for name, approaches in near.items():
-        other, (distance, at_ns) = min(approaches.items(), key=lambda pair: pair[1])
-        time = seconds(at_ns - tracks[name].start_ns)
+        other, closest = min(approaches.items(), key=lambda pair: pair[1])
+        time = seconds(closest.at_ns - tracks[name].start_ns)
         more = f", nearer than that to {len(approaches)} aircraft" if len(approaches) > 1 else ""
         shortfalls[name] = Shortfall(
             aim=Aim.SEPARATION,
-            sentence=f"{distance:.3g} m from {other} at t = {time:.2f} s, {least:g} m asked{more}",
+            sentence=f"{closest.distance:.3g} m from {other} at t = {time:.2f} s, "
+            f"{least:g} m asked{more}",
             figures={
                 "other": other,
-                "distance": distance,
+                "distance": closest.distance,
                 "time": time,
                 "least": least,
                 "count": len(approaches),

@@ -359,7 +359,12 @@ def _commands(tape: Tape, events: Sequence[Transient], end: float) -> Commands:
         tape.recording[topic].found for topic in ("target", "route") if topic in tape.recording
     )
     steps_taken = int(np.count_nonzero(tape["guidance"]["given"])) if "guidance" in tape else 0
-    return Commands(len(commands), sum(start <= end for start in commands), targets, steps_taken)
+    return Commands(
+        given=len(commands),
+        flown=sum(start <= end for start in commands),
+        targets=targets,
+        taken=steps_taken,
+    )
 
 
 def command_results(summary: Mapping[str, Any]) -> str:
@@ -370,14 +375,17 @@ def command_results(summary: Mapping[str, Any]) -> str:
     flight_account = account_of_json(summary)
     if flight_account is None or flight_account.commands is None:
         return ""
-    planned, flown, targets, steps_taken = flight_account.commands
-    if flown < planned:
-        parts = [f"{flown} of {planned} commands flown{taken_over(summary, 'commands')}"]
+    commands = flight_account.commands
+    if commands.flown < commands.given:
+        parts = [
+            f"{commands.flown} of {commands.given} commands flown{taken_over(summary, 'commands')}"
+        ]
     else:
         parts = []
-    if targets:
+    if commands.targets:
         parts.append(
-            f"{targets} targets and routes given, guidance took commands in {steps_taken} steps"
+            f"{commands.targets} targets and routes given, guidance took commands in "
+            f"{commands.taken} steps"
         )
     return "; ".join(parts)
 

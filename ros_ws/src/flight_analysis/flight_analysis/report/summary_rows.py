@@ -20,7 +20,7 @@ from flight_analysis.report.display_units import (
     format_value,
 )
 
-MILLISECONDS = DisplayUnit("ms", 1e3)
+MILLISECONDS = DisplayUnit(unit="ms", factor=1e3)
 
 
 @dataclass(frozen=True, kw_only=True)
