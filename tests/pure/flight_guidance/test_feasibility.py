@@ -90,7 +90,9 @@ def test_altitude_beyond_climb_flown_on_circles(altitude: float, side: str, rate
         CORNER[1]._replace(altitude=altitude),
         CORNER[2]._replace(altitude=altitude),
     )
-    legs, waypoints, (note,) = flyable(route, RADIUS, PERIOD, CAN)
+    flown = flyable(route, RADIUS, PERIOD, CAN)
+    legs = flown.legs
+    (note,) = flown.notes
     reach = math.floor(rate * STRAIGHT / 50.0)  # the straight part, with the wind from behind
     assert note.startswith(
         f"route[1]: 300 m {side} the waypoint before, flown on circles round the waypoint"
@@ -98,7 +100,10 @@ def test_altitude_beyond_climb_flown_on_circles(altitude: float, side: str, rate
     assert note.endswith(f"takes {reach} m")
     circles = [leg for leg in legs[:-1] if isinstance(leg, Arc) and leg.loiter]
     assert [circle.centre for circle in circles] == [route[0 if altitude > 1000.0 else 1].point]
-    assert [waypoint.departure for waypoint in waypoints[:2]] == [max(altitude, 1000.0), altitude]
+    assert [waypoint.departure for waypoint in flown.waypoints[:2]] == [
+        max(altitude, 1000.0),
+        altitude,
+    ]
     # A scenario writes each waypoint so.
     named = tuple(waypoint._replace(leave=waypoint.altitude) for waypoint in route)
     assert flyable(named, RADIUS, PERIOD, CAN).legs == legs
@@ -120,8 +125,10 @@ def test_waypoint_of_short_leg_left_out_where_route_passes_near() -> None:
         Waypoint(4200, 200, 0),
         Waypoint(4200, 4000, 0),
     )
-    legs, waypoints, (note,) = flyable(near, RADIUS, PERIOD, CAN)
-    assert len(waypoints) == 3
+    flown = flyable(near, RADIUS, PERIOD, CAN)
+    legs = flown.legs
+    (note,) = flown.notes
+    assert len(flown.waypoints) == 3
     match = re.search(r"route\[(\d)\]: corner cut, (\d+) m from the waypoint", note)
     assert match
     point = near[int(match[1])].point

@@ -7,6 +7,7 @@ They become rise_di_parameters.h, or the bytes of struct rise_di_parameters.
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -91,7 +92,8 @@ class Constant(NamedTuple):
     value: int | tuple[int, ...] | FloatArray
 
 
-class Sizes(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
     """The dimensions of the exported controller.
 
     They are 0 without an allocation, a feedforward or an observer.
@@ -326,7 +328,8 @@ def header(
 
 def _names_and_sizes(controller: RiseDiConfig, r: int, samples: int, *, float32: bool) -> list[str]:
     """Write the lines with the names of the channels, the dimensions, and what is compiled."""
-    m, p, n, s, schedule = sizes(controller)
+    dimensions = sizes(controller)
+    m, p, n, s = dimensions.m, dimensions.p, dimensions.n, dimensions.s
     effectors = [f"#define RISE_DI_EFFECTORS {_strings(controller.effectors)}"] if p else []
     return [
         f"#define RISE_DI_OUTPUTS {_strings(controller.outputs)}",
@@ -338,8 +341,8 @@ def _names_and_sizes(controller: RiseDiConfig, r: int, samples: int, *, float32:
         f"#define RISE_DI_S {s} /* estimates of the observer, 0: no observer */",
         f"#define RISE_DI_R {r} /* states of the reference model, 0: no reference model */",
         (
-            f"#define RISE_DI_SCHEDULE {int(schedule)} /* 1: input_scale follows the dynamic "
-            "pressure */"
+            f"#define RISE_DI_SCHEDULE {int(dimensions.schedule)} /* 1: input_scale follows the "
+            "dynamic pressure */"
         ),
         f"#define RISE_DI_FLOAT32 {int(float32)} /* 0: rise_di_real is double, 1: float */",
         f"#define RISE_DI_SAMPLES {samples} /* samples kept of y and of y_m */",

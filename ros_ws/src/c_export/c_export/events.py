@@ -79,11 +79,12 @@ def event_type(m: int) -> np.dtype[np.void]:
 
 def real_groups(controller: RiseDiConfig) -> dict[str, int]:
     """Return the groups of reals in a state with their sizes, in the order of proof.c."""
-    m, p, n, s, schedule = sizes(controller)
+    dimensions = sizes(controller)
+    m, p, n, s = dimensions.m, dimensions.p, dimensions.n, dimensions.s
     groups = dict.fromkeys(("u", "u_free", "u_trim", "u_ff", "u_failsafe"), m)
     groups |= {"effectors": p, "effectors_failsafe": p} if p else {}
     groups |= dict.fromkeys(("y", "y_m", "e_0", "e", "integral_e", "Pi"), m)
-    groups |= {"scale": m} if schedule else {}
+    groups |= {"scale": m} if dimensions.schedule else {}
     groups |= {"z": s, "u_o": m, "sigma": 1} if s else {}
     groups |= (
         {"feedforward.x": n, "feedforward.u": m, "feedforward.dt": 1, "feedforward.ticks": 1}

@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
@@ -43,7 +44,8 @@ FLOAT32_BOUND = 2.0**-10
 """
 
 
-class Difference(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Difference:
     """The first value of a recording that differs."""
 
     tick: int  # counts from 0
@@ -216,7 +218,10 @@ class Program:
             python = np.hstack([recording.integers[tick], recording.reals[tick]])
             c = np.hstack([integers[tick], reals[tick]])
             first = Difference(
-                tick, recording.names[column], float(python[column]), float(c[column])
+                tick=tick,
+                channel=recording.names[column],
+                python=float(python[column]),
+                c=float(c[column]),
             )
         u = recording.reals[:, :m]
         with np.errstate(over="ignore", invalid="ignore"):  # wrong C code may give any number
@@ -318,8 +323,11 @@ def proof_report(proof: Proof, scenario: str) -> str:
         ticks = f"{comparison.ticks} ticks, {comparison.values} values"
         lines.append(f"{comparison.name}{compiler}: {ticks}{difference}")
         if comparison.first is not None and not comparison.holds(float32=proof.float32):
-            tick, channel, python, c = comparison.first
-            lines.append(f"    first in tick {tick}: {channel} is {python!r} in Python, {c!r} in C")
+            first = comparison.first
+            lines.append(
+                f"    first in tick {first.tick}: {first.channel} is {first.python!r} in Python, "
+                f"{first.c!r} in C"
+            )
     lines += [
         "",
         *(f"{FIGURES[name]}: {proof.figures[name]}" for name in FIGURES if name in proof.figures),

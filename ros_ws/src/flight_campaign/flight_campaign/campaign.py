@@ -9,9 +9,10 @@ each chunk that is complete, and at the end its figures and its report.
 import logging
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import (
@@ -202,10 +203,11 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
     from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - as above
 
     definition = Definition.model_validate_json(text)
-    scenario, course, vehicle, law = _prepare(text, case)
+    shared = _prepare(text, case)
+    scenario, course, law = shared.scenario, shared.course, shared.law
     fleet_of_chunk = drawn_fleet(definition, scenario, first, size)  # while another chunk flies
     with turn():
-        fleet, equipped = fleet_of_chunk.on_device(course, vehicle)
+        fleet, equipped = fleet_of_chunk.on_device(course, shared.vehicle)
         flight_result = batch.fly(fleet, equipped, course, law.control_law, law.params)
         result = batch.on_host(flight_result)
     rms, largest, slew = (part[:, :count] for part in (result.rms, result.max, result.slew))
@@ -222,7 +224,8 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
     return Chunk(first, result.diverged[:count], figures, entries)
 
 
-class _Shared(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class _Shared:
     """What all chunks of a case share."""
 
     scenario: Scenario
@@ -240,10 +243,10 @@ def _prepare(text: str, case: int) -> _Shared:
     law = scenario.controller.tuned_law()
     course = build_course(scenario)
     return _Shared(
-        scenario,
-        course,
-        batch.vehicle(scenario),
-        law._replace(params=batch.shared(law.params)),
+        scenario=scenario,
+        course=course,
+        vehicle=batch.vehicle(scenario),
+        law=law._replace(params=batch.shared(law.params)),
     )
 
 

@@ -5,7 +5,7 @@
 A proof shows that C and Python give the same bits.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -121,7 +121,7 @@ def _as_json(exported: Exported) -> dict[str, Any]:
     if proof is None:
         return {**files, "proved": None}
     comparisons = [
-        {**comparison._asdict(), "first": comparison.first and comparison.first._asdict()}
+        {**comparison._asdict(), "first": comparison.first and asdict(comparison.first)}
         for comparison in proof.comparisons
     ]
     return {

@@ -99,24 +99,24 @@ class Import:
         vehicle_log = read_foreign_log(self.log, choice)
         show = partial(_show_agreement, console)
         window = Window(self.start, self.stop)
-        tape, parameters, notes = imported(
-            channel_map, vehicle_log, window, show, servos=self.servos
-        )
+        taken = imported(channel_map, vehicle_log, window, show, servos=self.servos)
         source = {"log": self.log.name, "kind": vehicle_log.kind, "map": channel_map.name}
         units = {name: UNITS[row.motion[0]] for name, row in channel_map.outputs.items()}
-        records = {IMPORTED: {**source, COMPARED: "; ".join(notes)}, CHANNEL_UNITS: units}
+        records = {IMPORTED: {**source, COMPARED: "; ".join(taken.notes)}, CHANNEL_UNITS: units}
         with writing("--output", folder, "a folder that can"):
             folder.mkdir(parents=True)
-            write_file(folder / PARAMETERS, dump_yaml(dict(sorted(parameters.items())), flow=False))
+            write_file(
+                folder / PARAMETERS, dump_yaml(dict(sorted(taken.parameters.items())), flow=False)
+            )
             write_file(folder / PROVENANCE, dump_yaml(provenance() | records, flow=False))
         files = (folder / PARAMETERS, find_map(map_name))
-        bag = write_run(tape, folder, LogAttachments(None, files, folder / PROVENANCE))
-        for sentence in notes:
+        bag = write_run(taken.tape, folder, LogAttachments(None, files, folder / PROVENANCE))
+        for sentence in taken.notes:
             warn(f"warning: {sentence}")
-        _show_topics(console, f"{self.log.name}, {vehicle_log.kind}", tape)
+        _show_topics(console, f"{self.log.name}, {vehicle_log.kind}", taken.tape)
         log_start_ns = vehicle_log.start_ns(channel_map.outputs[channel_map.instant].motion[0])
-        begin = (tape.start_ns - log_start_ns) / NANOSECONDS
-        length = (int(tape["y"].stamp_ns[-1]) - tape.start_ns) / NANOSECONDS
+        begin = (taken.tape.start_ns - log_start_ns) / NANOSECONDS
+        length = (int(taken.tape["y"].stamp_ns[-1]) - taken.tape.start_ns) / NANOSECONDS
         say(
             console,
             f"taken: {begin:.1f} to {begin + length:.1f} s of the log\nlog:   {display_path(bag)}",

@@ -7,6 +7,7 @@ The refusal names the nearest feasible value.
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -52,7 +53,8 @@ def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
     return tuple(leg_speeds)
 
 
-class FlyableRoute(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class FlyableRoute:
     """The legs of a route, and the waypoints that they fly.
 
     Waypoints that are cut are missing, and steep legs have loiters.
@@ -244,7 +246,7 @@ def _with_circles(
             sentences.append(f"route[{numbers[k]}]: {difference}, flown on circles {where}")
             break
         else:
-            return FlyableRoute(legs, tuple(waypoints), tuple(sentences))
+            return FlyableRoute(legs=legs, waypoints=tuple(waypoints), notes=tuple(sentences))
 
 
 def require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:

@@ -290,13 +290,19 @@ class GuidanceConfig(SteeringConfig):
         ]
         # `flyable` refuses an empty route.
         radius = max(radii, default=0.0)
-        legs, waypoints, notes = flyable(
+        flown = flyable(
             tuple(waypoints),
             self.radius or math.ceil(radius),
             self.period or self.least_period(),
             can,
         )
-        return as_route(legs, waypoints, self.speed, slopes=self.profile == "slope", notes=notes)
+        return as_route(
+            flown.legs,
+            flown.waypoints,
+            self.speed,
+            slopes=self.profile == "slope",
+            notes=flown.notes,
+        )
 
     def landing_on(self, route: Route) -> Landing | None:
         """Find the landing at the end of a line of a route; None if there is none.

@@ -5,7 +5,8 @@
 The agent takes the place of the controller, and a step is a tick.
 """
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,7 +39,8 @@ import gymnasium  # noqa: E402 - an extra
 UNLIMITED = 1.0
 
 
-class _Channels(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class _Channels:
     """The spaces of an aircraft, and the units of the score by output."""
 
     action: gymnasium.spaces.Space[FloatArray]
@@ -59,9 +61,9 @@ def _channels(scenario: Scenario) -> _Channels:
     )
     beyond = np.tile(largest(controller.outputs), 2)
     return _Channels(
-        gymnasium.spaces.Box(low, high, dtype=np.float64),
-        gymnasium.spaces.Box(-beyond, beyond, dtype=np.float64),
-        score_units(controller.outputs, scenario.aircraft.channels().outputs),
+        action=gymnasium.spaces.Box(low, high, dtype=np.float64),
+        observation=gymnasium.spaces.Box(-beyond, beyond, dtype=np.float64),
+        units=score_units(controller.outputs, scenario.aircraft.channels().outputs),
     )
 
 
@@ -182,7 +184,10 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         )
         self.outputs = controller.outputs
         self.inputs = controller.effectors
-        self.action_space, self.observation_space, self._units = _channels(scenario)
+        channels = _channels(scenario)
+        self.action_space = channels.action
+        self.observation_space = channels.observation
+        self._units = channels.units
         self.metadata = {**self.metadata, "render_fps": controller.rate}
         self._period = 1.0 / controller.rate
         self._period_ns = nanoseconds(self._period)
@@ -339,19 +344,21 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         self._vehicle = batch.vehicle(plain)
         self._assemble = batch_matrices.assemble
         self._stepper = batch.FleetStepper
-        self.single_action_space, self.single_observation_space, units = _channels(self.scenario)
+        channels = _channels(self.scenario)
+        self.single_action_space = channels.action
+        self.single_observation_space = channels.observation
         self.action_space = gymnasium.vector.utils.batch_space(
             self.single_action_space, self.num_envs
         )
         self.observation_space = gymnasium.vector.utils.batch_space(
             self.single_observation_space, self.num_envs
         )
-        self._units = units[:, None]
+        self._units = channels.units[:, None]
         self._largest = largest(scenario.controller.outputs)[:, None]
         self._k = 0
         self._last = 0
         self._y, self._ended = (
-            np.zeros((len(units), self.num_envs)),
+            np.zeros((len(self._units), self.num_envs)),
             np.zeros(self.num_envs, dtype=bool),
         )
 

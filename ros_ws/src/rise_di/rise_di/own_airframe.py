@@ -7,8 +7,9 @@
 
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,7 +37,8 @@ ANGLE_OF_GUST = {"lateral": "sideslip", "vertical": "angle of attack"}  # that a
 SAMPLES = 20  # uncertain airframes for the bounds of the theorem
 
 
-class NewAirframe(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class NewAirframe:
     """An airframe that was written.
 
     Attributes:
@@ -162,7 +164,13 @@ def new_airframe(
             write_file(files[0], text_of_airframe)
         write_file(files[1], scenario)
     note = sentences(note, _pairing_sentence(airframe))
-    return NewAirframe(*files, airframe, note, shortfall)
+    return NewAirframe(
+        airframe_file=files[0],
+        scenario_file=files[1],
+        airframe=airframe,
+        note=note,
+        shortfall=shortfall,
+    )
 
 
 def _pairing_sentence(airframe: Airframe) -> str | None:

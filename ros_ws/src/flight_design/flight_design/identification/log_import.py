@@ -3,6 +3,7 @@
 """Import y, u and pose by a channel map, from an autopilot's log that the stack did not fly."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -61,7 +62,8 @@ class Window(NamedTuple):
     stop: float | None
 
 
-class Imported(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Imported:
     """The tape of a log, and what is known of its autopilot.
 
     The parameters of the autopilot are those at the first sample. The notes are sentences on what
@@ -106,7 +108,7 @@ def imported(
     except ParameterError as error:
         raise ParameterError("; ".join([str(error), *losses])) from None
     gaps = [gap_sentence(name, flight.tape[name].stamp_ns, start_ns) for name in ("y", "u")]
-    return flight._replace(notes=(*losses, *filter(None, gaps), *flight.notes))
+    return replace(flight, notes=(*losses, *filter(None, gaps), *flight.notes))
 
 
 def _imported(
@@ -154,7 +156,7 @@ def _imported(
     except ParameterError as error:
         raise ParameterError("; ".join([str(error), *filter(None, notes)])) from None
     tape = _tape(channel_map, log, sources, readers, taken)
-    return Imported(tape, parameters, tuple(filter(None, notes)))
+    return Imported(tape=tape, parameters=parameters, notes=tuple(filter(None, notes)))
 
 
 def _require_kind(vehicle: str, channel_map: ChannelMap) -> None:

@@ -4,7 +4,8 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 from flight_core.parameters import require
 from flight_guidance.routes.route_places import Above, HomePlace, Place, Places
@@ -61,7 +62,8 @@ LAST = (UNLIMITED, 20, LAND, 85)
 OTHER_WAYS = (34, 35, 36, 94)  # other ways to a place, neither a line nor a loiter
 
 
-class Item(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Item:
     """An item of a mission."""
 
     name: str  # "NAV_LAND (item 5)"
@@ -104,26 +106,26 @@ def _in_order(key: str, items: Sequence[Item]) -> list[int]:
     k = steps = 0
     while k < len(items) and not (order and items[order[-1]].command in LAST):
         place = k
-        name, _, command, params, *_ = items[place]
+        item = items[place]
         k += 1
         steps += 1
         require(
             steps <= MOST_ITEMS,
             key,
-            f"more than {MOST_ITEMS} items by the repetitions of {name}",
+            f"more than {MOST_ITEMS} items by the repetitions of {item.name}",
             "fewer",
         )
-        if command != JUMP:
+        if item.command != JUMP:
             order.append(place)
             continue
-        target = params[0]
-        count = -0.5 if params[1] is None else float(params[1])
+        target = item.params[0]
+        count = -0.5 if item.params[1] is None else float(item.params[1])
         if not count:
             continue
         require(
             target in places and count.is_integer(),
             key,
-            f"{name} to {target}",
+            f"{item.name} to {target}",
             "a jump to an item, a whole number of times",
         )
         if count < 0.0 and places[target] <= place:
@@ -132,7 +134,7 @@ def _in_order(key: str, items: Sequence[Item]) -> list[int]:
         require(
             count < 0.0 or remaining >= 0.0,
             key,
-            f"{name}, a loop inside of a loop",
+            f"{item.name}, a loop inside of a loop",
             "loops one after the other",
         )
         repetitions[place] = remaining - 1.0 if count > 0.0 else count

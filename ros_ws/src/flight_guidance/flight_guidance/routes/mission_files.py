@@ -210,7 +210,11 @@ def wpl_items(content: bytes, key: str) -> tuple[list[Item], HomePlace | None]:
         )
         # ArduPilot's item 0 is the home
         if index == 0 and frame == 0 and command == WAYPOINT and not items:
-            home = HomePlace(*params[4:7]) if params[4] or params[5] else None
+            home = (
+                HomePlace(latitude=params[4], longitude=params[5], altitude=params[6])
+                if params[4] or params[5]
+                else None
+            )
             continue
         items.append(
             Item(
@@ -388,7 +392,11 @@ def home_of(position: Any) -> HomePlace | None:
     """Read the home from latitude, longitude and perhaps altitude; None for anything else."""
     if not is_position(position) or not all(isinstance(value, int | float) for value in position):
         return None
-    return HomePlace(position[0], position[1], position[2] if len(position) == 3 else None)
+    return HomePlace(
+        latitude=position[0],
+        longitude=position[1],
+        altitude=position[2] if len(position) == 3 else None,
+    )
 
 
 MOST_CORNERS = 10_000

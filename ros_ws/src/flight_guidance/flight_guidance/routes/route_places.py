@@ -4,6 +4,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import Enum
 from itertools import chain
 from typing import Any, NamedTuple
@@ -40,7 +41,8 @@ class Place(NamedTuple):
     left: bool | None = None  # whether circles are counter-clockwise; None: not said
 
 
-class HomePlace(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class HomePlace:
     """The home of a mission."""
 
     latitude: float  # deg
