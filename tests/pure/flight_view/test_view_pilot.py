@@ -115,7 +115,7 @@ def test_all_values_are_above_the_fold_of_a_small_laptop(browser: Browser, route
             f"one.getBoundingClientRect().bottom <= {fold}).map(one => "
             "one.getAttribute('aria-label'))"
         )
-        assert titles[:2] == ["altitude", "V - 25: y over y_m"]
+        assert titles[:2] == ["altitude", "V: y over y_m"]
     wide(browser, 1280)
 
 

@@ -143,13 +143,7 @@ def new_airframe(
     source_is_target = (
         isinstance(source, str | Path) and Path(source).absolute() == files[0].absolute()
     )
-    for path in files[source_is_target:]:
-        require(
-            replace or not path.exists(),
-            "folder",
-            f"{path}, which exists",
-            "a new file, or replace",
-        )
+    _require_free(files[source_is_target:], replace=replace)
     if lag is None:
         lags = first_flight.default_lags(airframe)
     else:
@@ -171,6 +165,17 @@ def new_airframe(
         note=note,
         shortfall=shortfall,
     )
+
+
+def _require_free(files: Sequence[Path], *, replace: bool) -> None:
+    """Raise ParameterError if a file exists and must not be replaced."""
+    for path in files:
+        require(
+            replace or not path.exists(),
+            "folder",
+            f"{path}, which exists",
+            "a new file, or replace",
+        )
 
 
 def _pairing_sentence(airframe: Airframe) -> str | None:

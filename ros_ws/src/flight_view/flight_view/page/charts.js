@@ -2,10 +2,13 @@
 import {MODE_COLOURS, prepared} from "./canvas.js";
 import {ON_ROUTE} from "./scene.js";
 import {indexAt} from "./series.js";
+import {fixed} from "./units.js";
 
 const LEFT = 58, RIGHT = 10, LINE = 15, BOTTOM = 4;
 const NARROW = 500; // px, width below which the readouts have a line of their own
-const NOISE = 1e-4; // of the extent of a chart: a value below reads 0
+const SHOWN = 0.01; // of the extent of a chart: about the last digit of a readout
+const MOST_DIGITS = 6; // behind the point
+const LEAST_SPEED = 0.5; // m/s beyond the airspeeds in view, so that noise does not fill the chart
 const RESOLUTION = {ms: 1e-3, deg: 1e-4, "m/s": 1e-4, m: 1e-3, "deg/s": 1e-3, "rad/s": 1e-6}; // by unit, the least extent of a chart
 const LIMIT_VIEW_RATIO = 3; // a limit is in view where it is at most this many times the largest value
 
@@ -19,11 +22,11 @@ export function ticks(low, high, most) {
   return found;
 }
 
-// A number as a readout: four digits, 0 below the noise of a chart of that extent, "-" without a value.
+// A number as a readout: with the digits behind the point that a chart of this extent shows, so that it keeps its width; "-" without a value.
 export function readout(value, largest) {
   if (!Number.isFinite(value)) return "-";
-  if (Math.abs(value) < NOISE * largest) return "0";
-  return Math.abs(value) >= 1e4 ? value.toFixed(0) : value.toPrecision(4);
+  const digits = largest > 0 ? Math.round(-Math.log10(SHOWN * largest)) : 0;
+  return fixed(value, Math.min(Math.max(digits, 0), MOST_DIGITS));
 }
 
 // Rows of a series to draw between two times: all, or the rows of the minimum and the maximum of each of `bins` bins; a gap ends a bin.
@@ -75,7 +78,7 @@ export function chartOf(flight, channels) {
   const [unit] = channels.map(name => known(name).unit);
   const lines = channels.map((name, k) => {
     const [topic, channel] = [name.slice(0, name.indexOf("/")), name.slice(name.indexOf("/") + 1)];
-    return {flight, topic, channel, label: name, colour: COLOURS[k % COLOURS.length], width: 1.4, factor: known(name).unit === unit ? known(name).factor : 1};
+    return {flight, topic, channel, label: name, colour: COLOURS[k % COLOURS.length], width: 1.4, offset: 0, factor: known(name).unit === unit ? known(name).factor : 1};
   });
   return {title: channels.join(", "), unit: channels.every(name => known(name).unit === unit) ? unit : "", lines, channels};
 }
@@ -84,7 +87,7 @@ export function chartOf(flight, channels) {
 export function chartsOf(flight, ghost) {
   const {units, limits} = flight.info;
   const unit = name => units[name] ?? {unit: "", factor: 1};
-  const line = (topic, channel, label, colour, width, more = {}) => ({flight, topic, channel, label, colour, width, factor: 1, ...more});
+  const line = (topic, channel, label, colour, width, more = {}) => ({flight, topic, channel, label, colour, width, factor: 1, offset: 0, ...more});
   const charts = guidanceCharts(flight, line), first = []; // a pilot's charts, altitude and speed
   if (flight.get("pose")?.channels.includes("altitude")) {
     const lines = [line("pose", "altitude", "altitude", "--plant", 1.4)];
@@ -95,15 +98,15 @@ export function chartsOf(flight, ghost) {
   const names = group => flight.get("internals")?.group(group) ?? [];
   const outputs = names("y").length ? names("y") : flight.get("y")?.channels ?? [];
   for (const name of outputs) {
-    const factor = unit(name).factor;
+    const isSpeed = name === "V", factor = unit(name).factor;
+    const offset = (isSpeed && flight.info.speed) || 0; // y is about trim, and a pilot reads the airspeed itself, as on the tape
     const lines = [
-      line(...timed(flight, `y_m.${name}`), "y_m", "--reference", 4, {factor}),
-      line(...timed(flight, `y.${name}`), "y", "--plant", 1.4, {factor}),
+      line(...timed(flight, `y_m.${name}`), "y_m", "--reference", 4, {factor, offset}),
+      line(...timed(flight, `y.${name}`), "y", "--plant", 1.4, {factor, offset}),
     ];
-    if (ghost) lines.splice(1, 0, line(...timed(ghost, `y.${name}`), "y of the ghost", "--ghost", 1.2, {factor, flight: ghost, dash: [5, 3]}));
+    if (ghost) lines.splice(1, 0, line(...timed(ghost, `y.${name}`), "y of the ghost", "--ghost", 1.2, {factor, offset, flight: ghost, dash: [5, 3]}));
     const referenced = names("y_m").length || flight.get("y_m");
-    const isSpeed = name === "V", label = isSpeed && flight.info.speed ? `V - ${Number(flight.info.speed.toPrecision(4))}` : name; // about trim
-    (isSpeed ? first : charts).push({title: referenced ? `${label}: y over y_m` : label, unit: unit(name).unit, lines});
+    (isSpeed ? first : charts).push({title: referenced ? `${name}: y over y_m` : name, unit: unit(name).unit, lines, least: isSpeed ? LEAST_SPEED : 0});
   }
   for (const name of names("e")) {
     const {factor, unit: text} = unit(name), band = flight.head.bands[name];
@@ -145,7 +148,7 @@ function guidanceCharts(flight, line) { // attitude over its command, and the di
     charts.push({title: `${name} over its command`, unit: "deg", lines});
   }
   if (guidance.channels.includes("wind.north")) {
-    const lines = [line("guidance", "wind.north", "to the north", "--plant", 1.4), line("guidance", "wind.east", "to the east", "--error", 1.4)];
+    const lines = [["north", "--plant"], ["east", "--error"]].map(([side, colour]) => line("guidance", `wind.${side}`, `from the ${side}`, colour, 1.4, {factor: -1})); // as pilots say it
     charts.push({title: "wind, estimated", unit: "m/s", lines});
   }
   if (guidance.channels.includes("xtrack")) charts.push({title: "cross-track", unit: "m", lines: [line("guidance", "xtrack", "cross-track", "--error", 1.2)]});
@@ -160,7 +163,7 @@ function extent(chart, view, bins) { // the decimated lines, and the least and l
     if (!column || !series.count) continue;
     const chosen = rows(series, column, view, bins), deviation = series.column(line.deviation);
     for (const k of chosen) {
-      const value = column[k] * line.factor, spread = deviation ? 2 * deviation[k] : 0;
+      const value = column[k] * line.factor + line.offset, spread = deviation ? 2 * deviation[k] : 0;
       if ((deviation || series.t[k] >= view[0] - 1) && Number.isFinite(value + spread)) { low = Math.min(low, value - spread); high = Math.max(high, value + spread); }
     }
     drawn.push({line, series, column, chosen});
@@ -171,7 +174,7 @@ function extent(chart, view, bins) { // the decimated lines, and the least and l
     if (Math.abs(bound) <= LIMIT_VIEW_RATIO * largest) { low = Math.min(low, bound); high = Math.max(high, bound); }
   }
   if (chart.band && chart.band <= 3 * largest) { low = Math.min(low, -chart.band); high = Math.max(high, chart.band); }
-  const pad = Math.max((high - low) * 0.08, Math.abs(high) * 1e-3, RESOLUTION[chart.unit] ?? 1e-9);
+  const pad = Math.max((high - low) * 0.08, Math.abs(high) * 1e-3, chart.least ?? 0, RESOLUTION[chart.unit] ?? 1e-9);
   return {drawn, low: low - pad, high: high + pad};
 }
 
@@ -214,11 +217,11 @@ export function drawChart(canvas, chart, flight, view, cursor, {selection, point
     ctx.beginPath();
     let pen = false, before = chosen[0];
     for (const k of chosen) {
-      const value = column[k] * line.factor;
+      const value = column[k] * line.factor + line.offset;
       if (series.hasGap(before, k)) pen = false;
       before = k;
       if (!Number.isFinite(value)) { pen = false; continue; }
-      if (pen && line.steps) ctx.lineTo(x(series.t[k]), y(column[k - 1] * line.factor));
+      if (pen && line.steps) ctx.lineTo(x(series.t[k]), y(column[k - 1] * line.factor + line.offset));
       if (pen) ctx.lineTo(x(series.t[k]), y(value)); else ctx.moveTo(x(series.t[k]), y(value));
       pen = true;
     }
@@ -243,7 +246,7 @@ export function drawChart(canvas, chart, flight, view, cursor, {selection, point
   ctx.textAlign = "right";
   ctx.textBaseline = "middle";
   for (const {value, text} of marks) ctx.fillText(text, LEFT - 5, y(value));
-  drawTitle(ctx, chart, drawn, [cursor, pointer], Math.max(Math.abs(low), Math.abs(high)), width, colour);
+  drawTitle(ctx, chart, drawn, [cursor, pointer], [low, high], width, colour);
 }
 
 function drawLearned(ctx, line, series, column, chosen, x, y, end, colour) { // a value until the next identification; dashed where no model was proposed
@@ -276,7 +279,7 @@ function drawSaturation(ctx, chart, flight, view, x, top) { // marks where the c
 }
 
 // The title, and the values of each line: at the cursor, and at the pointer where there is one.
-function drawTitle(ctx, chart, drawn, [cursor, pointer], largest, width, colour) {
+function drawTitle(ctx, chart, drawn, [cursor, pointer], [low, high], width, colour) {
   ctx.textAlign = "left";
   ctx.textBaseline = "alphabetic";
   ctx.fillStyle = colour("--ink");
@@ -286,7 +289,7 @@ function drawTitle(ctx, chart, drawn, [cursor, pointer], largest, width, colour)
   ctx.fillText(title, LEFT, LINE - 3);
   ctx.font = "11px system-ui, sans-serif";
   const texts = drawn.map(({line, series}) => {
-    const at = t => readout(series.shown(line.channel, t) * line.factor, largest);
+    const at = t => readout(series.shown(line.channel, t) * line.factor + line.offset, high - low);
     const spread = line.deviation ? ` +- ${(2 * series.at(line.deviation, cursor)).toPrecision(2)}` : "";
     return `${line.label} ${at(cursor)}${spread}${pointer === null ? "" : ` | ${at(pointer)}`}`;
   });
@@ -304,10 +307,28 @@ function drawTitle(ctx, chart, drawn, [cursor, pointer], largest, width, colour)
   }
 }
 
+// The axis of time under the charts, for the view.
+export function drawAxis(canvas, [from, to], cursor, colour) {
+  const {ctx, width, height} = prepared(canvas), x = t => LEFT + ((t - from) / (to - from)) * (width - LEFT - RIGHT);
+  ctx.strokeStyle = ctx.fillStyle = colour("--quiet");
+  ctx.font = "11px system-ui, sans-serif";
+  ctx.textBaseline = "alphabetic";
+  stroke(ctx, [[LEFT, 0.5], [width - RIGHT, 0.5]]);
+  for (const {value, text} of ticks(from, to, Math.max(width / 110, 2))) {
+    stroke(ctx, [[x(value), 0], [x(value), 4]]);
+    ctx.textAlign = x(value) > width - 2 * RIGHT ? "right" : "center";
+    ctx.fillText(`${text} s`, Math.min(x(value), width), height - 2);
+  }
+  if (cursor >= from && cursor <= to) {
+    ctx.fillStyle = colour("--ink");
+    ctx.fillRect(x(cursor) - 1, 0, 2, 6);
+  }
+}
+
 // The timeline: the mode of the controller over the whole flight, gusts, events, the view and the cursor.
 // Returns the numbers of the modes on it.
 export function drawTimeline(canvas, flight, [from, to], view, cursor, colour) {
-  const found = new Set(), {ctx, width, height} = prepared(canvas), x = t => LEFT / 6 + ((t - from) / (to - from)) * (width - LEFT / 3);
+  const found = new Set(), {ctx, width, height} = prepared(canvas), x = t => LEFT + ((t - from) / (to - from)) * (width - LEFT - RIGHT);
   const strip = height - 22;
   const internals = flight.get("internals"), modes = internals?.column("mode");
   ctx.fillStyle = colour("--panel");
@@ -370,4 +391,4 @@ function drawLegs(ctx, flight, [from, to], x, strip, colour) { // where a leg of
   }
 }
 
-export const timelineTime = (canvas, px, [from, to]) => from + ((px - LEFT / 6) / (canvas.clientWidth - LEFT / 3)) * (to - from);
+export const timelineTime = timeAt; // it lies under the charts

@@ -1,6 +1,6 @@
 // The page: asks the server for news, keeps the time and the view, draws what has changed.
 import {MODE_COLOURS} from "./canvas.js";
-import {chartsOf, drawChart, drawTimeline, modeColour, timeAt, timelineTime} from "./charts.js";
+import {chartsOf, drawAxis, drawChart, drawTimeline, modeColour, timeAt, timelineTime} from "./charts.js";
 import * as choice from "./choice.js";
 import {flyTo, offer, togglesFlyTo} from "./control.js";
 import {Flight} from "./data.js";
@@ -404,6 +404,7 @@ function frame(now) {
       const {top, bottom} = chart.canvas.getBoundingClientRect();
       if (bottom > 0 && top < innerHeight) drawChart(chart.canvas, chart, flight, shown, clock.t, {selection, pointer}, colour);
     }
+    drawAxis($("axis"), shown, clock.t, colour);
     drawModes(drawTimeline($("timeline"), flight, [begin(), Math.max(end(), begin() + 1)], shown, clock.t, colour));
     document.body.dataset.drawn = Number(document.body.dataset.drawn ?? 0) + 1;
   }

@@ -2,7 +2,7 @@
 import {windText} from "./units.js";
 
 const EDGE = 46; // px, that the mission keeps from the edge of the canvas
-const AIRCRAFT = 30; // px, drawn span
+export const AIRCRAFT = 30; // px, drawn span
 const FIRST_EXTENT = 200; // m, least extent of the map that shows everything
 const SAMPLED = 300; // places of the path that the extent is taken from
 const SCALE_BAR = 120; // px, longest

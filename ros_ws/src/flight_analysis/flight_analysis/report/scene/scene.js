@@ -1,7 +1,7 @@
 // The aircraft in three dimensions on a 2-D canvas, and the artificial horizon. No WebGL.
 // World: north, east, down (m). Body: forward, right, down. Angles in rad; matrices are rows.
 import {MODE_COLOURS, prepared} from "./canvas.js";
-import {drawGround, drawMarks, drawMission, drawOrbit, extentOf, Labels, mapped, mapSpan, takeMarks} from "./map.js";
+import {AIRCRAFT, drawGround, drawMarks, drawMission, drawOrbit, extentOf, Labels, mapped, mapSpan, takeMarks} from "./map.js";
 import {indexAt} from "./series.js";
 import {UNITS} from "./units.js";
 
@@ -216,6 +216,8 @@ export class Scene {
       this.aircraft(ctx, see, placed, deflections(beside.flight, beside.t), colour, beside.name ? 0.7 : 0.35);
       labels.add(beside.name, at.slice(0, 2), colour("--ghost"), {needed: true});
     }
+    const here = map && see(pose.place);
+    if (here) labels.take(here[0] - AIRCRAFT / 2, here[1] - AIRCRAFT / 2, AIRCRAFT, AIRCRAFT); // a number beside the aircraft, not under it
     const guidance = flight.get("guidance"), winds = ["wind.north", "wind.east"].map(name => guidance?.at(name, t) ?? NaN);
     const lateral = guidance?.at("mode.lateral", t);
     if (map) drawMission(ctx, see, labels, flight.info, lateral === ON_ROUTE ? guidance.at("leg", t) : -1, this.units, colour);
