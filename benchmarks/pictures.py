@@ -68,22 +68,17 @@ def flown(scenario: Scenario, folder: Path, name: str) -> Path:
 # ---- Pages
 
 
-def save(shots: Sequence[str], path: Path, shows: str, figures: str = "") -> None:
-    """Write screenshots, as base64, below each other, as a PNG of a third of their size.
+def save(shot: str, path: Path, shows: str, figures: str = "") -> None:
+    """Write a screenshot, as base64, as a PNG of a third of its size.
 
     `figures` of what it shows are kept as text, by which a test recognises a picture of another
     flight.
     """
-    parts = [Image.open(BytesIO(base64.b64decode(shot))).convert("RGB") for shot in shots]
-    whole = Image.new("RGB", (parts[0].width, sum(part.height for part in parts)))
-    top = 0
-    for part in parts:
-        whole.paste(part, (0, top))
-        top += part.height
+    picture = Image.open(BytesIO(base64.b64decode(shot))).convert("RGB")
     info = PngInfo()
     info.add_text(TITLE, shows)
     info.add_text(FIGURES, figures)
-    whole.quantize(COLOURS).save(path, optimize=True, pnginfo=info)
+    picture.quantize(COLOURS).save(path, optimize=True, pnginfo=info)
 
 
 def save_view(
@@ -113,14 +108,14 @@ def save_view(
             browser.wait_for(f"{DRAWN} > {before}")
         modes = browser.run("document.getElementById('modes').textContent")
         if modes == "ENGAGED":
-            save([browser.call("Page.captureScreenshot")["data"]], path, shows)
+            save(browser.call("Page.captureScreenshot")["data"], path, shows)
         else:
             print(f"{path.name}: left as it is, this host is too busy for its flight: {modes}")
         browser.open("about:blank")
 
 
 def report(path: Path, shows: str) -> None:
-    """Draw the page of the default flight: the title, the table of errors, y over y_m."""
+    """Draw the first screen of the page of the default flight, as it is."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
         run = flown(find_scenario(shows), Path(temporary), shows)
         errors = write_report(run).flight.summary["errors"]
@@ -129,25 +124,7 @@ def report(path: Path, shows: str) -> None:
             browser.call("Emulation.setDeviceMetricsOverride", **SCREEN)
             browser.open(run / REPORT)
             browser.wait_for(f"{DRAWN} === 1")
-            table = "document.querySelector('.tables > div').getBoundingClientRect().bottom"
-            below_errors = browser.run(table)
-            figure = browser.run(
-                "(one => { const {top, bottom} = one.closest('section').getBoundingClientRect();"
-                " return [top, bottom]; })(document.querySelector('figure[data-time]'))"
-            )
-            save(
-                [
-                    browser.call(
-                        "Page.captureScreenshot",
-                        captureBeyondViewport=True,
-                        clip={"x": 60, "y": top, "width": 1160, "height": low - top, "scale": 1},
-                    )["data"]
-                    for top, low in ((0.0, below_errors + 10.0), figure)
-                ],
-                path,
-                shows,
-                figures,
-            )
+            save(browser.call("Page.captureScreenshot")["data"], path, shows, figures)
 
 
 def view_ghost(path: Path, shows: str) -> None:
