@@ -103,6 +103,16 @@ def test_errors_of_flight_that_ended_early_are_shown_without_a_limit(
     assert all("not judged" in tile.text for tile in tiles)
 
 
+def test_errors_of_starved_flight_are_no_finding_and_its_spans_are_shaded(
+    servo: Scenario, tape: Tape
+) -> None:
+    flight = flown(servo, tape, host_starved("this host was too busy"))
+    assert [tile.has_limit for tile in tiles_of(flight)] == [False] * 4
+    flight.summary["account"]["starved"] = [(2.0, 8.0)]
+    shaded = figures.plot_context([flight]).intervals
+    assert ("host too busy", 2.0, 8.0) in [(each.label, each.start, each.stop) for each in shaded]
+
+
 def test_injected_fault_is_in_the_head(servo: Scenario, tape: Tape) -> None:
     faulty = servo.vary(aircraft={"actuators": {"faults": ["rudder lost 80"]}})
     verdict = verdict_of(flown(faulty, tape), faulty)

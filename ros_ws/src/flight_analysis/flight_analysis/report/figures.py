@@ -58,6 +58,7 @@ GUST = "#7f7f7f"
 END_STOP = "#8c8c8c"
 LIMIT = "#444444"
 NO_SAMPLE = "#5f6b73"
+STARVED = "#c98a2b"
 # Contrast of each line on its page: 3 to 1 at least, as WCAG 2.2 asks of graphics (1.4.11).
 # Okabe and Ito 2008, distinct to the colour blind too, without the orange that REFERENCE has;
 # lighter on a dark page
@@ -121,6 +122,7 @@ def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
         intervals += gust_intervals(longest, gusts)
     if len(flights) == 1:
         intervals += mode_intervals(longest, end * MIN_VISIBLE_FRACTION)
+        intervals += starved_intervals(flights[0])
         intervals += gap_intervals(longest)
     of_one = flights[0].message_times if len(flights) == 1 else []
     return PlotContext(
@@ -180,6 +182,15 @@ def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
             for start, stop in spans
         ]
     return intervals
+
+
+def starved_intervals(flight: RecordedFlight) -> list[Interval]:
+    """Return the spans in which the host was too busy for a flight in real time."""
+    spans = (flight.summary.get("account") or {}).get("starved", ())
+    return [
+        Interval(label="host too busy", start=start, stop=stop, colour=STARVED, labelled=False)
+        for start, stop in spans
+    ]
 
 
 def gap_intervals(tape: Tape) -> list[Interval]:

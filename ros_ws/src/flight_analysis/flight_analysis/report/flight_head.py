@@ -20,7 +20,7 @@ from flight_analysis.report.display_units import (
 )
 from flight_analysis.report.page import Colour, Step, Tile, Verdict
 from flight_analysis.report.sample_counts import is_simulated
-from flight_analysis.report.summary import RecordedFlight, command_results, time_flown
+from flight_analysis.report.summary import RecordedFlight, command_results
 from flight_core.outcome import STATUS_HOST, Aim, End
 from flight_log.clock import SINCE_EPOCH_NS
 
@@ -38,7 +38,10 @@ def meta_lines(flight: RecordedFlight, scenario: Scenario) -> list[str]:
     """Return when a flight was flown and how: airframe, law, length, speed and pace."""
     is_known = is_simulated(flight.tape) or "engagements" in flight.summary
     aircraft = scenario.aircraft.airframe if is_known else "an aircraft outside of the scenario"
-    parts = [f"{aircraft}, law {scenario.controller.law}", time_flown(flight.summary)]
+    parts = [
+        f"{aircraft}, law {scenario.controller.law}",
+        f"{format_seconds(flight.summary['duration'])} flown",
+    ]
     distance = guided.distance(flight.tape)
     if distance is not None:
         parts.append(f"{distance / 1e3:.2f} km over ground")
@@ -88,7 +91,7 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
     name = scenario_argument(scenario)
     if outcome["status"] == STATUS_HOST:
         headline = "No finding about the law."
-        texts.insert(0, sentence)
+        texts = [sentence, injected]
         colour = Colour.HOST
         step = Step(
             sentence="Fly the same without the clock:", command=f"rise-di fly {name} --lockstep"
@@ -166,11 +169,13 @@ def tiles_of(flight: RecordedFlight) -> list[Tile]:
     """Return a tile an output.
 
     It has the worst part of the flight beside what was allowed there. If the errors were not
-    judged, as in a flight that ended early, it has the error over the whole flight.
+    judged, as in a flight that ended early or that the host starved, it has the error over the
+    whole flight.
     """
     units = flight.units
-    worst = {figures["output"]: figures for figures in flight.summary["outcome"].get("errors", ())}
-    if worst:
+    outcome = flight.summary["outcome"]
+    worst = {figures["output"]: figures for figures in outcome.get("errors", ())}
+    if worst and outcome["status"] != STATUS_HOST:
         return [
             _judged_tile(worst[name], units.get(name, NO_UNIT)) for name in in_order(worst, units)
         ]
