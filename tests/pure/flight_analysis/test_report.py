@@ -21,7 +21,14 @@ from tests.recordings import EPOCH, MS, signal
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report import comparison, figures, guided_figures, html, plotting
+from flight_analysis.report import (
+    comparison,
+    figures,
+    guided_figures,
+    html,
+    intervals,
+    plotting,
+)
 from flight_analysis.report.display_units import DisplayUnit, display_units, state_units
 from flight_analysis.report.html import write_page
 from flight_analysis.report.plotting import Figure, PlotContext
@@ -199,7 +206,11 @@ def test_every_colour_of_page_has_dark_counterpart(
     tmp_path: Path, servo: Scenario, complete: Tape
 ) -> None:
     # Colours of modes, saturations and gusts serve light and dark pages alike.
-    shared = {*figures.MODE_COLOURS.values(), *figures.SATURATION_COLOURS.values(), figures.GUST}
+    shared = {
+        *intervals.MODE_COLOURS.values(),
+        *figures.SATURATION_COLOURS.values(),
+        intervals.GUST,
+    }
     specifications = re.findall(
         r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, complete)
     )
@@ -249,12 +260,12 @@ def test_faults_of_effectors_are_events_up_to_the_end(servo: Scenario) -> None:
 
 
 def test_every_mode_but_engaged_is_interval_with_name() -> None:
-    assert set(figures.MODE_COLOURS) == set(Mode) - {Mode.ENGAGED}
+    assert set(intervals.MODE_COLOURS) == set(Mode) - {Mode.ENGAGED}
     assert set(figures.SATURATION_COLOURS) == set(Saturation) - {Saturation.NO}
     modes = [mode for mode in Mode for _ in range(10)]
-    intervals = figures.mode_intervals(flight(60, internals=ticks(60, mode=modes)))
+    found = intervals.mode_intervals(flight(60, internals=ticks(60, mode=modes)))
     assert {interval.label: (round(interval.start, 3),
-    round(interval.stop, 3)) for interval in intervals} == {
+    round(interval.stop, 3)) for interval in found} == {
         "waiting": (0.0, 0.1), "hold": (0.2, 0.3), "ramp": (0.3, 0.4), "trim": (0.4, 0.5),
         "inactive": (0.5, 0.59),
     }  # fmt: skip
@@ -268,7 +279,7 @@ def test_legend_names_each_shade_and_message(columns: int) -> None:
     figure = drawn(plotting.time_series_figure(run, {"y": y}, columns=columns))
     shades = {shape.fillcolor for shape in figure.layout.shapes if shape.type == "rect"}
     named = [trace for trace in figure.data if trace.showlegend]
-    assert shades == set(figures.MODE_COLOURS.values())
+    assert shades == set(intervals.MODE_COLOURS.values())
     assert {trace.marker.color for trace in named if trace.mode == "markers"} >= shades
     assert "message of the log" in {trace.name for trace in named}
     # plotly stacks the entries of a legend where the curve alone has a group
@@ -276,8 +287,8 @@ def test_legend_names_each_shade_and_message(columns: int) -> None:
 
 
 def test_modes_of_guidance_and_controller_differ_in_colour() -> None:
-    colours = [*figures.MODE_COLOURS.values(), *guided_figures.MODE_SHADES.values()]
-    assert len({*colours, figures.GUST}) == len(colours) + 1
+    colours = [*intervals.MODE_COLOURS.values(), *guided_figures.MODE_SHADES.values()]
+    assert len({*colours, intervals.GUST}) == len(colours) + 1
 
 
 def test_spectrum_of_commanded_sine_has_peak_there() -> None:
@@ -401,7 +412,7 @@ def test_gust_that_comes_again_is_a_gust_each_time(servo: Scenario) -> None:
     gust = {"start": 1.0, "speed": 4.0, "length": 15.0, "every": 3.0}
     scenario = servo.vary(aircraft={"gusts": {"lateral": gust}}, flight={"duration": 9.0})
     assert [start for start, _ in scenario.gust_windows().values()] == [1.0, 4.0, 7.0]
-    listed = figures.gust_intervals(simulate(scenario), scenario.gust_windows())
+    listed = intervals.gust_intervals(simulate(scenario), scenario.gust_windows())
     assert [(each.label, each.start) for each in listed] == [
         ("lateral gust", 1.0),
         ("lateral gust", 4.0),
@@ -525,7 +536,7 @@ def test_sentence_on_the_sign_stands_at_the_law(tmp_path: Path, servo: Scenario)
     page = page_of(tmp_path, servo, simulate(servo.vary(flight={"duration": 1.0})))
     head, _, following = page.partition("<nav")
     assert "softened sign" not in head
-    assert "osprey, law rise_di · 1.0 s flown" in head
+    assert "osprey, control law rise_di · 1.0 s flown" in head
     law = following.partition("Integrals of the law</h2>")[2].partition("</section>")[0]
     assert "At 100 Hz with the softened sign" in law
 

@@ -15,7 +15,8 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import mask_spans
 from flight_analysis.report.display_units import DisplayUnit, display_unit
-from flight_analysis.report.figures import ERROR, GUST, PLANT
+from flight_analysis.report.figures import ERROR, PLANT
+from flight_analysis.report.intervals import GUST
 from flight_analysis.report.page import Page, Section, page_html
 from flight_analysis.report.plotting import (
     Curve,

@@ -9,7 +9,7 @@ from flight_analysis.linear_loop.certificate import kept_guarantee
 from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_analysis.linear_loop.loop_margins import LinearLoop, LoopMargins, loop_margins
 from flight_analysis.report.display_units import format_seconds, format_value
-from flight_analysis.report.flight_head import run_argument, scenario_argument
+from flight_analysis.report.flight_head import learned_spans, run_argument, scenario_argument
 from flight_analysis.report.flown_models import FlownLoops
 from flight_analysis.report.margin_figures import MARGIN_WORDS, decibels, guarantee_text
 from flight_analysis.report.page import Card, Step
@@ -131,7 +131,7 @@ def _changed_card(flown: FlownLoops) -> Card:
 def _learned_card(flight: RecordedFlight) -> Card:
     """Return which learned models flew, and what became of the error."""
     spans = flight.summary["models"]
-    learned = spans[1:]
+    learned = learned_spans(flight)
     if not learned:
         return Card(
             title="Learned models",

@@ -52,7 +52,7 @@ def comparison_page(flights: Sequence[RecordedFlight]) -> Page:
                 "Output y over the reference y_m",
                 "",
                 figures.tracking_figure(context, _common_trim(scenarios)),
-                contents="Tracking",
+                contents="Outputs",
             ),
             *_tracks(flights, colours),
             Section(
@@ -98,7 +98,7 @@ def _tracks(flights: Sequence[RecordedFlight], colours: Mapping[str, str]) -> li
     routes = guided_figures.flown_routes(first.scenario, first.tape)
     tracks = {label: (flight.tape, colours[label]) for label, flight in guided.items()}
     figure = guided_figures.tracks_figure(tracks, routes)
-    return [Section("Ground track", "", figure, over_time=False, contents="Track")]
+    return [Section("Ground track", "", figure, over_time=False, contents="Ground track")]
 
 
 def _metrics(

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import (
-    Windows,
     best_error,
     mask_spans,
     tracking_error,
@@ -27,8 +26,15 @@ from flight_analysis.report.display_units import (
     DisplayUnit,
     in_order,
 )
+from flight_analysis.report.intervals import (
+    fault_intervals,
+    flight_end,
+    gap_intervals,
+    gust_intervals,
+    mode_intervals,
+    starved_intervals,
+)
 from flight_analysis.report.plotting import (
-    MIN_GAP_PERIODS,
     SHOWS_ANGLES,
     Curve,
     Figure,
@@ -44,7 +50,6 @@ from flight_analysis.report.plotting import (
 from flight_analysis.report.spectra import spectra
 from flight_analysis.report.summary import RecordedFlight, common_units, labels
 from flight_analysis.report.timing import tick_periods
-from flight_core.modes import Mode
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller.internals import Saturation
@@ -54,11 +59,8 @@ REFERENCE = "#d97b1c"
 ERROR = "#8b1f4f"
 MEASURED = "#c9799b"
 WIND = "#2a7f62"
-GUST = "#7f7f7f"
 END_STOP = "#8c8c8c"
 LIMIT = "#444444"
-NO_SAMPLE = "#5f6b73"
-STARVED = "#c98a2b"
 # Contrast of each line on its page: 3 to 1 at least, as WCAG 2.2 asks of graphics (1.4.11).
 # Okabe and Ito 2008, distinct to the colour blind too, without the orange that REFERENCE has;
 # lighter on a dark page
@@ -81,13 +83,6 @@ DARK = FLIGHTS | {
     LIMIT: "#b9c0c7",
 }
 """Colours of curves on a light page, with those that replace them on a dark page."""
-MODE_COLOURS = {
-    Mode.WAITING: "#b0b0b0",
-    Mode.HOLD: "#f2c230",
-    Mode.RAMP: "#ef7d17",
-    Mode.TRIM: "#8a63b8",
-    Mode.INACTIVE: "#5f6b73",
-}
 SATURATION_COLOURS = {Saturation.MAGNITUDE: "#d62728", Saturation.RATE: "#8a63b8"}
 LIMIT_LINES = ({"color": END_STOP, "width": 4}, {"color": LIMIT, "width": 1.2, "dash": "dash"})
 NOISE_FLOOR_LINE = {"color": LIMIT, "width": 1.0, "dash": "dot"}
@@ -98,7 +93,6 @@ HISTOGRAM_BINS = 80
 FREQUENCIES = [digit * 10.0**power for power, digit in product(range(-4, 4), (1, 2, 5))]
 # share of the axis, about two pixels: shorter intervals are lengthened
 MIN_VISIBLE_FRACTION = 1 / 500
-SHOWN_GAP = 0.1  # s without a sample of y
 MOST_MARKED = 100  # times of messages: plotly is slow with more shapes
 LIMIT_VIEW_RATIO = 3.0  # a limit is in view if it is at most this many times the largest u
 
@@ -122,6 +116,7 @@ def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
         intervals += gust_intervals(longest, gusts)
     if len(flights) == 1:
         intervals += mode_intervals(longest, end * MIN_VISIBLE_FRACTION)
+        intervals += fault_intervals(flights[0], end)
         intervals += starved_intervals(flights[0])
         intervals += gap_intervals(longest)
     of_one = flights[0].message_times if len(flights) == 1 else []
@@ -142,73 +137,6 @@ def runs_of(flights: Sequence[RecordedFlight]) -> dict[str, Run]:
         label: Run(tape=flight.tape, period_ns=flight.period_ns, colour=colour)
         for label, flight, colour in zip(labels(flights), flights, colours, strict=False)
     }
-
-
-def flight_end(tape: Tape) -> float:
-    """Return the last instant of any signal, s; 0 for a tape without samples."""
-    return max(
-        (float(tape.time(topic)[-1]) for topic in tape.signals if len(tape[topic].stamp_ns)),
-        default=0.0,
-    )
-
-
-def gust_intervals(tape: Tape, gusts: Windows) -> list[Interval]:
-    """Return the gusts up to the end of the flight; a gust that repeats has one label."""
-    end = flight_end(tape)
-    return [
-        Interval(
-            label=f"{name.rstrip('0123456789 ')} gust",
-            start=start,
-            stop=min(stop, end),
-            colour=GUST,
-            labelled=True,
-        )
-        for name, (start, stop) in gusts.items()
-        if start < end
-    ]
-
-
-def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
-    """Return the intervals of the controller's modes except ENGAGED, by mode."""
-    if "internals" not in tape:
-        return []
-    t = tape.time("internals")
-    modes = tape["internals"]["mode"]
-    intervals = []
-    for mode, colour in MODE_COLOURS.items():
-        spans = mask_spans(t, modes == mode, min_length)
-        intervals += [
-            Interval(label=mode.name.lower(), start=start, stop=stop, colour=colour, labelled=False)
-            for start, stop in spans
-        ]
-    return intervals
-
-
-def starved_intervals(flight: RecordedFlight) -> list[Interval]:
-    """Return the spans in which the host was too busy for a flight in real time."""
-    spans = (flight.summary.get("account") or {}).get("starved", ())
-    return [
-        Interval(label="host too busy", start=start, stop=stop, colour=STARVED, labelled=False)
-        for start, stop in spans
-    ]
-
-
-def gap_intervals(tape: Tape) -> list[Interval]:
-    """Return the intervals without a sample of y that a reader of the page should see."""
-    if "y" not in tape or len(tape["y"].stamp_ns) < 2:
-        return []
-    t = tape.time("y")
-    longest = max(MIN_GAP_PERIODS * float(np.median(np.diff(t))), SHOWN_GAP)
-    return [
-        Interval(
-            label="no sample of y",
-            start=float(t[before]),
-            stop=float(t[before + 1]),
-            colour=NO_SAMPLE,
-            labelled=False,
-        )
-        for before in np.flatnonzero(np.diff(t) > longest)
-    ]
 
 
 def _curves(

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
 
+import numpy as np
+
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import scenarios
 from flight_analysis.report import guided
@@ -39,7 +41,7 @@ def meta_lines(flight: RecordedFlight, scenario: Scenario) -> list[str]:
     is_known = is_simulated(flight.tape) or "engagements" in flight.summary
     aircraft = scenario.aircraft.airframe if is_known else "an aircraft outside of the scenario"
     parts = [
-        f"{aircraft}, law {scenario.controller.law}",
+        f"{aircraft}, control law {scenario.controller.law}",
         f"{format_seconds(flight.summary['duration'])} flown",
     ]
     distance = guided.distance(flight.tape)
@@ -70,11 +72,12 @@ def pace(flight: RecordedFlight) -> str:
     if flight.tape.start_ns > SINCE_EPOCH_NS:
         return "in real time"
     has_nodes = bool((flight.summary["account"] or {}).get("processes"))
-    return "in lockstep" if has_nodes else "in one process, without topics"
+    return "in simulated time, over topics" if has_nodes else "in simulated time, in one process"
 
 
 # ---- Verdict
 
+FILE_MODEL = "file"  # name of the model of the file, which a learner may fly
 NEXT = {
     Aim.ERROR: "Ask whether its loop is stable, and with what margins:",
     Aim.LOG: "Fly it in lockstep, where no message is late or lost:",
@@ -97,12 +100,19 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
             sentence="Fly the same without the clock:", command=f"rise-di fly {name} --lockstep"
         )
     elif outcome["status"] == 0:
-        headline = sentence
-        if outcome["errors"]:
-            texts.insert(0, "The error of every output stayed within what is allowed.")
+        # What wind or noise excuses is a detail of a flight that went well.
+        end = outcome["reason"] or outcome["end"]
+        headline = f"{end[:1].upper()}{end[1:]}."
+        within = "The error of every output stayed within what is allowed"
+        texts = [
+            within if outcome["errors"] else "",
+            _route_text(flight),
+            _models_text(flight),
+            *texts,
+        ]
         colour = Colour.GOOD
         step = Step(
-            sentence="Compute every tick again, and compare it with the log:",
+            sentence="Check that the log reproduces every u, bit by bit:",
             command=f"rise-di replay {run_argument(flight)}",
         )
     else:
@@ -122,7 +132,10 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
         headline=headline,
         colour=colour,
         text=" ".join(f"{text.rstrip('.')}." for text in texts if text),
-        details=outcome["details"],
+        details=[
+            *outcome["details"],
+            *(each["sentence"] for each in outcome["allowances"] if outcome["status"] == 0),
+        ],
         step=step,
     )
 
@@ -139,6 +152,37 @@ def _next_step(outcome: Mapping[str, Any], scenario: str, otherwise: Step) -> St
     if outcome["end"] == End.NEVER_FLEW:
         return Step(sentence="See what the nodes say:", command=f"rise-di fly {scenario} --verbose")
     return otherwise
+
+
+def _route_text(flight: RecordedFlight) -> str:
+    """Return how a guided flight followed its route; "" without one."""
+    legs = (flight.summary["guidance"] or {}).get("legs") or ()
+    if not legs:
+        return ""
+    flown = sum(leg["result"] == "flown" for leg in legs)
+    on_last = " and was on the last one at the end" if flown == len(legs) - 1 else ""
+    text = f"It flew {flown} of {len(legs)} legs of its route{on_last}"
+    crossed = flight.tape["guidance"].names if "guidance" in flight.tape else ()
+    if "xtrack" in crossed:
+        beside = np.abs(flight.tape["guidance"]["xtrack"])
+        beside = beside[np.isfinite(beside)]
+        if len(beside):
+            text += f", at most {np.max(beside):.0f} m beside it"
+    return text
+
+
+def _models_text(flight: RecordedFlight) -> str:
+    """Return how many learned models flew; "" for a flight that did not learn."""
+    if not flight.summary["models"]:
+        return ""
+    count = len(learned_spans(flight))
+    return f"{count or 'No'} learned model{'' if count == 1 else 's'} flew"
+
+
+def learned_spans(flight: RecordedFlight) -> list[Mapping[str, Any]]:
+    """Return the spans in which a learned model flew, not the law of the start or of the file."""
+    _, *later = flight.summary["models"]
+    return [span for span in later if span["name"] != FILE_MODEL]
 
 
 def _injected(scenario: Scenario) -> str:
@@ -164,6 +208,9 @@ def run_argument(flight: RecordedFlight) -> str:
 
 # ---- Tiles
 
+NAMES = {"q": "pitch rate q", "p": "roll rate p", "r": "yaw rate r", "V": "airspeed V"}
+"""Outputs in words."""
+
 
 def tiles_of(flight: RecordedFlight) -> list[Tile]:
     """Return a tile an output.
@@ -185,20 +232,23 @@ def tiles_of(flight: RecordedFlight) -> list[Tile]:
         rms = parts["whole"]["rms"]
         if rms is not None:
             value = plain_number(rms * unit.factor, 3)
-            text = f"rms over {format_seconds(flight.summary['duration'])}, not judged"
-            tiles.append(Tile(name=name, value=value, unit=unit.unit, text=text))
+            text = f"over {format_seconds(flight.summary['duration'])}, not judged"
+            shown = NAMES.get(name, name)
+            tiles.append(Tile(name=shown, value=value, unit=f"{unit.unit} rms error", text=text))
     return tiles
 
 
 def _judged_tile(figures: Mapping[str, Any], unit: DisplayUnit) -> Tile:
     rms, allowed = aligned_numbers(figures["rms"] * unit.factor, figures["allowed"] * unit.factor)
     length = figures["stop"] - figures["start"]
-    when = f"t = {figures['start']:.1f} to {figures['stop']:.1f} s"
+    when = f"t = {figures['start']:.0f} to {figures['stop']:.0f} s"
+    part = figures["rms"] / figures["allowed"]
+    limit = f"{part:.1f} times the {allowed}" if part > 1.0 else allowed
     return Tile(
-        name=f"error of {figures['output']}, worst {length:.0f} s",
+        name=f"{NAMES.get(figures['output'], figures['output'])}, worst {length:.0f} s",
         value=rms,
-        unit=f"{unit.unit} rms",
-        text=f"{allowed} allowed; {when}",
-        part=figures["rms"] / figures["allowed"],
+        unit=f"{unit.unit} rms error",
+        text=f"{limit} allowed; {when}",
+        part=part,
         has_limit=True,
     )

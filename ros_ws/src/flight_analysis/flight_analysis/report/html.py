@@ -30,6 +30,7 @@ from flight_analysis.report.display_units import (
 )
 from flight_analysis.report.flight_head import (
     meta_lines,
+    run_argument,
     tiles_of,
     title_of,
     verdict_of,
@@ -46,13 +47,16 @@ from flight_analysis.report.learned_figure import learned_figure
 from flight_analysis.report.page import (
     Block,
     Cards,
+    Colour,
     Figures,
     MessageLine,
     Messages,
     Page,
     ReplayBlock,
     Section,
+    Step,
     TableGroup,
+    Verdict,
     page_parts,
 )
 from flight_analysis.report.parameter_rows import parameter_rows
@@ -63,6 +67,7 @@ from flight_analysis.report.summary_rows import Column
 from flight_core.files import replacing
 
 ABOUT_V = "V is the airspeed; its value at trim is subtracted."
+ABOUT_Y_M = "y_m is what the aircraft was asked to follow, and y what it did."
 MOST_MESSAGES = 500  # messages of a log on a page
 
 
@@ -114,13 +119,14 @@ def _imported_page(flight: RecordedFlight) -> Page:
     return Page(
         title=title_of(flight),
         lines=[f"{length}, {source['kind']}{by_map} · run {flight.name}"],
+        verdicts=[_not_judged(flight)],
         tiles=tiles_of(flight),
         notes=flight.summary["notes"],
         blocks=[
             Section(
                 "Output y over the reference y_m" if "y_m" in tape else "Output y",
                 "about trim",
-                time_series_figure(context, outputs),
+                time_series_figure(context, outputs, labels={"V": "V about trim (m/s)"}),
                 contents="Outputs",
             ),
             *([] if replay is None else [ReplayBlock(replay=replay)]),
@@ -130,6 +136,20 @@ def _imported_page(flight: RecordedFlight) -> Page:
             Figures(groups=[TableGroup(flight_tables)], is_folded=True),
         ],
         samples=context.samples,
+    )
+
+
+def _not_judged(flight: RecordedFlight) -> Verdict:
+    """Return why nothing is said about how an imported flight went."""
+    lack = "no reference" if "y_m" not in flight.tape else "no model of its aircraft"
+    return Verdict(
+        headline="Not judged.",
+        colour=Colour.PLAIN,
+        text=f"The log has {lack}, so that nothing says how large an error may be.",
+        step=Step(
+            sentence="Lay it over another log:",
+            command=f"rise-di report {run_argument(flight)} OTHER",
+        ),
     )
 
 
@@ -182,9 +202,9 @@ def _motion(flight: RecordedFlight, scenario: Scenario, context: PlotContext) ->
     return [
         Section(
             "Output y over the reference y_m",
-            about,
+            f"{ABOUT_Y_M} {about}".rstrip(),
             figures.tracking_figure(context, trim),
-            contents="Tracking",
+            contents="Outputs",
         ),
         *_guidance_sections(flight, scenario, context),
         *([] if replay is None else [ReplayBlock(replay=replay)]),
@@ -332,7 +352,7 @@ def _guidance_sections(
                 flight.tape, routes, speed, None if guidance is None else guidance.fence_zones()
             ),
             over_time=False,
-            contents="Track",
+            contents="Ground track",
         ),
         Section(
             "Altitude and airspeed over their commands",

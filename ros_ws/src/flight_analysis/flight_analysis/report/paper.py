@@ -13,7 +13,8 @@ from flight_analysis.report.display_units import (
     channel_label,
     in_order,
 )
-from flight_analysis.report.figures import GUST, REFERENCE, flight_end, gust_intervals, runs_of
+from flight_analysis.report.figures import REFERENCE, runs_of
+from flight_analysis.report.intervals import GUST, flight_end, gust_intervals
 from flight_analysis.report.summary import RecordedFlight, common_units
 from flight_core.arguments import as_names
 from flight_core.files import replacing

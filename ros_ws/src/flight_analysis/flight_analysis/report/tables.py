@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import MEASURED_ERROR, TRUE_ERROR, Windows
-from flight_analysis.report import figures
 from flight_analysis.report.account import account_of_json
 from flight_analysis.report.display_units import DisplayUnit, format_seconds, format_value
 from flight_analysis.report.glossary import legend, words_in
 from flight_analysis.report.guided import landing_results, leg_results
+from flight_analysis.report.intervals import flight_end, gust_intervals, mode_intervals
 from flight_analysis.report.summary import is_in_host_time, taken_over, time_flown
 from flight_analysis.report.summary_rows import (
     ERROR_COLUMNS,
@@ -153,7 +153,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
     of_flight = scenario if scenario is not None else tape.scenario
     listed = []
     # Gusts and modes, the intervals of one name as one row.
-    intervals = figures.gust_intervals(tape, gusts) + figures.mode_intervals(tape)
+    intervals = gust_intervals(tape, gusts) + mode_intervals(tape)
     for label, group in groupby(intervals, key=lambda interval: interval.label):
         spans = [(interval.start, interval.stop) for interval in group]
         times = f", {len(spans)} times" if len(spans) > 1 else ""
@@ -166,7 +166,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
             )
         )
     # Faults last to the end of the flight.
-    end = figures.flight_end(tape)
+    end = flight_end(tape)
     faults = of_flight.aircraft.actuators.read_faults() if isinstance(of_flight, Scenario) else ()
     listed += [
         EventInterval(f"fault: {fault.subject}", fault.at, end, fault.extent)
