@@ -65,7 +65,7 @@ def test_output_that_is_off_is_red_first_and_over_its_limit(servo: Scenario, tap
     flight = flown(servo, off)
     verdict = verdict_of(flight, servo)
     assert verdict.colour is Colour.BAD
-    assert verdict.headline.startswith("R off by 17 deg/s rms")
+    assert verdict.headline.startswith("r off by 17 deg/s rms")
     assert verdict.step is not None
     assert verdict.step.command == "rise-di gains check osprey_servo"
     over = [tile.name.partition(",")[0] for tile in tiles_of(flight) if not tile.is_within]

@@ -119,7 +119,9 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
         # What is wrong comes first: a flight that completed may still fall short of much.
         end, _, worst = sentence.partition("; ")
         headline = worst.removeprefix("worst: ") or sentence
-        headline = f"{headline[:1].upper()}{headline[1:]}"
+        # The name of an output stays as it is.
+        if headline.split()[0] not in scenario.controller.outputs:
+            headline = f"{headline[:1].upper()}{headline[1:]}"
         if worst:
             texts.insert(0, end)
         colour = Colour.BAD
