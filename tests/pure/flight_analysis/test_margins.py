@@ -285,7 +285,9 @@ def test_margins_are_those_of_python_control(delay: float) -> None:
         if 1e-3 < w < 157.0 and zeta < 0.9999
     }
     assert slow == {
-        (round(w, 3), round(zeta, 3)) for w, zeta in zip(*modes, strict=True) if zeta < 0.9999
+        (round(w, 3), round(zeta, 3))
+        for w, zeta in zip(modes.frequency, modes.damping, strict=True)
+        if zeta < 0.9999
     }
     assert margins.damping == approx(min(zeta for _, zeta in slow), abs=1e-3)
 

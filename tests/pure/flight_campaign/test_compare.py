@@ -24,7 +24,6 @@ from control_laws.catalogue import LAWS, Gains, initial_gains
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.linear_loop.input_margins import Margins
 from flight_analysis.linear_loop.loop_margins import margins
 from flight_analysis.metrics import error_metrics
 from flight_campaign.batch import batch
@@ -322,7 +321,7 @@ def test_search_within_margins_has_them(short: Benchmark) -> None:
 
     def least(gains: Gains) -> float:
         results = nominal_margins(law, gains, short.model)
-        return least_fraction(Margins(*(values[0] for values in results)), REQUIREMENT)
+        return least_fraction(results.at(0), REQUIREMENT)
 
     assert least(initial_gains(law, short.model)) < 0.98  # 43 degrees for 45
     result = tuning.tune(law, OBJECTIVES["margins"], short, (3, 4), generations=8)

@@ -85,6 +85,10 @@ class Margins(NamedTuple):
         with np.errstate(divide="ignore"):
             return np.minimum(self.gain_increase, 1.0 / self.gain_decrease)
 
+    def at(self, place: int | slice) -> "Margins":
+        """Return the figures of one of N aircraft, or of some of them."""
+        return Margins(**{name: value[place] for name, value in self._asdict().items()})
+
     def worst(self) -> "Margins":
         """Return the worst of N aircraft figure by figure, from shapes (N, m) and (N,)."""
         least = {name: np.asarray(value.min(axis=0)) for name, value in self._asdict().items()}

@@ -163,8 +163,8 @@ def loop_margins(linear: LinearLoop) -> LoopMargins:
     if linear.box is not None and len(linear.plant.A) > 1:
         return _assessed_by_search(linear, linear.box)
     together = input_margins(linear.plant, linear.law, linear.loop)
-    nominal = Margins._make(value[0] for value in together)
-    uncertain = Margins._make(value[1:] for value in together)
+    nominal = together.at(0)
+    uncertain = together.at(slice(1, None))
     delay = delay_margin(linear.nominal, linear.law, linear.loop)
     each = tuple(
         delay_margin(linear.nominal, linear.law, linear.loop, share)

@@ -139,7 +139,8 @@ def _least(margins: Margins, delay: float) -> list[float]:
 
 def modes_text(margins: LoopMargins) -> str:
     """Write the slow modes that have little damping as a sentence."""
-    slow_modes = [(w, zeta) for w, zeta in zip(*margins.modes, strict=True) if zeta < SHOWN_DAMPING]
+    every = zip(margins.modes.frequency, margins.modes.damping, strict=True)
+    slow_modes = [(w, zeta) for w, zeta in every if zeta < SHOWN_DAMPING]
     modes = ", ".join(f"{w:.3g} rad/s {zeta:.2f}" for w, zeta in slow_modes)
     if margins.worst is not None:
         least = f"; least of the uncertain aircraft {float(margins.worst.damping):.2f}"

@@ -185,9 +185,7 @@ def score_cells(result: LawResult) -> list[str]:
 def _margins(law: Law, gains: TuningResult, benchmark: Benchmark) -> Margins | None:
     if not law.has_margins:
         return None
-    return Margins(
-        *(values[0] for values in nominal_margins(law, as_gains(gains), benchmark.model))
-    )
+    return nominal_margins(law, as_gains(gains), benchmark.model).at(0)
 
 
 def _scores(scores: FloatArray) -> Scores:

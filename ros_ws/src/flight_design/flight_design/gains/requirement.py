@@ -314,7 +314,7 @@ class _Loops(Generic[Controller]):
             loop = _stacked(candidates)
             margins = input_margins(loop.nominal, loop.law, loop.loop, together=False)
             for k, (place, candidate) in enumerate(zip(places, candidates, strict=True)):
-                self._measured[place] = candidate, Margins(*(values[k] for values in margins))
+                self._measured[place] = candidate, margins.at(k)
 
     def _count_costs(self, places: Sequence[Place]) -> None:
         if places:
