@@ -14,7 +14,6 @@ from rich.status import Status
 from aircraft_sim.airframes.airframe import airframes
 from flight_analysis.closed_loop.scenario_library import scenarios
 from flight_analysis.report.html import write_loop_page
-from flight_cli.gain_tables import GainSets, gains_as_json, show_gains
 from flight_cli.gains_guarantee import (
     proved,
     require_guarantee,
@@ -22,6 +21,7 @@ from flight_cli.gains_guarantee import (
     write_certificate,
     write_unstable,
 )
+from flight_cli.gains_tables import GainSets, gains_as_json, show_gains
 from flight_cli.gains_verdicts import (
     loop_verdict,
 )

@@ -16,7 +16,7 @@ from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from aircraft_sim.jsbsim.jsbsim_aircraft import named_properties, require_aircraft
 from flight_analysis.closed_loop.replay import recorded_parameters, recorded_scenario
 from flight_cli.bridge_experiment import BridgeExperiment
-from flight_cli.identified import identified_as_json, show_identified
+from flight_cli.identified_aircraft import identified_as_json, show_identified
 from flight_cli.identified_model import (
     fly_again,
     model_as_json,

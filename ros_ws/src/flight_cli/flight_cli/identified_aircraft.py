@@ -10,7 +10,7 @@ from rich.console import Console
 
 from aircraft_sim.jsbsim.jsbsim_aircraft import INPUTS, OUTPUTS, RESIDUALS, STATES
 from flight_analysis.report.display_units import display_unit
-from flight_cli.gain_tables import speed_of_margin
+from flight_cli.gains_tables import speed_of_margin
 from flight_cli.output import new_table, print_table, say
 from flight_core.units import si_per_unit
 from flight_design.identification.jsbsim_identification import IdentifiedAircraft
