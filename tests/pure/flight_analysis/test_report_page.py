@@ -25,7 +25,7 @@ from flight_core.tape import Signal, Tape
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
 DRAWN = "Number(document.body?.dataset.drawn ?? 0)"  # counts the views of all figures
 # of a value on the page: plotting.MANTISSA, and float32
-RESOLUTION = 2.0**-15.9
+RESOLUTION = 2.0**-13.9
 PLOTS = "[...document.querySelectorAll('figure [data-plot]')]"
 
 

@@ -31,12 +31,12 @@ T = TypeVar("T", bound=np.generic)
 MAX_POINTS = 2400
 LEVEL = 4  # of zlib: samples of a flight take 1 % more space than with 6, and 60 % of the time
 PACKERS = 2  # threads that pack: each holds a channel twice
-# samples of a curve on a page: 120 s at 500 Hz, or 25 times MAX_POINTS, so that we can zoom. With
-# all samples an hour of flight would take 141 MB
-MAX_STORED = 60_000
-# bits of a stored value, with the leading one: within 1 in 2^16, finer than a pixel and the 4
-# digits of a hover
-MANTISSA = 16
+# samples of a curve on a page: 60 s at 500 Hz, or 13 times MAX_POINTS, so that we can zoom. With all
+# samples an hour of flight would take 141 MB
+MAX_STORED = 32_000
+# bits of a stored value, with the leading one: within 1 in 2^14, finer than a pixel, and a hover
+# shows no more than 4 digits
+MANTISSA = 14
 MARGIN = {"l": 80, "r": 36}  # pixels, left and right of the subplots
 ACROSS = 0.3  # of a column: between two columns
 LABELS = 70  # pixels, of the labels and the title of an axis; four columns fit the page
