@@ -149,9 +149,8 @@ def identified(
         with flying() as autopilot:
             autopilot.patient_map(map_name)
             autopilot.experiment(*command)
-    gain_result = on_the_ground(
-        *command, str((log or REPOSITORY / "runs" / "latest").resolve()), "--json"
-    )
+    run = (log or REPOSITORY / "runs" / "latest").resolve()
+    gain_result = on_the_ground(*command, "--run", str(run), "--json")
     if gain_result.returncode:
         return {"refused": gain_result.stderr}
     result = json.loads(gain_result.stdout)
@@ -229,7 +228,13 @@ def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -
     omega: dict[str, dict[str, float]] = {}
     for name, source in (("stack", run), ("imported", bag)):
         identification = on_the_ground(
-            *command, str(source), "--write", str(place / f"of_{name}"), "--accept", "--json"
+            *command,
+            "--run",
+            str(source),
+            "--write",
+            str(place / f"of_{name}"),
+            "--accept",
+            "--json",
         )
         if identification.returncode:
             return {"refused": f"{name}: {identification.stderr}"}
