@@ -495,7 +495,7 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(
     sentences = [restarted.propose(none_left, NAMES).sentence for _ in range(2)]
     assert sentences == [
         "each part flies the law of the start from now on: no part is left to learn",
-        "",
+        None,
     ]
 
 
