@@ -72,8 +72,53 @@ def test_samples_that_a_lost_one_reaches_are_lost() -> None:
     assert found.y[~is_lost][600:] == approx(filtered(y, BROAD)[~is_lost][600:], abs=1e-3)
 
 
-def test_surface_that_ends_at_another_torque_is_named() -> None:
-    parameters = {"CA_SV_CS0_TRQ_R": -0.5, "CA_SV_CS1_TRQ_P": 1.0, "CA_SV_CS2_TRQ_Y": 0.0}
+def surfaces(**rows: tuple[float, ...]) -> dict[str, float]:
+    """The parameters of PX4's surfaces, with the effects of each of them on an axis."""
+    parameters = {"CA_SV_CS_COUNT": float(max(map(len, rows.values())))}
+    for axis, effects in rows.items():
+        parameters |= {f"CA_SV_CS{k}_TRQ_{axis}": effect for k, effect in enumerate(effects)}
+    return parameters
+
+
+STANDARD_PLANE = surfaces(R=(-0.5, 0.5, 0, 0), P=(0, 0, 1.0, 0), Y=(0, 0, 0, 1.0))
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        surfaces(R=(1.0, 0, 0), P=(0, -1.0, 0), Y=(0, 0, 1.0)),
+        # measured in SITL: a torque of 1 is a servo of 1.000
+        STANDARD_PLANE,
+        surfaces(R=(-0.5, 0.5), P=(0.5, 0.5)),
+        surfaces(R=(-0.5, 0.5, 0, 0), P=(0, 0, 0.5, 0.5), Y=(0, 0, 0.5, -0.5)),
+        # rows beyond the count are those of an airframe that was chosen before
+        surfaces(R=(1.0,)) | {"CA_SV_CS1_TRQ_R": 1.0},
+        {"IMU_GYRO_CUTOFF": 40.0},
+    ],
+    ids=["single", "2100_standard_plane", "elevons", "V-tail", "beyond the count", "no surface"],
+)
+def test_surfaces_whose_end_stop_is_a_torque_of_1_are_not_named(
+    parameters: dict[str, float],
+) -> None:
+    assert scaled_torques(parameters) == []
+
+
+@pytest.mark.parametrize(
+    ("parameters", "axis", "end", "factor"),
+    [
+        (surfaces(R=(-0.5, 0), P=(0, 1.0)), "R", 0.5, 2.0),
+        # measured in SITL: a torque of 1 is a servo of 0.500
+        (surfaces(R=(-1.0, 1.0, 0), P=(0, 0, 1.0)), "R", 2.0, 0.5),
+        (surfaces(R=(-0.5, 0.5), P=(1.0, 1.0)), "P", 2.0, 0.5),
+        (surfaces(P=(0.5, 0.5), Y=(0.25, -0.25)), "Y", 0.5, 2.0),
+    ],
+    ids=["half an aileron", "two whole ailerons", "elevons", "V-tail"],
+)
+def test_axis_whose_end_stop_is_another_torque_is_named_with_its_factor(
+    parameters: dict[str, float], axis: str, end: float, factor: float
+) -> None:
     (sentence,) = scaled_torques(parameters)
-    assert sentence.startswith("CA_SV_CS0_TRQ_R is -0.5: its surface reaches the end stop at")
-    assert "set it to -1" in sentence
+    assert f"a torque of {end:g} is the end stop" in sentence
+    assert f"multiply each CA_SV_CSk_TRQ_{axis} by {factor:g}" in sentence
+    rows = {name: value * factor for name, value in parameters.items() if name.endswith(axis)}
+    assert scaled_torques(parameters | rows) == []

@@ -6,7 +6,6 @@ A torque of 1 is u at the upper end stop, as in the module of `rise-di export`.
 """
 
 import math
-import re
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
@@ -41,6 +40,11 @@ SPARSE = 1.5  # periods of the law; a log with a longer period does not have eve
 BROAD = 90.0
 OVER = 2.2  # times a cut-off: the least rate of a log from which the filter can be removed
 PERIODS = 6.0  # of a cut-off; then the impulse response of the filter is below 1e-5
+
+MOST_SURFACES = 8  # of PX4, without CA_SV_CS_COUNT in the log
+SAME_END = 1e-3  # the largest deviation from 1 of a servo at the torque 1, by rounding
+AXES: Mapping[str, str] = MappingProxyType({"R": "roll", "P": "pitch", "Y": "yaw"})
+"""The axis that a letter of PX4's parameters stands for."""
 
 
 class RatesLog(NamedTuple):
@@ -124,13 +128,30 @@ def rates_of_log(
 
 
 def scaled_torques(parameters: Mapping[str, float]) -> list[str]:
-    """Say which surfaces of PX4 reach their end stop at another torque than 1."""
+    """Name the axes on which PX4 drives a surface to its end stop at another torque than 1.
+
+        servo = M^+ torque,  M^+ the pseudo-inverse of the CA_SV_CSk_TRQ, (axes, surfaces)
+
+    A servo of 1 is the end stop, so the largest entry in the column of an axis must be 1. If the
+    row of an axis is multiplied by a factor, its column is divided by it. Source: PX4 1.16,
+    ActuatorEffectivenessControlSurfaces.cpp, ControlAllocationPseudoInverse.cpp.
+    """
+    surfaces = int(parameters.get("CA_SV_CS_COUNT", MOST_SURFACES))
+    axes = []
+    for letter in "RPY":
+        names = [f"CA_SV_CS{k}_TRQ_{letter}" for k in range(surfaces)]
+        row = [parameters.get(name, 0.0) for name in names]
+        if any(row):
+            axes.append((letter, row))
+    if not axes:
+        return []
+    inverse = np.linalg.pinv(np.array([row for _, row in axes]))
     sentences = []
-    for name, value in sorted(parameters.items()):
-        if re.fullmatch(r"CA_SV_CS\d+_TRQ_[RPY]", name) and abs(value) not in (0.0, 1.0):
+    for (letter, _), largest in zip(axes, np.abs(inverse).max(axis=0).tolist(), strict=True):
+        if abs(largest - 1.0) > SAME_END:
             sentences.append(
-                f"{name} is {value:g}: its surface reaches the end stop at a torque of "
-                f"{abs(value):g}; set it to {math.copysign(1.0, value):g}, and log again"
+                f"{AXES[letter]}: a torque of {1.0 / largest:.3g} is the end stop of a surface, "
+                f"expected 1: multiply each CA_SV_CSk_TRQ_{letter} by {largest:.3g}, and log again"
             )
     return sentences
 
