@@ -5,7 +5,6 @@
 It imports, identifies, selects gains, bounds and exports, as the commands of these names do.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -47,11 +46,14 @@ from flight_design.gains.effectors import lags_by_input
 from flight_design.gains.gain_design import check_gains, select_gains
 from flight_design.gains.gain_selection import Selection
 from flight_design.gains.ideal_control import ChannelPairing
-from flight_design.identification.innovation_filters import (
-    Actuation,
-    FlightData,
-    measured_noise,
+from flight_design.identification.excitation import (
+    factors_of,
+    is_late,
+    still_outputs,
+    to_fly,
+    to_set,
 )
+from flight_design.identification.innovation_filters import Actuation, measured_noise
 from flight_design.identification.likelihood import Unknown
 from flight_design.identification.log_import import Window
 from flight_design.identification.model_identification import (
@@ -64,10 +66,10 @@ from flight_design.identification.model_identification import (
 from flight_design.identification.model_quality import (
     NoBetter,
     best_known,
-    excitation_factor,
+    in_time,
 )
 from flight_design.identification.own_loop import OwnLoop, own_loop
-from flight_design.identification.rates_log import rates_of_log, scaled_torques
+from flight_design.identification.rates_log import RatesLog, rates_of_log, scaled_torques
 from flight_log.px4_parameters import low_pass_delay, rate_loop
 from flight_log.vehicle_log import read_foreign_log
 from rise_di.c_code import export
@@ -76,9 +78,10 @@ UNPROVED = 1
 LEAST, MOST = 0.05, 0.3  # bounds on the uncertainty of A and B that the margins must cover
 SAMPLES = 60  # uncertain aircraft
 DELAY_MARGIN = 0.01  # s, with the observer, as in examples/px4_airplane/rates_observer.yaml
-FEWEST = 3  # doublets on an axis
-LENGTH = 0.5  # s, of half a doublet if the scenario has none
-APART = 2.0  # s between doublets
+WIDEST = 0.9  # of an entry, in the box of the guarantee
+LOGGED_OFTEN = {
+    "px4": ": set SDLOG_PROFILE to 17, by which PX4 logs rates and torque at the rate of the gyro"
+}
 STEPS = {
     "px4": (
         (
@@ -212,10 +215,9 @@ class Tune:
         expected = "--calm: an observer estimates the wind"
         require(self.calm or bool(nominal.gusts), nominal.name, "no gusts", expected)
         log = read_foreign_log(self.log)
-        recorded, taken, cutoff, advance = rates_of_log(
-            log, scenario, nominal, autopilot, Window(self.start, self.stop)
-        )
-        delay = low_pass_delay(cutoff) or controller.delay
+        of_log = rates_of_log(log, scenario, nominal, autopilot, Window(self.start, self.stop))
+        recorded, taken = of_log.recorded, of_log.taken
+        delay = low_pass_delay(of_log.cutoff) or controller.delay
         if autopilot == "px4":
             loop = rate_loop(self.log, controller.rate)
             scenario = scenario.vary(controller={"delay": loop.delay})
@@ -223,15 +225,17 @@ class Tune:
             delay = loop.filters
         for sentence in (*taken.notes, *scaled_torques(taken.parameters)):
             warn(f"warning: {sentence}")
-        actuation = Actuation(lags, delay - advance)
-        identification = _identified(console, scenario, nominal, recorded, actuation)
+        _require_motion(of_log, scenario, nominal, self.log)
+        actuation = Actuation(lags, delay - of_log.advance)
+        identification = _identified(console, scenario, nominal, of_log, actuation)
         airframe = _kept(nominal, identification)
         if airframe is None:
-            raise ParameterError(_what_to_fly(identification, scenario, self.log))
+            raise ParameterError(_what_to_log(identification, scenario, self.log, autopilot))
         for part in identification.parts:
             if part.refusal is not None:
                 warn(f"warning: {', '.join(part.outputs)}: {part.refusal}; {_kept_model(part)}")
         uncertainty = _uncertainty(identification)
+        entries = _box(identification, airframe)
         taken_parts = tuple(filter(_is_better, identification.parts))
         identification = identification._replace(airframe=airframe, parts=taken_parts)
         path = folder / "airframe.yaml"
@@ -242,7 +246,12 @@ class Tune:
         chosen = flight.vary(controller=selection.chosen)
         with console.status("bounding every aircraft within the errors"):
             answer = check_gains(
-                airframe, chosen, uncertainty=uncertainty, samples=SAMPLES, as_told=True
+                airframe,
+                chosen,
+                uncertainty=LEAST,
+                samples=SAMPLES,
+                entries=entries,
+                as_told=True,
             )
             promise = guarantee(answer.loop_with_box())
         own = own_loop(taken.parameters, chosen, autopilot)
@@ -296,7 +305,7 @@ def _identified(
     console: Console,
     scenario: Scenario,
     nominal: Airframe,
-    recorded: FlightData,
+    of_log: RatesLog,
     actuation: Actuation,
 ) -> Identification:
     """Search for the model on the log, and show a progress bar."""
@@ -308,42 +317,41 @@ def _identified(
             bar.update, bar.add_task(f"search, u {1e3 * actuation.delay:.1f} ms late")
         )
         identification = identify_model(
-            recorded,
+            of_log.recorded,
             nominal,
             actuation,
             pairing,
             show,
             unknown=unknown,
             searches_again=True,
+            timing=of_log.timing,
         )
         show(completed=1, total=1)
     return identification
 
 
-def _what_to_fly(identification: Identification, scenario: Scenario, log: Path) -> str:
-    """Say why the model is refused, and which doublets would show what is missing."""
+def _require_motion(of_log: RatesLog, scenario: Scenario, nominal: Airframe, log: Path) -> None:
+    """Raise ParameterError, before any search, if an input does not move its output in a log."""
+    controller = scenario.rise_di()
+    pairing = ChannelPairing(controller.outputs, controller.inputs)
+    still = still_outputs(of_log.recorded, nominal, pairing)
+    if not still:
+        return
+    outputs = [each.output for each in still]
+    found = "; ".join(each.sentence for each in still)
+    fly = to_fly(dict.fromkeys(outputs, 1.0), scenario, nominal, of_log.recorded.y)
+    raise ParameterError(f"{log}: {found}{to_set(outputs, of_log.taken.parameters)}{fly}")
+
+
+def _what_to_log(
+    identification: Identification, scenario: Scenario, log: Path, autopilot: str
+) -> str:
+    """Say why the model is refused, and which log would show what is missing."""
+    parts = identification.parts
     y = identification.recorded.y
-    reference = scenario.reference_model
-    texts = []
-    for part in identification.parts:
-        for effect in best_known(part.entries, part.outputs):
-            factor = excitation_factor(effect)
-            if factor <= 1.0:
-                continue
-            moved = float(np.nanpercentile(np.abs(y[:, _column(identification, effect.row)]), 99.0))
-            pulses = reference.pulses.get(effect.row)
-            size = moved if pulses is None else max(moved, *np.abs(pulses.value))
-            length = LENGTH if pulses is None else pulses.stop[0] - pulses.start[0]
-            number = max(FEWEST, math.ceil(FEWEST * (factor * moved / size) ** 2))
-            texts.append(
-                f"{effect.row}: {number} doublets of {size:.2g} rad/s, {length:.2g} s each way"
-            )
-    fly = f"; fly, {APART:g} s apart, {', then '.join(texts)}" if texts else ""
-    return f"{log}: {identification.refusal}{fly}"
-
-
-def _column(identification: Identification, output: str) -> int:
-    return identification.airframe.outputs.index(output)
+    fly = to_fly(factors_of(parts), scenario, identification.airframe, y)
+    often = LOGGED_OFTEN.get(autopilot, "") if is_late(parts) else ""
+    return f"{log}: {identification.refusal}{often}{fly}"
 
 
 def _kept(nominal: Airframe, identification: Identification) -> Airframe | None:
@@ -371,13 +379,43 @@ def _kept_model(part: Part) -> str:
 
 
 def _uncertainty(identification: Identification) -> float:
-    """Return twice the largest standard deviation of the best known effects, from LEAST to MOST.
+    """Return twice the largest deviation of the best known effects, from LEAST to MOST.
 
-    The deviation of an effect is a fraction of the value that was found.
+    The deviation of an effect is a fraction of the value that was found. An uncertain delay does
+    not count: by it A, B and the delay are off together, and the loop of the log stays the same.
     """
-    effects = best_known(identification.entries, identification.airframe.outputs)
-    parts = [effect.deviation * abs(effect.nominal / effect.value) for effect in effects]
-    return float(np.clip(2.0 * max(parts), LEAST, MOST))
+    relative = [
+        effect.deviation * abs(effect.nominal / effect.value)
+        for part in identification.parts
+        for effect in best_known(in_time(part.entries, part.by_timing), part.outputs)
+    ]
+    return float(np.clip(2.0 * max(relative), LEAST, MOST))
+
+
+def _box(identification: Identification, airframe: Airframe) -> dict[str, float]:
+    """Return twice the standard deviation of each entry, by name, as a part of its value.
+
+    The values are those of the airframe. A part that stays nominal counts at least the change that
+    was found.
+    """
+    A, B = airframe.matrix_a(), airframe.matrix_b()
+    inputs = list(airframe.inputs)
+    box = {}
+    for part in identification.parts:
+        is_taken = _is_better(part)
+        for entry in part.entries:
+            row = airframe.index(entry.row)
+            if entry.matrix == "A":
+                value = A[row, airframe.index(entry.column)]
+            else:
+                value = B[row, inputs.index(entry.column)]
+            size = (
+                2.0 * entry.deviation if is_taken else max(2.0 * entry.deviation, abs(entry.error))
+            )
+            if value:
+                relative = abs(entry.unit * size / value)
+                box[f"{entry.matrix}[{entry.row},{entry.column}]"] = min(relative, WIDEST)
+    return box
 
 
 def _on_airframe(scenario: Scenario, airframe: Path, noise: FloatArray) -> Scenario:
@@ -499,9 +537,14 @@ def _page(tuned: _Tuned, log: str, autopilot: str) -> Page:
 
 def _what_to_do(tuned: _Tuned, autopilot: str) -> list[str]:
     """Say what is guaranteed, what to set and switch, and how to go back."""
-    part = f"A and B within {100 * tuned.uncertainty:.0f} %"
-    holds = "every aircraft is stable" if tuned.promise.holds else "an aircraft may be unstable"
-    return [
-        f"{part}: {holds} by the guarantee, up to {100 * tuned.promise.stable:.0f} %",
-        *STEPS[autopilot],
-    ]
+    return [_guaranteed(tuned.promise), *STEPS[autopilot]]
+
+
+def _guaranteed(promise: Guarantee) -> str:
+    """Say how many of the stated deviations of A and B the guarantee covers."""
+    holds = "every aircraft is stable" if promise.holds else "an aircraft may be unstable"
+    covered = 2.0 * promise.stable / promise.uncertainty
+    return (
+        f"A and B within twice their stated deviations: {holds} by the guarantee, which holds for "
+        f"{covered:.2g} of them"
+    )

@@ -15,6 +15,8 @@ from flight_core.vectors import FloatArray
 from flight_design.identification.likelihood import Fit, Innovations, Likelihood
 
 DIFFERENCE = 1e-4  # of a parameter, for the derivatives
+LATER = 1e-3  # s, of the delay, for the same
+BLOCK = 4.0  # s, of the parts of a log that are compared with each other: more than a doublet
 # Share of the decrease that the quadratic model predicts. From this on, the undamped step is taken
 # and no damped one is tried.
 GOOD = 0.7
@@ -43,6 +45,22 @@ class SearchEnd(NamedTuple):
     theta: FloatArray  # (p,)
     hessian: FloatArray  # (p, p)
     levels: NDArray[np.int64]  # (spans,) levels of the wind
+
+
+class Slopes(NamedTuple):
+    """The innovations of a theta over their rms, with their derivatives."""
+
+    cost: float
+    e: FloatArray  # (samples, m)
+    J: FloatArray  # (p, samples m), of e
+    half_log_det: FloatArray  # (p,) of the sum of log det S / 2
+
+
+class Doubt(NamedTuple):
+    """What the deviations of a fit count beside the noise of the innovations."""
+
+    timing: float  # s, deviation of the delay of u, which is not identified
+    whiteness: FloatArray  # (m,) of the innovations of the held-out samples
 
 
 class Search(Likelihood):
@@ -225,6 +243,37 @@ class Search(Likelihood):
         filters side by side. The Hessian is J'J + prior^-2, where J has the derivatives of the
         innovations over their rms. Source: L. Ljung, "System Identification", 7.4 and 10.2.
         """
+        slopes = self._slopes(theta, levels, used, free)
+        hessian = slopes.J @ slopes.J.T + np.diag(self.prior**-2)
+        slope = slopes.J @ slopes.e.ravel() + (theta - self.centre) / self.prior**2
+        slope += slopes.half_log_det
+        trials = np.clip(
+            theta + damped_steps(theta, slope, hessian, self._lower, self._upper, free),
+            self._lower,
+            self._upper,
+        )
+        expected = -float(slope @ (trials[0] - theta)) / 2.0
+        for several in (trials[:1], trials[1:]):
+            innovations = self.innovations(self.models(several, levels), levels)
+            lower, _, _ = self._costs(innovations, used, several)
+            progressed = float(slopes.cost - lower.min())
+            if progressed >= GOOD * expected:
+                break
+        if progressed <= 0.0:
+            return theta, hessian, progressed
+        best = several[int(lower.argmin())]
+        if len(several) == 1:
+            self._passed = best.tobytes(), levels, innovations
+        return best, hessian, progressed
+
+    def _slopes(
+        self,
+        theta: FloatArray,
+        levels: NDArray[np.int64],
+        used: NDArray[np.bool_],
+        free: NDArray[np.bool_],
+    ) -> Slopes:
+        """Return the derivatives at theta, with the filters of all differences side by side."""
         size = len(theta)
         indices = np.flatnonzero(free)
         models = self.models(
@@ -236,27 +285,45 @@ class Search(Likelihood):
         rms = np.sqrt(np.mean(e[0] ** 2, axis=0))
         J = np.zeros((size, e[0].size))
         J[indices] = ((e[1:] - e[0]) / DIFFERENCE / rms).reshape(len(indices), -1)
-        hessian = J @ J.T + np.diag(self.prior**-2)
-        slope = J @ (e[0] / rms).ravel() + (theta - self.centre) / self.prior**2
-        slope[indices] += (half_log_det[1:] - half_log_det[0]) / DIFFERENCE
-        trials = np.clip(
-            theta + damped_steps(theta, slope, hessian, self._lower, self._upper, free),
-            self._lower,
-            self._upper,
+        log_det = np.zeros(size)
+        log_det[indices] = (half_log_det[1:] - half_log_det[0]) / DIFFERENCE
+        return Slopes(cost=float(costs[0]), e=e[0] / rms, J=J, half_log_det=log_det)
+
+    def with_doubt(self, fit: Fit, doubt: Doubt) -> tuple[Fit, FloatArray]:
+        """Replace the deviations of a fit by those that also hold for a model that is not right.
+
+            covariance = H^-1 (M + prior^-2) H^-1 + s s' timing^2,  s = -H^-1 J j
+
+        H is the Hessian, and J has the derivatives by theta of the innovations e over their rms. M
+        is J J' for a right model. Here it is the larger one of two: the sum over blocks of the log
+        of the outer products of J e; and J J' times the whiteness of each output, as in Birge's
+        ratio. s is the change of theta with the delay of u, by which e has the derivative j.
+        Sources: H. White, Econometrica 50(1), 1982; R. T. Birge, Phys. Rev. 40(2), 1932; S. F.
+        Schmidt, Advances in Control Systems 3, 1966, for a delay that is not estimated.
+
+        Returns the fit, and the part of the entries' deviations that the delay makes, (p - G,).
+        """
+        theta, used = fit.theta, self.fitted()
+        slopes = self._slopes(theta, fit.levels, used, np.ones(len(theta), dtype=bool))
+        before = np.diag(self.prior**-2)
+        inverse = np.linalg.inv(slopes.J @ slopes.J.T + before)
+        by_output = slopes.J.reshape(len(theta), *slopes.e.shape)
+        coloured = (by_output * np.sqrt(np.maximum(doubt.whiteness, 1.0))).reshape(slopes.J.shape)
+        scores = np.einsum("psm,sm->sp", by_output, slopes.e)
+        places = np.flatnonzero(used) // round(BLOCK / self._period)
+        sums = np.array([scores[places == k].sum(axis=0) for k in np.unique(places)])
+        sums -= sums.mean(axis=0)
+        middles = (coloured @ coloured.T, sums.T @ sums * len(sums) / max(len(sums) - 1, 1))
+        spread = [np.diag(inverse @ (middle + before) @ inverse) for middle in middles]
+        models = self.models(theta[None], fit.levels)
+        later = models._replace(u=self._delayed(self._delay + LATER / self._period))
+        (e,), (e_later,) = (
+            self._costs(self.innovations(each, fit.levels), used, theta[None])[1]
+            for each in (models, later)
         )
-        expected = -float(slope @ (trials[0] - theta)) / 2.0
-        for several in (trials[:1], trials[1:]):
-            innovations = self.innovations(self.models(several, levels), levels)
-            lower, _, _ = self._costs(innovations, used, several)
-            progressed = float(costs[0] - lower.min())
-            if progressed >= GOOD * expected:
-                break
-        if progressed <= 0.0:
-            return theta, hessian, progressed
-        best = several[int(lower.argmin())]
-        if len(several) == 1:
-            self._passed = best.tobytes(), levels, innovations
-        return best, hessian, progressed
+        j = (e_later - e) / np.sqrt(np.mean(e**2, axis=0)) / LATER
+        late = np.abs(doubt.timing * inverse @ (slopes.J @ j.ravel()))
+        return fit._replace(deviation=np.sqrt(np.maximum(*spread) + late**2)), late[: self.count]
 
     def flying(self, flown: FloatArray, parts: Iterable[tuple[Likelihood, Fit]]) -> Innovations:
         """Return the innovations of the model that flies, theta (p,).

@@ -52,6 +52,7 @@ from flight_design.identification.likelihood_search import (
     START_STEPS,
     STARTS,
     STEPS,
+    Doubt,
     Search,
 )
 from flight_design.identification.model_quality import (
@@ -60,11 +61,13 @@ from flight_design.identification.model_quality import (
     advantage,
     at_bound,
     correlation,
+    in_time,
     prediction,
     reason_against_airframe,
     reason_against_excitation,
     reason_against_prediction,
     reason_against_signs,
+    reason_against_timing,
 )
 
 # `correlation` from which innovations follow the u of another part: uncoupled aircraft have up to 3
@@ -88,6 +91,8 @@ class Part(NamedTuple):
     gusts: bool  # whether a share of FEW or more of its seconds has gusts
     delays: tuple[float, ...] = ()  # s, the delay of each input
     advantage: float = 0.0  # of the model `flown` over the nominal one, see `identify_model`
+    # of the deviation of each entry, the part that an uncertain delay makes
+    by_timing: tuple[float, ...] = ()
 
 
 class Identification(NamedTuple):
@@ -125,6 +130,7 @@ class _Study(NamedTuple):
     channels: ChannelPairing
     bound_count: int  # how many entries may lie at their bound
     searches_again: bool
+    timing: float | None  # s, deviation of the delay; None if the model counts as right
     step: Callable[[], None]
 
     def search(self, model: NominalModel, block: Block, *, coupled: bool = False) -> Search:
@@ -144,16 +150,20 @@ class _Study(NamedTuple):
     def part(self, search: Search, fit: Fit) -> Part:
         """Return the model of a block, with the reason if it must not be used."""
         outputs = search.names.outputs
-        entries = search.entries(fit)
         before = prediction(fit.before, self.validating)
         after = prediction(fit.after, self.validating)
+        by_timing = np.zeros(search.count)
+        if self.timing is not None:
+            fit, by_timing = search.with_doubt(fit, Doubt(self.timing, after.whiteness))
+        entries = search.entries(fit)
         identified = with_entries(self.airframe, entries)
         reasons = (
             self.reason_against_airframe(search.about_centre(entries)),
             search.reason_against_air(fit),
-            reason_against_excitation(entries, outputs),
+            reason_against_timing(entries, by_timing.tolist(), outputs),
+            reason_against_excitation(in_time(entries, by_timing.tolist()), outputs),
             reason_against_signs(self.airframe, identified, self.channels),
-            reason_against_prediction(before, after),
+            reason_against_prediction(before, after, outputs),
         )
         delays, deviations = search.delays(fit)
         gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
@@ -168,6 +178,7 @@ class _Study(NamedTuple):
             gusts=gusts,
             delays=tuple(delays.tolist()),
             advantage=0.0 if fit.flown is None else self.advantage(fit.flown, fit.before),
+            by_timing=tuple(by_timing.tolist()),
         )
 
     def identification(
@@ -265,6 +276,7 @@ def identify_model(
     may_couple: bool = True,
     quick: bool = False,
     searches_again: bool = False,
+    timing: float | None = None,
 ) -> Identification:
     """Identify the model of a flight. If the model must not be used, the result says why.
 
@@ -285,6 +297,8 @@ def identify_model(
             every span and the model may be used.
         searches_again: Whether a part with too many entries of A at their bounds is searched again,
             about what was found.
+        timing: Standard deviation of the delay in `actuation`, s. With it, even 0, the deviations
+            also hold for a model that is not right (`Search.with_doubt`).
 
     Raises:
         ParameterError: An output does not move.
@@ -307,6 +321,7 @@ def identify_model(
         channels=channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs)),
         bound_count=bound_count,
         searches_again=searches_again,
+        timing=timing,
         step=_counter(progress, len(every), starts_at_flown=flown is not None),
     )
     searches = [study.search(model, block) for block in every]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How well a model predicts held-out samples, and the reasons against a model."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,6 +26,9 @@ from flight_design.identification.likelihood import (
 # Largest deviation of the best known effect of an input on each output: two deviations are a fifth
 # of the loop gain.
 MAX_DEVIATION = 0.1
+# The same for the part of this deviation that an uncertain delay of u makes: with it, the guarantee
+# has to cover 30 % of the loop gain.
+MAX_BY_TIMING = 0.15
 # White innovations have 1, with a deviation of 0.3. A model with more than this leaves out
 # something that the aircraft does.
 MAX_WHITENESS = 3.0
@@ -191,10 +194,13 @@ class NoBetter(Refusal):
     """The only reason against a model is that it predicts no better than the nominal one."""
 
 
-def reason_against_prediction(before: Prediction, after: Prediction) -> NoBetter | None:
+def reason_against_prediction(
+    before: Prediction, after: Prediction, outputs: Sequence[str]
+) -> NoBetter | None:
     """Refuse a model that predicts the held-out samples no better than before.
 
-    A model whose innovations are neither white nor whiter than before is refused, too.
+    A model is refused, too, if the innovations of one of its outputs are neither white nor whiter
+    than before.
     """
     if after.log_likelihood <= before.log_likelihood:
         return NoBetter(
@@ -203,13 +209,38 @@ def reason_against_prediction(before: Prediction, after: Prediction) -> NoBetter
             f" {before.log_likelihood:.4g} of the nominal airframe, which explains this flight "
             "as it is"
         )
-    if (
-        np.sum(after.whiteness) >= np.sum(before.whiteness)
-        and np.max(after.whiteness) > MAX_WHITENESS
-    ):
+    coloured = (after.whiteness > MAX_WHITENESS) & (after.whiteness >= before.whiteness)
+    if coloured.any():
+        worst = int(np.argmax(np.where(coloured, after.whiteness, 0.0)))
         return NoBetter(
-            "held-out samples: found innovations with a whiteness of "
-            f"{np.mean(after.whiteness):.3g}, expected less than the"
-            f" {np.mean(before.whiteness):.3g} of the nominal airframe"
+            f"held-out samples: found innovations of {outputs[worst]} with a whiteness of "
+            f"{after.whiteness[worst]:.3g}, expected less than the {before.whiteness[worst]:.3g} "
+            "of the nominal airframe"
         )
     return None
+
+
+def in_time(entries: Iterable[Entry], by_timing: Iterable[float]) -> list[Entry]:
+    """Return the entries with the deviations that they have if the delay of u is known."""
+    return [
+        entry._replace(deviation=float(np.sqrt(max(entry.deviation**2 - late**2, 0.0))))
+        for entry, late in zip(entries, by_timing, strict=True)
+    ]
+
+
+def reason_against_timing(
+    entries: Sequence[Entry], by_timing: Sequence[float], outputs: Iterable[str]
+) -> Refusal | None:
+    """Refuse a part whose best known effect of an input hangs on when u acts.
+
+    `by_timing` is the part of the deviation of each entry that an uncertain delay of u makes.
+    """
+    late = dict(zip((entry.name for entry in entries), by_timing, strict=False))
+    worst = max(best_known(entries, outputs), key=lambda effect: late.get(effect.name, 0.0))
+    part = late.get(worst.name, 0.0)
+    if part <= MAX_BY_TIMING:
+        return None
+    return Refusal(
+        f"timing of u: found {worst.name} known to {100 * part:.3g} %, because u may act at any "
+        f"instant between two samples, expected {100 * MAX_BY_TIMING:.2g} %: log u more often"
+    )

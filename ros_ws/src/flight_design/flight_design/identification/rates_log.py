@@ -54,6 +54,8 @@ class RatesLog(NamedTuple):
     taken: Imported
     cutoff: float  # of the gyro's second-order low-pass, Hz; 0 if the log names none
     advance: float  # s, by which y comes earlier than behind that filter
+    # s, deviation of the instant at which u acts, which lies anywhere within a period of the log
+    timing: float
 
 
 def rates_map(scenario: Scenario, autopilot: str) -> ChannelMap:
@@ -114,17 +116,19 @@ def rates_of_log(
         "u": Signal(u.stamp_ns, tuple(airframe.inputs), values),
     }
     recorded = recording(Tape(signals, tape.start_ns), airframe)
+    timing = recorded.period / math.sqrt(12.0)
     if recorded.period > SPARSE / scenario.controller.rate:
         # The loop changes u between two samples. The mean of both is exact if u is linear between
         # them.
         following = np.vstack([recorded.u[1:], recorded.u[-1:]])
         recorded = recorded._replace(u=(recorded.u + following) / 2.0)
+        timing /= 2.0  # u is known at both ends
     cutoff = taken.parameters.get(CUTOFFS[autopilot], 0.0)
     advance = 0.0
     if 0.0 < cutoff < BROAD < 1.0 / (OVER * recorded.period):
         recorded, advance = broadened(recorded, cutoff)
     means = coarser(recorded, max(1, round(PERIOD / recorded.period)))
-    return RatesLog(recorded=means, taken=taken, cutoff=cutoff, advance=advance)
+    return RatesLog(recorded=means, taken=taken, cutoff=cutoff, advance=advance, timing=timing)
 
 
 def scaled_torques(parameters: Mapping[str, float]) -> list[str]:

@@ -1,0 +1,138 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a log shows an aircraft, and which doublets would show what it lacks."""
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import expm
+
+from aircraft_sim.airframes.airframe import Airframe
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.vectors import FloatArray
+from flight_design.gains.ideal_control import ChannelPairing
+from flight_design.identification.innovation_filters import FlightData, measured_noise
+from flight_design.identification.model_identification import Part
+from flight_design.identification.model_quality import (
+    MAX_DEVIATION,
+    best_known,
+    excitation_factor,
+    in_time,
+    reason_against_timing,
+)
+
+# Of the motion of an output, by its own input: 0.2 in doublets of yaw, and 0.02 or less without.
+LEAST_SHARE = 0.05
+FORGETTING = 0.5  # 1/s, taken from the poles, so that what a neutral aircraft integrates fades
+FEWEST = 3  # doublets on an axis
+LENGTH = 0.5  # s, of half a doublet if the scenario has none
+SIZE = 0.3  # rad/s, of a doublet if the scenario has none
+APART = 2.0  # s between doublets
+YAW_RATES = "FW_ACRO_YAW_EN"
+
+
+class Still(NamedTuple):
+    """An output that its own input does not move enough to be identified."""
+
+    output: str
+    input: str
+    share: float  # of the variance of the output that the input explains
+
+    @property
+    def sentence(self) -> str:
+        """Say what was found and what is expected."""
+        return (
+            f"{self.output}: found that {self.input} explains {100 * self.share:.2g} % of its "
+            f"motion, expected {100 * LEAST_SHARE:g} %"
+        )
+
+
+def shares(recorded: FlightData, airframe: Airframe) -> FloatArray:
+    """Return the share of each output's variance that each input explains, (m outputs, m inputs).
+
+        share_ij = var (C_i x_j) / (var y_i - noise_i^2),  x_j_dot = (A - FORGETTING) x_j + B_j u_j
+
+    The rough airframe suffices for this. A share is more than 1 if inputs work against each other.
+    """
+    A = airframe.matrix_a() - FORGETTING * np.eye(len(airframe.states))
+    B = airframe.matrix_b()
+    C = airframe.matrix_c()
+    n, m = B.shape
+    step = recorded.period * np.block([[A, B], [np.zeros((m, n + m))]])
+    both = expm(step)
+    x = np.zeros((n, m))
+    responses = np.empty((len(recorded.u), len(C), m))
+    for k, u in enumerate(recorded.u):
+        responses[k] = C @ x
+        x = both[:n, :n] @ x + both[:n, n:] * u
+    noise = measured_noise(recorded.y, np.zeros(recorded.y.shape[1]))
+    variance = np.nanvar(recorded.y, axis=0)
+    motion = np.maximum(variance - noise**2, 1e-3 * variance)
+    return np.asarray(responses.var(axis=0) / motion[:, None])
+
+
+def still_outputs(
+    recorded: FlightData, airframe: Airframe, channels: ChannelPairing
+) -> list[Still]:
+    """Return the outputs of which their own input explains less than LEAST_SHARE."""
+    share = shares(recorded, airframe)
+    inputs = list(airframe.inputs)
+    own = [
+        Still(output, name, float(share[airframe.outputs.index(output), inputs.index(name)]))
+        for output, name in zip(channels.outputs, channels.inputs, strict=True)
+    ]
+    return [each for each in own if each.share < LEAST_SHARE]
+
+
+def to_set(outputs: Iterable[str], parameters: Mapping[str, float]) -> str:
+    """Say which parameter of PX4 lets its own controller fly the doublets; "" if none is missing.
+
+    Source: PX4 1.16, fw_rate_control: without it the yaw rate of a setpoint is not controlled.
+    """
+    if "r" not in outputs or parameters.get(YAW_RATES) != 0.0:
+        return ""
+    return f"; set {YAW_RATES} to 1, without which PX4 does not control r"
+
+
+def to_fly(
+    outputs: Mapping[str, float], scenario: Scenario, airframe: Airframe, y: FloatArray
+) -> str:
+    """Say which doublets show outputs, each of which needs a factor on its amplitude so far.
+
+    They have the size and length of the pulses of the scenario, at least what the log has, y (T,
+    m). "" if there are no outputs.
+    """
+    pulses = scenario.reference_model.pulses
+    texts = []
+    for output, factor in outputs.items():
+        column = y[:, airframe.outputs.index(output)]
+        moved = float(np.nanpercentile(np.abs(column), 99.0))
+        pulse = pulses.get(output)
+        size = max(moved, SIZE) if pulse is None else max(moved, *np.abs(pulse.value))
+        length = LENGTH if pulse is None else pulse.stop[0] - pulse.start[0]
+        number = max(FEWEST, math.ceil(FEWEST * (factor * moved / size) ** 2))
+        texts.append(f"{output}: {number} doublets of {size:.2g} rad/s, {length:.2g} s each way")
+    return f"; fly, {APART:g} s apart, {', then '.join(texts)}" if texts else ""
+
+
+def factors_of(parts: Iterable[Part]) -> dict[str, float]:
+    """Return the outputs of which no effect is known to MAX_DEVIATION, by motion that they lack.
+
+    Each has the factor on its amplitude. What a delay makes uncertain, no motion mends.
+    """
+    return {
+        effect.row: excitation_factor(effect)
+        for part in parts
+        for effect in best_known(in_time(part.entries, part.by_timing), part.outputs)
+        if effect.deviation > MAX_DEVIATION
+    }
+
+
+def is_late(parts: Iterable[Part]) -> bool:
+    """Return whether an uncertain delay makes too much of the deviation of a best known effect."""
+    return any(
+        reason_against_timing(part.entries, part.by_timing, part.outputs) is not None
+        for part in parts
+    )
