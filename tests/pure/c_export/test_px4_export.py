@@ -368,6 +368,9 @@ def test_spare_is_that_of_the_vehicle(tmp_path: Path) -> None:
         write_module("px4", scenarios[name], target, float32=False)
         start = f"{expected[0]} stop\n{expected[0]} start vtol\nrise_di_control start\n"
         assert (target / "extras.txt").read_text() == start
+        topics = (target / "logger_topics.txt").read_text().splitlines()
+        # at every sample: what the replay and `tune` need
+        assert {"rise_di_status", "vehicle_angular_velocity", "vehicle_torque_setpoint"} < {*topics}
         text = "".join(path.read_text() for path in target.rglob("*") if path.is_file())
         for word in expected:
             assert word in text

@@ -536,7 +536,7 @@ def test_multicopter_gives_outputs_of_its_rate_controllers_in_any_mode(
     assert tape["u"].values == approx(flight.u, abs=1e-6)
     rover = multicopter(tmp_path / "rover.bin", flight, "ArduRover V4.5.7 (2a3dc4b7)")
     servos = imported(log, tmp_path / "no", "--servos", map_name=quadrotor)
-    assert "--servos: found a multicopter, expected none" in str(servos.exception)
+    assert "servos as commands: found a multicopter, expected a plane" in str(servos.exception)
     refused = imported(rover, tmp_path / "no", map_name=quadrotor)
     assert "found one of a rover, expected one of a plane or a multicopter" in str(
         refused.exception
@@ -889,8 +889,7 @@ def test_log_of_the_other_kind_of_vehicle_than_the_map_is_refused(
 ) -> None:
     path = multicopter(tmp_path / "copter.bin", flight)
     sentence = (
-        "the log: found one of a multicopter, expected one of a plane as in the map "
-        "ardupilot, or another --map"
+        "the log: found one of a multicopter, expected one of a plane, as the map ardupilot is for"
     )
     assert str(imported(path, tmp_path / "no").exception) == sentence
 

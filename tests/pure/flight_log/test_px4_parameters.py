@@ -56,6 +56,24 @@ def test_defaults_are_those_of_px4(tmp_path: Path) -> None:
     assert rate_loop(path, 200.0).delay == approx(0.0056 + 0.005 + 0.0025, abs=5e-5)
 
 
+@pytest.mark.parametrize(
+    ("logged", "wait"),
+    [
+        # SITL's gyro has 250 Hz, whatever IMU_GYRO_RATEMAX says
+        (250.0, 0.0),
+        # a gyro at that parameter, and a log that leaves samples out
+        (400.0, 0.0025),
+        (50.0, 0.0025),
+    ],
+)
+def test_gyro_is_as_slow_as_its_samples_in_the_log(
+    tmp_path: Path, logged: float, wait: float
+) -> None:
+    path = written(tmp_path / "plane.params", IMU_GYRO_CUTOFF=40.0)
+    delay = rate_loop(path, 250.0, logged).delay
+    assert delay == approx(filter_delay(40.0, {}) + 0.004 + wait, abs=5e-5)
+
+
 def test_parameters_come_from_a_ulog(tmp_path: Path) -> None:
     rows = [(1000 * k, (0.0, 0.0, 0.0)) for k in range(1, 20)]
     topics = {"vehicle_angular_velocity": ("float[3] xyz;", rows)}

@@ -47,7 +47,74 @@ float64 y_m_offset       # [s] of the newest y_m after y
 float32 rate             # [Hz] of the samples of the rates, measured; 0: not yet
 """
 
+# PX4 logs the topics of this file in place of its own, each with its least interval in ms.
+TOPICS = """rise_di_status
+vehicle_angular_velocity
+vehicle_torque_setpoint
+vehicle_thrust_setpoint
+vehicle_rates_setpoint
+airspeed_validated 100
+actuator_armed
+actuator_motors 100
+actuator_outputs 100
+actuator_servos 100
+airspeed 1000
+battery_status 200
+control_allocator_status 200
+cpuload
+differential_pressure 1000
+distance_sensor 1000
+esc_status 250
+estimator_innovation_test_ratios 500
+estimator_sensor_bias 1000
+estimator_status 200
+estimator_status_flags 500
+failsafe_flags
+failure_detector_status 100
+home_position
+input_rc 500
+manual_control_setpoint 200
+manual_control_switches
+mission_result
+navigator_status
+offboard_control_mode 100
+parameter_update
+position_controller_status 500
+position_setpoint_triplet 200
+rate_ctrl_status 200
+rtl_time_estimate 1000
+sensor_baro 1000
+sensor_combined
+sensor_gps 1000
+sensor_mag 1000
+sensor_selection
+sensors_status_imu 200
+system_power 500
+tecs_status 200
+telemetry_status 1000
+trajectory_setpoint 200
+vehicle_acceleration 50
+vehicle_air_data 200
+vehicle_attitude 50
+vehicle_attitude_setpoint 50
+vehicle_command
+vehicle_command_ack
+vehicle_control_mode
+vehicle_global_position 200
+vehicle_imu 500
+vehicle_imu_status 1000
+vehicle_land_detected
+vehicle_local_position 100
+vehicle_local_position_setpoint 100
+vehicle_magnetometer 200
+vehicle_status
+wind 1000
+"""
+"""Of the module and of `tune` at every sample, and those that PX4 1.16 logs by default
+(logged_topics.cpp): a file without them would leave them out of the log."""
+
 PX4 = {
+    "logger_topics.txt": TOPICS,
     "src/CMakeLists.txt": "set(config_module_list_external modules/rise_di_control PARENT_SCOPE)\n",
     "msg/CMakeLists.txt": "set(config_msg_list_external RiseDiStatus.msg PARENT_SCOPE)\n",
     "extras.txt": "fw_rate_control stop\nfw_rate_control start vtol\nrise_di_control start\n",

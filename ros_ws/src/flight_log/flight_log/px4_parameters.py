@@ -43,8 +43,11 @@ class RateLoop(NamedTuple):
     origin: str  # what they come from
 
 
-def rate_loop(path: Path, rate: float | None = None) -> RateLoop:
+def rate_loop(path: Path, rate: float | None = None, logged: float = 0.0) -> RateLoop:
     """Return the loop for a law at a rate, by default at that of the gyro.
+
+    The gyro has IMU_GYRO_RATEMAX, or the lower rate at which its samples were `logged`, Hz, unless
+    they were too rare for the law.
 
         delay = 1 / (sqrt(2) pi f) + sum_k b_k / (2 pi f_k^2) + 1 / rate + wait
 
@@ -55,6 +58,8 @@ def rate_loop(path: Path, rate: float | None = None) -> RateLoop:
     values = {**DEFAULTS, **_read(path)}
     fastest = values["IMU_GYRO_RATEMAX"]
     design_rate = fastest if rate is None else rate
+    if design_rate <= LIKE_PART * logged < fastest:
+        fastest = max(logged, design_rate)
     require(
         0.0 < design_rate <= fastest,
         "rate",

@@ -164,7 +164,7 @@ def _require_kind(vehicle: str, channel_map: ChannelMap) -> None:
     vehicle_found = f"one of a {vehicle}"
     require(vehicle in {PLANE, COPTER}, "the log", vehicle_found, "one of a plane or a multicopter")
     kind = kind_of_map(channel_map)
-    expected = f"one of a {kind} as in the map {channel_map.name}, or another --map"
+    expected = f"one of a {kind}, as the map {channel_map.name} is for"
     require(vehicle == kind, "the log", vehicle_found, expected)
 
 
@@ -304,9 +304,9 @@ def _commands(
         )
         require(
             not servos,
-            "--servos",
+            "servos as commands",
             "a ULog",
-            "none: its setpoints of torque and thrust are the commands",
+            "a log of ArduPilot: in a ULog the setpoints of torque and thrust are the commands",
         )
         return _Reader(log, source, row.line)
     if log.vehicle == COPTER:
@@ -348,9 +348,9 @@ def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
         )
     require(
         not servos,
-        "--servos",
+        "servos as commands",
         "a multicopter",
-        "none: the outputs of its rate controllers are the commands",
+        "a plane: of a multicopter the outputs of the rate controllers are the commands",
     )
     return _Reader(log, source, LinearConversion(1 if sign > 0 else -1, row.scale, 0.0))
 
@@ -474,7 +474,7 @@ def gap_sentence(name: str, stamp_ns: Stamps, start_ns: int) -> str | None:
     """Say how many samples a topic lacks, judged by its usual period; None if it has all."""
     gaps = np.diff(stamp_ns)
     period = float(np.median(gaps))
-    expected = round(float(stamp_ns[-1] - stamp_ns[0]) / period) + 1
+    expected = _expected(stamp_ns)
     if expected <= len(stamp_ns) or gaps.max() < 1.5 * period:
         return None
     instant = seconds(int(stamp_ns[gaps.argmax()]) - start_ns)
@@ -482,6 +482,16 @@ def gap_sentence(name: str, stamp_ns: Stamps, start_ns: int) -> str | None:
         f"{name} lacks {expected - len(stamp_ns)} of {expected} samples: the longest gap, "
         f"{seconds(int(gaps.max())):.2g} s, begins at {instant:.1f} s of the log"
     )
+
+
+def lost_share(stamp_ns: Stamps) -> float:
+    """Return the share of the samples that a topic lacks, judged by its usual period."""
+    return max(1.0 - len(stamp_ns) / _expected(stamp_ns), 0.0)
+
+
+def _expected(stamp_ns: Stamps) -> int:
+    """Return how many samples a topic without gaps would have."""
+    return round(float(stamp_ns[-1] - stamp_ns[0]) / float(np.median(np.diff(stamp_ns)))) + 1
 
 
 def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Signal | None:

@@ -153,7 +153,7 @@ def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
         for number in range(1, SERVOS + 1)
         if values.get(f"SERVO{number}_FUNCTION") == function
     ]
-    sticks_instead = "or the sticks in MANUAL, without --servos"
+    sticks_instead = "or a log in MANUAL, where the sticks are the commands"
     if not outputs:
         missing = f"found no servo with SERVOn_FUNCTION {function} in the log"
         raise ParameterError(f"inputs.{name}: {missing}, expected one, {sticks_instead}")

@@ -17,6 +17,7 @@ from aircraft_sim.airframes.airframe import Airframe
 from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.parameters import require
+from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_design.identification.innovation_filters import FlightData, coarser, recording
@@ -52,10 +53,12 @@ class RatesLog(NamedTuple):
 
     recorded: FlightData
     taken: Imported
+    rate: float  # of the samples of y, Hz
     cutoff: float  # of the gyro's second-order low-pass, Hz; 0 if the log names none
     advance: float  # s, by which y comes earlier than behind that filter
     # s, deviation of the instant at which u acts, which lies anywhere within a period of the log
     timing: float
+    every: float  # s, from one sample of u to the next
 
 
 def rates_map(scenario: Scenario, autopilot: str) -> ChannelMap:
@@ -116,7 +119,8 @@ def rates_of_log(
         "u": Signal(u.stamp_ns, tuple(airframe.inputs), values),
     }
     recorded = recording(Tape(signals, tape.start_ns), airframe)
-    timing = recorded.period / math.sqrt(12.0)
+    every = recorded.period
+    timing = every / math.sqrt(12.0)
     if recorded.period > SPARSE / scenario.controller.rate:
         # The loop changes u between two samples. The mean of both is exact if u is linear between
         # them.
@@ -128,7 +132,15 @@ def rates_of_log(
     if 0.0 < cutoff < BROAD < 1.0 / (OVER * recorded.period):
         recorded, advance = broadened(recorded, cutoff)
     means = coarser(recorded, max(1, round(PERIOD / recorded.period)))
-    return RatesLog(recorded=means, taken=taken, cutoff=cutoff, advance=advance, timing=timing)
+    return RatesLog(
+        recorded=means,
+        taken=taken,
+        rate=NANOSECONDS / float(np.median(np.diff(y.stamp_ns))),
+        cutoff=cutoff,
+        advance=advance,
+        timing=timing,
+        every=every,
+    )
 
 
 def scaled_torques(parameters: Mapping[str, float]) -> list[str]:
