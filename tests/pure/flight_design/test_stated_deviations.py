@@ -18,7 +18,13 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
-from flight_design.identification.excitation import still_outputs, to_fly, to_set
+from flight_design.identification.excitation import (
+    OwnShare,
+    gust_warning,
+    own_shares,
+    to_fly,
+    to_set,
+)
 from flight_design.identification.innovation_filters import Actuation, FlightData, coarser
 from flight_design.identification.likelihood import Unknown
 from flight_design.identification.model_identification import Identification, identify_model
@@ -99,7 +105,9 @@ def flown(
 def identified(
     nominal: Airframe, y: FloatArray, u: FloatArray, timing: float | None = TIMING
 ) -> Identification:
-    recorded = FlightData(PERIOD, np.arange(len(y)) * PERIOD, y[:, None], u[:, None])
+    recorded = FlightData(
+        PERIOD, np.arange(len(y), dtype=np.float64) * PERIOD, y[:, None], u[:, None]
+    )
     return identify_model(
         coarser(recorded, 2),
         nominal,
@@ -113,6 +121,15 @@ def identified(
 def farthest(found: Identification) -> float:
     """The largest error of an entry in its stated deviations."""
     return max(abs(entry.error - TRUE[entry.name]) / entry.deviation for entry in found.entries)
+
+
+@pytest.mark.slow
+def test_log_of_gusts_has_a_warning(nominal: Airframe) -> None:
+    """Their effect on the estimate is beyond the deviations."""
+    (part,) = identified(nominal, *flown(nominal, wind=1.0)).parts
+    assert "fly the doublets in calm air" in gust_warning(part)
+    (calm,) = identified(nominal, *flown(nominal)).parts
+    assert gust_warning(calm) == ""
 
 
 @pytest.mark.slow
@@ -165,16 +182,32 @@ def test_lost_samples_do_not_move_an_entry_farther_than_stated(nominal: Airframe
 def test_output_that_its_own_input_does_not_move_is_named(nominal: Airframe) -> None:
     """Wind moves q, and the elevator stands still."""
     y, u = flown(nominal, setpoint=0.0, wind=0.5, length=20.0)
-    recorded = FlightData(PERIOD, np.arange(len(y)) * PERIOD, y[:, None], 0.0 * u[:, None])
-    (still,) = still_outputs(recorded, nominal, CHANNELS)
-    assert (still.output, still.input) == ("q", "elevator")
+    recorded = FlightData(
+        PERIOD, np.arange(len(y), dtype=np.float64) * PERIOD, y[:, None], 0.0 * u[:, None]
+    )
+    (still,) = own_shares(recorded, nominal, CHANNELS)
+    assert still == OwnShare("q", "elevator", 0.0)
+    assert still.is_still
     assert still.sentence == "q: found that elevator explains 0 % of its motion, expected 5 %"
+
+
+def test_output_that_the_noise_of_its_feedback_moves_is_named(nominal: Airframe) -> None:
+    """In calm air without doublets the noise of y is all that moves the elevator."""
+    y, u = flown(nominal, setpoint=0.0, length=20.0)
+    recorded = FlightData(
+        PERIOD, np.arange(len(y), dtype=np.float64) * PERIOD, y[:, None], u[:, None]
+    )
+    (still,) = own_shares(recorded, nominal, CHANNELS)
+    assert still.is_still
 
 
 def test_output_that_doublets_move_is_not_named(nominal: Airframe) -> None:
     y, u = flown(nominal, length=20.0)
-    recorded = FlightData(PERIOD, np.arange(len(y)) * PERIOD, y[:, None], u[:, None])
-    assert still_outputs(recorded, nominal, CHANNELS) == []
+    recorded = FlightData(
+        PERIOD, np.arange(len(y), dtype=np.float64) * PERIOD, y[:, None], u[:, None]
+    )
+    (moved,) = own_shares(recorded, nominal, CHANNELS)
+    assert not moved.is_still
 
 
 @pytest.mark.parametrize(

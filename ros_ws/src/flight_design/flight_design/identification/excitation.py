@@ -13,18 +13,19 @@ from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
-from flight_design.identification.innovation_filters import FlightData, measured_noise
+from flight_design.identification.innovation_filters import FlightData
 from flight_design.identification.model_identification import Part
 from flight_design.identification.model_quality import (
     MAX_DEVIATION,
     best_known,
     excitation_factor,
     in_time,
-    reason_against_timing,
 )
 
-# Of the motion of an output, by its own input: 0.2 in doublets of yaw, and 0.02 or less without.
+# Of the variance of an output, by its own input: 0.2 in doublets of yaw, and 0.01 or less without.
 LEAST_SHARE = 0.05
+CLEAR_SHARE = 0.2  # below this an output is flown again, if another one has to be
+WINDY = 1.0  # times moderate turbulence, from which on gusts hide the effects of the inputs
 FORGETTING = 0.5  # 1/s, taken from the poles, so that what a neutral aircraft integrates fades
 FEWEST = 3  # doublets on an axis
 LENGTH = 0.5  # s, of half a doublet if the scenario has none
@@ -33,12 +34,17 @@ APART = 2.0  # s between doublets
 YAW_RATES = "FW_ACRO_YAW_EN"
 
 
-class Still(NamedTuple):
-    """An output that its own input does not move enough to be identified."""
+class OwnShare(NamedTuple):
+    """The share of an output's variance that its own input explains."""
 
     output: str
     input: str
-    share: float  # of the variance of the output that the input explains
+    share: float
+
+    @property
+    def is_still(self) -> bool:
+        """Whether the log does not show the effect of the input."""
+        return self.share < LEAST_SHARE
 
     @property
     def sentence(self) -> str:
@@ -52,7 +58,7 @@ class Still(NamedTuple):
 def shares(recorded: FlightData, airframe: Airframe) -> FloatArray:
     """Return the share of each output's variance that each input explains, (m outputs, m inputs).
 
-        share_ij = var (C_i x_j) / (var y_i - noise_i^2),  x_j_dot = (A - FORGETTING) x_j + B_j u_j
+        share_ij = var (C_i x_j) / var y_i,  x_j_dot = (A - FORGETTING) x_j + B_j u_j
 
     The rough airframe suffices for this. A share is more than 1 if inputs work against each other.
     """
@@ -67,23 +73,19 @@ def shares(recorded: FlightData, airframe: Airframe) -> FloatArray:
     for k, u in enumerate(recorded.u):
         responses[k] = C @ x
         x = both[:n, :n] @ x + both[:n, n:] * u
-    noise = measured_noise(recorded.y, np.zeros(recorded.y.shape[1]))
-    variance = np.nanvar(recorded.y, axis=0)
-    motion = np.maximum(variance - noise**2, 1e-3 * variance)
-    return np.asarray(responses.var(axis=0) / motion[:, None])
+    return np.asarray(responses.var(axis=0) / np.nanvar(recorded.y, axis=0)[:, None])
 
 
-def still_outputs(
+def own_shares(
     recorded: FlightData, airframe: Airframe, channels: ChannelPairing
-) -> list[Still]:
-    """Return the outputs of which their own input explains less than LEAST_SHARE."""
+) -> list[OwnShare]:
+    """Return the share of each output, in the law's order, that its own input explains."""
     share = shares(recorded, airframe)
     inputs = list(airframe.inputs)
-    own = [
-        Still(output, name, float(share[airframe.outputs.index(output), inputs.index(name)]))
+    return [
+        OwnShare(output, name, float(share[airframe.outputs.index(output), inputs.index(name)]))
         for output, name in zip(channels.outputs, channels.inputs, strict=True)
     ]
-    return [each for each in own if each.share < LEAST_SHARE]
 
 
 def to_set(outputs: Iterable[str], parameters: Mapping[str, float]) -> str:
@@ -117,6 +119,20 @@ def to_fly(
     return f"; fly, {APART:g} s apart, {', then '.join(texts)}" if texts else ""
 
 
+def gust_warning(part: Part) -> str:
+    """Warn of a part that flew in gusts, which the deviations do not count; "" in calmer air.
+
+    In gusts of 0.5 m/s the effects of a light airplane came out a fifth too weak.
+    """
+    if part.wind < WINDY:
+        return ""
+    return (
+        f"{', '.join(part.outputs)}: the air moved as in turbulence of {part.wind:g} times "
+        "moderate: gusts hide what the inputs do, and their effects may come out a fifth too weak; "
+        "fly the doublets in calm air"
+    )
+
+
 def factors_of(parts: Iterable[Part]) -> dict[str, float]:
     """Return the outputs of which no effect is known to MAX_DEVIATION, by motion that they lack.
 
@@ -128,11 +144,3 @@ def factors_of(parts: Iterable[Part]) -> dict[str, float]:
         for effect in best_known(in_time(part.entries, part.by_timing), part.outputs)
         if effect.deviation > MAX_DEVIATION
     }
-
-
-def is_late(parts: Iterable[Part]) -> bool:
-    """Return whether an uncertain delay makes too much of the deviation of a best known effect."""
-    return any(
-        reason_against_timing(part.entries, part.by_timing, part.outputs) is not None
-        for part in parts
-    )

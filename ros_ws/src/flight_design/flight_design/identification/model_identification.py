@@ -91,6 +91,7 @@ class Part(NamedTuple):
     gusts: bool  # whether a share of FEW or more of its seconds has gusts
     delays: tuple[float, ...] = ()  # s, the delay of each input
     advantage: float = 0.0  # of the model `flown` over the nominal one, see `identify_model`
+    wind: float = 0.0  # of most of its seconds, relative to moderate turbulence
     # of the deviation of each entry, the part that an uncertain delay makes
     by_timing: tuple[float, ...] = ()
 
@@ -178,6 +179,7 @@ class _Study(NamedTuple):
             gusts=gusts,
             delays=tuple(delays.tolist()),
             advantage=0.0 if fit.flown is None else self.advantage(fit.flown, fit.before),
+            wind=float(LEVELS[np.bincount(fit.levels).argmax(), 0]),
             by_timing=tuple(by_timing.tolist()),
         )
 

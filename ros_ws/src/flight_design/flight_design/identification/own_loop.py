@@ -63,12 +63,18 @@ class OwnLoop(NamedTuple):
         return scenario.vary(controller=pi)
 
     def flown(
-        self, scenario: Scenario, airframe: Airframe, y_m: FloatArray, noise: FloatArray
+        self,
+        scenario: Scenario,
+        airframe: Airframe,
+        y_m: FloatArray,
+        noise: FloatArray,
+        f: FloatArray,
     ) -> FloatArray:
         """Return y - y_m, (N, m), of the aircraft under this loop, with y_m (N, m) as the setpoint.
 
         A row is a period of the controller. y has the noise, (m,) rms. It is late by the delay of
-        the scenario minus a period, and u acts from the next period on.
+        the scenario minus a period, and u acts from the next period on. f, (N, n), is
+        the disturbance of x_dot, SI.
         """
         controller = scenario.rise_di()
         period = 1.0 / controller.rate
@@ -96,7 +102,7 @@ class OwnLoop(NamedTuple):
             before, u = u, end * np.clip(self.FF * setpoint + self.P * e + integral, -1.0, 1.0)
             for _ in range(STEPS):
                 position = position + follows * (before - position)
-                x = both[:n, :n] @ x + both[:n, n:] @ position
+                x = both[:n, :n] @ x + both[:n, n:] @ position + step * f[k]
         return error
 
 

@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The controllers that `rise-di tune` compares on the identified aircraft, and the best of them.
+
+Each flies the commands of the scenario in calm air and in gusts. The autopilot's own loop flies
+beside them.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from aircraft_sim.airframes.airframe import Airframe
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_core.outcome import COMPLETED
+from flight_core.parameters import ParameterError
+from flight_core.rates import period_ns
+from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
+from flight_design.gains.gain_design import check_gains, select_gains
+from flight_design.gains.gain_selection import with_feedforward
+from flight_design.identification.own_loop import OwnLoop
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+CALM, GUSTS = "calm", "gusts"
+TURBULENCE: Mapping[str, float] = MappingProxyType({"altitude": 5.0, "wind": 5.0})
+"""Near the ground the gusts of a wind of 5 m/s have 0.5 m/s rms along the vertical axis."""
+ROLLING = {"amplitude": 0.7, "frequency": 5.0}
+"""A gust that turns about the roll axis, rad/s and rad/s: 0.5 rad/s rms, with a time of 0.2 s."""
+SAMPLES = 60  # uncertain aircraft
+DELAY_MARGIN = 0.01  # s, with the observer, as in examples/px4_airplane/rates_observer.yaml
+FORMER = "as in the scenario"
+Report = Callable[[str], None]
+
+
+class Candidate(NamedTuple):
+    """A controller beside others."""
+
+    name: str
+    scenario: Scenario  # with the identified aircraft
+    origin: str  # where the gains come from; "" if that is the scenario
+    shortfall: str  # margins that the loop lacks, in a sentence; "" if there are none
+    rms: Mapping[str, FloatArray]  # of y - y_m, by air, (m,); infinite if the flight ends early
+
+    @property
+    def score(self) -> float:
+        """Return the geometric mean over the outputs of the rms over all airs, rad/s.
+
+        A share of the error counts the same in each output, and an air by the size of its errors.
+        """
+        in_all = np.sqrt(np.mean(np.square(list(self.rms.values())), axis=0))
+        return float(np.exp(np.mean(np.log(in_all))))
+
+
+class Selectors(NamedTuple):
+    """How the candidates are found and judged."""
+
+    airframe: Airframe  # the identified one
+    flight: Scenario  # that of the log, with the identified aircraft
+    uncertainty: float  # of A and B, for the margins
+    lead: Callable[[RiseDiConfig], RiseDiConfig]  # gives a feedforward the lead of the module
+    calm: bool  # whether calm air counts alone, without an observer
+    accept: bool  # whether weights are taken as they are
+    weights: Path | None
+    report: Report
+
+    @property
+    def airs(self) -> dict[str, dict[str, Any]]:
+        """The airs in which the candidates fly, each as changes of the aircraft."""
+        airs: dict[str, dict[str, Any]] = {CALM: {}}
+        if self.airframe.gusts and not self.calm:
+            airs[GUSTS] = {"turbulence": dict(TURBULENCE)}
+            if "p" in self.airframe.states:
+                # The air turns, and so p_dot changes by A[p, p] times less the rate of the air.
+                row = self.airframe.index("p")
+                damping = abs(float(self.airframe.matrix_a()[row, row]))
+                rolling = ROLLING | {"amplitude": damping * ROLLING["amplitude"]}
+                airs[GUSTS]["sines"] = {"p": rolling}
+        return airs
+
+
+def candidates(selectors: Selectors) -> list[Candidate]:
+    """Return the scenario's own controller first, then those that were selected.
+
+    A selection that fails is reported and left out. Raises ParameterError if all of them fail.
+    """
+    flight, airframe = selectors.flight, selectors.airframe
+    former = flight.rise_di()
+    found = {FORMER: (former, "")}
+    if former.feedforward is not None and former.observer is None:
+        of_aircraft = selectors.lead(with_feedforward(former, airframe))
+        found["its gains, feedforward of this aircraft"] = of_aircraft, ""
+    options: dict[str, dict[str, Any]] = {"without an observer": {}}
+    observer = {"observer": True, "margin": DELAY_MARGIN}
+    if not selectors.calm:
+        options["observer by a rule"] = observer
+        if selectors.weights is not None:
+            # as they are: the margins are judged below, beside those of the others
+            as_read = {"weights": selectors.weights, "accept": True}
+            options[f"observer of {selectors.weights.name}"] = observer | as_read
+    reasons = []
+    for number, (name, choice) in enumerate(options.items(), 1):
+        selectors.report(f"gains {number} of {len(options)}: {name}")
+        try:
+            selection = select_gains(
+                airframe,
+                flight,
+                uncertainty=selectors.uncertainty,
+                samples=SAMPLES,
+                feedforward=True,
+                **({"accept": selectors.accept} | choice),
+            )
+        except ParameterError as error:
+            reasons.append(f"{name}: {error}")
+            selectors.report(reasons[-1])
+            continue
+        found[name] = selectors.lead(selection.chosen), selection.origin
+    if len(reasons) == len(options):
+        raise ParameterError("; ".join(reasons))
+    return [
+        _judged(selectors, name, controller, origin) for name, (controller, origin) in found.items()
+    ]
+
+
+def best_of(found: Sequence[Candidate], *, accept: bool) -> Candidate:
+    """Return the candidate of the least score whose margins suffice, or are accepted as they are.
+
+    Raises ParameterError, with the shortfall of the best one, if none has the margins.
+    """
+    by_score = sorted(found, key=lambda candidate: candidate.score)
+    enough = [candidate for candidate in by_score if accept or not candidate.shortfall]
+    if not enough:
+        short = f"{by_score[0].name}: {by_score[0].shortfall}"
+        expected = "--accept, which writes them all the same, or --calm"
+        raise ParameterError(f"gains: found {short}, expected {expected}")
+    return enough[0]
+
+
+def rms_of_own_loop(own: OwnLoop, selectors: Selectors) -> dict[str, FloatArray]:
+    """Return the rms of y - y_m of the autopilot's own loop by air, (m,)."""
+    flight, airframe = selectors.flight, selectors.airframe
+    controller = flight.rise_di()
+    errors = {}
+    for air, changes in selectors.airs.items():
+        tape = simulate(flight.vary(aircraft=changes))
+        y_m = tape["y_m"]
+        length = y_m.stamp_ns[-1] - tape.start_ns
+        stamps = tape.start_ns + np.arange(0, length, period_ns(controller.rate, "rate"))
+        setpoints = [np.interp(stamps, y_m.stamp_ns, y_m[name]) for name in controller.outputs]
+        truth = tape["truth"]
+        forces = [np.interp(stamps, truth.stamp_ns, truth[f"f.{name}"]) for name in airframe.states]
+        rows = [airframe.outputs.index(name) for name in controller.outputs]
+        error = own.flown(
+            flight,
+            airframe,
+            np.column_stack(setpoints),
+            np.array(flight.aircraft.sensors.noise)[rows],
+            np.column_stack(forces),
+        )
+        errors[air] = _root_mean_square(error)
+    return errors
+
+
+def _judged(selectors: Selectors, name: str, controller: RiseDiConfig, origin: str) -> Candidate:
+    """Fly a controller in each air, and compare its margins with the requirement."""
+    scenario = selectors.flight.vary(controller=controller)
+    selectors.report(f"flying in {' and in '.join(selectors.airs)}: {name}")
+    rms = {
+        air: _error(simulate(scenario.vary(aircraft=changes)), selectors.airframe)
+        for air, changes in selectors.airs.items()
+    }
+    answer = check_gains(
+        selectors.airframe,
+        scenario,
+        uncertainty=selectors.uncertainty,
+        samples=SAMPLES,
+        as_told=True,
+    )
+    short = [row.sentence(controller.outputs) for row in answer.unmet]
+    return Candidate(
+        name=name, scenario=scenario, origin=origin, shortfall="; ".join(short), rms=rms
+    )
+
+
+def _error(tape: Tape, airframe: Airframe) -> FloatArray:
+    """Return the rms of y - y_m of a flight, (m,), of the true y; infinite if it ended early."""
+    truth, y_m = tape["truth"], tape["y_m"]
+    rows = [airframe.outputs.index(name) for name in y_m.names]
+    if tape.outcome != COMPLETED:
+        return np.full(len(rows), np.inf)
+    states = np.column_stack([truth[f"x.{state}"] for state in airframe.states])
+    y = states @ airframe.matrix_c()[rows].T
+    wanted = [np.interp(truth.stamp_ns, y_m.stamp_ns, y_m[name]) for name in y_m.names]
+    return _root_mean_square(y - np.column_stack(wanted))
+
+
+def _root_mean_square(e: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.mean(e**2, axis=0)))
