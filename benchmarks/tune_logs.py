@@ -1,0 +1,233 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Print what `rise-di tune` makes of logs that lack something, beside the truth, as CSV.
+
+The logs are of linear airplanes with known A and B: that of examples/px4_airplane with other
+inertias, and that of examples/arduplane with other effects. A rate controller of PX4's form flies
+doublets of each rate for a minute.
+
+    python -m benchmarks.tune_logs > docs/evidence/tables/export-logs.csv
+"""
+
+import csv
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import expm
+
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
+from flight_core.vectors import FloatArray
+from flight_design.gains.ideal_control import ChannelPairing
+from flight_design.identification.excitation import gust_warning, own_shares
+from flight_design.identification.innovation_filters import Actuation, FlightData, coarser
+from flight_design.identification.likelihood import Unknown
+from flight_design.identification.model_identification import identify_model
+from flight_design.identification.model_quality import NoBetter
+from flight_design.identification.rates_log import SPARSE
+
+ROOT = Path(__file__).parents[1]
+STEP = 5e-4  # s, of the aircraft
+APART = 3.0  # s, from a doublet to the next
+LENGTH = 72.0  # s
+SEED = 7
+OFF = 2.5  # stated deviations
+HEADINGS = (
+    "log",
+    "entry",
+    "true change (%)",
+    "found (%)",
+    "stated deviation (%)",
+    "deviations off (1)",
+    "verdict",
+)
+
+
+class Case(NamedTuple):
+    """A log, and what it lacks."""
+
+    name: str
+    still: str = ""  # output that the autopilot does not control
+    silent: str = ""  # output without doublets
+    every: int = 1  # periods from one logged u to the next
+    lost: float = 0.0  # share of the samples of y
+    hole: float = 0.0  # s without y
+    colour: float = 0.0  # e_k = colour e_(k-1) + white noise
+    late: float = 0.0  # s, by which u acts later than known
+    gusts: float = 0.0  # m/s rms
+    plane: str = "px4_airplane"
+
+
+CASES = (
+    Case("nothing is missing"),
+    Case("yaw is not controlled", still="r"),
+    Case("no doublets of roll", silent="p"),
+    Case("the torque each 20 ms", every=5),
+    Case("a tenth of y and 8 s are lost", lost=0.1, hole=8.0),
+    Case("coloured noise", colour=0.5),
+    Case("u acts 2 ms later", late=0.002),
+    Case("gusts of 0.5 m/s", gusts=0.5),
+    Case("gusts, coloured noise, u 2 ms later", gusts=0.5, colour=0.5, late=0.002),
+    Case("ArduPlane, servos at 25 Hz", every=8, plane="arduplane"),
+)
+
+
+class Plane(NamedTuple):
+    """An airplane and its autopilot, channels in the airframe's order."""
+
+    period: float  # s
+    size: tuple[float, ...]  # rad/s, of a doublet
+    noise: tuple[float, ...]  # rad/s
+    gains: tuple[tuple[float, ...], ...]  # FF, P, I
+    end: float  # rad, u at the torque 1
+    changes: Mapping[str, float]  # of the rows of A and B, by output
+    lag: float  # s
+
+
+PLANES = {
+    "px4_airplane": Plane(
+        period=0.004,
+        size=(0.3, 0.6, 0.2),
+        noise=(0.05, 0.1, 0.02),
+        gains=((0.331, 0.206, 0.259), (0.086, 0.05, 0.4155), (1.19, 2.95, 10.0)),
+        end=0.261799,
+        changes={"q": 1.0 / 0.9, "p": 1.0 / 1.3, "r": 1.0 / 1.5},
+        lag=0.0,
+    ),
+    "arduplane": Plane(
+        period=0.005,
+        size=(0.3, 0.6),
+        noise=(0.01, 0.01),
+        gains=((0.25, 0.2), (0.3, 0.2), (0.5, 0.5)),
+        end=0.5,
+        changes={"q": 0.9, "p": 0.85},
+        lag=0.03,
+    ),
+}
+
+
+def true_model(nominal: Airframe, plane: Plane) -> tuple[FloatArray, FloatArray]:
+    """Return A and B of the aircraft that flies."""
+    A, B = nominal.matrix_a(), nominal.matrix_b()
+    for name, factor in plane.changes.items():
+        A[nominal.index(name)] *= factor
+        B[nominal.index(name)] *= factor
+    return A, B
+
+
+def flown(case: Case, nominal: Airframe, plane: Plane) -> FlightData:
+    """Fly a case, and return what its log has."""
+    rng = np.random.default_rng(SEED)
+    A, B = true_model(nominal, plane)
+    C = nominal.matrix_c()
+    n, m = B.shape
+    outputs = list(nominal.outputs)
+    both = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * STEP)
+    count, steps = int(LENGTH / plane.period), round(plane.period / STEP)
+    FF, P, gain = (np.array(row) for row in plane.gains)
+    controlled = np.array([name != case.still for name in outputs], dtype=float)
+    axes = [i for i, name in enumerate(outputs) if name not in (case.still, case.silent)]
+    follows = 1.0 - np.exp(-STEP / plane.lag) if plane.lag else 1.0
+    line = [np.zeros(m)] * round(case.late / STEP)
+    G = len(nominal.gusts)
+    x, integral, noise, position = np.zeros(n), np.zeros(m), np.zeros(m), np.zeros(m)
+    air = np.zeros(G)
+    y, u = np.zeros((count, m)), np.zeros((count, m))
+    for k in range(count):
+        number, phase = divmod(k * plane.period, APART)
+        setpoint = np.zeros(m)
+        axis = axes[int(number) % len(axes)]
+        setpoint[axis] = plane.size[axis] * ((phase < 0.5) - float(0.5 <= phase < 1.0))
+        noise = case.colour * noise + np.sqrt(1.0 - case.colour**2) * rng.normal(size=m)
+        y[k] = C @ x + np.array(plane.noise) * noise
+        error = setpoint - y[k]
+        integral = np.clip(integral + gain * error * plane.period, -0.4, 0.4)
+        torque = controlled * np.clip(FF * setpoint + P * error + integral, -1.0, 1.0)
+        u[k] = plane.end * torque
+        for _ in range(steps):
+            line.append(u[k])
+            air = air - air * STEP / 0.5 + case.gusts * np.sqrt(4.0 * STEP) * rng.normal(size=G)
+            position = position + follows * (line.pop(0) - position)
+            x = both[:n, :n] @ x + both[:n, n:] @ position + STEP * nominal.matrix_gusts() @ air
+    return logged(case, plane, y, u, rng)
+
+
+def logged(
+    case: Case, plane: Plane, y: FloatArray, u: FloatArray, rng: np.random.Generator
+) -> FlightData:
+    """Return what a log keeps of y and u: a u that is linear between two rare samples."""
+    is_lost = rng.random(len(y)) < case.lost
+    begin = len(y) // 2
+    is_lost[begin : begin + round(case.hole / plane.period)] = True
+    y = np.where(is_lost[:, None], np.nan, y)
+    t = np.arange(len(y), dtype=np.float64) * plane.period
+    if case.every == 1:
+        return coarser(FlightData(plane.period, t, y, u), max(1, round(0.008 / plane.period)))
+    rare = FlightData(
+        case.every * plane.period, t[:: case.every], y[:: case.every], u[:: case.every]
+    )
+    following = np.vstack([rare.u[1:], rare.u[-1:]])
+    return rare._replace(u=(rare.u + following) / 2.0)
+
+
+def rows(case: Case) -> list[list[str]]:
+    """Return the rows of a case: one for each entry, or one for a log that is refused at once."""
+    plane = PLANES[case.plane]
+    nominal = load_airframe(str(ROOT / "examples" / case.plane / "rates_airframe.yaml"))
+    recorded = flown(case, nominal, plane)
+    pairing = ChannelPairing(nominal.outputs, tuple(nominal.inputs))
+    period = case.every * plane.period
+    if case.plane == "px4_airplane" and case.every > SPARSE:
+        sentence = f"refused: torque: found a sample each {1e3 * period:.0f} ms, expected each one"
+        return [[case.name, "", "", "", "", "", sentence]]
+    still = [each for each in own_shares(recorded, nominal, pairing) if each.is_still]
+    if still:
+        return [[case.name, "", "", "", "", "", f"refused: {each.sentence}"] for each in still]
+    found = identify_model(
+        recorded,
+        nominal,
+        Actuation(np.full(len(nominal.inputs), plane.lag), 0.0),
+        pairing,
+        unknown=Unknown(has_hidden_rows=False),
+        searches_again=True,
+        timing=period / np.sqrt(12.0) / (2.0 if case.every > 1 else 1.0),
+    )
+    A, B = true_model(nominal, plane)
+    inputs = list(nominal.inputs)
+    lines = []
+    for part in found.parts:
+        refusal = part.refusal
+        kept = (
+            "kept nominal" if part.after.log_likelihood <= part.before.log_likelihood else "taken"
+        )
+        kept += ", with a warning of gusts" if gust_warning(part) else ""
+        is_refused = refusal is not None and not isinstance(refusal, NoBetter)
+        for entry in part.entries:
+            row = nominal.index(entry.row)
+            is_A = entry.matrix == "A"
+            value = (
+                A[row, nominal.index(entry.column)] if is_A else B[row, inputs.index(entry.column)]
+            )
+            if not entry.nominal:
+                continue
+            true = float(value / entry.nominal - 1.0)
+            off = abs(entry.error - true) / entry.deviation
+            figures = (100 * true, 100 * entry.error, 100 * entry.deviation, off)
+            verdict = f"refused: {refusal}" if is_refused else kept
+            lines.append([case.name, entry.name, *(f"{figure:.1f}" for figure in figures), verdict])
+    return lines
+
+
+def main() -> None:
+    """Print the table."""
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(HEADINGS)
+    for case in CASES:
+        writer.writerows(rows(case))
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
