@@ -627,7 +627,7 @@ def test_comparison_says_the_share_of_each_flight(
 ) -> None:
     flights = [half, read_flight(whole)]
     write_page(tmp_path / "page.html", flights)
-    assert "flown, over 49 % of truth" in (tmp_path / "page.html").read_text()
+    assert "(true error, over 49 % of truth" in (tmp_path / "page.html").read_text()
 
 
 def test_fleet_says_the_share_of_the_ticks_engaged(

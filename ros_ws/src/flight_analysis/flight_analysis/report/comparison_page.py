@@ -13,7 +13,7 @@ from flight_analysis.report.glossary import words_in
 from flight_analysis.report.overlay import difference_table
 from flight_analysis.report.page import Colour, Figures, Page, Section, TableGroup, Verdict
 from flight_analysis.report.plotting import PlotContext
-from flight_analysis.report.summary import RecordedFlight
+from flight_analysis.report.summary import RecordedFlight, taken_over
 from flight_analysis.report.summary_rows import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
@@ -75,7 +75,8 @@ def _verdict(flight: RecordedFlight, label: str, colour: str) -> Verdict:
         return Verdict(headline=headline, colour=Colour.PLAIN, label=label, line=colour)
     verdict = verdict_of(flight, flight.scenario)
     described, _ = meta_lines(flight, flight.scenario)
-    text = f"{flight.scenario.name}: {described} ({flight.summary['error']})"
+    error = f"{flight.summary['error']}{taken_over(flight.summary, 'errors')}"
+    text = f"{flight.scenario.name}: {described} ({error})"
     return replace(verdict, text=text, step=None, label=label, line=colour)
 
 
