@@ -101,7 +101,9 @@ def flown_by_px4(airframe: Path, t: Rows, y_m: Rows) -> dict[str, Rows]:
     assert loop is not None
     instants = np.arange(0.0, t[-1], PERIOD)
     setpoints = np.column_stack([np.interp(instants, t, column) for column in y_m.T])
-    return rms(instants, loop.flown(scenario, load_airframe(str(airframe)), setpoints, NOISE))
+    loaded = load_airframe(str(airframe))
+    calm = np.zeros((len(instants), len(loaded.states)))
+    return rms(instants, loop.flown(scenario, loaded, setpoints, NOISE, calm))
 
 
 @pytest.fixture(scope="module")

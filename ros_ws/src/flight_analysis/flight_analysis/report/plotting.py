@@ -31,8 +31,8 @@ T = TypeVar("T", bound=np.generic)
 MAX_POINTS = 2400
 LEVEL = 4  # of zlib: samples of a flight take 1 % more space than with 6, and 60 % of the time
 PACKERS = 2  # threads that pack: each holds a channel twice
-# samples of a curve on a page: 60 s at 500 Hz, or 13 times MAX_POINTS, so that we can zoom. With all
-# samples an hour of flight would take 141 MB
+# samples of a curve on a page: 60 s at 500 Hz, or 13 times MAX_POINTS, so that we can zoom. With
+# all samples an hour of flight would take 141 MB
 MAX_STORED = 32_000
 # bits of a stored value, with the leading one: within 1 in 2^14, finer than a pixel, and a hover
 # shows no more than 4 digits
