@@ -581,6 +581,7 @@ def test_all_samples_of_long_curves_stored_once() -> None:
 def test_page_has_extremes_of_bins_of_very_long_curve(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of an hour the page had 141 MB. Bins of four samples, with a gap in the third."""
     monkeypatch.setattr(plotting, "MAX_STORED", 6)
+    monkeypatch.setattr(plotting, "BINS", 3)
     stamps = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 100, 101], dtype=np.int64)
     values = np.array([1.0, 5.0, 0.0, 2.0, 7.0, 9.0, 8.0, 6.0, 3.0, 4.0, 5.0])
     shared = context(Tape({}))

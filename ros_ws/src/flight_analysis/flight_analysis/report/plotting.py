@@ -34,6 +34,7 @@ PACKERS = 2  # threads that pack: each holds a channel twice
 # samples of a curve on a page: 60 s at 500 Hz, or 13 times MAX_POINTS, so that we can zoom. With
 # all samples an hour of flight would take 141 MB
 MAX_STORED = 32_000
+BINS = 12_000  # of a longer curve: 10 times the pixels of a wide screen
 # bits of a stored value, with the leading one: within 1 in 2^14, finer than a pixel, and a hover
 # shows no more than 4 digits
 MANTISSA = 14
@@ -448,7 +449,7 @@ def _instants(t_ns: NDArray[np.int64], steps: bool) -> Instants:
     if not steps and len(periods):
         before = np.flatnonzero(periods > MIN_GAP_PERIODS * np.median(periods))
         t_ns = np.insert(t_ns, before + 1, t_ns[before]) if len(before) else t_ns
-    width = -(-len(t_ns) // (MAX_STORED // 2)) if len(t_ns) > MAX_STORED else 1
+    width = -(-len(t_ns) // BINS) if len(t_ns) > MAX_STORED else 1
     stamps = t_ns if width == 1 else _bins(t_ns, width)[:, [0, width // 2]].ravel()
     return Instants(t_ns=stamps, gaps=before + 1, width=width)
 
