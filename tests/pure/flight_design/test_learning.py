@@ -40,11 +40,8 @@ from flight_design.gains.gain_design import selected_observer
 from flight_design.gains.observer_search import SelectedObserver
 from flight_design.identification.likelihood import Innovations
 from flight_design.identification.model_identification import Part
-from flight_design.identification.model_quality import (
-    Prediction,
-    advantage,
-    reason_against_airframe,
-)
+from flight_design.identification.model_quality import Prediction, advantage
+from flight_design.identification.model_refusals import reason_against_airframe
 from flight_design.learning import learner as design_learner
 from flight_design.learning import part_checks
 from flight_design.learning.change_test import Change

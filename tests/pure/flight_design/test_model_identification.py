@@ -38,12 +38,8 @@ from flight_design.identification.model_identification import (
     identify_model,
     model_yaml,
 )
-from flight_design.identification.model_quality import (
-    MAX_WHITENESS,
-    correlation,
-    reason_against_excitation,
-    whiteness,
-)
+from flight_design.identification.model_quality import MAX_WHITENESS, correlation, whiteness
+from flight_design.identification.model_refusals import reason_against_excitation
 from flight_log.bag import LogAttachments
 from flight_log.tape_writer import write_run
 

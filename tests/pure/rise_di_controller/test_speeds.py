@@ -28,7 +28,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.vectors import StampedVector
 from flight_design.gains.gain_design import selected_observer
 from flight_design.gains.observer_search import SelectedObserver
-from flight_design.identification.model_quality import best_known
+from flight_design.identification.model_refusals import best_known
 from flight_design.learning.designs import Goal
 from flight_design.learning.learner import Learner
 from rise_di_controller.controller import Controller

@@ -50,7 +50,8 @@ from flight_design.identification.model_identification import (
     model_yaml,
     with_entries,
 )
-from flight_design.identification.model_quality import NoBetter, best_known, in_time
+from flight_design.identification.model_quality import NoBetter
+from flight_design.identification.model_refusals import best_known, in_time
 from flight_design.identification.own_loop import own_loop
 from flight_design.identification.rates_log import SPARSE, RatesLog, rates_of_log, scaled_torques
 from flight_log.px4_parameters import low_pass_delay, rate_loop

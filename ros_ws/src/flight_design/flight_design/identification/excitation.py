@@ -15,7 +15,7 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.innovation_filters import FlightData
 from flight_design.identification.model_identification import Part
-from flight_design.identification.model_quality import (
+from flight_design.identification.model_refusals import (
     MAX_DEVIATION,
     best_known,
     excitation_factor,

@@ -59,13 +59,15 @@ from flight_design.identification.model_quality import (
     MAX_WHITENESS,
     Prediction,
     advantage,
-    at_bound,
     correlation,
-    in_time,
     prediction,
+    reason_against_prediction,
+)
+from flight_design.identification.model_refusals import (
+    at_bound,
+    in_time,
     reason_against_airframe,
     reason_against_excitation,
-    reason_against_prediction,
     reason_against_signs,
     reason_against_timing,
 )

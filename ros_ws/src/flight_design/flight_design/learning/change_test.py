@@ -28,7 +28,7 @@ from flight_design.identification.likelihood_search import (
     TURBULENT,
     Search,
 )
-from flight_design.identification.model_quality import MAX_DEVIATION
+from flight_design.identification.model_refusals import MAX_DEVIATION
 
 # s, length of the flight that is tested. With 10 s, losses showed up to 4 s later, and halved
 # effects did not show at all.

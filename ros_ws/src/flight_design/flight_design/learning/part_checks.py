@@ -11,7 +11,8 @@ from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.outcome import Refusal
 from flight_design.identification.likelihood import MAX_DELAY_ERROR, PRIOR
 from flight_design.identification.model_identification import Part
-from flight_design.identification.model_quality import MAX_DEVIATION, MAX_WHITENESS, best_known
+from flight_design.identification.model_quality import MAX_WHITENESS
+from flight_design.identification.model_refusals import MAX_DEVIATION, best_known
 from flight_design.learning.change_test import Change
 
 # standard deviations of a normal distribution, passed with 5 %: the level of either test of a model
