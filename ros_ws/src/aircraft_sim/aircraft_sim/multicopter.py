@@ -26,9 +26,9 @@ class MulticopterModel(StateSpaceModel):
         c_dot = A[c, c] c + T_c + (n_up - 1) T,  T = g + T_c,  T_c = (B u)[c]
         v_dot = T [n_north, n_east] + A[c, c] v
 
-    with n = `thrust_axis` of the attitude, which follows Euler's equations. The damping of the
-    climb acts in every direction. States phi and theta of the airframe, as A has them, do not act
-    on the pose. n and the rates are taken in the middle of a step.
+    The attitude follows Euler's equations, and n is its `thrust_axis`. The damping of the climb
+    acts in every direction. If A has the states phi and theta, they do not act on the pose, because
+    the model integrates an attitude of its own. n and the rates are taken in the middle of a step.
     """
 
     def __init__(self, parameters: AircraftConfig) -> None:

@@ -148,9 +148,9 @@ class Bridge:
         self._u = sample.value
 
     def take_effects(self, sample: StampedVector, now_ns: int) -> None:
-        """Take the effects of the inputs as the controller's probe found them, (m,), map's order.
+        """Take the effects of the inputs as the controller's probe found them, (m,).
 
-        An input without effect ends an engagement.
+        They are in the order of the map. If an input has no effect, an engagement ends.
         """
         stuck = reason_against_inputs(self.inputs, sample.value.tolist())
         if stuck and self.phase is Phase.ENGAGED:

@@ -119,7 +119,7 @@ def check_map(channel_map: ChannelMap, releases: Iterable[Types]) -> list[Checke
 
 
 def is_known(types: Types, kind: str) -> bool:
-    """Return whether a message is defined there, or in ROS 2 Jazzy."""
+    """Return whether `types` or ROS 2 Jazzy defines a message."""
     return kind in types or kind in typestore().fielddefs
 
 

@@ -264,9 +264,10 @@ def prove(
 ) -> Proof:
     """Compile the code in a folder with each compiler, and compare it with the recordings.
 
-    The states of C are compared. `runner` starts the programs of a compiler for another machine, as
-    qemu does. With g++, a program whose reals count their operations gives the largest number of
-    operations in a call.
+    Every state of the C code is compared with the recorded state of the Python code. `runner`
+    starts the programs of a compiler for another machine, as qemu does. If g++ is installed, a
+    further program counts the operations on reals, and so gives the largest number of them in one
+    call.
     """
     comparisons: list[Comparison] = []
     with tempfile.TemporaryDirectory(prefix="rise_di_export_") as name:

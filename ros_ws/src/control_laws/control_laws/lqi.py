@@ -95,9 +95,10 @@ def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, Fl
         y_m_dot = w - LEAK y_m,  w_dot = -fade w,  integral of e: C x - y_m
 
     F is (n + 3 m, n + 3 m), G (n + 3 m, m) and E (2 m, n + 3 m). The model is sampled with u held
-    over a period, and the cost is on E z, which is e and the integral of e. The rows of angles are
-    -LEAK angle, a measured disturbance. Angles integrate the controlled rates: with the true rows
-    the integral of e would not be controllable.
+    over a period, and the cost is on E z, which is e and the integral of e. In this model an
+    angle only decays, angle_dot = -LEAK angle, so that the design takes the angles as measured
+    disturbances. In truth they integrate the controlled rates, but with those rows the integral of
+    e would not be controllable.
     """
     n, m = model.B.shape
     free = 1.0 - model.kinematic[:, None]

@@ -24,7 +24,7 @@ DISCOVERY_TIME = 1.0  # s, to discover other publishers
 EXPECTED = "no publisher: set ROS_DOMAIN_ID to an unused domain, or choose other --topics"
 MATCHING_TIME = 0.5  # s, to discover the subscribers
 CLOCK_PERIOD_NS = 10_000_000  # ns of the log between two samples of `/clock`
-CLOCK_NAME = f"/{CLOCK.name}"  # as simulated time has it
+CLOCK_NAME = f"/{CLOCK.name}"  # the name that ROS uses for simulated time
 PROGRESS_PERIOD_NS = 100_000_000
 
 Outgoing = tuple[int, str, bytes, bool]
@@ -96,7 +96,7 @@ def _restamped(data: bytes, begin_ns: int, first_ns: int, rate: float) -> bytes:
     try:
         since_ns = stamp_of(data) - first_ns
     except ChannelError:
-        # It is too short for a stamp: we send it as it is in the log.
+        # The message is too short to have a stamp: we send it as it is in the log.
         return data
     stamp_ns = begin_ns + (since_ns if rate == 1.0 else round(since_ns / rate))
     message = bytearray(data)
@@ -129,7 +129,7 @@ def _message_type(topic: str, name: str) -> Any:
     try:
         return getattr(import_module(f"{package}.msg"), kind)
     except (ImportError, AttributeError, ValueError):
-        # We end up here whatever a log has in place of a name.
+        # This also catches a log that has something else than the name of a type there.
         raise ParameterError(
             f"{topic}: its type {name} is not installed, expected the package {package}"
         ) from None

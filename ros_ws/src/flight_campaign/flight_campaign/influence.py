@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find which drawn entries of A and B decide the score of a campaign.
 
-Rank correlations show them, and the corner of the box to which they point.
+Rank correlations show which entries matter, and the corner of the box in which the score is worst.
 """
 
 import math
@@ -46,11 +46,11 @@ def rank_correlations(table: "pl.DataFrame", published: Mapping[str, float]) -> 
 def chance_level(aircraft: int, entries: int) -> float:
     """Return the rank correlation that no entry without effect exceeds in 95 % of campaigns.
 
-    For independent values it has mean 0 and variance 1 / (N - 1), and is normal for large N.
-    Source: Kendall, Rank Correlation Methods, 1948. The level allows for the number of entries
-    (Bonferroni).
+    The correlation of independent values has mean 0 and variance 1 / (N - 1), and is normal for
+    large N. Source: Kendall, Rank Correlation Methods, 1948. The level allows for the number of
+    entries (Bonferroni).
     """
-    from scipy.stats import norm  # noqa: PLC0415 - as above
+    from scipy.stats import norm  # noqa: PLC0415 - takes half a second
 
     return float(norm.ppf(1.0 - CHANCE / (2 * entries))) / math.sqrt(aircraft - 1)
 
@@ -63,10 +63,11 @@ def influence(
 ) -> dict[str, Any]:
     """Return the rank correlations of a case as figures for a file.
 
-    They are those of `table`, with the entries of the row `worst`, the worst aircraft.
+    `table` gives the correlations, and the row `worst` the entries of the worst aircraft.
     `uncertainty` is the largest deviation by entry. "worst_aircraft" and "worst_corner" are
-    relative to the published entry: the deviation of the worst aircraft, and the limit of the
-    uncertainty on the side of the higher score, which is 0 if the entry is within chance.
+    relative to the published entry. The first is the deviation of the worst aircraft. The second is
+    plus or minus the uncertainty, on the side on which the score rises, and 0 if the correlation is
+    within chance.
     """
     correlations = rank_correlations(table, published)
     level = chance_level(table.height, len(correlations)) if correlations else None

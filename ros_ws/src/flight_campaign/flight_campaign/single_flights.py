@@ -42,7 +42,8 @@ class LearningOutcome(NamedTuple):
 
     first_model: float  # s, when the first model flew; NaN without one
     models: int  # proposals that flew, not counting the rough model
-    refused: int  # identifications that the learner refused, and proposals that the controller did
+    # identifications that the learner refused, and proposals that the controller refused
+    refused: int
     fallbacks: int  # how often the law of the start took over, in all channels or in some
 
 
@@ -128,10 +129,10 @@ def mission_figures(tape: Tape, guidance: GuidanceConfig) -> dict[str, float]:
     """Return the figures of a mission, SI.
 
     They are the score, cross-track and altitude error on the route, the largest bank and the legs
-    that were missed. With a fence there are also the distance flown beyond it and the last distance
-    from home. The score is the largest cross-track error in half seconds of flight at V0. The orbit
-    round the last waypoint, which begins at its centre, and the ways onto a leg are left out. If no
-    leg was flown, figures are NaN.
+    that were missed. With a fence there are also the distance flown beyond it and the distance from
+    home at the end. The score is the largest cross-track error divided by the distance that the
+    aircraft flies in half a second at V0. Errors on the orbit round the last waypoint and on the
+    way onto a leg do not count. If no leg was flown, the score and these errors are NaN.
     """
     log = tape["guidance"]
     last_leg = len(guidance.plan(guidance.waypoints()).legs) - 1
@@ -164,7 +165,7 @@ def _rms(values: FloatArray) -> float:
 
 def fly_chunk_singly(definition: Definition, job: Job, learner: MakeLearner | None = None) -> Chunk:
     """Fly a chunk of a campaign one by one."""
-    from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - JAX, as the loop of many
+    from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - imports JAX
 
     case, chunk = job
     first = chunk * definition.chunk

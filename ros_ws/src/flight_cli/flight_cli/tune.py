@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di tune`: make a module that flies better from the log of an autopilot.
+"""`rise-di tune`: from the log of an autopilot, make a module that flies better.
 
 It imports, identifies, selects gains, compares, bounds and exports, as the commands of these names
 do.
@@ -61,8 +61,8 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 UNPROVED = 1
 LEAST, MOST = 0.05, 0.3  # bounds on the uncertainty of A and B that the margins must cover
-MOST_LOST = 0.1  # of the samples of y or u
-WIDEST = 0.9  # of an entry, in the box of the guarantee
+MOST_LOST = 0.1  # largest share of the samples of y or u that may be missing
+WIDEST = 0.9  # largest half-width of an entry in the box, as a fraction of its value
 LOGGED_OFTEN = "each one: set SDLOG_PROFILE to 17, by which PX4 logs rates and torque at full rate"
 
 
@@ -80,7 +80,8 @@ class Tune:
     the module, even if that is the controller that you had.
 
     Exit status: 0; 1 if an aircraft within the errors of the identification may be unstable, or if
-    a bit of the code differs; 2 bad input, a model that is refused, or margins that fall short.
+    a result of the C code differs from that of Python in one bit; 2 bad input, a model that is
+    refused, or margins that fall short.
     """
 
     log: Path = argument("ULog of PX4, or DataFlash log of ArduPlane.", default=REQUIRED)
@@ -212,7 +213,8 @@ class Tune:
     ) -> tuple[Scenario, float]:
         """Give the loop of a scenario the delay of the log, and return that of the gyro's filter.
 
-        For PX4 the gyro's rate and filters give it, for ArduPlane the filter, or else the scenario.
+        For PX4 it follows from the gyro's rate and filters, and for ArduPlane from the filter. If
+        the log has none, it is that of the scenario.
         """
         controller = scenario.rise_di()
         if autopilot != "px4":
@@ -253,8 +255,8 @@ def _lags(scenario: Scenario, nominal: Airframe) -> FloatArray:
 def _with_lead(controller: RiseDiConfig) -> RiseDiConfig:
     """Let the feedforward lead by the lag of the servos and half a period.
 
-    The module compares y with the y_m of the instant that y is of, so the filter of the gyro does
-    not count.
+    The module compares y with the y_m of the same instant, so the lead must not have the delay of
+    the gyro's filter.
     """
     if controller.feedforward is None:
         return controller
@@ -365,7 +367,7 @@ def _uncertainty(identification: Identification) -> float:
     """Return twice the largest deviation of the best known effects, from LEAST to MOST.
 
     The deviation of an effect is a fraction of the value that was found. An uncertain delay does
-    not count: by it A, B and the delay are off together, and the loop of the log stays the same.
+    not count: if it is wrong, A and B are wrong with it, and the loop is still that of the log.
     """
     relative = [
         effect.deviation * abs(effect.nominal / effect.value)
@@ -376,10 +378,10 @@ def _uncertainty(identification: Identification) -> float:
 
 
 def _box(identification: Identification, airframe: Airframe) -> dict[str, float]:
-    """Return twice the standard deviation of each entry, by name, as a part of its value.
+    """Return twice the standard deviation of each entry, by name, as a fraction of its value.
 
-    The values are those of the airframe. A part that stays nominal counts at least the change that
-    was found.
+    The values are those of the airframe. If an axis stays nominal, each of its entries has at least
+    the change that the identification found.
     """
     A, B = airframe.matrix_a(), airframe.matrix_b()
     inputs = list(airframe.inputs)

@@ -45,7 +45,7 @@ def _keys(schema: type[Config], prefix: str) -> Iterator[str]:
 
 
 def _section(annotation: Any) -> tuple[type[Config] | None, bool]:
-    """Return the parameter set in an annotation, and whether a mapping has one by name."""
+    """Return the parameter set in an annotation, and whether it is the value type of a mapping."""
     if isinstance(annotation, type) and issubclass(annotation, Config):
         return annotation, False
     parts = get_args(annotation)

@@ -15,7 +15,7 @@ from pathlib import Path
 TIMER_SLACK = Path("/proc/self/timerslack_ns")  # of the main thread; Linux
 THREADS = Path("/proc/self/task")
 REAL_TIME = (os.SCHED_FIFO, os.SCHED_RR)
-SLICE_NS = 100_000  # the shortest slice of Linux; by default 0.7 ms times 1 + log2 of the cores
+SLICE_NS = 100_000  # the shortest slice of Linux, which has 0.7 ms (1 + log2(cores)) by default
 # numbers of the system call; glibc has no function for the call before 2.41
 SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 # struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
@@ -27,9 +27,9 @@ def lower_real_time_priority(levels: int) -> None:
 
     It falls by `levels`, but not below 1. Threads started later inherit it. Processes of equal
     priority do not preempt each other: compression in the recorder would delay a tick of the law by
-    milliseconds, and a tick of the law, of up to 3 ms, the next y_m. Rate-monotonic priorities,
-    lower for longer periods, are the optimal fixed priorities. Source: sched(7); C. L. Liu and J.
-    W. Layland, Journal of the ACM 20(1), 1973, theorem 2.
+    milliseconds, and a tick of the law takes up to 3 ms, by which it would delay y_m.
+    Rate-monotonic priorities, lower for longer periods, are the optimal fixed priorities. Source:
+    sched(7); C. L. Liu and J. W. Layland, Journal of the ACM 20(1), 1973, theorem 2.
     """
     if (policy := os.sched_getscheduler(0)) in REAL_TIME:
         _schedule_threads(
@@ -49,7 +49,7 @@ def leave_real_time_priority() -> None:
 
 
 def _schedule_threads(policy: int, priority: int) -> None:
-    for path in THREADS.iterdir():  # importing rclpy starts some
+    for path in THREADS.iterdir():  # importing rclpy starts further threads
         with suppress(ProcessLookupError):  # the thread has ended
             os.sched_setscheduler(int(path.name), policy, os.sched_param(priority))
 

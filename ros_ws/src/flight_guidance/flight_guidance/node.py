@@ -204,7 +204,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return (self._pose if self._inputs.has_y else self._y).name
 
     def _receives_authority(self, now_ns: int) -> bool:
-        """In lockstep, say whether the last `authority` from before a step has arrived.
+        """In lockstep, return whether the last `authority` that is due before a step has arrived.
 
         A controller that learns sends `authority`.
         """

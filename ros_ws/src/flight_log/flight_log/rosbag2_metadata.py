@@ -30,7 +30,10 @@ class TopicCount(NamedTuple):
 
 
 class FileContents(NamedTuple):
-    """The content of a file of a bag. Log times in ns, 0 without messages."""
+    """The content of a file of a bag.
+
+    The log times are in ns. They are 0 if the file has no message.
+    """
 
     file: str
     first_ns: int

@@ -25,8 +25,8 @@ EXPECTED = "a DataFlash log (.bin, .log), a tlog or a ULog"
 def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
     """Read the log of an autopilot.
 
-    Raises ParameterError for any other file, if no message can be decoded, and if two systems or
-    sensors may have flown.
+    Raises ParameterError if the file is no such log, if no message can be decoded, or if it is not
+    clear which of two systems or sensors flew.
     """
     require(path.is_file(), str(path), "no such file", EXPECTED)
     kind = file_kind(path)
@@ -43,7 +43,7 @@ def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
     except ParameterError:
         raise
     except Exception as error:
-        # pymavlink raises Exception itself for a damaged format.
+        # pymavlink raises a bare Exception for a damaged format.
         reason = str(error) or type(error).__name__
         raise ParameterError(
             f"{path}: found {kind} that cannot be decoded ({reason}), expected {EXPECTED}"
@@ -58,7 +58,7 @@ def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
 def _silent() -> Iterator[None]:
     """Discard what pymavlink and pyulog print about a damaged file, even from C.
 
-    They print a line for each byte without a message.
+    They print a line for each byte that belongs to no message.
     """
     with (
         redirect_stdout(StringIO()) as text,
@@ -68,7 +68,7 @@ def _silent() -> Iterator[None]:
         try:
             stderr = os.dup(2)
         except OSError:
-            # It is closed.
+            # Standard error is closed.
             yield
             return
         os.dup2(null.fileno(), 2)
@@ -80,11 +80,12 @@ def _silent() -> Iterator[None]:
 
 
 LIMITS = (5.0, 6.0)
-"""Processor time of the decoding, s, and s per megabyte of the log: pymavlink takes 1.2 s for a
-megabyte of DataFlash here."""
+"""Limit of the processor time of the decoding: s, and in addition s per megabyte of the log.
+pymavlink takes 1.2 s for a megabyte of DataFlash here."""
 
 MEMORY = (1 << 30, 100)
-"""Data of the decoding, bytes, and bytes per byte of the log: pymavlink takes some 35."""
+"""Limit of the memory of the decoding: bytes, and in addition bytes per byte of the log. pymavlink
+takes some 35."""
 
 
 def read_foreign_log(path: Path, choice: Choice = ANY) -> VehicleLog:

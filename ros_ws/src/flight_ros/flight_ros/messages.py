@@ -30,7 +30,7 @@ BYTE_ORDERS: Mapping[bytes, Literal["big", "little"]] = MappingProxyType(
 )
 STAMP = struct.Struct("<iI")  # seconds and nanoseconds; they follow the encapsulation
 STAMP_PLACE = len(ENCAPSULATION)
-LENGTH_PLACE = STAMP_PLACE + STAMP.size  # of header.frame_id
+LENGTH_PLACE = STAMP_PLACE + STAMP.size  # of the length of header.frame_id
 COUNT = struct.Struct("<I")  # length of a sequence or a string, before its elements
 FRAME_ID_PLACE = LENGTH_PLACE + COUNT.size
 MAX_SIZE = 16_384
@@ -65,9 +65,9 @@ def from_message(message: JointState, channels: Sequence[str]) -> StampedVector:
 class Encoder:
     """Encodes the samples of a publisher as the bytes of a message.
 
-    Without names the message is a vector without channels: in lockstep, no sample exists at the
-    instant. Layout: CDR (OMG Common Object Request Broker Architecture, 9.3). The offset of each
-    value from the encapsulation is a multiple of its size; padding bytes are 0.
+    If there are no names, the message has no channels. In lockstep it says that there is no sample
+    at this instant. Layout: CDR (OMG Common Object Request Broker Architecture, 9.3). The offset of
+    each value from the encapsulation is a multiple of its size; padding bytes are 0.
     """
 
     def __init__(self, names: Sequence[str], frame_id: str) -> None:
@@ -146,7 +146,7 @@ class Decoder:
             encoder.encode(stamp.sec * NANOSECONDS + stamp.nanosec, np.array(message.position))
             != raw
         ):
-            return  # more than a named vector: the middleware decodes it each time
+            return  # it has more than a named vector: the middleware decodes it each time
         self._names = list(message.name)
         self._place = encoder.place
         self._sender = message.header.frame_id
@@ -181,7 +181,7 @@ class NamedDecoder:
 
 
 def sender_of(raw: bytes) -> str | None:
-    """Read the publisher of a message that begins with a header, without the names and values.
+    """Return the publisher of a message that begins with a header; decode no names and values.
 
     Returns None if the bytes are too short, or not plain CDR.
     """
@@ -209,7 +209,7 @@ def instant(stamp_ns: int) -> bytes:
 
 
 def require_size(raw: bytes, limit: int = MAX_SIZE) -> None:
-    """Raise ChannelError, reason "size", for a message of more bytes."""
+    """Raise ChannelError, reason "size", for a message of more than `limit` bytes."""
     if len(raw) > limit:
         raise ChannelError("size", f"a message of {len(raw)} bytes, expected at most {limit}")
 

@@ -79,8 +79,9 @@ def _without_global(
 ) -> dict[str, Any]:
     """Drop the parameters given to all nodes that this node does not know.
 
-    The node undeclares them, as a node of ROS declares none of them. A parameter from a section for
-    this node stays, and is refused if it is unknown.
+    The node also undeclares them, because an ordinary node of ROS does not declare a parameter that
+    it does not know. A parameter from a section for this node stays, and is refused if it is
+    unknown.
     """
     known = schema.keys_beside(overrides)
     foreign = [key for key in overrides if key not in known and _is_global(node, key, sys.argv)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The private names of rclpy 7.1 in the stack.
+"""Keep every use of a private name of rclpy 7.1 in one place.
 
 `tests/ros/flight_ros/test_rclpy_private.py` checks them.
 """
@@ -18,7 +18,7 @@ from rclpy.subscription import Subscription
 
 from flight_core.text import bounded
 
-Participant: TypeAlias = Any  # the node of rclpy's C extension, without a Node
+Participant: TypeAlias = Any  # a node of rclpy's C extension, which belongs to no Node
 
 # the exception of `deserialize_message` for bytes that are not a message of the type
 DeserializationError = _rclpy.RMWError
@@ -86,7 +86,7 @@ class WaitSet:
 def answer_invalid_transitions(node: Node) -> None:
     """Let a lifecycle node answer a request for an invalid transition with success false.
 
-    Rclpy raises, and sends no answer.
+    Without this, rclpy raises and sends no answer.
     """
     service = node._service_change_state
     change_state = service.callback
@@ -103,7 +103,7 @@ def answer_invalid_transitions(node: Node) -> None:
 
 
 def refuse_foreign_parameters(node: Node) -> None:
-    """Let a node refuse a request with an unknown parameter as a whole.
+    """Let a node refuse a whole request if it has an unknown parameter.
 
     `ros2 param load` joins the sections of all nodes of a file. Without the refusal, a node would
     take the values of names it shares, such as an age limit, from the section of another node.

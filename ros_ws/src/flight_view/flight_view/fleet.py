@@ -42,7 +42,10 @@ class FleetView:
 
     @property
     def description(self) -> dict[str, Any]:
-        """Name and flight time 0 of each aircraft, on the clock of the stamps, s."""
+        """Return the name of each aircraft, and the instant of its flight time 0, s.
+
+        The instant is by the clock of the stamps.
+        """
         return {
             "aircraft": [
                 [flight.aircraft, flight.start_ns / NANOSECONDS] for flight in self.flights

@@ -43,8 +43,8 @@ class Series:
     def append(self, stamp_ns: NDArray[np.int64], values: FloatArray) -> None:
         """Append rows.
 
-        A row that is up to DISORDER_NS older than an earlier row takes the newer stamp. An older
-        row is refused.
+        If a row is up to DISORDER_NS older than an earlier row, it gets the stamp of that row. If
+        it is older still, it is refused.
         """
         earliest = (
             self._stamp_ns[self.count - 1] if self.count else np.iinfo(np.int64).min + DISORDER_NS

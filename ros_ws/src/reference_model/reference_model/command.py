@@ -129,8 +129,8 @@ def command(t: Array, profile: Profile) -> FloatArray:
 def polyline(t: FloatArray, lines: Polyline) -> tuple[FloatArray, FloatArray]:
     """Evaluate piecewise linear signals and their integrals at t, each of shape t.shape + (m,).
 
-    With s = t - time_k since the last knot they are value_k + slope_k s, and area_k + value_k s +
-    slope_k s^2 / 2.
+    Let s = t - time_k be the time since the last knot k. Then the signal is value_k + slope_k s,
+    and its integral area_k + value_k s + slope_k s^2 / 2.
     """
     k = np.maximum(np.searchsorted(lines.time, t, side="right") - 1, 0)
     since = np.maximum(t - lines.time[k], 0.0)[..., None]
@@ -151,7 +151,7 @@ def linear_chirp(t: FloatArray, chirps: Chirps) -> tuple[FloatArray, FloatArray]
 
     Source: Abramowitz and Stegun, Handbook of Mathematical Functions, 7.3.1 and 7.3.2.
     """
-    from scipy.special import fresnel  # noqa: PLC0415 - a tenth of a second, which few commands need
+    from scipy.special import fresnel  # noqa: PLC0415 - takes 0.1 s, and few commands need it
 
     frequency, sweep = chirps.frequency, chirps.sweep
     since = t[..., None] - chirps.start

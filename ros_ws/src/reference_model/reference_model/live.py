@@ -31,7 +31,7 @@ class LiveParams(NamedTuple):
 
 
 class Live(NamedTuple):
-    """The last u_m and the attitude since then, by dead reckoning."""
+    """The last u_m, and the attitude now, by dead reckoning from the attitude in that u_m."""
 
     t_ns: int  # flight time of its stamp
     u_m: FloatArray  # (m,)

@@ -34,8 +34,8 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     The commands are those of the scenario's profile until u_m is received.
 
     In lockstep the node publishes y_m up to the instant of clock and computes the next y_m ahead.
-    If `u_m_rate` is set, u_m comes first: every instant of u_m has exactly one y_m, which has no
-    channels if there is no command.
+    If `u_m_rate` is set, it first waits for u_m: there must be exactly one u_m at each instant of
+    its rate, which has no channels if there is no command.
     """
 
     def __init__(self) -> None:
@@ -135,9 +135,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             advanced = True
 
     def _commands_known(self) -> bool:
-        """In lockstep, say whether u_m of the instant before the next sample is here, if due.
+        """In lockstep, return whether the next y_m can be computed.
 
-        That u_m is taken.
+        If a u_m is due one period earlier, it must have arrived. It is then taken.
         """
         t_ns = (self._number - 1) * self.period_ns()
         if not self._u_m_ns or t_ns < 0 or t_ns % self._u_m_ns:

@@ -130,10 +130,11 @@ class LearnConfig(Config):
     )
 
     def least_margin(self, margin: float) -> float:
-        """Return the delay margin that a learned model must keep, s, given that of the start.
+        """Return the delay margin that a learned model must keep, s.
 
-        It is the configured margin. If none is configured, it is `margin`, but at most
-        LEAST_MARGIN, because the loop of the file may keep less around the aircraft.
+        It is the configured margin. If none is configured, it is `margin`, the delay margin at the
+        start, but at most LEAST_MARGIN, because around the real aircraft the loop of the file may
+        have less.
         """
         return min(margin, LEAST_MARGIN) if self.margin is None else self.margin
 
@@ -458,7 +459,10 @@ class RiseDiConfig(ControllerConfig):
         return grouped if self.learn is None else grouped | {internals.GIVEN_UP: self.outputs}
 
     def given_up(self) -> FloatArray:
-        """Give up the outputs of `learn.without`."""
+        """Return 1 for each output in `learn.without` and 0 for every other one, shape (m,).
+
+        The array is empty if nothing is learned.
+        """
         if self.learn is None:
             return np.zeros(0)
         return np.array([float(name in (self.learn.without or ())) for name in self.outputs])

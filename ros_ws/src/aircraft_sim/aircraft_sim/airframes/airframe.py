@@ -280,9 +280,9 @@ class Airframe(Config):
         return matrix * row[:, None] / column[None, :]
 
     def no_thrust(self) -> FloatArray:
-        """Return the inputs without thrust, deviations from trim, shape (p,), SI.
+        """Return the value of each input at which it gives no thrust, from trim, shape (p,), SI.
 
-        They are 0 for a surface, and nan if the file does not say.
+        It is 0 for a surface, and nan if the file does not say it.
         """
         units = [quantity(channel.unit) for channel in self.inputs.values()]
         unsaid = [0.0 if unit.dimension == ANGLE else math.nan for unit in units]

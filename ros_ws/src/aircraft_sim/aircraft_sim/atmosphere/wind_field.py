@@ -16,11 +16,12 @@ from flight_core.vectors import FloatArray
 
 LAYER = 12.5
 PEAK_HEIGHT = math.log(LAYER) / (LAYER - 1.0)
-"""z* over the height e of the boundary layer, and the height of the largest outflow over z*."""
+"""The ratio of z* to the height e of the boundary layer, and of the height of the largest outflow
+to z*."""
 
 PEAK = 0.319086343 * (math.exp(-PEAK_HEIGHT) - math.exp(-LAYER * PEAK_HEIGHT))
-"""Largest outflow of a microburst over scale and radius: (1 - exp(-r^2)) / 2 r at 1.1209, times the
-spread at the height of the largest outflow."""
+"""Largest outflow of a microburst, divided by scale and radius: (1 - exp(-r^2)) / 2 r at 1.1209,
+times the spread at the height of the largest outflow."""
 
 
 class Log(NamedTuple):
@@ -53,7 +54,7 @@ class Table(NamedTuple):
     """Wind over the height: linear between the heights, constant beyond them."""
 
     height: tuple[float, ...]  # m, rising
-    north: tuple[float, ...]  # m/s, where the air moves to
+    north: tuple[float, ...]  # m/s, positive if the air moves to the north
     east: tuple[float, ...]
 
 
@@ -97,7 +98,7 @@ class WindField(NamedTuple):
     """
 
     wind: tuple[float, float]  # m/s to the north, to the east
-    ground: float  # altitude of the ground, m, as `pose`
+    ground: float  # altitude of the ground, m, with the zero of the altitude in `pose`
     shear: Log | Power | Table | None = None
     microburst: Microburst | None = None
 
@@ -120,10 +121,10 @@ class WindField(NamedTuple):
 
 
 class RelativeWind:
-    """Wind relative to that of the start, in the axes of a flight.
+    """Wind minus the wind at the start, in the axes of a flight.
 
-    The flight begins at the origin, to the north. `carried` is the wind at the start to the north
-    and to the east, m/s, which moves the air mass.
+    In these axes the flight begins at the origin and heads north. `carried` is the wind at the
+    start to the north and to the east, m/s, which moves the air mass.
     """
 
     def __init__(self, field: WindField, start: Start, altitude: float) -> None:

@@ -256,7 +256,8 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution | Unbalanced:
     get time in frozen flight, where everything runs except position, velocity and attitude. If
     JSBSim's trim fails, or does not last, a solver finds the six unknowns (alpha, throttle, pitch
     trim, aileron, rudder, bank) in frozen flight, where everything has settled. Raises FlightEnded
-    with one sentence if there is no trim, unless the solver only does not reach one.
+    with one sentence if there is no trim. If the solver merely does not reach one, the function
+    returns Unbalanced.
     """
     fdm = _load(condition)
     try:

@@ -328,9 +328,9 @@ class _Steps:
                 state = ticks.state(k, in_force.limits, in_force.law, state)
 
     def _state_after_gap(self, k: int) -> ControllerState | None:
-        """Return the recorded state of an engaged tick, or None before it.
+        """Return the recorded state at a tick, or None if the controller is not engaged there.
 
-        An open loop engages in this tick.
+        In an open loop, return the state of a law that engages at this tick.
         """
         if not self._ticks.flies[k]:
             return None

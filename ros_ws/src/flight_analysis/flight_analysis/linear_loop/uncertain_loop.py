@@ -116,7 +116,10 @@ class Channels(NamedTuple):
         return self.centred(c)
 
     def centred(self, c: FloatArray) -> "Channels":
-        """Move the channels to w = diag(c) z, (..., p), instead of w = 0. Leading axes batch."""
+        """Return the channels centred on w = diag(c) z in place of w = 0.
+
+        c has the shape (..., p), and its leading axes are a batch.
+        """
         columns = c[..., None, :]
         inverse = np.linalg.inv(np.eye(len(self.D)) - self.D * columns)
         Z = inverse @ self.Z

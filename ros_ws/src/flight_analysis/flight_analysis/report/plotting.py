@@ -251,7 +251,7 @@ class Figure:
 
     @property
     def text(self) -> str:
-        """Return the figure in words: from what to what each curve goes, by subplot."""
+        """Return the figure in words: the least and the largest value of each curve, by subplot."""
         by_plot: dict[int, list[str]] = {}
         for index, name, low, high in self.extents:
             by_plot.setdefault(index, []).append(f"{name} from {low:.3g} to {high:.3g}")

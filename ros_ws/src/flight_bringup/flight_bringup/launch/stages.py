@@ -119,7 +119,7 @@ def runs_argument() -> DeclareLaunchArgument:
 
 
 def recorder_argument(*further: str) -> DeclareLaunchArgument:
-    """Declare the argument `recorder`; it may be `further` words too."""
+    """Declare the argument `recorder`. Its value can also be one of the words in `further`."""
     description = (
         "true: the stack's recorder; rosbag2: `ros2 bag record` into the folder rosbag2 of the run"
     )
@@ -288,10 +288,11 @@ def say_on_exit(event: ProcessExited, context: LaunchContext, flight: Flight) ->
 def on_state(
     flight: Flight, spec: NodeSpec, state: NodeState, then: Callable[[], Sequence[Action]]
 ) -> Action:
-    """Run the actions of `then` once, when a node of this launch reaches a state, or has already.
+    """Run the actions of `then` once, when a node of this launch has reached a state.
 
-    A later state counts too. A node can be matched before the stage in which we wait for that: if
-    its inputs are nodes of the user, these may have started before it.
+    A later state counts, too. If the node has reached it already, they run at once. A node can be
+    matched before we wait for that: if its inputs are nodes of the user, these may have started
+    before it.
     """
     node = f"{flight.namespace}/{spec.executable}"
     states = [*NodeState]

@@ -340,7 +340,10 @@ def advance(
 def _actuated(
     position: Array, command: Array, times: Array, vehicle: Vehicle, *, unroll: bool
 ) -> tuple[Array, Array]:
-    """Return the actuators' positions after the steps at some times, and the mean in each step."""
+    """Move the actuators through the lengths of time in `times`, one after the other.
+
+    Return their position at the end, and their mean position in each of these steps.
+    """
     ordered_command = rows_of(command, np.argsort(vehicle.inputs))
 
     def move(before: Array, t: Array) -> tuple[Array, Array]:

@@ -35,7 +35,10 @@ UNKNOWN = TickKind(None, None)  # a branch asks for both at the tick
 
 
 class TickRun(NamedTuple):
-    """Ticks in one loop: a pattern of kinds that repeats. It is hashable."""
+    """A run of ticks that one compiled loop computes.
+
+    The kinds of its ticks repeat in a pattern. It is hashable.
+    """
 
     length: int  # ticks, a multiple of the pattern
     pattern: tuple[TickKind, ...]

@@ -178,9 +178,10 @@ def unit_gains(lag: Sequence[float], delay: float) -> dict[str, Any]:
 
 
 def scenario_to_design(scenario: FilePath | Scenario) -> Scenario:
-    """Load a scenario whose section controller may lack the gains; they are then 1, to be selected.
+    """Load a scenario whose section controller may lack the gains.
 
-    Rate, channels, lags, delay and failsafe are needed. Raises ParameterError.
+    Gains that it lacks are set to 1, and are selected later. The section must have the rate,
+    channels, lags, delay and failsafe. Raises ParameterError.
     """
     if isinstance(scenario, Scenario):
         return find_scenario(scenario)

@@ -13,8 +13,8 @@ the loop leave out. `rise_di_controller.law.linear_loop` has the linear loop and
 
 The crossover lag product of a channel is its bandwidth times the lag of its loop, in rad. It is the
 phase that the lag costs at the crossover: 57.3 degrees times the product. A loop that integrates
-then has a phase margin of 90 degrees minus that. If you take the lag as a pure delay, its gain
-margin is (pi / 2) / product: 2.5 at 0.63, 2.0 at 0.8.
+then has a phase margin of 90 degrees minus this phase. If you take the lag as a pure delay, the
+gain margin of the loop is (pi / 2) / product: 2.5 at 0.63, 2.0 at 0.8.
 
 All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), in which
 abs(Omega_ii) is about 1.
@@ -37,10 +37,10 @@ MIN_K = 1.5
 """1/s, lower bound of K, since (22) requires K > 1. A slower channel gets this K and a smaller
 input scale, which is the same loop."""
 
-# factor of k_g above its bound rho^2 / (4 min(Lambda, 1)): step 2 then leaves a third of the decay
-# to step 3.
+# factor of k_g above its bound rho^2 / (4 min(Lambda, 1)): after step 2 a third of the decay is
+# left for step 3
 K_G_MARGIN = 1.5
-MAX_STEP_3_FRACTION = 0.3  # fraction of the decay that step 3 uses in total, out of that third
+MAX_STEP_3_FRACTION = 0.3  # of the whole decay, which step 3 uses: less than that third
 
 MAX_CROSSOVER_LAG_PRODUCT = 0.8
 """rad, bandwidth times the lag of the loop: 46 degrees of phase at the crossover. On the `osprey`
@@ -75,12 +75,12 @@ class GainSet(NamedTuple):
 class Bounds(NamedTuple):
     """Bounds on the aircraft that Theorem 1 requires."""
 
-    # (m, m) bounds of abs(U_ij), j > i, zero elsewhere: zeta_U of (27), zeta_Psi of (30) with two
-    # indices
+    # (m, m) upper bounds of abs(U_ij) for j > i, zero elsewhere. They are zeta_U of (27), and
+    # zeta_Psi of (30) with two indices.
     U: FloatArray
     N_d: FloatArray  # (m,) zeta_Nd,i of (19), units of y / s^2
     rho: float  # of (19), 1/s
-    gamma_2: FloatArray  # (m,) of Lemma 1, 1/s: an assumption, which nothing bounds
+    gamma_2: FloatArray  # (m,) of Lemma 1, 1/s: we must assume it, since no bound of it is known
 
 
 class GainCondition(NamedTuple):
@@ -188,9 +188,10 @@ def zeta_Phi(i: int, K: FloatArray, U: FloatArray) -> float:
 def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
     """Compute gains that meet (22), (29), (30) and steps 2 and 3 of Theorem 1 for given bounds.
 
-    Shapes are those of the fields.
+    The shapes are those in `Bounds` and `GainSet`. least is the decay of e and r, from which N~ and
+    Phi then take a part:
 
-        least = min(Lambda, 1), the decay of e and r before N~ and Phi
+        least = min(Lambda, 1)
         k_g   = 1.5 rho^2 / (4 least)                                     step 2
         k_d,i = zeta_Phi,i^2 / (4 part), part = 0.3 least / (m - 1)       step 3, i = m-1 .. 1
         beta  = `least_beta`                                              step 1
@@ -300,12 +301,13 @@ def engineering_gains(
     channel that is too slow for (22).
 
         K_m = max(bandwidth_m, 1.5),  K_i = max(bandwidth_i, K_m),  response_i = bandwidth_i / K_i
-        Lambda_i = bandwidth_i / (4 slower_i)  K_i response_i is the bandwidth
+        Lambda_i = bandwidth_i / (4 slower_i)
         beta_i = min(factor slew_i, 0.7 rate_limit_i) / response_i
 
-    `slew` is the largest rate of the ideal control and `rate_limit` that of the actuator (infinite
-    without one), both in inputs of unit response, units of y / s^2. Raises ParameterError for a
-    factor below 1. Source: this project; beta follows from N_d = -D U v*_dot at e = 0, see `N_d`.
+    The bandwidth of channel i is then K_i response_i. `slew` is the largest rate of the ideal
+    control and `rate_limit` that of the actuator (infinite without one), both in inputs of unit
+    response, units of y / s^2. Raises ParameterError for a factor below 1. Source: this project;
+    beta follows from N_d = -D U v*_dot at e = 0, see `N_d`.
     """
     require(factor >= 1.0, "factor", factor, "at least 1: beta above the slew of the ideal control")
     K = np.maximum(bandwidth, max(MIN_K, float(bandwidth[-1])))
@@ -374,10 +376,11 @@ def check_loop(
         implicit: lag:    lag_i + delay <= period / 2
         implicit: omega:  omega_i >= largest_i
 
-    Without the first, beta causes a limit cycle; it is stated for a response of 1. Without the
-    other two, the implicit sign chatters. response_i = abs(Omega_ii) is nominal, in the inputs of
-    the law, and `largest` is its upper bound. rate_limit is in those same inputs, in units of y /
-    s^2, and infinite without a limit. All have shape (m,).
+    If the first condition fails, beta may cause a limit cycle. It holds in inputs of unit response,
+    to which the check converts. If one of the others fails, the implicit sign chatters. response_i
+    = abs(Omega_ii) is nominal, in the inputs of the law, and `largest` is its upper bound.
+    rate_limit is in those same inputs, in units of y / s^2, and infinite without a limit. All have
+    shape (m,).
     """
     fastest = MAX_BETA_TO_RATE_LIMIT * rate_limit * response
     conditions = _by_channel("beta below rate", params.beta * response, fastest, at_least=False)

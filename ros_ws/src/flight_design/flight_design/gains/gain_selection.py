@@ -62,14 +62,14 @@ CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {
     "climb": 0.46,
 }
 """Bandwidth of a channel times the lag of its loop, rad, by output, where the search begins: 0.63
-and 0.46 cost 36 and 26 degrees of phase at the crossover. Yaw has a margin for the dutch roll,
-speed one for the engine. The integral (Lambda and the slope of the softened sign) costs more phase.
-The search makes the integral slower, and lowers the bandwidth if that is not enough, until the
-margins meet the requirement."""
+and 0.46 cost 36 and 26 degrees of phase at the crossover. That of yaw is lower because of the dutch
+roll, and that of speed because of the engine. The integral (Lambda and the slope of the softened
+sign) costs more phase. The search makes the integral slower, and lowers the bandwidth if that is
+not enough, until the margins meet the requirement."""
 
 DEFAULT_CROSSOVER_LAG_PRODUCT = 0.23  # rad, for an output that is not in CROSSOVER_LAG_PRODUCTS
 
-SOFTENING = 2.75  # 1, width of the softened sign in total lags where the search begins
+SOFTENING = 2.75  # 1, width of the softened sign at the start of the search, in total lags
 
 BETA_TO_SLEW = 1.25
 """beta / largest slew of the ideal control. The law needs at least 1; more than 1.5 gained nothing
@@ -112,7 +112,8 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
     controller: Controller
     theorem: tuple[GainCondition, ...]  # empty for a law other than RISE-DI
-    rules: tuple[GainCondition, ...]  # of the engineering procedure; empty without it
+    # of the engineering procedure; empty with an observer, and for a law other than RISE-DI
+    rules: tuple[GainCondition, ...]
     loop: tuple[GainCondition, ...]
     bounds: Bounds | None  # None for a law other than RISE-DI
     margins: LoopMargins | None  # None for the literal sign
@@ -142,13 +143,13 @@ class GainAssessment(NamedTuple, Generic[Controller]):
     def has_requirement(self) -> bool:
         """Whether the loop must have certain margins.
 
-        An ideal loop with the implicit or the literal sign need not.
+        An ideal loop with the implicit or the literal sign has no such requirement.
         """
         return any(condition.name in REQUIRED for condition in self.loop)
 
     @property
     def unmet(self) -> tuple[GainCondition, ...]:
-        """Margins of the requirement that the loop does not have."""
+        """Required margins that the loop does not reach."""
         return tuple(
             condition
             for condition in gain_conditions.failing(self.loop)
@@ -163,7 +164,7 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
 
 def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
-    """Return the linear loop of a controller around the aircraft of a study, with their box."""
+    """Return the linear loop of a controller around a study's aircraft, with the box of A and B."""
     timing = study.timing_of(controller)
     loop = linear_loop(controller, study.airframe, study.A, study.B, timing)
     airframe = study.airframe if study.effected is None else study.effected.airframe
@@ -177,14 +178,15 @@ def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
 class Selection:
     """The two gain sets for an airframe.
 
-    A set is assessed when it is first used, because the margins of all samples cost most.
+    A set is assessed when it is first used, because the margins of all samples take most of the
+    time.
     """
 
     study: Study
     setting: LoopSetting
     literal: RiseDiConfig  # the gain set of Theorem 1
     chosen: RiseDiConfig  # the engineering gains
-    origin: str = ""  # where the gains beside an observer come from, a sentence
+    origin: str = ""  # with an observer: a sentence on how the gains beside it were selected
 
     @cached_property
     def theorem(self) -> GainAssessment[RiseDiConfig]:
@@ -204,11 +206,12 @@ def gain_sets(study: Study, setting: LoopSetting) -> Selection:
 
     Both sets have the same channels (the fastest first, so that the last has the smallest K),
     inputs scaled by 1 / abs(Omega_ii), and D from the minors. The theorem's set is `theorem_gains`
-    with Lambda = 1 1/s, which needs the smallest k_g. The other one is `engineering_gains` with the
-    slew of the nominal airframe; behind servos, `within_requirement` finds the integrals and
-    bandwidths with the least error whose margins meet the setting's requirement, for the samples
-    too. `omega` is the largest abs(Omega_ii) of the samples. Raises ParameterError as
-    `signs_of_pairing` does, and for parameters that the controller does not accept.
+    with Lambda = 1 / s, for which the smallest k_g suffices. The other one is `engineering_gains`
+    with the slew of the nominal airframe. Behind servos, `within_requirement` searches for the
+    integral gains and the bandwidths with the least error. Their margins must meet the setting's
+    requirement on the nominal airframe and on every sample. `omega` is the largest abs(Omega_ii) of
+    the samples. Raises ParameterError as `signs_of_pairing` does, and for parameters that the
+    controller does not accept.
     """
     pairs = _paired(study, setting)
     engineering = gain_candidates(study, setting)
@@ -226,8 +229,8 @@ def gain_candidates(
 ) -> Callable[[FloatArray, FloatArray], Candidate[RiseDiConfig]]:
     """Return a function from `slower` and `lower`, (m,), to the engineering gains and the loop.
 
-    The bandwidth is lower by `lower`, and the integral slower by `slower` and `lower`. Raises
-    ParameterError as `gain_sets` does.
+    The bandwidth is divided by `lower`, and the integral gain by both. Raises ParameterError as
+    `gain_sets` does.
     """
     pairs = _paired(study, setting)
     limits = (
@@ -361,9 +364,8 @@ def _controller(
 def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
     """Return the same controller with the airframe as the nominal model of its feedforward.
 
-    lead = lag + delay + half a period of the
-    controller. Raises ParameterError if the airframe cannot be the model, for example because it
-    has a zero in the right half plane.
+    The lead is lag + delay + half a period of the controller. Raises ParameterError if the airframe
+    cannot be the model, for example because it has a zero in the right half plane.
     """
     for name in controller.outputs:
         require(
@@ -423,12 +425,16 @@ def assess_gains(
 
     Rate, lag and delay are the controller's; gamma_2 and rate limits are the setting's.
 
-    The conditions of the theorem are those of `_rise_di_conditions`. The rules are those of
-    `check_rules`, if there is no observer. The conditions of the loop are `check_loop`, if there is
-    no observer, the fraction of the samples for which the linear loop is stable, its delay margin
-    on the nominal airframe, and the margins of the setting's requirement (35 degrees of phase with
-    an observer). The delay margin should be at least one period, a missed tick, or what an observer
-    requires beyond the delay. With the implicit sign the linear loop is the one inside the width of
+    The conditions of the theorem are those of `_rise_di_conditions`. If there is no observer, the
+    rules are those of `check_rules`. The loop has these conditions:
+
+    - those of `check_loop`, if there is no observer,
+    - the fraction of the samples for which the linear loop is stable,
+    - its delay margin on the nominal airframe: at least one period, so that one tick may be missed,
+      or with an observer what this requires beyond the delay,
+    - the margins of the setting's requirement, which is 35 degrees of phase with an observer.
+
+    With the implicit sign the linear loop is the one inside the width of
     the sign, dt^2 omega beta; its margin is then the delay at which chatter begins, at most half a
     period. A law other than RISE-DI only has the conditions of the linear loop.
     """
@@ -508,7 +514,7 @@ def _rise_di_conditions(
         *gain_conditions.check_theorem(gains, bounds),
         GainCondition("V2_dot", None, decay_rate, 0.0, strict=True),
     )
-    # the engineering rules hold for a law without any other feedback beside it
+    # the engineering rules hold only without an observer
     if controller.observer is not None:
         return theorem, (), (), bounds
     responses = np.abs(np.einsum("Nii->Ni", C @ Bs))[counts] * params.input_scale
@@ -533,7 +539,7 @@ def response(study: Study, controller: ControllerConfig) -> FloatArray:
 
 
 def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
-    """Find the ratio to the trim speed up to which the delay margin lasts with fixed gains.
+    """Return the largest V / V0 up to which the delay margin stays positive with the same gains.
 
     The response to every input but that of V grows with V^2, and everything else stays as in trim.
     The result is rounded down to SPEED_STEP. It is 0 if there is no delay margin in trim, and
@@ -563,9 +569,10 @@ def _bounds(
     Lambda: FloatArray,
     gamma_2: float,
 ) -> tuple[Bounds, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Compute the bounds of Theorem 1 in inputs over `scale` (m,), with two masks of samples.
+    """Compute the bounds of Theorem 1 for inputs divided by `scale`, with two masks of samples.
 
-    The first mask has the samples with this D, the second those that have stable zeros as well.
+    `scale` is (m,). The first mask has the samples whose Omega has the signs D, the second those of
+    them that have stable zeros as well.
     """
     C = study.C[rows]
     Omegas = C @ study.B[:, :, columns] * scale

@@ -215,8 +215,8 @@ class Search(Likelihood):
     ) -> SearchEnd:
         """Search from one start, and return where it ends.
 
-        `levels` gives the level of each span; without it, theta decides. Every span counts in the
-        first step and in `unsettled` more steps, which never end the search.
+        `levels` gives the level of each span; without it, theta decides. In the first step and in
+        the next `unsettled` steps every span counts, and the search cannot end in any of them.
         """
         for iteration in range(STEPS):
             self.progress()
@@ -273,7 +273,10 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         free: NDArray[np.bool_],
     ) -> Slopes:
-        """Return the derivatives at theta, with the filters of all differences side by side."""
+        """Return the derivatives at theta by finite differences.
+
+        The filters of all differences run side by side, as one batch.
+        """
         size = len(theta)
         indices = np.flatnonzero(free)
         models = self.models(
@@ -355,10 +358,11 @@ def damped_steps(
     upper: FloatArray,
     free: NDArray[np.bool_],
 ) -> FloatArray:
-    """Return damped steps -(hessian + d diag hessian)^-1 slope, and fractions of the first, (k, p).
+    """Return damped steps -(hessian + d diag hessian)^-1 slope, and parts of the first one, (k, p).
 
-    Each damping d gives one step. Only the free parameters move, mask (p,), and none moves outwards
-    at its bound. Source: D. W. Marquardt, J. SIAM 11(2), 1963.
+    Each damping d gives one step. The first step follows again, times each of FRACTIONS. Only the
+    parameters in the mask `free`, (p,), move, and none of them moves outwards at its bound. Source:
+    D. W. Marquardt, J. SIAM 11(2), 1963.
     """
     steps = np.zeros((len(DAMPINGS), len(theta)))
     while True:

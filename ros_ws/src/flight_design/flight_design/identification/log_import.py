@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Import y, u and pose by a channel map, from an autopilot's log that the stack did not fly."""
+"""Import y, u and pose by a channel map, from the log of a flight that the stack did not fly."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -37,12 +37,14 @@ COMMANDS = "commands"  # the topic with trim + u, by input
 # Share of the typical airspeed, or for a multicopter of the typical thrust, below which the
 # aircraft is on the ground.
 AIRBORNE = 0.5
-# Percentile that is typical in a log, which may have more time on the ground than in the air.
+# We take this percentile as the typical value: a log may have more time on the ground than in the
+# air.
 TYPICAL = 90.0
-LEAST = 2.0  # s of flight that make a bag worth while
-# s below that speed for which an aircraft counts as in the air: no landing is as short
+LEAST = 2.0  # s, of the shortest stretch that is imported
+# s. If the speed is too low for at most this long, the aircraft still counts as in the air, because
+# no landing is as short.
 BRIDGED = 1.0
-AROUND = 5  # samples whose median is not a damaged one
+AROUND = 5  # samples, of which the median is never a damaged value
 
 FLOWN_AS = LogField("vehicle_status", "vehicle_type")
 VEHICLE_TYPES = {COPTER: 1.0, PLANE: 2.0}  # PX4, VehicleStatus.msg
@@ -53,7 +55,7 @@ Stamps = NDArray[np.int64]
 
 
 class Window(NamedTuple):
-    """What is taken of a log, s since its first sample of the output `instant`.
+    """What is taken of a log, s since its first sample of the output that the map calls `instant`.
 
     None means the beginning or the end of the flight that is found.
     """
@@ -95,11 +97,11 @@ def imported(
     (PX4) or of the rate controllers (ArduCopter), or else the stick in MANUAL; with `servos` it is
     the position of the servo, scaled as the stick. Without a window the longest stretch in the air
     is taken; for sticks it must be in MANUAL. `show` gets the comparison of the log with the map
-    before anything is refused because of it.
+    before a mismatch is refused.
 
     Raises ParameterError if the log lacks a channel, is of another vehicle or has no such stretch,
-    or if its parameters differ from the map or change between the samples. The sentence ends with
-    what the log has lost.
+    or if its parameters differ from the map or change between the samples. If the log has
+    lost data, the message of the error ends with that.
     """
     start_ns = log.start_ns(channel_map.outputs[channel_map.instant].motion[0])
     losses = [] if log.loss is None else [log.loss.sentence(start_ns)]
@@ -175,7 +177,7 @@ def _speed(
     stamps: Stamps,
     servos: bool,
 ) -> FloatArray | None:
-    """Return the airspeed, or a multicopter's thrust, which shows when it flies.
+    """Return the airspeed or a multicopter's thrust, from which one sees when the aircraft flies.
 
     Returns None if the map has neither.
     """
@@ -246,7 +248,7 @@ def _measured(log: VehicleLog, quantity: str, key: str) -> LogField:
 
 def _messages(log: VehicleLog, quantity: str) -> str:
     """Name the messages of a log's format that have a quantity."""
-    from flight_log.vehicle_tables import ULOG_SOURCES  # noqa: PLC0415 - of this sentence alone
+    from flight_log.vehicle_tables import ULOG_SOURCES  # noqa: PLC0415 - only this sentence needs it
 
     sources = ULOG_SOURCES if log.format is None else log.format.sources
     return (
@@ -258,7 +260,7 @@ def _messages(log: VehicleLog, quantity: str) -> str:
 class _Reader(NamedTuple):
     """The command of an input: SI = line(raw).
 
-    The raw value of the map's field comes from the pulse of a stick or a servo.
+    In the log of a plane by ArduPilot, raw is computed from the pulse of the stick or of the servo.
     """
 
     log: VehicleLog
@@ -375,7 +377,7 @@ def _flight(
         "no sample",
         f"a part of the {1e-9 * (stamps[-1] - start_ns):.0f} s of the log",
     )
-    # Without a window, the flight is where the speed is that of a flight.
+    # Without a window, the flight is the time in which the speed is high enough for one.
     if speed is not None and window.start is None and window.stop is None:
         require(
             bool(np.isfinite(speed).any()),
@@ -456,8 +458,9 @@ def _other_flights(
 def _complete(stamp_ns: Stamps, values: FloatArray, is_damaged: bool) -> tuple[Stamps, FloatArray]:
     """Return the samples in which every channel is known.
 
-    Bytes that are lost within a message leave wrong values. In a damaged log, a value counts as
-    wrong if it lies outside the range of the medians of AROUND samples by more than that range.
+    Bytes that are lost within a message leave wrong values. In a damaged log, take the
+    running medians over AROUND samples, from the lowest to the highest. A value counts as wrong if
+    it is farther outside of this range than the range is wide.
     """
     is_known = np.isfinite(values).all(axis=1)
     stamp_ns, values = stamp_ns[is_known], values[is_known]

@@ -41,18 +41,19 @@ def sketch(
     It comes from Omega = C B and the trim speed V0, m/s.
 
         V_dot     = -0.26 n V + Omega_V u                          n = g / V0
-        alpha_dot = -11 n alpha + q                                lift slope over lift coefficient
+        alpha_dot = -11 n alpha + q
         q_dot     = -2.6 |Omega_q| alpha - 20 n q + Omega_q u
-        beta_dot  = -0.17 beta + 0.05 p - r + n sin(phi)  1/s, and the angle of attack in trim
+        beta_dot  = -0.17 beta + 0.05 p - r + n sin(phi)
         p_dot     = -2.3 |Omega_p| beta - P p + 0.37 P r + Omega_p u,  P = 1.4 sqrt(11 n |Omega_p|)
         r_dot     = 6 |Omega_r| beta - 0.05 P p - R r + Omega_r u,  R = 0.95 sqrt(11 n |Omega_r|)
 
-    V stands apart, because the airspeed contains the wind itself, next to which y hardly shows what
-    alpha and theta do to V. The factors are geometric means over the twelve aircraft of
-    `benchmarks.jsbsim_gains`, from differences of their accelerations in trim. The entries of a
-    single aircraft differ from them by a factor of 1.3 to 3. Omega (m, m) has rows `outputs` and
-    columns `inputs`; input i drives output i. Raises ParameterError for other outputs than q, V, p,
-    r.
+    11 is the lift slope divided by the lift coefficient, 0.17 is in 1/s, and 0.05 is the angle of
+    attack in trim, rad. V depends on no other state: the airspeed contains the wind itself, and
+    beside the wind y hardly shows what alpha and theta do to V. The factors are geometric means
+    over the twelve aircraft of `benchmarks.jsbsim_gains`, from differences of their accelerations
+    in trim. The entries of a single aircraft differ from them by a factor of 1.3 to 3. Omega (m, m)
+    has rows `outputs` and columns `inputs`; input i drives output i. Raises ParameterError for
+    other outputs than q, V, p, r.
     """
     require(
         sorted(outputs) == ["V", "p", "q", "r"],

@@ -246,7 +246,7 @@ def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
 
 
 def _gpx_segments(line: Element, kind: str) -> list[list[Place]]:
-    """Return the segments of a track, or the only one of a route, that have a position."""
+    """Return the segments of a track that have a position; a route counts as one segment."""
     parts = [line] if kind == "rte" else [element for element in line if _kind(element) == "trkseg"]
     return [places for element in parts if (places := _gpx_places(element, f"{kind}pt"))]
 

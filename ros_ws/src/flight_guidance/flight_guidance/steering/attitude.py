@@ -82,12 +82,12 @@ def body_rates(
 def yaw_for_bank(phi_c: Scalar, phi: Scalar, speed: Scalar) -> Scalar:
     """Compute the yaw rate for a bank without an aileron, rad/s, within +-g tan(LARGEST_YAW) / V.
 
-    It is the rate of the turn, plus more to roll there:
+    It is the yaw rate of the turn, and more of it to roll the aircraft to the bank:
 
         r_m = g tan(phi_c) / V + k (SKIDDING phi_c - phi),  k = YAW_TO_BANK
 
-    phi_c is that of a coordinated turn at the same rate. A yaw rolls an aircraft to the same side:
-    the outer wing is faster, and the dihedral rolls away from the sideslip.
+    phi_c is the bank of a coordinated turn at the same rate. A yaw rolls an aircraft to the same
+    side: the outer wing is faster, and the dihedral makes the sideslip roll it there, too.
     """
     xp = array_namespace(phi)
     turn = GRAVITY / forward(speed)

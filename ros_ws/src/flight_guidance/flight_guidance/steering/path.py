@@ -199,9 +199,9 @@ def end_course(leg: Leg) -> float:
 
 
 def is_passed(leg: Leg, position: Point) -> bool:
-    """Return whether a position lies beyond the end of a leg, across the course there.
+    """Return whether a position lies beyond the line through the end of a leg, across its course.
 
-    It never does for an orbit.
+    For an orbit, return False.
     """
     return (
         leg.end is not None
@@ -326,7 +326,7 @@ def is_joined(
 def outline(leg: Leg, start: Point) -> list[Point]:
     """Draw points along a leg from its start.
 
-    They are at most 10 deg apart on an arc; an orbit is at least a full turn.
+    On an arc the points are at most 10 deg apart. An orbit is drawn as at least one full turn.
     """
     if isinstance(leg, Line):
         return [leg.start, leg.end]

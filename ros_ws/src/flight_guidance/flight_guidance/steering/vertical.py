@@ -11,13 +11,13 @@ from flight_core.vectors import Scalar, array_namespace
 from flight_guidance.steering.protection import forward
 
 STALL_ANGLE = 0.3
-"""rad from zero lift, C_Lmax / C_Lalpha: 1.45 and 4.9 1/rad, of a clean wing of aspect ratio 7 by
-lifting-line theory."""
+"""Angle of attack from zero lift to the stall, C_Lmax / C_Lalpha, rad. By lifting-line theory a
+clean wing of aspect ratio 7 has 1.45 and 4.9 1/rad."""
 
 
 CLIMB_BANDWIDTH = 0.4
-"""1/s, of the climb rate by the airspeed: a third of the osprey's bandwidth of V, which adds 37 deg
-of lag there."""
+"""Bandwidth of the climb rate that the airspeed controls, 1/s. It is a third of the osprey's
+bandwidth of V. At this frequency the loop of V adds 37 deg of lag."""
 
 
 class VerticalParams(NamedTuple):

@@ -62,15 +62,17 @@ def allocate(
 ) -> tuple[FloatArray, FloatArray]:
     """Find u (p,) inside the limits for a demanded v (m,), and return it with the v that it gives.
 
-    If no limit acts, these are T v and v, to the last bit.
+    If no limit acts, the results are exactly T v and v.
 
     If T v is beyond an end stop, `exchange w` passes what the effector lacks on to the others, one
     stop after the other. If that is not enough, the inputs of the law are added in the order of
     priority, each as far as the stops allow:
 
-        u += s (T_i v_i + exchange w),  s the largest in [0, 1] inside the end stops, from u = 0
+        u += s (T_i v_i + exchange w)
 
-    From u_before towards this u the same is done inside the rates, with the change of v for v.
+    The sum begins at u = 0, and s is the largest number in [0, 1] for which u stays inside the end
+    stops. If the rate limits do not permit this u, then u goes from u_before towards it: the inputs
+    are added in the same way, with the change of v in place of v, and inside the rate limits, too.
 
     Source: pseudo-inverse with redistribution and priority, T. A. Johansen, T. I. Fossen, "Control
     allocation - a survey", Automatica 49(5), 2013, section 2; the exchange is the relaxation method

@@ -93,8 +93,8 @@ def with_new_model(
 ) -> FeedforwardState:
     """Return the state for a new model in the same motion.
 
-    x and u_0 stay if there are any, and the new model gives u. u_ff continues at u - u_0. y_m_dot
-    and dt are those of the last tick.
+    x and u_0 stay if the old state has them, and u is computed with the new model. u_ff goes on
+    from u - u_0. y_m_dot and dt are those of the last tick.
     """
     start = initial_state(y_m, nominal)
     if state is not None and state.x.shape == start.x.shape:

@@ -28,7 +28,8 @@ from rise_di_controller.extensions.observer import VaneParams
 from rise_di_controller.law.decomposition import DecompositionError, signs
 from rise_di_controller.law.saturation import Limits
 
-MAX_INVERSE_ERROR = 1e-6  # 1, of an entry of effect T; numbers with ten digits leave 1e-9
+# largest error of an entry of effect T against I; if the file has ten digits, it is about 1e-9
+MAX_INVERSE_ERROR = 1e-6
 
 
 def _require_sizes(section: Config, key: str, sizes: Mapping[str, tuple[int, int]]) -> None:
@@ -192,7 +193,7 @@ class ObserverConfig(Config):
         return Phi, Gamma, H, L, np.reshape(self.F, (m, s))
 
     def at_rate(self, rate: float, nominal: Nominal) -> "ObserverConfig":
-        """Convert the observer to another rate, whose periods are a = self.rate / rate as long.
+        """Convert the observer to another rate; a = self.rate / rate is the ratio of the periods.
 
         [Phi, Gamma; 0, I]' = [Phi, Gamma; 0, I]^a,  I - L' H = (I - L H)^a,  F' = F
         """

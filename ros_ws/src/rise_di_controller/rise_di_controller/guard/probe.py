@@ -31,7 +31,7 @@ LARGEST = 4.0  # Hz, highest frequency of a sine: five bins a period
 
 
 class ProbeConfig(Config):
-    """Probe of the inputs, an extension that finds a stuck surface without a command."""
+    """Probe of the inputs, an extension that finds a stuck surface while no command moves it."""
 
     effect: NonNegatives | None = Field(
         default=None,
