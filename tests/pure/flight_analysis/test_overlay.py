@@ -35,6 +35,16 @@ def test_difference_of_sines_is_the_closed_form() -> None:
     assert found.outside == pytest.approx(1.0 - 4.0 * np.arcsin(0.2) / (2.0 * np.pi), abs=0.01)
 
 
+def test_tolerance_of_a_channel_replaces_that_of_its_size() -> None:
+    """abs(0.1 sin t) > 0.05 in all but 4 asin(0.5) of 2 pi, which leaves two thirds."""
+    t = np.linspace(0.0, 2.0 * np.pi, 2001)
+    logs = (tape("y", t, np.sin(t)), tape("y", t, 0.9 * np.sin(t)))
+    found = difference(*logs, "y", "phi", tolerance=0.05)
+    assert found is not None
+    assert found.tolerance == 0.05
+    assert found.outside == pytest.approx(2.0 / 3.0, abs=0.01)
+
+
 def test_input_is_held_between_samples_and_output_is_linear() -> None:
     """At 0.5 s a step from 0 to 1 at 1 s is still 0 if held, and 0.5 if linear."""
     first = {topic: tape(topic, np.array([0.5]), np.array([1.0])) for topic in ("y", "u")}

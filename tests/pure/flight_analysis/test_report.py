@@ -334,6 +334,7 @@ def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> N
         "Output y over the reference y_m",
         "Tracking error e = y - y_m",
         "All figures",
+        "Differences of the signals from the first flight",
         "Words",
     ]
 

@@ -185,6 +185,18 @@ def test_flight_that_hung_before_y_m_is_told_with_its_cause(
     assert row["outcome"].startswith("never flew: the controller never engaged; uav7.controller")
 
 
+def test_tolerance_of_unknown_channel_and_of_a_single_run_is_refused(
+    runs: list[Path], tmp_path: Path
+) -> None:
+    page = tmp_path / "page.html"
+    with refusing("tolerances: found 'w', expected one of"):
+        Report(runs=runs, html=page, tolerance=["w=0.1"]).execute()
+    with refusing("tolerances: found a single run, expected several runs"):
+        Report(runs=runs[:1], tolerance=["q=0.1"]).execute()
+    Report(runs=runs, html=page, tolerance=["q=0.1"]).execute()
+    assert "5.73" in page.read_text()  # 0.1 rad/s in deg/s
+
+
 @pytest.mark.parametrize("option", ["html", "csv"])
 def test_file_that_cannot_be_written_is_one_sentence(runs: list[Path], option: str) -> None:
     nowhere: dict[str, Any] = {option: Path("/proc/none/file")}

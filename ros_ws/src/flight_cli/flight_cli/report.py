@@ -22,6 +22,7 @@ from flight_cli.output import (
     LATEST,
     STDOUT,
     has_desktop,
+    named_numbers,
     new_table,
     print_json,
     print_table,
@@ -82,6 +83,10 @@ class Report:
         "each output.",
         default="",
     )
+    tolerance: list[str] | None = rare_option(
+        "Tolerance of a channel in the differences of runs, SI, as in q=0.02; may be repeated.",
+        metavar="NAME=VALUE",
+    )
     opens: bool | None = rare_option(
         "Open the page in the browser; by default if you are at a terminal on a desktop.",
         "--open/--no-open",
@@ -102,6 +107,7 @@ class Report:
                 csv=None if self.csv == STDOUT else self.csv,
                 scenario=scenario_file(self.scenario),
                 remaps=remaps_of(self.remap),
+                tolerances=named_numbers("tolerance", self.tolerance or (), "q=0.02"),
             )
         except UnflownError as error:
             warn(f"error: {error}")

@@ -24,11 +24,11 @@ from flight_analysis.report.summary_rows import (
 from flight_analysis.report.tables import TIMES, MetricTable
 
 
-def comparison_page(flights: Sequence[RecordedFlight]) -> Page:
+def comparison_page(flights: Sequence[RecordedFlight], tolerances: Mapping[str, float]) -> Page:
     """Return the page of several flights, each in its own colour and compared with the first.
 
     If one of them is an imported log, the signals that have a name in common are laid over each
-    other, with their differences.
+    other. `tolerances` are those of differences by channel, SI.
     """
     context = figures.plot_context(flights)
     colours = {label: run.colour for label, run in context.runs.items()}
@@ -37,8 +37,9 @@ def comparison_page(flights: Sequence[RecordedFlight]) -> Page:
         _verdict(flight, label, colour)
         for (label, colour), flight in zip(colours.items(), flights, strict=True)
     ]
+    differences = TableGroup([difference_table(flights, context.units, tolerances)])
     if len(scenarios) < len(flights):
-        return _overlay_page(flights, context, verdicts)
+        return _overlay_page(flights, context, verdicts, differences)
     return Page(
         title=f"{len(flights)} flights compared",
         verdicts=verdicts,
@@ -60,6 +61,12 @@ def comparison_page(flights: Sequence[RecordedFlight]) -> Page:
             ),
             Section("Input u", "", figures.input_figure(context), contents="Inputs"),
             _metrics(flights, context, list(colours.values())),
+            Figures(
+                groups=[differences],
+                is_folded=True,
+                title="Differences of the signals from the first flight",
+                contents="Differences",
+            ),
             Section("Spectrum of u", "", figures.spectrum_figure(context), over_time=False),
             Section("Timing of the ticks", "", figures.timing_figure(context), over_time=False),
         ],
@@ -140,7 +147,10 @@ def _conditions(flights: Sequence[RecordedFlight], labels: Sequence[str]) -> lis
 
 
 def _overlay_page(
-    flights: Sequence[RecordedFlight], context: PlotContext, verdicts: Sequence[Verdict]
+    flights: Sequence[RecordedFlight],
+    context: PlotContext,
+    verdicts: Sequence[Verdict],
+    differences: TableGroup,
 ) -> Page:
     """Return the page of logs laid over each other, with the differences from the first."""
     has_references = all("y_m" in flight.tape for flight in flights)
@@ -166,7 +176,7 @@ def _overlay_page(
             Section("Pose", "", figures.overlay_figure(context, "pose"), contents="Pose"),
             Section("Spectrum of u", "", figures.spectrum_figure(context), over_time=False),
             Figures(
-                groups=[TableGroup([difference_table(flights, context.units)])],
+                groups=[differences],
                 title="Differences from the first log",
                 contents="Differences",
             ),

@@ -7,6 +7,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.linear_loop.certificate import kept_guarantee
@@ -71,10 +72,17 @@ ABOUT_Y_M = "y_m is what the aircraft was asked to follow, and y what it did."
 MOST_MESSAGES = 500  # messages of a log on a page
 
 
-def write_page(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write the page of a flight, or of a comparison if there are several."""
+def write_page(
+    path: Path,
+    flights: Sequence[RecordedFlight],
+    tolerances: Mapping[str, float] = MappingProxyType({}),
+) -> None:
+    """Write the page of a flight, or of a comparison if there are several.
+
+    `tolerances` are those of differences between several flights, by channel, SI.
+    """
     if len(flights) > 1:
-        page = comparison_page(flights)
+        page = comparison_page(flights, tolerances)
     elif flights[0].scenario is None:
         page = _imported_page(flights[0])
     else:

@@ -4,7 +4,7 @@
 
 The difference of a signal is taken at the instants of the first log, where the other log has
 samples before and after: y and pose are linear between two samples, and u is held. Each signal has
-a tolerance, by default TOLERANCE of the largest absolute value in the first log.
+a tolerance: that of its name, or else TOLERANCE of the largest absolute value in the first log.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,6 +23,7 @@ from flight_analysis.report.display_units import (
 from flight_analysis.report.summary import RecordedFlight, labels
 from flight_analysis.report.summary_rows import Column
 from flight_analysis.report.tables import MetricTable
+from flight_core.parameters import one_of, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
@@ -43,8 +44,13 @@ class Difference(NamedTuple):
     outside: float  # part of the compared instants
 
 
-def difference(first: Tape, second: Tape, topic: str, name: str) -> Difference | None:
-    """Return how a channel of two logs differs, or None if they have no time in common."""
+def difference(
+    first: Tape, second: Tape, topic: str, name: str, tolerance: float | None = None
+) -> Difference | None:
+    """Return how a channel of two logs differs, or None if they have no time in common.
+
+    The tolerance is in SI; None: TOLERANCE of the largest absolute value in the first log.
+    """
     t, before = _samples(first, topic, name)
     instants, values = _samples(second, topic, name)
     if not (len(t) and len(instants)):
@@ -60,7 +66,8 @@ def difference(first: Tape, second: Tape, topic: str, name: str) -> Difference |
     change = after - before
     if topic == "pose" and name in ANGLES:
         change = np.angle(np.exp(1j * change))
-    tolerance = TOLERANCE * float(np.max(np.abs(before)))
+    if tolerance is None:
+        tolerance = TOLERANCE * float(np.max(np.abs(before)))
     size = np.abs(change)
     worst = int(np.argmax(size))
     return Difference(
@@ -82,11 +89,18 @@ def _samples(tape: Tape, topic: str, name: str) -> tuple[FloatArray, FloatArray]
 
 
 def difference_table(
-    flights: Sequence[RecordedFlight], units: Mapping[str, DisplayUnit]
+    flights: Sequence[RecordedFlight],
+    units: Mapping[str, DisplayUnit],
+    tolerances: Mapping[str, float],
 ) -> MetricTable:
-    """Return the differences of each later log from the first, a row for each common signal."""
+    """Return the differences of each later log from the first, a row for each common signal.
+
+    `tolerances` has those of channels by name, SI. Raises ParameterError for a channel that no two
+    logs have in common.
+    """
     first, *others = flights
     rows = []
+    named: set[str] = set()
     for label, other in zip(labels(flights)[1:], others, strict=True):
         for topic in TOPICS:
             if topic not in first.tape or topic not in other.tape:
@@ -94,16 +108,19 @@ def difference_table(
             known = POSE_UNITS if topic == "pose" else units
             common = [name for name in first.tape[topic].names if name in other.tape[topic].names]
             for name in in_order(common, known):
-                found = difference(first.tape, other.tape, topic, name)
+                named.add(name)
+                found = difference(first.tape, other.tape, topic, name, tolerances.get(name))
                 if found is not None:
                     unit = known.get(name, NO_UNIT)
                     title = f"{topic} {channel_label(name, known)}"
                     of_log = f"{label}: {title}" if len(others) > 1 else title
                     rows.append([of_log, *_cells(found, unit)])
+    for name in tolerances:
+        require(name in named, "tolerances", repr(name), one_of(sorted(named), name))
     heads = ("rms", "largest", "at (s)", "tolerance", "outside, %")
     note = (
-        f"The tolerance is {100 * TOLERANCE:g} % of the largest value in the first log. Outside is "
-        "the part of its instants in which the difference is larger"
+        f"Unless given, the tolerance is {100 * TOLERANCE:g} % of the largest value in the first "
+        "log. Outside is the part of its instants in which the difference is larger"
     )
     return MetricTable("", [Column(group="", head=head) for head in heads], rows, note)
 

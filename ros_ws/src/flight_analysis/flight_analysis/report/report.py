@@ -59,6 +59,7 @@ def report(
     namespace: str | None = None,
     remaps: Mapping[str, str] = {},
     scenario: FilePath | None = None,
+    tolerances: Mapping[str, float] = {},
 ) -> Report:
     """Write the report page of a recorded run, or of a comparison of several runs.
 
@@ -82,6 +83,8 @@ def report(
             "/sensors/y"}.
         scenario: Scenario file of the flights, for logs without a scenario; None: the scenario in
             each log.
+        tolerances: Tolerance of the difference between several runs by channel, SI, as {"q":
+            0.02}; for any other channel 2 % of the largest value in the first run.
 
     Returns:
         The path of the page, and the flights on the page.
@@ -97,13 +100,13 @@ def report(
     require(bool(runs), "runs", "none", A_RUN)
     folders = [as_path(run, "run", A_RUN) for run in runs]
     if figure is None:
-        key = "channels" if channels else "width"
-        unused = not channels and width == WIDTH
-        require(unused, key, "no figure to use it for", "a path for figure too")
+        _require_no_figure(channels, width)
+    require(not tolerances or len(folders) > 1, "tolerances", "a single run", "several runs")
+    page_of = partial(write_page, tolerances=tolerances)
     files = [
         File(key, as_path(path, key, A_FILE), write)
         for key, path, write in (
-            ("html", html, write_page),
+            ("html", html, page_of),
             ("png", png, write_png),
             ("csv", csv, write_csv),
             ("parquet", parquet, write_parquet),
@@ -111,7 +114,7 @@ def report(
         )
         if path is not None
     ]
-    # One run gets its own page; with `html` it gets the page of a comparison, as several runs do.
+    # One run gets its own page, or with `html` that of a comparison.
     is_single = len(folders) == 1 and html is None
     require(
         output is None or is_single,
@@ -131,13 +134,20 @@ def report(
         flights = [read_one(folder) for folder in folders]
         if html is None:
             page = _comparison_folder(folders[0]) / COMPARISON
-            files.insert(0, File("html", page, write_page))
+            files.insert(0, File("html", page, page_of))
         else:
             page = Path(html)
     for file in files:
         with writing(file.key, file.path, A_FILE):
             file.write(file.path, flights)
     return Report(page=page, flights=flights)
+
+
+def _require_no_figure(channels: str | Sequence[str], width: str | float) -> None:
+    """Raise ParameterError for channels or a width without a figure to use them for."""
+    key = "channels" if channels else "width"
+    is_default = not channels and width == WIDTH
+    require(is_default, key, "no figure to use it for", "a path for figure too")
 
 
 def _comparison_folder(first: Path) -> Path:

@@ -425,18 +425,14 @@ def assess_gains(
 
     Rate, lag and delay are the controller's; gamma_2 and rate limits are the setting's.
 
-    The conditions of the theorem are those of `_rise_di_conditions`. If there is no observer, the
-    rules are those of `check_rules`. The loop has these conditions:
-
-    - those of `check_loop`, if there is no observer,
-    - the fraction of the samples for which the linear loop is stable,
-    - its delay margin on the nominal airframe: at least one period, so that one tick may be missed,
-      or with an observer what this requires beyond the delay,
-    - the margins of the setting's requirement, which is 35 degrees of phase with an observer.
-
-    With the implicit sign the linear loop is the one inside the width of
-    the sign, dt^2 omega beta; its margin is then the delay at which chatter begins, at most half a
-    period. A law other than RISE-DI only has the conditions of the linear loop.
+    The conditions of the theorem are those of `_rise_di_conditions`, and without an observer the
+    rules are those of `check_rules`. The loop has these conditions: those of `check_loop`, without
+    an observer; the fraction of the samples for which the linear loop is stable; its delay margin
+    on the nominal airframe, which must be a period, so that a tick may be missed, or with an
+    observer what this requires beyond the delay; and the margins of the setting's requirement,
+    which is 35 degrees of phase with an observer. With the implicit sign the linear loop is the one
+    inside the width of the sign, dt^2 omega beta; its margin is then the delay at which chatter
+    begins, at most half a period. A law other than RISE-DI has the conditions of the linear loop.
     """
     rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
