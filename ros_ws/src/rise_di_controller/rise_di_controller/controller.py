@@ -29,11 +29,11 @@ from rise_di_controller.params import ControllerConfig, as_controller
 class ControlOutput(NamedTuple):
     """Output of a tick."""
 
-    stamp_ns: int  # of y, the source of u
+    stamp_ns: int  # of the y from which u was computed
     u: FloatArray  # (p,) in the order of the parameters' effectors
     inputs: guard.TickInputs
     log: Callable[[], FloatArray]
-    effects: FloatArray | None = None  # (m,) of the inputs, if a test was due: `EffectTest.most`
+    effects: FloatArray | None = None  # (m,) by `EffectTest.most`; None if no test was due
 
     @property
     def internals(self) -> FloatArray:
@@ -45,9 +45,9 @@ class ControlOutput(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """What a controller needs of new parameters before they take effect.
+    """What a controller computes from new parameters before they take effect.
 
-    Preparing it takes a third of the time of a change in flight.
+    This is a third of the time that a change in flight takes.
     """
 
     parameters: ControllerConfig
@@ -58,7 +58,7 @@ class Prepared(NamedTuple):
 
 
 def preparing(parameters: ControllerConfig) -> Generator[None, None, Prepared]:
-    """Prepare parameters as `prepared` does, in parts of at most about 1 ms."""
+    """Prepare parameters as `prepared` does, in steps of at most about 1 ms."""
     law = parameters.tuned_law()
     yield
     limits = parameters.guard()
@@ -84,13 +84,13 @@ def prepared(parameters: ControllerConfig) -> Prepared:
 
 
 class Controller:
-    """`guard.tick` with state and the last samples of y and y_m.
+    """Controller without ROS: `guard.tick` with its state and the last samples of y and y_m.
 
     Args:
         parameters: Parameters of the controller.
 
     Raises:
-        ParameterError: `parameters` are no ControllerConfig.
+        ParameterError: `parameters` is not a ControllerConfig.
 
     Examples:
         >>> controller = rise_di.Controller(rise_di.find_scenario("osprey_servo").controller)
@@ -136,7 +136,7 @@ class Controller:
 
     @property
     def has_internals(self) -> bool:
-        """Whether the law has a state to log, which it has from the first engagement on."""
+        """Whether the law has a state to log, as it does from the first engagement on."""
         return self._state.law is not None
 
     @property
@@ -151,14 +151,14 @@ class Controller:
 
     @property
     def has_learned_model(self) -> bool:
-        """Whether feedforward and observer differ from those at the start.
+        """Whether the feedforward or the observer differs from the one at the start.
 
-        A learner proposes the new ones.
+        Only the proposals of a learner change them.
         """
         return not self._first_law
 
     def restart(self) -> None:
-        """Engage the law again with the next fresh y and y_m, starting from the u that flies then.
+        """Engage the law again with the next fresh y and y_m, starting from the present u.
 
         The transfer is bumpless. A failsafe that is under way continues.
         """
@@ -171,10 +171,11 @@ class Controller:
         If the parameters are equal, nothing changes.
 
         Args:
-            parameters: The new parameters, or the same prepared outside of a tick.
+            parameters: The new parameters, or what `prepared` returned for them outside of a tick.
 
         Raises:
-            ParameterError: The state would differ: another law, or an observer that is added.
+            ParameterError: The log would have other channels, because the law is another one or
+                because an observer is added or removed.
         """
         new = parameters if isinstance(parameters, Prepared) else prepared(parameters)
         if new.digest == self._digest:
@@ -202,8 +203,8 @@ class Controller:
     def still_vanes(self) -> tuple[str, ...]:
         """Return the names of the vanes that the observer leaves out because they stand still.
 
-        Each engagement measures the motion afresh, from 0. Until a vane has moved, or the time of
-        the average has passed, the last report about it stays valid.
+        Each engagement measures the motion afresh, from 0. Until a vane has moved, or the
+        averaging time has passed, the vane counts as it did before the engagement.
         """
         return tuple(
             name
@@ -253,7 +254,7 @@ class Controller:
     def oscillations(self) -> dict[str, float]:
         """Return the period, s, of each output that oscillates under a model learned in flight.
 
-        Only outputs that oscillate more than they did before count.
+        An output counts only if it oscillates more than it did under the law of the start.
         """
         if self._first_law or not self._oscillations.periods.any():
             return {}
@@ -270,12 +271,12 @@ class Controller:
     def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
         """Buffer a sample of y, in the law's order.
 
-        A sample that no aircraft can give (`samples`) is lost: it counts as one that never arrived.
-        Once a sample is lost because y changed too fast, no older stamp is taken any more. If later
-        samples confirm a jump, the law engages again.
+        A sample that no aircraft can give (see `samples`) is lost, as if it had never arrived. If a
+        sample is lost because y changed too fast, the next one must still have a later stamp. If
+        later samples confirm a jump, the law engages again.
 
         Args:
-            sample: The sample, shape (m,), longer if there are vanes, SI, deviations from trim.
+            sample: The sample, shape (m,), or (m + k,) with k vanes, SI, deviations from trim.
             now_ns: The clock, ns.
 
         Returns:
@@ -307,7 +308,7 @@ class Controller:
         return None
 
     def take_y_m(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """Buffer a sample of y_m, (m,), as `take_y` does, except that y_m may jump.
+        """Buffer a sample of y_m, (m,), as `take_y` does, except that y_m may jump or stand still.
 
         Args:
             sample: The sample, shape (m,), SI, deviations from trim.
@@ -331,7 +332,7 @@ class Controller:
     ) -> Refusal | None:
         """Refuse a sample of m values that is beyond the bounds.
 
-        Raises ChannelError if its stamp is in the future or not newer than the last.
+        Raises ChannelError if its stamp is in the future or not newer than that of `last`.
         """
         require_not_future(sample.stamp_ns, now_ns, self._guard.max_age_ns)
         if last is not None:
@@ -365,7 +366,7 @@ class Controller:
         )
         if inputs is None:
             return None
-        # a step has a dt above 0, an engagement has 0
+        # in a step of the law dt is above 0, at an engagement it is 0
         if was_engaged and self._state.mode is Mode.ENGAGED and inputs.dt == 0.0:
             gap_ns = 0 if last is None else inputs.stamp_ns - last.stamp_ns
             self._restart_reason = Refusal(
@@ -397,7 +398,7 @@ class Controller:
         )
 
     def watch(self, e: FloatArray, dt: float) -> None:
-        """Take the error of a tick, which `diverging` and `oscillations` judge.
+        """Record the error of a tick for `diverging` and `oscillations`.
 
         Args:
             e: y - y_m, shape (m,), SI.
@@ -420,9 +421,9 @@ class Controller:
 
         They are needed if the last tick is longer ago than the age limit.
 
-        The aircraft has meanwhile started a failsafe of its own for u. Two ticks without fresh
-        inputs bring the controller's u to the same failsafe value, so that the re-engagement is
-        bumpless.
+        The aircraft has meanwhile started its own failsafe, since u was missing. Two ticks without
+        fresh inputs bring the controller's u to the same failsafe value, so that the re-engagement
+        is bumpless.
 
         Args:
             last_ns: Instant of the last tick, ns.

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The section `controller` of a scenario, as it is under any control law.
+"""The section `controller` of a scenario: the fields that it has under any control law.
 
-Its fields make the arrays of guard, feedforward and observer.
+The arrays of guard, feedforward and observer are built from these fields.
 """
 
 import json
@@ -48,14 +48,14 @@ OF_NODE = frozenset({"lockstep", "y_rate", "autostart", "start_active"})
 
 
 class ControllerSection(NodeConfig):
-    """The fields of the section `controller`, and the arrays that they make.
+    """The fields of the section `controller`, and the arrays that are built from them.
 
     `params.ControllerConfig` checks them, and a subclass of it adds the parameters of a law.
     """
 
     needs: ClassVar[str] = ""
-    """What the law needs beside y and y_m, in words. The controller refuses a law that needs
-    anything."""
+    """What the law must measure in addition to y and y_m, in words. The controller refuses a law
+    that needs such a measurement."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="rate of the law, Hz")
     y_rate: Annotated[float, Field(ge=0, le=1000)] = Field(
@@ -82,7 +82,7 @@ class ControllerSection(NodeConfig):
         default=None,
         description="largest abs(y) and abs(y_m); none: p, q, r 2000 deg/s, V 340 m/s, else 1e6",
     )
-    # ten ticks at 100 Hz: a busy host stalls for less, and a command takes longer than that to rise
+    # ten ticks at 100 Hz: a busy host stalls for a shorter time, and a command takes longer to rise
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(
         default=0.1, description="age above which y or y_m is stale, s"
     )
@@ -233,7 +233,7 @@ class ControllerSection(NodeConfig):
         return np.zeros(0)
 
     def history_ticks(self) -> int:
-        """Return the number of past ticks from which an observer starts if replaced in flight."""
+        """Return the number of past ticks that initialise an observer which is new in flight."""
         return 0
 
     def nominal(self) -> Nominal | None:
@@ -243,9 +243,10 @@ class ControllerSection(NodeConfig):
         return self.feedforward.nominal(self.outputs, self.inputs, self.D)
 
     def _flown_nominal(self) -> Nominal | None:
-        """Return the nominal model that follows y_m.
+        """Return the nominal model with which the feedforward follows y_m.
 
-        Beside an observer of part 0 it adds no input; only a learner needs its states.
+        With an observer whose `part` is 0, the feedforward adds no input. The model is then kept
+        only if there is a learner, which needs its states. Otherwise the result is None.
         """
         nominal = self.nominal()
         if nominal is None or self.observer is None or self.observer.part > 0.0:
@@ -255,11 +256,11 @@ class ControllerSection(NodeConfig):
     def digest(self) -> int:
         """Compute a hash of the parameters of law and guard, 0 to 2^48 - 1, exact as a float64.
 
-        It is a BLAKE2b of names and values, so it changes with any bit of any gain. Parameters that
-        concern only the node are left out.
+        It is the BLAKE2b hash of names and values, so it changes with any bit of any gain.
+        Parameters that concern only the node are left out.
         """
         content = self.model_dump(exclude=OF_NODE)
-        # logs of versions that had no other law do not name it either
+        # older versions had only this law, and the digests in their logs do not include its name
         if content["law"] == "rise_di":
             del content["law"]
         return int.from_bytes(
@@ -270,7 +271,7 @@ class ControllerSection(NodeConfig):
         """Compute abs(y_i / u_i) at the frequency of each sine, (m,), 0 where there is no sine.
 
         The model is C (j omega - A)^-1 B if there is a nominal one, and 1 / (input_scale omega) if
-        not. The lag of the actuator comes before it.
+        not. The lag of the actuator is included.
         """
         gain = np.zeros(len(self.outputs))
         if self.probe is None:
@@ -288,7 +289,10 @@ class ControllerSection(NodeConfig):
         return gain
 
     def _probe(self) -> Probe | None:
-        """Size each sine to move y by its amplitude under the model; None without a probe."""
+        """Build the probe, whose sines move y by the amplitudes of the section; None without one.
+
+        The size of each sine follows from `probe_gain`.
+        """
         if self.probe is None:
             return None
         gain = self.probe_gain()

@@ -35,7 +35,8 @@ RESERVED = frozenset(
         GIVEN_UP,
     }
 ) - {"e"}
-"""Names that the log reserves, so that no law can use them in its state. e is y - y_m."""
+"""Names that the log reserves, so that no law can use them in its state. A law may have a
+state e, which must be y - y_m."""
 
 
 class Saturation(IntEnum):
@@ -61,7 +62,7 @@ def groups(
     (u_free) and after saturation (u), u_trim, limited (Saturation) and u_ff (feedforward). An
     observer adds its estimates z, u_o for each input, and sigma, the fade-in. Vanes add their mean,
     the mean square around it, 1 if the vane is in use, the reading, and the reading in the
-    reference motion. An allocation adds effector, as commanded.
+    reference motion. An allocation adds effector, the commanded effectors.
     """
     state_groups = [
         name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS, *VANE_STATE)

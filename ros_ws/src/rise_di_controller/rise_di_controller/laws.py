@@ -96,7 +96,7 @@ class AnyLaw(ControllerConfig):
 
     @classmethod
     def keys_beside(cls, values: Mapping[str, Any]) -> Set[str]:
-        """Return the keys of the law that the values name, or those of every law if none."""
+        """Return the keys of the law that the values name; if it is unknown, those of every law."""
         with suppress(ParameterError):
             return schema(values.get("law", DEFAULT)).model_fields.keys()
         return ControllerConfig.model_fields.keys()

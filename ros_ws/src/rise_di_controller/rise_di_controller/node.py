@@ -51,8 +51,8 @@ from rise_di_controller.learning.proposals import (
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-LONG_MAX_AGE = 1.0  # s, from which a failsafe is named as late
-SLOW_PERIOD_NS = 60 * NANOSECONDS  # between two lines on a rate too low for max_age
+LONG_MAX_AGE = 1.0  # s, max_age above which the log warns that the failsafe begins late
+SLOW_PERIOD_NS = 60 * NANOSECONDS  # between two warnings that a rate is too low for max_age
 BEHIND_NS = 1_000_000
 """Time from the instants of y and y_m, every 2 ms of the system clock at 500 Hz, to a tick. By then
 both have arrived, and their nodes have finished their own ticks of up to 1 ms. Ticks at a random
@@ -108,7 +108,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             )
         self._last_ns = 0  # of the last tick
         self._still_vanes: tuple[str, ...] = ()
-        self._restarts = 0  # of the law, by itself
+        self._restarts = 0  # how often the law has engaged again by itself
         self._slow = Throttle(SLOW_PERIOD_NS)
         if self.parameters.autostart:
             self.trigger_configure()
@@ -161,9 +161,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return self._y.subscription, self._y_m.subscription
 
     def start_ns(self) -> int:
-        """Start BEHIND_NS after a whole period of the system clock.
+        """Return a start BEHIND_NS after a whole period of the system clock, ns.
 
-        If half a period is less, start half a period after it.
+        If half a period is shorter than BEHIND_NS, it is half a period after.
         """
         return self.next_period_ns() + min(BEHIND_NS, self.period_ns() // 2)
 
@@ -202,7 +202,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return taking
 
     def _tell_restart(self) -> None:
-        """Log and count that the law has engaged again by itself, at most once in 2 s."""
+        """Count that the law has engaged again by itself, and log it at most once in 2 s."""
         if (reason := self._controller.pop_restart_reason()) is not None:
             self._restarts += 1
             self.get_logger().warning(f"the law engages again: {reason}", throttle_duration_sec=2.0)
@@ -236,15 +236,15 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     def _timeouts_ns(self) -> tuple[int, int]:
         """Return the ages above which a publisher has timed out, ns.
 
-        The first age is for the same node in a new process, the second for a different node: that
-        one may take over only once the failsafe has brought u to trim.
+        The first age is for the same node in a new process, the second for a different node, which
+        may take over only after the failsafe has brought u to trim.
         """
         return self._max_age_ns(), self._max_age_ns() + nanoseconds(
             self.parameters.hold + self.parameters.ramp
         )
 
     def _step(self, now_ns: int, late_ns: int) -> bool:
-        """Run one tick of the controller, and say whether it had an output to publish."""
+        """Run one tick of the controller, and return whether it had an output to publish."""
         before = self._controller.mode
         output = self._controller.tick(now_ns, late_ns, active=self._active)
         if self._learning is not None and output is not None and self._controller.has_internals:
@@ -305,7 +305,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             PROPOSAL,
             self._decode_proposal,
             self._take_proposal,
-            max_age_ns=None,  # `Learning` bounds it
+            max_age_ns=None,  # `Learning` limits the age
             lock=self.publisher_lock(lambda: timeouts_ns),
             qos=LOCKSTEP if parameters.lockstep else PROPOSALS,
             max_size=MAX_REPORT_SIZE,
@@ -329,7 +329,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     def _publish_authority(self, now_ns: int) -> None:
         """Tell guidance what the inputs can do according to the model that flies.
 
-        Without a learner nothing is told.
+        Without a learner nothing is published.
         """
         if self._learning is not None:
             self._send_authority(
@@ -337,9 +337,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             )
 
     def _has_proposal(self, now_ns: int) -> bool:
-        """In lockstep, say whether the proposal for which the step of an instant waits has arrived.
+        """In lockstep, return whether the proposal that is due before a step has arrived.
 
-        True if none is due.
+        Return True if none is due.
         """
         if self._learning is None:
             return True
@@ -359,7 +359,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         flown = change.pop("flown", None)
         if not isinstance(start, int) or not isinstance(flown, int):
             raise ChannelError("malformed", "a proposal without the digests start and flown")
-        assert self._learning is not None  # noqa: S101 - the receiver was made beside it
+        assert self._learning is not None  # noqa: S101 - made together with the receiver
         self._learning.receive(
             Proposal(
                 stamp_ns=report.stamp_ns,

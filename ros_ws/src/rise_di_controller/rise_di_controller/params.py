@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the controller under any control law.
 
-They are validated here; `controller_section` has the fields and the arrays that they make.
+They are validated here; `controller_section` has the fields, and builds the arrays from them.
 
 The parameters of a law are a subclass, which `AnyLaw.validate_mapping` finds by the name of the
 law.
@@ -79,7 +79,7 @@ class ControllerConfig(ControllerSection):
     def tunable(cls) -> frozenset[str]:
         """Return the parameters that may change in flight: those of the law and the guard.
 
-        Names of channels and signs may not.
+        The names of the channels and the signs D may not change.
         """
         common = {"lag", "delay", "max_age", "hold", "ramp", "lower", "upper", "slew", "y_max"}
         return frozenset(common | (set(cls.model_fields) - set(ControllerConfig.model_fields)))
@@ -233,7 +233,7 @@ class ControllerConfig(ControllerSection):
         )
         Phi, Gamma, H, L, F = observer.matrices(nominal)
         matrices = {"L": Phi @ (np.eye(len(Phi)) - L @ H)}
-        if F.any(axis=1).all():  # channels without F fly the law alone: the loop below
+        if F.any(axis=1).all():  # a channel without F flies the law alone: see the loop below
             matrices["F"] = Phi - Gamma @ F
         for key, matrix in matrices.items():
             radius = spectral_radius(matrix)

@@ -37,7 +37,8 @@ from rise_di_controller.law.control_law import ControlLaw, TunedLaw
 from rise_di_controller.law.law import CONTROL_LAWS, LawParams, Sign, gain, total_lag
 from rise_di_controller.params import ControllerConfig
 
-# s, for which a new observer runs before it flies, so that its disturbances hold what the law held
+# s of past ticks over which a new observer runs before it flies, so that its estimates of the
+# disturbances take over what the law has integrated
 HISTORY = 5.0
 
 
@@ -167,17 +168,17 @@ class RiseDiConfig(ControllerConfig):
     beta: Positives = Field(
         description="the diagonal of beta (21) in scaled inputs, units of y / s^2"
     )
-    # An input_scale of 1 / abs(Omega_ii) makes it 1; `read` gives one to each output.
+    # It is 1 if input_scale is 1 / abs(Omega_ii). If it is left out, `read` sets it to 1.
     omega: Positives = Field(
         default=(),
         description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign); by "
         "default 1 for each output",
     )
-    # the lag decides which of the two is stable
+    # the lag decides whether implicit or soft is stable
     sign: Literal["auto", "literal", "implicit", "soft"] = Field(
         default="auto", description="how the sign of (21) is sampled; auto: implicit or soft"
     )
-    # three times the width at which the loop of the sign and the lags is on the edge
+    # three times the width at which the loop of the sign and the lags is on the edge of stability
     softening: Positive | Positives = Field(
         default=3.0,
         description="width of the softened sign in total lags; stable above 1, 3 is usual",
@@ -213,7 +214,7 @@ class RiseDiConfig(ControllerConfig):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Add the scale of the inputs to the parameters that may change in flight."""
+        """Return the parameters that may change in flight, with input_scale and without `learn`."""
         return (super().tunable() | {"input_scale"}) - {"learn"}
 
     @classmethod
@@ -310,9 +311,9 @@ class RiseDiConfig(ControllerConfig):
         )
 
     def checks(self) -> Iterator[None]:
-        """Check the controller, and beside models at two more speeds check it at several speeds.
+        """Check the controller, at several speeds if it has models at two more speeds.
 
-        These are the trim speed, the two speeds, and the points halfway to each.
+        They are the trim speed, the two speeds, and the speeds halfway from it to each of the two.
         """
         if self.schedule is None or not self.schedule.models:
             yield from super().checks()

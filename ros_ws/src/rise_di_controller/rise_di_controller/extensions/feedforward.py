@@ -17,14 +17,14 @@ from flight_core.arithmetic import product, sine
 from flight_core.integrators import rk4
 from flight_core.vectors import Array, array_namespace
 
-# 1/s. A smaller real part counts as zero: rounding leaves 1e-14, and a mode of 1e-6 1/s takes 11
-# days.
+# 1/s. A smaller real part counts as zero: rounding errors are about 1e-14, and a mode at 1e-6 1/s
+# has a time constant of 11 days.
 ZERO_REAL_PART = 1e-6
 
 
 LONGEST_PART = 10
-"""Most periods in a Runge-Kutta step of the nominal model. A tick after lost samples has several
-steps."""
+"""Largest number of periods in a Runge-Kutta step of the nominal model. A tick after many lost
+samples takes several steps."""
 
 
 class Nominal(NamedTuple):
@@ -38,7 +38,7 @@ class Nominal(NamedTuple):
     C: Array  # (m, n), selects the outputs
     gravity: Array  # (n, n), f(x) = gravity @ sin(x)
     inverse: Array  # (m, m), inverse of Omega = C B
-    path: Array  # (n, n), I - B Omega^-1 C: what the ideal input leaves of a drift
+    path: Array  # (n, n), I - B Omega^-1 C: the part of a drift that the ideal input leaves
     path_A: Array  # (n, n), path A
     path_gravity: Array  # (n, n), path gravity
     # (m,) time from a tick until the input acts: half a period of hold, delay, actuator lag; s
@@ -51,7 +51,7 @@ class Nominal(NamedTuple):
 def nominal_model(
     A: Array, B: Array, C: Array, gravity: Array, lead: Array, acts: Array | None = None
 ) -> Nominal:
-    """Build the nominal model with the products that a tick needs. Omega = C B must be regular."""
+    """Build the nominal model with the products that a tick needs; C B must be invertible."""
     inverse = arithmetic.inverse(product(C, B))
     path = np.eye(len(A)) - product(product(B, inverse), C)
     angles = tuple(np.flatnonzero(gravity.any(axis=0)).tolist())
@@ -122,7 +122,7 @@ def x_dot(t: Array, x: Array, forced: Array, nominal: Nominal) -> Array:
 
 
 def sines(x: Array, nominal: Nominal) -> Array:
-    """Take the sine of the states with a sine term, 0 for all others, shape (n,) or (n, N)."""
+    """Return sin(x) for the states with a sine term, 0 for all others, shape (n,) or (n, N)."""
     if not isinstance(x, np.ndarray):
         rows = [sine(row) if j in nominal.sine_states else 0.0 * row for j, row in enumerate(x)]
         return array_namespace(x).stack(rows)
@@ -155,7 +155,7 @@ def step(
         u_ff    = u + (dt / 2 + lead) (u - u_p) / ((dt + dt_p) / 2)
 
     u_ff extrapolates the last two u linearly to the instant at which this tick's input acts: a
-    first-order actuator moves by u if it is commanded u + lag u_dot. The first two ticks after
+    first-order actuator follows u if its command is u + lag u_dot. The first two ticks after
     engagement only determine the slope and add nothing. u_0 is u_ff of the second tick, so that u
     does not jump (bumpless transfer). dt > 0.
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sections of the parameters with a model: feedforward, observer, vanes, allocation."""
+"""Sections of the parameters that contain a model: feedforward, observer, vanes, allocation."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated
@@ -197,7 +197,7 @@ class ObserverConfig(Config):
 
         [Phi, Gamma; 0, I]' = [Phi, Gamma; 0, I]^a,  I - L' H = (I - L H)^a,  F' = F
         """
-        from scipy.linalg import fractional_matrix_power  # noqa: PLC0415 - needed by few
+        from scipy.linalg import fractional_matrix_power  # noqa: PLC0415 - few flights need it
 
         Phi, Gamma, H, L, _ = self.matrices(nominal)
         s, m = Gamma.shape
@@ -236,7 +236,7 @@ class AllocationConfig(Config):
     )
 
     def ordered(self, inputs: Sequence[str], order: Sequence[str]) -> "AllocationConfig":
-        """Return the allocation of `inputs` for the same inputs in another order."""
+        """Return the allocation for the same inputs in the order `order` instead of `inputs`."""
         places = [list(inputs).index(name) for name in order]
         p = len(self.effectors)
         T = np.reshape(self.T, (p, -1))[:, places]

@@ -23,7 +23,7 @@ from rise_di_controller.law.saturation import Limits, saturate
 class VaneParams(NamedTuple):
     """Parameters of k vanes, which are sensors beside y that only the observer uses.
 
-    H z predicts by how much a reading differs from that of the reference motion.
+    H z predicts by how much a reading differs from the reading in the reference motion.
     """
 
     H: Array  # (k, s)
@@ -31,7 +31,7 @@ class VaneParams(NamedTuple):
     L: Array
     # (k,) mean square of the motion of a reading below which the vane counts as frozen
     least: Array
-    time: Array  # () s, over which the motion is averaged
+    time: Array  # () averaging time of the motion, s
 
 
 class ObserverParams(NamedTuple):
@@ -48,7 +48,7 @@ class ObserverParams(NamedTuple):
     Gamma: Array  # (s, m)
     H: Array  # (m, s)
     L: Array  # (s, m) correction of the estimates by the innovation
-    F: Array  # (m, s) u per estimate
+    F: Array  # (m, s) feedback gain, u_o = -F z
     limits: Limits  # of u_o
     fade_rate: Array  # () 1/s, inverse of the fade-in time of u_o after engagement
     vanes: VaneParams | None = None  # None: the observer of y alone
@@ -61,7 +61,7 @@ class PastTick(NamedTuple):
     u: Array  # (m,) u less the trim and the feedforward of the tick
     y_m: Array  # (m,)
     dt: Array  # () length of the tick, s
-    scale: Array | None = None  # (m,) factor of input_scale, beside a schedule
+    scale: Array | None = None  # (m,) factor of input_scale; None without a schedule
 
 
 class ObserverState(NamedTuple):
@@ -81,7 +81,7 @@ class VaneObserverState(NamedTuple):
     u_o: Array
     sigma: Array
     vane_mean: Array  # (k,) mean of the readings
-    vane_square: Array  # (k,) mean square of the readings around it
+    vane_square: Array  # (k,) mean square of the readings around the mean
     vane_measures: Array  # (k,) 1 for a vane in use, 0 for a still vane
 
 
@@ -105,10 +105,11 @@ def estimates_after(
         z = z + L (e - H z),  z = Phi z + Gamma (u - change)                       over the ticks,
         that is z = (Phi - Phi L H) z + Phi L e + Gamma (u - change)
 
-    The filter then knows what the law held, which would take it longer than the record to estimate.
-    A tick without a y has no correction. For speed, the products with e and u are taken for all
-    ticks of a filter at once, which takes a third of the time. `history` must contain at least one
-    y, `change` is that of the feedforward since then, (m,), and `filters` are those of the ticks.
+    This start includes the disturbances that the law has compensated so far. From z = 0 the filter
+    would need longer than the record to estimate them. A tick without a y has no correction. The
+    products with e and u are computed for all ticks of a filter at once, in a third of the time.
+    `history` must contain at least one y. `change` is the change of the feedforward since the
+    record, (m,), and `filters` has the parameters of the observer at each tick.
     """
     known = np.array([tick.e is not None for tick in history])
     e = np.array([np.zeros_like(change) if tick.e is None else tick.e for tick in history]).T
@@ -143,8 +144,8 @@ def with_motion(
         square += part ((reading - mean)^2 - square)
         measures 1 where square > least, else 0
 
-    A frozen vane shows only electrical noise, less than `least`. So does a vane in calm air, which
-    has no wind to tell about.
+    A frozen vane shows only electrical noise, with a mean square below `least`. The same is true of
+    a vane in calm air, where there is no wind to measure.
     """
     xp = array_namespace(reading)
     part = xp.minimum(dt / params.time, 1.0 + 0.0 * dt)
@@ -159,7 +160,7 @@ def by_vanes(
 ) -> Array:
     """Compute the correction by the vanes in use, (s,): sum of L_v [e - H z, deviation_v - H_v z].
 
-    `innovation` is that of y, (m,); `deviation` is that of the readings from the reference motion,
+    `innovation` is e - H z, (m,). `deviation` is the readings minus those of the reference motion,
     (k,).
     """
     xp = array_namespace(z)
@@ -173,14 +174,14 @@ def by_vanes(
 
 
 def without_frozen(params: ObserverParams, frozen: Sequence[bool]) -> ObserverParams:
-    """Return parameters that never use frozen vanes, and use all others from the start."""
+    """Return parameters with which frozen vanes are never used, and all others always."""
     if params.vanes is None:
         return params
     return params._replace(vanes=params.vanes._replace(least=np.where(frozen, np.inf, 0.0)))
 
 
 def filter_matrix(params: ObserverParams) -> FloatArray:
-    """Compute Phi (I - L H - sum of L_v [H, H_v]), (s, s): the estimates from tick to tick.
+    """Compute Phi (I - L H - sum of L_v [H, H_v]), (s, s), the step of z from tick to tick.
 
     Only vanes with a finite `least` count.
     """
@@ -236,7 +237,7 @@ def _at_engagement(
 def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
     """Extend a control law so that it starts from the trim u_trim + u_o.
 
-    The observer takes u after saturation (anti-windup), and the vanes.
+    The observer also takes u after saturation (anti-windup) and the readings of the vanes.
 
         u_o by `correct`
         u   = law(y, y_m) from the trim u_trim + u_o

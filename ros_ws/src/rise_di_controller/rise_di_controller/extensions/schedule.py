@@ -5,7 +5,7 @@
 The response to a control surface grows with the dynamic pressure: Omega grows with V^2, and the
 delay margin of fixed gains falls accordingly. The schedule keeps Omega input_scale near its value
 at trim. It extends a law that has the parameter input_scale, without changing the law's own
-equations. If there is a feedforward and an observer, they use the models of the airspeed too.
+equations. If there is a feedforward and an observer, they use models for the present airspeed, too.
 """
 
 import math
@@ -23,17 +23,18 @@ from rise_di_controller.law.control_law import ControlLaw, Measurements
 from rise_di_controller.law.saturation import Limits
 
 SCALE_RANGE = (0.3, 3.0)
-"""Least and largest factor of input_scale: from 1.83 to 0.58 of the trim speed."""
+"""Least and largest factor of input_scale, reached at 1.83 and 0.58 of the trim speed."""
 
 
-# per unit of V / V0: models change every 0.2 m/s at 25 m/s, so that most ticks find theirs made
+# steps of the model per unit of V / V0. At 25 m/s the model changes every 0.2 m/s, so that most
+# ticks find theirs in the cache.
 STEPS = 128
 
 
 class OverSpeed(NamedTuple):
-    """A model over the airspeed, from `least` to `most` of d = V / V0 - 1."""
+    """A model as a function of the airspeed, for d = V / V0 - 1 from `least` to `most`."""
 
-    model: Callable[[float], Any]  # of d, in whole STEPS
+    model: Callable[[float], Any]  # the model at d, a multiple of 1 / STEPS
     least: float
     most: float
     airspeed: FloatArray  # (m,) 1 for the output V, else 0
@@ -47,7 +48,7 @@ class OverSpeed(NamedTuple):
         return self.model(round(min(max(d, self.least), self.most) * STEPS) / STEPS)
 
     def at_scales(self, scales: FloatArray) -> list[Any]:
-        """Return the models for T factors, (T, m), as from `at_scale` but all at once."""
+        """Return the models of T ticks with the factors `scales`, (T, m), as `at_scale` does."""
         d = 1.0 / np.sqrt(((1.0 - self.airspeed) * scales).max(axis=1)) - 1.0
         return [
             self.model(place)
@@ -61,11 +62,11 @@ def over_speed(
     airspeed: FloatArray,
     model: Callable[[FloatArray, FloatArray], Any],
 ) -> OverSpeed:
-    """Interpolate a model over the airspeed: trim + d (slope + d curvature).
+    """Interpolate a model between airspeeds: trim + d (slope + d curvature).
 
     The matrices pass through `values` at the trim speed and at two ratios to it, the first below 1
     and the second above. Whatever turns y_dot into u, such as F of an observer or the inverse of
-    Omega, is divided by the factor of input_scale in `values`; `model` takes the matrices and these
+    Omega, is divided by the factor of input_scale in `values`. `model` takes the matrices and these
     factors, (m,).
     """
     trim, slow, fast = values
@@ -88,8 +89,8 @@ class ScheduleParams(NamedTuple):
     law: Any  # parameters of the extended law
     speed: Array  # () trim speed V0, m/s
     airspeed: Array  # (m,) 1 for the output V, else 0
-    time: Array  # () time constant, s
-    # the law's parameters over the airspeed, of a law with an observer
+    time: Array  # () time constant with which the factor follows, s
+    # the law's parameters as a function of the airspeed; None without an observer
     observer: OverSpeed | None = None
 
 
@@ -122,14 +123,14 @@ def target_scale(y: Array, params: ScheduleParams) -> Array:
 
 
 def side_by_side(params: ObserverParams, scale: FloatArray) -> FloatArray:
-    """Stack [Phi, Gamma, L, F'] of an observer, with F over the factors `scale`, (s, s + 3 m)."""
+    """Stack [Phi, Gamma, L, F'] of an observer, with F divided by `scale`, (s, s + 3 m)."""
     return np.hstack([params.Phi, params.Gamma, params.L, (params.F / scale[:, None]).T])
 
 
 def observer_of(
     observer: ObserverParams, matrices: FloatArray, scale: FloatArray
 ) -> ObserverParams:
-    """Give an observer other matrices, the inverse of `side_by_side`."""
+    """Return the observer with stacked matrices, the inverse of `side_by_side`."""
     s, m = observer.Gamma.shape
     F = np.ascontiguousarray(matrices[:, s + 2 * m :].T) * scale[:, None]
     return observer._replace(
@@ -138,9 +139,10 @@ def observer_of(
 
 
 def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
-    """Stack the matrices of a feedforward side by side, with the factors `scale`.
+    """Stack the matrices of a feedforward side by side, with the inverse divided by `scale`.
 
-    They are [A, gravity, B, path A, path gravity, inverse'], the last in n rows.
+    They are [A, gravity, B, path A, path gravity, inverse'], the last with zeros to fill
+    n rows.
     """
     n, m = nominal.B.shape
     inverse = np.zeros((n, m))
@@ -151,7 +153,7 @@ def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
 
 
 def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nominal:
-    """Give a nominal model other matrices, the inverse of `nominal_side_by_side`."""
+    """Return the model with stacked matrices, the inverse of `nominal_side_by_side`."""
     n, m = nominal.B.shape
     ends = (0, n, 2 * n, 2 * n + m, 3 * n + m, 4 * n + m, 4 * n + 2 * m)
     A, gravity, B, path_A, path_gravity, inverse = (
@@ -166,7 +168,7 @@ def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nom
 def law_at(params: ScheduleParams, scale: Array) -> Any:
     """Return the parameters of the extended law at an airspeed.
 
-    input_scale is multiplied by `scale`, and with an observer the models are those of the airspeed.
+    input_scale is multiplied by `scale`. With an observer, the models are those of this airspeed.
     """
     return _scaled(
         params.law if params.observer is None else params.observer.at_scale(scale), scale
@@ -181,7 +183,7 @@ def _scaled(params: Any, scale: Array) -> Any:
 
 
 def observers_of(params: Any, scales: Sequence[Array | None]) -> list[ObserverParams]:
-    """Return the observers of some ticks, at their factors of input_scale if scheduled."""
+    """Return the observer of each tick, for its factor of input_scale if there is a schedule."""
     if not isinstance(params, ScheduleParams):
         return [params] * len(scales)
     if params.observer is None:

@@ -12,7 +12,7 @@ The guard is pure, like the law, and fits every control law.
 - The failsafe for stale inputs holds u, then ramps it to trim (modes HOLD, RAMP, TRIM).
 - Bumpless transfer: every engagement starts from the present u, with the law's state as at the
   first engagement.
-- Only finite values: a sample with NaN or infinity counts as none, and if u or the state of the law
+- Only finite values: a sample with NaN or infinity counts as missing. If u or the state of the law
   would not be finite, the law engages again.
 """
 
@@ -35,15 +35,14 @@ from rise_di_controller.guard.samples import SampleLimits
 from rise_di_controller.law.control_law import Measurements, TunedLaw, fields
 from rise_di_controller.law.saturation import Limits, saturate
 
-# Least distance of two samples that give a slope, as a fraction of the extrapolation. Closer
-# samples are noisier: extrapolating with them would amplify the noise of their difference more than
-# 20 times.
+# Least time between two samples that give a slope, as a fraction of the longest extrapolation. If
+# they were closer, extrapolating would amplify the noise of their difference more than 20 times.
 MIN_SLOPE_SPAN = 0.05
 
-LARGEST_VANE = np.pi  # rad, where the motion of a vane ends
+LARGEST_VANE = np.pi  # rad, largest reading of a vane
 
-# Samples that are kept of y and of y_m, so that y_m is known at the stamp of y: 0.1 s at 1 kHz,
-# more at lower rates.
+# Number of samples of y and of y_m that are kept, so that y_m is known at the stamp of y. They span
+# 0.1 s at 1 kHz, and more at lower rates.
 SAMPLE_BUFFER_SIZE = 100
 
 
@@ -61,28 +60,29 @@ class GuardParams(NamedTuple):
     # ticks over which a new observer runs before it flies; 0: it starts from the present error
     history: int = 0
     allocation: Allocation | None = None  # None: the inputs of the law are the effectors
-    # states of the nominal model read by vanes; the readings follow the outputs in y
+    # indices of the states of the nominal model that the vanes measure; in y their readings come
+    # after the outputs
     vanes: tuple[int, ...] = ()
-    # the nominal model over the airspeed, beside a schedule; None: the one of the trim
+    # the nominal model as a function of the airspeed; None: `nominal` at every airspeed
     over_speed: OverSpeed | None = None
     probe: Probe | None = None  # added to u_trim; None: no probe
 
     @property
     def longest_ns(self) -> int:
-        """Longest time between two y that a step bridges; after more the law engages again.
+        """Longest time between two y that a step of the law spans; after that it engages again.
 
         The last tick with a y within the age limit can be a period before the tick of the next y. A
-        step integrates the whole time: with half of the ticks lost, a limit of 3 periods would
+        step integrates the whole time: if half of the ticks are lost, a limit of 3 periods would
         raise the error by 15 % in q and 22 % in r.
         """
         return self.max_age_ns + self.period_ns
 
 
-# periods; least dt of a step, which keeps a burst of samples from exciting the sign term
+# least dt of a step, in periods; it keeps a burst of samples from exciting the sign term
 LEAST_DT = 0.2
 
 
-# The stamp of the last u where there is none yet: every y is later.
+# Stamp of the last u before there is one. Every y is later.
 BEFORE_ALL_NS = -(2**63)
 
 
@@ -98,11 +98,11 @@ class ControllerState(NamedTuple):
 
     mode: Mode
     law: Any  # state of the control law; None until engaged
-    y: StampedVector | None  # of the last step
+    y: StampedVector | None  # y of the last step
     y_m: FloatArray | None  # the reference at the stamp of y
     u: FloatArray  # commanded, after saturation
     u_free: FloatArray  # before saturation
-    u_trim: FloatArray  # u at engagement, term of u added by the law
+    u_trim: FloatArray  # u at engagement, to which the law adds its output
     failsafe_start_ns: int  # when the inputs became stale, or the controller was deactivated
     u_failsafe: FloatArray  # u at the start of the failsafe
     u_ff: FloatArray  # the feedforward, 0 where there is none
@@ -112,9 +112,9 @@ class ControllerState(NamedTuple):
     hold_ns: int = 0
     ramp_ns: int = 0
     history: tuple[PastTick, ...] = ()
-    # (p,) commanded, with an allocation; u is the input of the law that they give
+    # (p,) commanded effectors, None without an allocation; u is the input of the law that they give
     effectors: FloatArray | None = None
-    effectors_failsafe: FloatArray | None = None  # at the start of the failsafe
+    effectors_failsafe: FloatArray | None = None  # effectors at the start of the failsafe
     vanes: VaneReadings | None = None  # None without vanes
     stamp_ns: int = BEFORE_ALL_NS  # of the last u
     tick_ns: int = 0  # instant of the tick that gave the last u
@@ -131,7 +131,7 @@ class TickInputs(NamedTuple):
     If you compute the tick again from these inputs, you get u to the last bit.
     """
 
-    stamp_ns: int  # of u: that of its y; without a y it continues with the clock
+    stamp_ns: int  # of u: that of its y, or without a y continued with the clock
     y: FloatArray
     y_m: FloatArray  # interpolated to the stamp of y
     y_m_offset: float  # stamp of the newest y_m minus stamp of y, s
@@ -200,7 +200,7 @@ def _with_history(
     missed: int,
     guard: GuardParams,
 ) -> ControllerState:
-    """Append the past ticks, missed ones included, to the history of a step of the law."""
+    """Append a step of the law, and the ticks missed before it, to the history."""
     scale = getattr(stepped.law, "scale", None)
     nominal = np.float64(seconds(guard.period_ns))
     lost_ticks = (
@@ -241,8 +241,8 @@ def tick(
 
     Stale inputs start the failsafe: HOLD, in which nothing is integrated, then RAMP to trim, then
     TRIM. The stamp of u is normally that of its y. In a failsafe it continues from there with the
-    clock, as the stamp of the y that did not come would. A y from before the last u does not engage
-    the law, so no stamp ever goes back.
+    clock, like the stamp of the y that is missing. A y that is older than the last u does not
+    engage the law, so the stamp of u never goes back.
 
     If `active` is false, the mode is INACTIVE, and u is held or ramps to trim. With fresh inputs u
     is published, at trim, even before the first engagement. The inputs are None if there is nothing
@@ -453,7 +453,7 @@ def _engaged(
 
 
 def _is_finite(state: ControllerState) -> bool:
-    """Return whether u and everything that the next u comes from are finite."""
+    """Return whether u and every value from which the next u is computed are finite."""
     arrays = [state.u, state.u_free, state.u_ff, *fields(state.law).values()]
     if state.effectors is not None:
         arrays.append(state.effectors)
@@ -539,7 +539,7 @@ def _within_effectors(
 def _failsafe(
     state: ControllerState, stamp_ns: int, now_ns: int, guard: GuardParams, active: bool
 ) -> tuple[ControllerState, TickInputs | None]:
-    """Advance by a tick without fresh inputs, or of a deactivated controller; u gets `stamp_ns`."""
+    """Advance by a tick without fresh inputs or while deactivated; u gets the stamp `stamp_ns`."""
     y = state.y
     y_m = state.y_m
     if y is None or y_m is None:

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Probe of the inputs while engaged, and the test for their effect.
 
-Without it, a surface that is stuck in trim shows no error in calm air.
+Without a probe nothing shows a surface that is stuck at trim in calm air, because it causes no
+error there.
 
 Each probed input carries a sine of its own frequency on top of what the law commands. Over a window
 all sines are orthogonal, also to the frequencies in between, where the disturbances are measured.
@@ -20,13 +21,13 @@ from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
 
 RATES = frozenset({"p", "q", "r"})
-EFFECT = 0.02  # rad/s, of a body rate by default: ArduPlane's noise in calm air is 0.006 rms
-GAP = 4  # multiples of 1 / window from one sine to the next: those in between show disturbances
+EFFECT = 0.02  # rad/s, default amplitude of a body rate; ArduPlane's noise in calm air is 0.006 rms
+GAP = 4  # multiples of 1 / window between two sines; the ones in between show disturbances
 BIN_NS = NANOSECONDS // 20  # length of the bins over which y and u are averaged
 TESTS = 12  # tests in a window
 FILLED = 0.8  # fraction of the bins of a window that a test needs
 DRIFT = 3  # degree of the polynomial that fits what is slower than the window, such as a turn
-LEAST_SINE = 0.05  # fraction of the amplitude: at a limit, less of the sine than this is left in u
+LEAST_SINE = 0.05  # fraction of its amplitude that a sine must keep in u; at a limit it keeps less
 LARGEST = 4.0  # Hz, highest frequency of a sine: five bins a period
 
 
@@ -137,7 +138,7 @@ class EffectTest:
         return len(self._means) >= FILLED * (self._means.maxlen or 0)
 
     def most(self) -> FloatArray:
-        """Compute the largest effect of each input that the window allows, (m,).
+        """Compute an upper bound of the effect of each input over the window, (m,).
 
         It is relative to the effect in the model, and UNKNOWN for an input without a sine.
 

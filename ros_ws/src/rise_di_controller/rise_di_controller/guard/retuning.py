@@ -30,9 +30,9 @@ def retune_state(
     | new observer | z from the new filter, u_o continues | starts from the present e |
     | new feedforward | continues in the same motion | u_ff becomes part of u_trim |
 
-    An observer that starts from the present error also hands its u_o over to u_trim. A schedule
-    uses the models of the present speed, and those of each tick over the history. `guards` are the
-    old and the new guard, with the models of the feedforward.
+    An observer that starts from the present error also hands its u_o over to u_trim. With a
+    schedule, the models are those of the present speed, and over the history those of each tick.
+    `guards` are the old and the new guard, which have the models of the feedforward.
     """
     y = state.y
     y_m = state.y_m
@@ -64,7 +64,7 @@ def retune_state(
             z = observer.estimates_after(state.history, change, filters)
             inner = _with_estimates(state, inner, z, change, observers)
     else:
-        # Without one they begin again, and what they gave becomes part of u_trim.
+        # Without a history both begin again, and their contributions become part of u_trim.
         if has_new_observer and not _same_model(*observers):
             z = observer.initial_estimates(y.value - y_m, observers[1])
             state = state._replace(u_trim=state.u_trim + inner.u_o)
@@ -92,9 +92,9 @@ def _with_estimates(
 
     It continues from the estimates z and the change of u_ff, (m,).
 
-    u_o moves on to -F z at its own rate. In a channel that had no observer before, u_o starts from
-    the part of the law: what the law has integrated would otherwise stay there beside the observer,
-    which would take long to integrate it again.
+    u_o moves on to -F z at its own rate. In a channel that had no observer before, u_o takes
+    over what the law has integrated. Otherwise this would stay in the law, and the observer would
+    take long to build it up again.
     """
     law_part = state.u - state.u_trim - state.u_ff
     limits = observers[1].limits

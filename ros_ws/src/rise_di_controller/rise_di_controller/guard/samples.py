@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Decides which samples the controller takes.
+"""Checks that decide which samples the controller takes.
 
 An impossible sample is lost: it counts as a sample that did not arrive.
 
 - `bound_violation`: a value is beyond the bound of its output. No sensor gives such a value.
 - `step`: y changes faster than an aircraft can. The test compares y with the y before it and uses
-  no model, so a wrong model locks nothing out. An aircraft that really jumps loses two samples: the
-  controller takes the third in a row that agrees.
+  no model, so a wrong model locks nothing out. If y really jumps, two samples are lost: the
+  controller takes the third one in a row that agrees with the one before.
 - `step`: y stands still, equal to the last bit in every value, after it has changed with every
   sample.
 """
@@ -25,26 +25,28 @@ from flight_core.vectors import FloatArray, StampedVector
 
 TIMES = 5.0
 """How much larger a change may be than the largest one of the last minute. Noise changes by up to
-four standard deviations in a minute, so this allows 20. In flights of seven of the scenarios no
-change exceeded a quarter of the limit."""
+four standard deviations in a minute, so a factor of 5 allows 20 of them. In flights of seven of the
+scenarios no change exceeded a quarter of the limit."""
 
-MEMORY = 60.0  # s, over which the largest change fades
-FIRST_NS = NANOSECONDS  # after the first sample, during which y shows how it changes
+MEMORY = 60.0  # s, time constant with which the largest change fades
+FIRST_NS = NANOSECONDS  # time after the first sample, in which y shows how it changes
 AUTHORITY = 2.0
-"""Possible change of y in a period over the change that full inputs cause: wind moves an aircraft
-as much as its inputs do."""
+"""Largest possible change of y in a period, divided by the change that full inputs cause. Wind can
+move an aircraft as much as its inputs do."""
 
-UNLIMITED = 1.0  # SI, counts as the full input if it has no limit: 57 deg, or the weight as thrust
+UNLIMITED = 1.0  # SI, the full input if it has no limit: 57 deg, or a thrust equal to the weight
 
 LEAST = {"V": 1.0}
-"""Change that is always possible, m/s a sample. An airspeed may come in whole knots."""
+"""Change that is always possible, m/s per sample. An airspeed may come in whole knots."""
 
 LEAST_RATE = 0.1
-"""The same for other outputs, rad/s a sample: 20 times the noise of a gyro, 0.005 rad/s."""
-AGREEING = 3  # samples in a row after a jump that agree
+"""Change of any other output that is always possible, rad/s per sample. It is 20 times the noise of
+a gyro, 0.005 rad/s."""
+AGREEING = 3  # number of samples in a row that must agree after a jump
 
 STILL = 5
-"""Number of samples in a row, over as many periods, that must equal the last before y is frozen."""
+"""Number of samples in a row that must equal the one before until y counts as frozen. They must
+also span this number of periods."""
 
 MOVING = 100
 """Number of changing samples in a row which show that this y never stands still by itself.
@@ -87,7 +89,8 @@ class SampleState(NamedTuple):
 
     begin_ns: int  # stamp of the first sample
     last: StampedVector  # the last sample taken
-    change: FloatArray  # (m,) largest change in a period of the samples taken, fading, units of y
+    # (m,) largest change per period of the samples taken, which fades with time, units of y
+    change: FloatArray
     # The last sample that was compared, which differs from `last` if it was lost. Its stamp does
     # not come again: one wrong sample that is sent three times does not count as three that agree.
     far: StampedVector
@@ -186,7 +189,7 @@ def step(
         return state._replace(
             last=sample, change=largest, far=sample, agreeing=0
         ), SampleChange.NEAR
-    # If no sample was lost before, `far` has the values of `last` at its stamp or later: far, too.
+    # If no sample was lost before, `far` has the values of `last`: the sample is far from it, too.
     agrees = _comparison(state.far, sample, state.change, limits)[0]
     agreeing = state.agreeing + 1 if agrees else 1
     if agreeing < AGREEING:
@@ -210,7 +213,7 @@ def _next_stillness(
 def _comparison(
     before: StampedVector, sample: StampedVector, largest: FloatArray, limits: SampleLimits
 ) -> tuple[bool, FloatArray]:
-    """Tell whether a sample is near the one before, and its change in a period, (m,)."""
+    """Return whether a sample is near the one before, and its change per period, (m,)."""
     periods = max((sample.stamp_ns - before.stamp_ns) / limits.period_ns, 1.0)
     change = np.abs(sample.value - before.value) / periods
     return bool((change <= np.maximum(TIMES * largest, limits.reach)).all()), change

@@ -27,15 +27,15 @@ class Measurements(NamedTuple):
     y: Array  # measured outputs
     y_m: Array  # reference at the stamp of y
     y_m_dot: Array  # slope of y_m since the previous tick
-    u_trim: Array  # the law adds to this input: u at engagement, and the feedforward
+    u_trim: Array  # the input to which the law adds: u at engagement plus the feedforward
     u_before: Array  # the last command, after saturation
-    position: Array | None = None  # of the actuators
+    position: Array | None = None  # positions of the actuators
     # (n, N) state: measured values of the outputs, true values of all other states
     x: Array | None = None
     x_air: Array | None = None  # (n, N) x with alpha and beta relative to the air
     y_dot: Array | None = None  # true derivative of C x, free of noise and delay
     vane: Array | None = None  # (k,) readings of the vanes of an observer, rad
-    # (k,) those of the reference motion, from the model of the feedforward
+    # (k,) readings of the vanes in the reference motion, by the model of the feedforward
     vane_m: Array | None = None
 
 
@@ -114,7 +114,7 @@ def without_limits(
 
 
 def fields(state: Any) -> dict[str, Array]:
-    """Return the arrays of a law's state by name; those of an extended law come first."""
+    """Return the arrays of a law's state by name; those of the law that it extends come first."""
     values: dict[str, Array] = {}
     for name, value in state._asdict().items():
         values |= fields(value) if hasattr(value, "_asdict") else {name: value}

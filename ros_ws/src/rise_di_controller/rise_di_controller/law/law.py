@@ -42,8 +42,8 @@ class LawParams(NamedTuple):
         input_scale: u per scaled input, shape (m,), units of u s / units of y.
         omega: abs(Omega_ii) in scaled inputs, or an over-estimate, shape (m,); for Sign.IMPLICIT.
         eps: Half-width of the softened sign, shape (m,), units of y, > 0; for Sign.SOFT.
-        sign: How the sign is sampled. None in the parameters of many aircraft: the control law has
-            the sign then.
+        sign: How the sign is sampled. It is None in the parameters of many aircraft, because
+            there the control law has it.
 
     Examples:
         >>> rise_di.find_scenario("osprey_servo").rise_di().law_params().D.shape

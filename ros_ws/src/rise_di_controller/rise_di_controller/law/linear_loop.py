@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled linear loop of a control law around a model: its stability.
+"""The sampled linear loop of a control law around a model, and whether it is stable.
 
-The loop has actuators and delay.
+The loop includes the actuators and the delay.
 """
 
 from functools import lru_cache
@@ -20,12 +20,12 @@ SPECTRAL_RADIUS_TOLERANCE = 1e-6
 """A spectral radius above 1 by more than this is unstable. Angles that integrate the outputs give a
 double eigenvalue 1, which rounding splits by the root of the rounding error, 1e-8."""
 
-ROOT = np.sqrt(3.0)  # of the second Legendre polynomial, normalised: ROOT (2 s - 1)
+ROOT = np.sqrt(3.0)  # factor of the normalised second Legendre polynomial, ROOT (2 s - 1)
 
 SMALL = (
     2.0**-40
-    # size of the steps from 0: below every limit and every width of a sign; a power of two loses no
-    # digit
+    # size of the steps from 0. It is below every limit and every width of a sign, and as a power of
+    # two it loses no digit.
 )
 
 
@@ -60,7 +60,7 @@ class LinearLaw(NamedTuple):
     """
 
     A: FloatArray  # (..., k, k)
-    B: FloatArray  # (..., k, m), with vanes these in further columns, as in D
+    B: FloatArray  # (..., k, m); each vane adds a column, as in D
     C: FloatArray  # (..., m, k)
     D: FloatArray  # (..., m, m)
 
@@ -135,7 +135,7 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
 
 
 def _takes_columns(params: Any) -> bool:
-    """Return whether the law is known to take columns side by side.
+    """Return whether the law is known to accept columns side by side.
 
     RISE-DI does, also with an observer.
     """

@@ -80,7 +80,7 @@ def limited_integral(before: Array, after: Array, change: Array, beyond: Array) 
         before: Integral before the tick, shape (m,).
         after: Integral after the tick without limits, shape (m,).
         change: Change of u by the increment, shape (m,), in the units of u.
-        beyond: u with the increment less u after saturation, shape (m,), in the units of u.
+        beyond: u with the increment, minus u after saturation, shape (m,), in the units of u.
 
     Returns:
         The integral after the tick, shape (m,), in the units of `before`.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tells whether a law with a learned model diverges or oscillates.
+"""Tests whether a law with a learned model diverges or oscillates.
 
 The error is compared with the error under the law of the start.
 """
@@ -16,21 +16,23 @@ from flight_core.vectors import FloatArray
 # s, time constant of the mean square of e: a few periods of the slowest oscillation that servos
 # allow
 MEMORY = 1.0
-FACTOR = 3.0  # on the largest rms error before: later gusts are up to twice as strong
+FACTOR = 3.0  # on the largest rms error under the first law: later gusts are up to twice as strong
 LEAST = {"V": 1.0}  # m/s, rms error that does not yet count as a divergence
-# rad/s, the same of other outputs: five times that of the law alone in moderate turbulence
+# rad/s, the same limit of every other output: five times the rms error of the law alone in moderate
+# turbulence
 LEAST_RATE = 0.1
 
-# s, length of the record of e, and of the means in it: no loop with servos oscillates faster
+# s, length of the record of e, and of each mean in it: a loop with servos oscillates more slowly
+# than these means
 WINDOW = 10.0
 STEP = 0.02
 TEST = 50  # means between two tests for an oscillation, 1 s
 # correlation of e with e a period later: 0.9 in a limit cycle, at most 0.5 in turbulence and gusts
 LIKENESS = 0.7
-# factor on the largest rms error over WINDOW before: below it the law of the start is not clearly
-# better
+# factor on the largest rms error over a WINDOW under the first law: if the error has grown by less,
+# this law is not clearly better
 GROWN = 1.5
-HARMLESS = 0.2  # fraction of the rms errors that do not yet count as a divergence
+HARMLESS = 0.2  # fraction of LEAST or LEAST_RATE below which an oscillation does not count
 
 
 class Errors(NamedTuple):
@@ -80,7 +82,7 @@ class Oscillations:
     """
 
     def __init__(self, least: FloatArray) -> None:
-        """Take the mean squares below which nothing diverges, (m,)."""
+        """Take the mean squares below which nothing counts as a divergence, (m,)."""
         # s, periods of the oscillations at the last test, (m,); 0 for none
         self.periods = np.zeros_like(least)
         self._least = HARMLESS**2 * least

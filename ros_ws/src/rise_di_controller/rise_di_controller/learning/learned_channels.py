@@ -18,7 +18,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 def with_channels_of(
     start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence[bool], dead: Sequence[bool]
 ) -> RiseDiConfig:
-    """Give a designed controller the gains of `start` in some channels; nothing is checked.
+    """Give a designed controller the gains of `start` in the channels `bare`, without checks.
 
     These channels get neither feedforward nor observer.
 
@@ -71,7 +71,7 @@ def with_channels_of(
 
 
 def acting_inputs(parameters: RiseDiConfig) -> tuple[str, ...]:
-    """Return the inputs with a feedforward or an observer: those of parts with a model."""
+    """Return the inputs on which a feedforward or an observer acts."""
     feedforward = parameters.feedforward
     observer = parameters.observer
     inputs = parameters.inputs
@@ -93,17 +93,17 @@ def authority_names(outputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
-    """Compute the least change of each output by its paired input, (2m,), units/s.
+    """Compute the y_dot that each input can at least give to its output, (2m,), units of y / s.
 
-    The first m values go from trim to the lower limits, the others to the upper limits:
+    The first m values hold for a falling output, the others for a rising output:
 
         y_dot_i = abs(Omega_ii) exp(-2 s_i) abs(limit of u_i),
             Omega = C B of the model learned in flight
 
-    s_i is the standard deviation of Omega_ii over Omega_ii: for a small s_i this subtracts two
-    deviations, and it stays above 0 for any s_i. If there are models at other speeds, the least
-    over the speeds counts. The change is 0 for an input without effect, and UNKNOWN without a limit
-    or if the output flies the law of the start.
+    s_i is the standard deviation of Omega_ii divided by abs(Omega_ii). For a small s_i the factor
+    subtracts two deviations, and for any s_i it stays above 0. If there are models at other speeds,
+    the least value over the speeds counts. The result is 0 for an input without effect. It is
+    UNKNOWN if the input has no limit, or if the output flies the law of the start.
     """
     m = len(parameters.outputs)
     model = parameters.feedforward
@@ -132,7 +132,7 @@ def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
 def with_fallback(
     start: RiseDiConfig, parameters: RiseDiConfig, bare: Sequence[bool]
 ) -> RiseDiConfig:
-    """Return what flies if more channels fall back to the law of the start.
+    """Return the parameters that fly if more channels fall back to the law of the start.
 
     This is the start itself if no channel keeps a model.
     """
@@ -157,7 +157,7 @@ def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
 def without_models(
     start: RiseDiConfig, parameters: RiseDiConfig, outputs: Collection[str]
 ) -> RiseDiConfig:
-    """Return what flies if some outputs fall back to the law of the start.
+    """Return the parameters that fly if some outputs fall back to the law of the start.
 
     They keep this law until the engagement ends, and are added to `learn.without`.
     """

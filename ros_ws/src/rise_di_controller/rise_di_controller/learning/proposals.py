@@ -85,7 +85,7 @@ class Event(NamedTuple):
 
 
 UNVERIFIED = "until a model is learned"
-"""Ends the sentence of a proposal that flies the rough model before there is any record."""
+"""End of the sentence of a proposal that flies the rough model before there is any record."""
 
 FALLBACKS = 2
 """After this number of fallbacks in an engagement a part gets no more models: the second model was
@@ -99,13 +99,13 @@ class Fallback(NamedTuple):
     """A fallback to the law of the start in all parts."""
 
     flown: int  # digest of the parameters before
-    input_scale: tuple[float, ...]  # of these
+    input_scale: tuple[float, ...]  # of the parameters before
     fallen: int  # digest of the parameters after
 
     def outlived_by(self, proposal: Proposal, digest: int) -> bool:
         """Return whether a proposal that was made before the fallback still holds after it.
 
-        It does if all that it adds is another input held still because it has no effect.
+        It does if it holds another input still, because this input has no effect.
         """
         scale = proposal.change.get("input_scale")
         if (proposal.flown, digest) != (self.flown, self.fallen) or not isinstance(scale, Sequence):
@@ -117,15 +117,16 @@ class Updates:
     """Decides when proposals are due: at the first tick, and at given times counted from it.
 
     At the first tick the rough model is proposed as it is. Between those times, and after the last
-    of them, the aircraft is tested every `learn.check`, unless the next of them comes too soon.
+    of them, the aircraft is tested every `learn.check`, unless one of them is less than another
+    `learn.check` away.
     """
 
     def __init__(self, settings: LearnConfig) -> None:
         self._check_ns = nanoseconds(settings.check)
         self._times_ns = deque(map(nanoseconds, (0.0, *settings.updates)))
-        self._begin_ns = nanoseconds(settings.updates[0])  # of the tests
+        self._begin_ns = nanoseconds(settings.updates[0])  # before this time there is no test
         self._first_ns: int | None = None
-        self._last_ns = 0  # the last that was due, from the first tick on
+        self._last_ns = 0  # time of the last identification or test, from the first tick on
 
     def due(self, now_ns: int) -> bool:
         """Return whether an identification or a test begins at this tick.
@@ -182,11 +183,11 @@ class Learning:
     def authority(self, controller: Controller) -> FloatArray:
         """Return the `authority` of what flies."""
         parameters = controller.parameters
-        assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - a proposal is of the law of the start
+        assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - proposals keep the law of the start
         return authority(parameters, self.start)
 
     def ticked(self, controller: Controller, now_ns: int) -> bool:
-        """Note a tick, and say whether an identification begins there.
+        """Note a tick, and return whether an identification or a test begins at it.
 
         None begins while the law is deactivated.
         """
@@ -196,7 +197,7 @@ class Learning:
         return due
 
     def waits(self, now_ns: int) -> bool:
-        """In simulated time, say whether the tick at `now_ns` waits for a proposal."""
+        """In simulated time, return whether the tick at `now_ns` waits for a proposal."""
         return any(
             self._acts_ns(end_ns) <= now_ns and end_ns not in self._received for end_ns in self._due
         )
@@ -356,7 +357,7 @@ class Learning:
             self._announce(Event(now_ns, EventKind.NO_MODEL, {}, f"no model: {proposal.sentence}"))
 
     def _certify(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
-        """Do a part of the certificate, or all of it in simulated time.
+        """Do one step of the certificate, or all of them in simulated time.
 
         Returns the parameters that are taken at the end.
         """
@@ -424,7 +425,7 @@ class Learning:
         self._announce(Event(now_ns, kind, change, sentence))
 
     def _refuse(self, refusal: Refusal, proposal: Proposal, now_ns: int) -> None:
-        # the sentence says which input has no effect, and that stays true
+        # the sentence may say which input has no effect, and this is true in spite of the refusal
         proposed = "" if proposal.sentence is None else f"; proposed: {proposal.sentence}"
         self._announce(Event(now_ns, EventKind.REFUSED, {}, f"refused: {refusal}{proposed}"))
 
@@ -497,9 +498,10 @@ def _speeds(parameters: RiseDiConfig) -> str:
 
 
 def design_changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
-    """Return all of DESIGNED of a new set by dotted name.
+    """Return the values of all DESIGNED parameters of a new set, by dotted name.
 
-    The value is None for whatever the old set, or what flies meanwhile, may have in addition.
+    The value is None for each parameter that the new set lacks, although the old set has it or the
+    parameters in force may have it.
     """
     before = _designed_values(old)
     after = _designed_values(new)
