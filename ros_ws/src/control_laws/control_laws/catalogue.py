@@ -22,8 +22,8 @@ from rise_di_controller.law.law import Sign
 Gains = dict[str, FloatArray]  # gains by name, shape (m, N), or (1, N) for all channels; positive
 
 INITIAL_CROSSOVER_LAG_PRODUCT = 0.4
-"""rad, bandwidth times the lag of the loop at the start of a search: 23 degrees of phase at the
-crossover."""
+"""Bandwidth times the lag of the loop at the start of a search, rad. The lag then costs 23 degrees
+of phase at the crossover."""
 
 INITIAL_CHANNEL_GAINS = {
     "beta": 5.0,
@@ -35,8 +35,8 @@ INITIAL_CHANNEL_GAINS = {
     "rate_drift": 0.5,
     "decay": 5.0,
 }
-"""Initial gains of a search in every channel, in scaled inputs and SI. K and Lambda start from the
-lag of the loop."""
+"""Initial gains of a search in every channel, in scaled inputs and SI. K and Lambda are not here,
+because they start from the lag of the loop."""
 
 INITIAL_COMMON_GAINS = {
     "softening": 3.0,
@@ -64,15 +64,16 @@ class Law(NamedTuple):
 
     title: str
     law: str  # as a scenario names it in controller.law
-    measurements: str  # of the aircraft, besides y_m
-    model_data: str  # of the nominal aircraft, besides D
+    measurements: str  # what it measures of the aircraft; y_m is always known
+    model_data: str  # what it knows of the nominal aircraft; D is always known
     control_law: Callable[[NominalModel], ControlLaw]
     params: Callable[[Gains, NominalModel], Any]
     tuned: tuple[str, ...]  # names of the gains
     feedforward: str = NONE  # model of the feedforward
-    # gains at which a search begins; None: by the lag of the loop and the constants above
+    # gains at which a search begins; None: they follow from the lag of the loop and the constants
+    # above
     initial: Gains | None = None
-    linear: bool = True  # whether it is linear near e = 0
+    linear: bool = True  # whether the law is linear near e = 0
 
     @property
     def has_margins(self) -> bool:
@@ -100,9 +101,10 @@ def initial_gains(law: Law, model: NominalModel) -> Gains:
 def _over(
     law_params: Callable[[Gains, NominalModel], Any], part: float = observed.PART
 ) -> Callable[[Gains, NominalModel], ObserverParams]:
-    """Return parameters of an observer with the aircraft's model over a law.
+    """Return the function for the parameters of an observer over a law.
 
-    `law_params` is the function for the law's own parameters.
+    The observer has the aircraft's model. `law_params` is the function for the law's own
+    parameters.
     """
     return lambda gains, model: observed.observer_params(
         observed.aircraft_design(gains, model), law_params(gains, model), model, part

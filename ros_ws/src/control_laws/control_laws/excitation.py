@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Excitation of the inputs in turn, open loop and without control.
+"""Excitation of the inputs one after the other, in open loop.
 
 Doublets and a multisine excite each input for an identification.
 """
@@ -17,7 +17,7 @@ from rise_di_controller.law.control_law import ControlLaw, Measurements, without
 from rise_di_controller.law.saturation import Limits, saturate
 from rise_di_controller.params import ControllerConfig
 
-DOUBLETS = 8.0  # widths: a doublet of 2, a gap of 1, the opposite doublet of 4, a gap of 1
+DOUBLETS = 8.0  # widths in total: a doublet of 2, a gap of 1, the opposite doublet of 4, a gap of 1
 
 
 class ExcitationParams(NamedTuple):
@@ -26,30 +26,30 @@ class ExcitationParams(NamedTuple):
     amplitude: Array  # units of u
     width: Array  # s
     begin: Array  # s after engagement, when the doublets of an input begin
-    period: Array  # s, of the multisine, also the duration
+    period: Array  # s, period of the multisine, which lasts for one period
     harmonic: Array  # multiples of 1 / period
     phase: Array  # rad
-    part: Array  # of the amplitude; 0 beyond the harmonics of an input
+    part: Array  # fraction of the amplitude in each harmonic; 0 for harmonics that an input lacks
 
 
 class ExcitationState(NamedTuple):
     """State between two ticks, (m,)."""
 
-    e: Array  # y - y_m, shown and not corrected by this law
+    e: Array  # y - y_m, for the log; this law does not correct it
     elapsed: Array  # s since engagement, the same for every input
 
 
 def signal(elapsed: Array, params: ExcitationParams) -> Array:
-    """Compute the excitation of every input over its amplitude, shape (m,), in [-1, 1].
+    """Compute the excitation of every input divided by its amplitude, (m,), in [-1, 1].
 
-    With tau = elapsed - begin in widths w of an input:
+    With tau = elapsed - begin, in units of the width w of an input:
 
         +1 in [0, 1), -1 in [1, 2), -1 in [3, 5), +1 in [5, 7)  two opposite doublets
         sum_k part_k sin(2 pi harmonic_k (tau - 8) w / period + phase_k) in [8, 8 + period / w)
             a multisine
 
-    A doublet and the multisine have the mean 0, so that a rate in proportion to u leaves no
-    attitude behind.
+    A doublet and the multisine have the mean 0, so that a rate proportional to u does not change
+    the attitude in the end.
     """
     xp = array_namespace(params.amplitude)
     since = elapsed - params.begin
@@ -66,10 +66,11 @@ def signal(elapsed: Array, params: ExcitationParams) -> Array:
 def multisine(
     period: float, lowest: float, highest: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return harmonics of 1 / period from `lowest` to `highest`, Hz, their phases and parts.
+    """Return harmonics of 1 / period from `lowest` to `highest`, Hz, their phases and sizes.
 
-    Their shapes are (h,), and the parts add up to a peak of 1. phase_k = -pi k (k - 1) / h keeps
-    the peak low. Source: M. R. Schroeder, IEEE Trans. Information Theory 16(1), 1970.
+    All have the shape (h,). The sizes are equal, and give the sum a peak of 1. The phases
+    phase_k = -pi k (k - 1) / h keep the peak low. Source: M. R. Schroeder, IEEE Trans. Information
+    Theory 16(1), 1970.
     """
     harmonic = np.arange(
         max(round(lowest * period), 1), max(int(highest * period), 1) + 1, dtype=np.float64
@@ -115,7 +116,7 @@ EXCITATION = ControlLaw(
 
 
 class ExcitationConfig(ControllerConfig):
-    """A controller that excites the inputs in turn, in the order of `inputs`, without control."""
+    """A controller that excites the inputs one after the other, in their order, in open loop."""
 
     amplitude: NonNegatives = Field(description="largest deviation of each input from trim")
     width: Positives = Field(description="half the first doublet of each input, s")

@@ -31,8 +31,8 @@ class IndiState(NamedTuple):
     """State of the law between two ticks, (m,)."""
 
     y: Array
-    y_dot: Array  # filtered difference of y
-    position: Array  # filtered
+    y_dot: Array  # difference of y after the filter, units of y / s
+    position: Array  # measured position of the actuators after the filter
 
 
 def control_law(model: NominalModel) -> ControlLaw:
@@ -42,9 +42,9 @@ def control_law(model: NominalModel) -> ControlLaw:
             a = 1 - exp(-bandwidth dt)
         u           = position_f + share Omega^-1 (y_m_dot - K e - y_dot_f)
 
-    The two filters are the same, so y_dot_f and position_f belong to the same instant. There is no
-    integral, so no windup. Source: S. Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6), 2010; E. J.
-    J. Smeur, Q. P. Chu, G. C. H. E. de Croon, JGCD 39(3), 2016, for the filters.
+    Both filters are equal, so y_dot_f and position_f belong to the same instant. The law has no
+    integral and so no windup. Source: S. Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6), 2010; E.
+    J. J. Smeur, Q. P. Chu, G. C. H. E. de Croon, JGCD 39(3), 2016, for the filters.
     """
     inverse = model.inverse
 

@@ -16,8 +16,8 @@ from rise_di_controller.law.saturation import Limits
 from rise_di_controller.params import ControllerConfig
 
 ADAPTATION_POLE = 1.0
-"""1/s, pole of the predictor. It scales the estimate by a dt / (exp(a dt) - 1), 0.995 at 100 Hz; K
-corrects the rest."""
+"""Pole a of the predictor, 1/s. It scales the estimate by a dt / (exp(a dt) - 1), which is 0.995 at
+100 Hz. K corrects the rest."""
 
 
 class L1Params(NamedTuple):
@@ -34,9 +34,9 @@ class L1State(NamedTuple):
 
     e: Array
     y_before: Array  # y of this tick, for the prediction of the next tick
-    y_dot_u: Array  # Omega u, u after saturation
+    y_dot_u: Array  # Omega u, with u after saturation
     sigma_hat: Array  # estimate of y_dot - Omega u
-    sigma_f: Array  # filtered
+    sigma_f: Array  # sigma_hat - sigma_r after the low-pass filter
 
 
 def _control_law(*, feedforward: bool) -> ControlLaw:
@@ -47,12 +47,12 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
         sigma_f  += (1 - exp(-bandwidth dt)) (sigma_hat - sigma_r - sigma_f)
         u         = u_r - Omega^-1 (K e + sigma_f),  sigma_r = y_m_dot - Omega u_r
 
-    y_hat is the step of y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat: this sigma_hat cancels
-    the rest of y_hat - y in a tick. Reference input: u_r = u_trim + Omega^-1 y_m_dot; with
-    `feedforward` u_r = u_trim, where u_trim holds the reference input. sigma_r is the part of sigma
-    already cancelled by u_r. At engagement sigma_f = -K e, so that u = u_r (bumpless transfer);
-    retuning at y_m_dot = 0 changes sigma_f likewise. Anti-windup: the predictor takes u after
-    saturation. Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
+    y_hat is a step of the predictor y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat. This
+    sigma_hat cancels the rest of y_hat - y in a tick. The reference input is u_r = u_trim +
+    Omega^-1 y_m_dot; with `feedforward` it is u_trim, which then contains it. u_r already cancels
+    sigma_r, a part of sigma. At engagement sigma_f = -K e, so that u = u_r (bumpless transfer); if
+    y_m_dot = 0, retuning keeps u, too. As anti-windup, the predictor takes u after saturation.
+    Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
     """
 
     def engage(measurements: Measurements, params: L1Params) -> L1State:

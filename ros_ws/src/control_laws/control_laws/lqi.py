@@ -26,8 +26,8 @@ from rise_di_controller.law.saturation import Limits
 from rise_di_controller.params import ControllerConfig
 
 LEAK = 0.01
-"""1/s, decay of the angles and of y_m in the design model, because modes that neither inputs nor
-cost reach must be stable."""
+"""Decay of the angles and of y_m in the design model, 1/s. Modes that the inputs do not control or
+that the cost does not contain must be stable there."""
 
 
 class LqiParams(NamedTuple):

@@ -27,7 +27,7 @@ class MacKunisParams(NamedTuple):
     Lambda: Array  # 1/s
     beta: Array  # units of y / s^2
     eps: Array  # half-width of the softened sign, units of y / s
-    bandwidth: Array  # of the filtered difference, rad/s; unused with a perfect y_dot
+    bandwidth: Array  # of the filter of the difference, rad/s; unused with a perfect y_dot
 
 
 class MacKunisState(NamedTuple):
@@ -35,7 +35,7 @@ class MacKunisState(NamedTuple):
 
     e_0: Array
     e: Array
-    e_dot: Array  # filtered difference
+    e_dot: Array  # difference of e after the filter
     integral_e: Array
     Pi: Array
 
@@ -48,10 +48,10 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
         integral_e += dt (e + e_p) / 2
         u          = -Omega^-1 (K (e - e_0 + Lambda integral_e) + Pi)
 
-    Then u_dot = -Omega^-1 (K r + beta sgn(r)). `ideal`: e_dot = y_dot - y_m_dot with the perfect
-    derivative of C x; else a filtered difference, e_dot += (1 - exp(-bandwidth dt)) ((e - e_p) / dt
-    - e_dot). Source: W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST 18(6), 2010,
-      with the matrices of this module.
+    Then u_dot = -Omega^-1 (K r + beta sgn(r)). With `ideal`, e_dot = y_dot - y_m_dot with the
+    perfect derivative of C x. Otherwise it is a filtered difference, e_dot +=
+    (1 - exp(-bandwidth dt)) ((e - e_p) / dt - e_dot). Source: W. MacKunis, P. M. Patre, M. K.
+    Kaiser, W. E. Dixon, IEEE TCST 18(6), 2010, with the matrices of this module.
     """
     Omega = model.Omega
     inverse = model.inverse

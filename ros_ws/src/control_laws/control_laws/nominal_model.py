@@ -27,8 +27,9 @@ class NominalModel(NamedTuple):
     B: FloatArray  # (n, m)
     C: FloatArray  # (m, n), picks the outputs
     gravity: FloatArray  # (n, n), f(x) = gravity @ sin(x)
-    wind: FloatArray  # (n, G), contribution of 1 m/s of wind along an axis to x_dot
-    # (m,) of the measured outputs, rms per sample; a tenth of the unit of a score without noise
+    wind: FloatArray  # (n, G), x_dot for 1 m/s of wind along each axis
+    # (m,) noise of the measured outputs, rms per sample; if they have none, a tenth of the unit of
+    # the score
     noise: FloatArray
     kinematic: FloatArray  # (n,) 1 for an angle that integrates rates, e.g. theta, else 0
     size: FloatArray  # (n,) unit of a state in adaptation and weights: 1 m/s or 0.1 rad (/s)
@@ -53,7 +54,7 @@ class NominalModel(NamedTuple):
 
     @property
     def limits(self) -> Limits:
-        """Limits as arguments of a law, shape (m, 1); the rate of u has none."""
+        """Limits of u as a law takes them, shape (m, 1); the rate of u is not limited."""
         return Limits(
             self.lower[:, None], self.upper[:, None], np.full((len(self.lower), 1), np.inf)
         )
@@ -115,9 +116,9 @@ def saturate_with_excess(
 def conditional_integration(before: Array, after: Array, effect: Array, excess: Array) -> Array:
     """Choose `before` if effect * excess > 0, else `after`: anti-windup by conditional integration.
 
-    `effect` is the change of u (or of the scaled input) by the increment; `excess` is u over the
-    limit, in the same units and channels. Source: K. J. Astrom, T. Hagglund, "Advanced PID
-    Control", 3.5.
+    `effect` is the change of u (or of the scaled input) by the increment. `excess` is the part of u
+    beyond the limit, in the same units and channels. Source: K. J. Astrom, T. Hagglund, "Advanced
+    PID Control", 3.5.
     """
     return array_namespace(before).where(effect * excess > 0.0, before, after)
 

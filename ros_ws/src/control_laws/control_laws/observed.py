@@ -25,8 +25,8 @@ from rise_di_controller.law.saturation import Limits
 PART = 0.6
 WITHIN = 0.1
 FADE = 1.0
-"""Bound of u_o as a fraction of the limits of u, time from 0 to it, s, and time of the fade-in, s:
-the defaults of `ObserverConfig`."""
+"""Bound of u_o as a fraction of the limits of u, least time in which u_o goes from 0 to this bound,
+s, and time of the fade-in, s. They are the defaults of `ObserverConfig`."""
 
 
 def observer_params(
@@ -72,7 +72,10 @@ def aircraft_design(
 def extended_state_design(
     gains: dict[str, FloatArray], model: NominalModel, names: Names | None = None
 ) -> ObserverDesign:
-    """Design observers from Omega and lags alone: effort, drift, rate_drift, decay, (m, N)."""
+    """Design observers from Omega and the lags alone.
+
+    The gains are effort, drift, rate_drift and decay, each (m, N).
+    """
     weights = ExtendedStateWeights(*(gains[name].T for name in ExtendedStateWeights._fields))
     return extended_state_observer(model, names or unnamed(model), weights)
 

@@ -22,9 +22,10 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import zero_order_hold
 
 Correction = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
-"""`riccati.correction_of`, or another function for the same gain."""
+"""A function that computes the gain of `riccati.correction_of`, which is one of them."""
 
-# 1/s, decay of angles and disturbances in the model, so that every mode is observable or stable
+# 1/s, decay of the angles and the disturbances in the model, so that every mode is observable or
+# stable
 LEAK = 0.01
 MIN_LAG = 1e-4  # s, lag of an ideal actuator in the model
 ACTUATOR_NOISE = 1e-6  # rad or 1 per root s, noise of the actuators' positions: negligible
@@ -45,12 +46,12 @@ class Weights(NamedTuple):
     The units of the states are `NominalModel.size`, "sizes" below.
     """
 
-    effort: FloatArray  # (.., m) error at the cost of an input of unit response, s
+    effort: FloatArray  # (.., m) error that costs as much as an input of unit response, s
     drift: FloatArray  # (.., m) noise of the disturbances, sizes/s per root s
     gust: FloatArray  # (.., G) noise of the wind, m/s per root s
     wind_time: FloatArray  # (.., G) time constants of the wind, s
-    # (.., n), or (.., 1) for every state: noise of the states, for the model error, sizes per root
-    # s
+    # (.., n), or (.., 1) for every state: noise of the states that stands for the model error,
+    # sizes per root s
     loose: FloatArray
 
 
@@ -165,7 +166,8 @@ def _sampled(
 ) -> ObserverModel:
     """Sample a model.
 
-    The actuators' positions are the states p, and the first states have the outputs C.
+    The states with the numbers p are the positions of the actuators. The outputs are C times the
+    first states.
     """
     lag, (m, n) = np.maximum(model.lag, MIN_LAG), C.shape
     drive = np.zeros((motion.shape[-1], m))
@@ -182,10 +184,10 @@ def _sampled(
 def aircraft_observer(model: NominalModel, names: Names, weights: Weights) -> ObserverDesign:
     """Design the observer over `aircraft_model`, with the gains of two Riccati equations.
 
-    F minimises the sum of (e / size)^2 + (effort (u - u_ff) / (input_scale size))^2, and L the
-    variance of the estimate: white noise of `gust` drives the wind, `drift` the disturbances,
-    `loose` the states, and e has the noise of the model. Source: H. Kwakernaak, R. Sivan, "Linear
-    Optimal Control Systems", ch. 5 and 6.
+    F minimises the sum of (e / size)^2 + (effort (u - u_ff) / (input_scale size))^2. L minimises
+    the variance of the estimate. White noise drives the wind (`gust`), the disturbances (`drift`)
+    and the states (`loose`), and e has the noise of the model. Source: H. Kwakernaak, R. Sivan,
+    "Linear Optimal Control Systems", ch. 5 and 6.
     """
     model_by_tick = aircraft_model(model, names, weights.wind_time)
     return ObserverDesign(
@@ -221,9 +223,10 @@ def vane_correction(
 ) -> FloatArray:
     """Compute the gains of a vane that are added to L of `aircraft_correction`, (s, m + 1).
 
-    They are the filter of y and the vane less the filter of y alone. The last column acts on the
-    vane: a reading beyond the reference motion is `row` z, (s,), with white `noise`, rms. `weights`
-    come without and with the vane.
+    They are the gains of the filter of y and the vane, minus those of the filter of y alone. The
+    last column acts on the vane. The reading of the vane minus that of the reference motion is
+    `row` z, with `row` (s,), plus white noise with the rms `noise`. `weights` are those without and
+    with the vane.
     """
     without_vane = aircraft_correction(model_by_tick, model, weights[0])
     with_vane = model_by_tick._replace(H=np.vstack([model_by_tick.H, row]))

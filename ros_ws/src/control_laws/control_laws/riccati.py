@@ -4,20 +4,20 @@
 
 It solves the discrete Riccati equation.
 
-Leading axes of the arguments of a function are broadcast together.
+In each function the leading axes of the arguments are broadcast together.
 """
 
 import numpy as np
 
 from flight_core.vectors import FloatArray
 
-MAX_DOUBLINGS = 40  # 2^40 steps of a finite horizon: enough for a mode that decays within 1e9 steps
+MAX_DOUBLINGS = 40  # a horizon of 2^40 steps: enough for a mode that decays within 1e9 steps
 
 
 def riccati(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
     """Solve for the stabilising P = F'P F - F'P G (R + G'P G)^-1 G'P F + Q, shape (.., s, s).
 
-    A doubling squares the horizon's transition: with W = I + G_k P_k,
+    A doubling squares the transition over the horizon. With W = I + G_k P_k,
 
         P+ = P + F'P W^-1 F,  G+ = G + F W^-1 G F',  F+ = F W^-1 F,  from G R^-1 G', Q and F
 
@@ -69,8 +69,9 @@ def correction_of(
     """Compute the gain S H'(H S H' + noise)^-1 of the stationary Kalman filter, (.., s, m).
 
     The filter is z + gain (y - H z), and S is the covariance of the predicted state. `process` is
-    the covariance of the state in a step, (.., s, s), `noise` that of y, (.., m, m), and H has
-    shape (.., m, s). Source: B. D. O. Anderson, J. B. Moore, "Optimal Filtering", 4.4.
+    the covariance of the process noise in a step, (.., s, s), and `noise` the covariance of the
+    noise of y, (.., m, m). H has shape (.., m, s). Source: B. D. O. Anderson, J. B. Moore, "Optimal
+    Filtering", 4.4.
     """
     S = riccati(transpose(F), transpose(H), process, noise)
     return transpose(np.asarray(np.linalg.solve(H @ S @ transpose(H) + noise, H @ S)))
@@ -88,8 +89,9 @@ def corrections_near(
 
         dS = A dS A' + F_i (I - K H) S (I - K H)'F_i' + F_i K noise K'F_i' + process_i - S
 
-    because S is the least one over the gains: a change of the gain is of second order. The first
-    axis of F and process is that of the models. Source: D. L. Kleinman, IEEE TAC 13(1), 1968.
+    because S is the minimum over the gains, so a change of the gain has only an effect of second
+    order. The first axis of F and process is that of the models. Source: D. L. Kleinman, IEEE TAC
+    13(1), 1968.
     """
     S = riccati(transpose(F[:1]), transpose(H), process[:1], noise)
     K = transpose(np.asarray(np.linalg.solve(H @ S @ transpose(H) + noise, H @ S)))
