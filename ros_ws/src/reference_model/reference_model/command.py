@@ -28,7 +28,7 @@ class Edge(NamedTuple):
     change: float  # in the channel's unit
 
     def line(self) -> Line:
-        """Return the edge as a signal: 0 before, `change` after."""
+        """Return the edge as a signal that is 0 before the edge and `change` after it."""
         return Line(np.array([self.start, self.stop]), np.array([0.0, self.change]))
 
 
@@ -37,12 +37,12 @@ class Polyline(NamedTuple):
 
     time: FloatArray  # (K,) s, increasing
     value: FloatArray  # (K, m) at the knots
-    slope: FloatArray  # (K, m) 1/s, after the knots; 0 after the last one
+    slope: FloatArray  # (K, m) slope from each knot to the next, per s; 0 after the last knot
     area: FloatArray  # (K, m) integral from the first knot
 
     @classmethod
     def through(cls, lines: Sequence[Sequence[Line]]) -> "Polyline":
-        """Sum the lines of each channel; the first knot is at 0, or before it."""
+        """Sum the lines of each channel. The first knot is at t = 0 or earlier."""
         every = [line for channel in lines for line in channel]
         time = np.unique(np.concatenate([[0.0], *(line.time for line in every)]))
         value = np.zeros((len(time), len(lines)))
@@ -62,13 +62,13 @@ class Chirps(NamedTuple):
 
     amplitude: FloatArray  # (m,)
     start: FloatArray  # (m,) s
-    duration: FloatArray  # (m,) of the sweep, s, > 0
-    frequency: FloatArray  # (m,) at the start, rad/s, > 0
+    duration: FloatArray  # (m,) duration of the sweep, s, > 0
+    frequency: FloatArray  # (m,) frequency at the start, rad/s, > 0
     sweep: FloatArray  # (m,) change of the frequency, rad/s^2, not 0
 
 
 class Profile(NamedTuple):
-    """Commands on m channels with at most E edges a channel (unused edges have change 0).
+    """Commands on m channels with at most E edges per channel; unused edges have the change 0.
 
     Times are in s, values in the channel's unit.
     """
@@ -77,8 +77,8 @@ class Profile(NamedTuple):
     change: (
         Array  # (m, E) change of the command by each edge; a pulse is two edges, a doublet three
     )
-    rise: Array  # () duration of each edge, > 0
-    amplitude: Array  # (m,) of the sine
+    rise: Array  # () duration of each edge, s, > 0
+    amplitude: Array  # (m,) amplitude of the sine
     frequency: Array  # (m,) rad/s, > 0
     phase: Array  # (m,) rad
     # (m,) 1 on the channel whose integral is the bank angle of a coordinated turn, else 0
@@ -105,7 +105,7 @@ def command(t: Array, profile: Profile) -> FloatArray:
     elapsed = np.maximum(since, 0.0)
     rising = np.minimum(elapsed, profile.rise)
     angle = profile.frequency * t[..., None] + profile.phase
-    # a product with ones sums over the edges several times faster than np.sum
+    # a matrix product with ones sums over the edges, several times faster than np.sum
     ones = np.ones_like(profile.change[0, :])
     w = (profile.change * rising) @ ones / profile.rise + profile.amplitude * np.sin(angle)
     w_integral = (

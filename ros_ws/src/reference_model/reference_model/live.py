@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Live commands u_m: their age limit, and how they end if their publisher is lost.
+"""Live commands u_m: their age limit, and the commands that follow if the publisher is lost.
 
-Zero rates would keep the present bank, so the ending levels the wings first, from the attitude in
-u_m.
+These final commands are the ending. Zero rates would keep the present bank, so the ending levels
+the wings first, from the attitude in u_m.
 """
 
 from typing import NamedTuple
@@ -24,18 +24,19 @@ class LiveParams(NamedTuple):
     bounds: FloatArray  # (m,) largest absolute values of u_m
     reach: FloatArray  # (m,) largest changes of u_m from step to step
     speed: float | None  # trim speed V0, m/s; None: the ending cannot turn the aircraft level
-    # places of q, V, p, r in u_m; r is None without rudder, all is None if another one is missing
+    # indices of q, V, p, r in u_m. That of r is None without a rudder; the whole tuple is None if
+    # another one is missing.
     channels: tuple[int, int, int, int | None] | None
-    gain: tuple[float, float]  # of bank and of pitch, 1/s
+    gain: tuple[float, float]  # gains of the bank and of the pitch, 1/s
     roll_rate: float  # largest roll rate of the ending, rad/s
 
 
 class Live(NamedTuple):
     """The last u_m, and the attitude now, by dead reckoning from the attitude in that u_m."""
 
-    t_ns: int  # flight time of its stamp
+    t_ns: int  # flight time at the stamp of u_m
     u_m: FloatArray  # (m,)
-    attitude: tuple[float, float] | None  # phi, theta, rad, at present; None if not known
+    attitude: tuple[float, float] | None  # present phi and theta, rad; None if they are not known
 
 
 def take(t_ns: int, u_m: FloatArray, attitude: FloatArray | None, params: LiveParams) -> Live:
@@ -53,14 +54,14 @@ def take(t_ns: int, u_m: FloatArray, attitude: FloatArray | None, params: LivePa
 def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> FloatArray:
     """Compute u_m at t, shape (m,): the last u_m up to the age limit, then the ending.
 
-    If the attitude is known, the ending takes phi and theta by dead reckoning and V = V0 + V_m for
-    `levelling_ns`, and commands
+    If the attitude is known, the ending uses phi and theta by dead reckoning, and V = V0 + V_m.
+    For `levelling_ns` it commands
 
         phi_dot_c = -k_phi phi, at most `roll_rate`;  theta_dot_c = -k_theta theta
 
     p, q, r follow by the inverse of Euler's equations in a coordinated turn
-    (`flight_core.kinematics`); all other commands ramp to zero. Afterwards, and if the attitude is
-    not known, every command is zero.
+    (`flight_core.kinematics`), and all other commands ramp to zero. Afterwards every command is
+    zero, and also if the attitude is not known.
     """
     silent_ns = t_ns - live.t_ns - params.max_age_ns
     if silent_ns <= 0:
@@ -86,7 +87,7 @@ def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> Floa
 
 
 def dead_reckon(live: Live, y_m: FloatArray, period_ns: int, params: LiveParams) -> Live:
-    """Return the state a period later: the attitude moves by Euler's equations.
+    """Return the state a period later, with the attitude integrated by Euler's equations.
 
     The rates are those of the reference, which the law tracks.
     """

@@ -39,8 +39,8 @@ class Stepper(NamedTuple):
 def stepper(dt: float, params: ReferenceMatrices) -> Stepper:
     """Build the matrices of x_m(t + dt) = Phi x_m(t) + Gamma [u_m(t), u_m(t + dt/2), u_m(t + dt)].
 
-    Their columns are Runge-Kutta steps of the unit vectors. The product equals the same step up to
-    rounding, in a quarter of the time.
+    The columns are Runge-Kutta steps that start from the unit vectors. Up to rounding, the products
+    equal the Runge-Kutta step, and take a quarter of the time.
     """
     n, m = params.B_m.shape
     x = np.eye(n, n + 3 * m)
@@ -56,8 +56,8 @@ def stepper(dt: float, params: ReferenceMatrices) -> Stepper:
 def step(x_m: Array, u_m: Array, matrices: Stepper) -> Array:
     """Advance x_m by a step, shape (n,), from x_m(t) and u_m.
 
-    `u_m`, shape (3m,), holds u_m at t, t + dt/2 and t + dt. The sums have the order of `product`,
-    so that exported C code gives the same bits.
+    `u_m`, shape (3m,), holds u_m at t, t + dt/2 and t + dt. `product` sums in a fixed order, so
+    that exported C code gives the same bits.
     """
     return product(matrices.Phi, x_m) + product(matrices.Gamma, u_m)
 

@@ -31,7 +31,7 @@ class LiveCommand(NamedTuple):
 class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     """Computes x_m(k) from x_m(k-1) at tick k and publishes y_m(k).
 
-    The commands are those of the scenario's profile until u_m is received.
+    The commands are those of the scenario's profile until the first u_m is received.
 
     In lockstep the node publishes y_m up to the instant of clock and computes the next y_m ahead.
     If `u_m_rate` is set, it first waits for u_m: there must be exactly one u_m at each instant of
@@ -41,7 +41,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     def __init__(self) -> None:
         super().__init__("reference_model", ReferenceModelConfig)
         self._reference = Reference(self.parameters)
-        self._start_ns = 0  # start of the flight; in lockstep t = 0
+        self._start_ns = 0  # clock at the start of the flight, ns; 0 in lockstep
         self._publish_y_m = self.advertise(Y_M)
         self._encoder = self.encoder(self.parameters.outputs)
         self._decoder = Decoder(self.parameters.outputs)
@@ -82,9 +82,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         return nanoseconds(self.parameters.live.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Return the timeouts of the publisher of u_m.
+        """Return the ages above which the publisher of u_m has timed out, ns.
 
-        Another node may take over once the wings are level.
+        The second age is for another node, which may take over only after the wings are levelled.
         """
         live = self.parameters.live
         return nanoseconds(live.max_age), nanoseconds(live.max_age + live.levelling)
@@ -96,7 +96,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         return LiveCommand(sample.stamp_ns, sample.value, self._attitude(raw), sample.sender)
 
     def _attitude(self, raw: bytes) -> FloatArray | None:
-        """Read the attitude if the message has it."""
+        """Return the attitude, or None if the message has none."""
         try:
             sample = self._attitude_decoder.decode(raw)
         except ChannelError as error:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the reference model.
 
-They are validated, and converted to the arrays of model and profile.
+They are validated, and converted to the arrays of the model and the profile.
 """
 
 import math
@@ -37,7 +37,7 @@ from reference_model.stick import read_stick
 SIGNALS = ("pulses", "doublets", "ramps", "sines", "chirps", "recorded")
 """The parameters with commands by channel."""
 
-MOST_RECORDED = 10_000  # points: a scenario file with their values stays below its largest size
+MOST_RECORDED = 10_000  # points: with more, a scenario file could exceed its largest size
 
 
 class Pulses(Config):
@@ -122,7 +122,7 @@ class Chirp(Config):
 class Recorded(Config):
     """A recorded command on a channel, interpolated linearly; the last value is held.
 
-    A `file` is read once: the set then holds its values, and its path as `source`.
+    A `file` is read only once. The set then contains its values, and its path as `source`.
     """
 
     file: str = Field(
@@ -340,7 +340,7 @@ class ReferenceModelConfig(NodeConfig):
         )
         with np.errstate(over="ignore", invalid="ignore"):
             Phi = stepper(1.0 / self.rate, self.model()).Phi
-        # 1e-6: equal eigenvalues, of a damping of 1, are computed to 1e-8
+        # with a damping of 1 two eigenvalues are equal, and computed to 1e-8 only: allow 1e-6
         stable = (
             bool(np.isfinite(Phi).all())
             and float(np.abs(np.linalg.eigvals(Phi)).max()) < 1.0 + 1e-6
@@ -370,8 +370,9 @@ class ReferenceModelConfig(NodeConfig):
     def live_params(self) -> LiveParams:
         """Return the limits of u_m and the gains of the ending.
 
-        The gains are a quarter of the reference's bandwidths of p and q. With a second-order
-        reference of damping 0.9, this gain gives the loop of the angle a damping of about 0.74.
+        The gains are a quarter of the reference model's natural frequencies of p and q. If the
+        reference model has a damping of 0.9, the loop of the angle then has a damping of about
+        0.74.
         """
         section = self.live
         channels = None
@@ -398,7 +399,7 @@ class ReferenceModelConfig(NodeConfig):
         )
 
     def edges(self) -> dict[str, list[Edge]]:
-        """Return the edges of pulses, doublets and ramps by channel, ordered as the outputs."""
+        """Return the edges of pulses, doublets and ramps by channel, in the outputs' order."""
         return self._edges(self.pulses, self.doublets, self.ramps)
 
     def _edges(self, *signals: Mapping[str, Pulses | Doublets | Ramps]) -> dict[str, list[Edge]]:
@@ -415,7 +416,7 @@ class ReferenceModelConfig(NodeConfig):
     def profile(self) -> Profile:
         """Return the commands u_m(t) as arrays over the outputs; the signals of a channel add up.
 
-        The edges of pulses and doublets are padded with edges of height 0.
+        Channels with fewer edges of pulses and doublets are padded with edges of height 0.
         """
         m = len(self.outputs)
         rows = [*self._edges(self.pulses, self.doublets).values()]

@@ -18,11 +18,11 @@ from reference_model.params import ReferenceModelConfig
 
 LAST_GOES_ON = "a step of the reference model failed, the last y_m goes on"
 
-BLOCK = 100  # steps for which the profile is evaluated at once
+BLOCK = 100  # number of steps for which the profile is evaluated at once
 
 
 class Reference:
-    """Equation (2) with the state x_m at the instants k periods.
+    """Equation (2) with the state x_m, which is known at whole periods.
 
     The commands are those of the profile until the first live u_m.
     """
@@ -35,7 +35,7 @@ class Reference:
         self._x_m = np.zeros(len(self._model.A_m))  # the reference starts in trim
         self._number = 0
         self._u_m = self._block(0)
-        self._begin = 0  # the number of its first step
+        self._begin = 0  # number of the first step in the block _u_m
         self._live_params = parameters.live_params()
         self._live: Live | None = None
         self._applied = np.zeros_like(self._u_m[0])  # u_m at the end of the last step
@@ -43,10 +43,10 @@ class Reference:
         self._failure: Refusal | None = None
 
     def take(self, t_ns: int, u_m: FloatArray, attitude: FloatArray | None = None) -> None:
-        """Take a live u_m, shape (m,), of flight time t, which acts from the next step on.
+        """Take a live u_m, shape (m,), with the flight time t_ns. It acts from the next step on.
 
-        `attitude` has `channels.ATTITUDE`, or is None if it is not known. Raises ChannelError if
-        u_m is old or out of bounds.
+        `attitude` holds the values of `channels.ATTITUDE`; it is None if they are not known. Raises
+        ChannelError if u_m is old or out of bounds.
         """
         if self._live is not None:
             require_newer(t_ns, self._live.t_ns, "u_m")
@@ -58,9 +58,9 @@ class Reference:
         return self._x_m
 
     def source(self) -> str:
-        """Say where the commands come from at the last sample.
+        """Return where the commands come from at the last sample.
 
-        The answer is "profile", "live commands", or "ending" if u_m has timed out.
+        It is "profile", "live commands", or "ending" if u_m has timed out.
         """
         if self._live is None:
             return "profile"
@@ -70,9 +70,9 @@ class Reference:
     def sample(self, number: int) -> FloatArray:
         """Compute y_m at sample `number`, shape (m,), in steps of a period.
 
-        The law tracks the last sample until this one; over skipped samples the dead reckoning takes
-        the last rates. If a step raises an exception or gives a value that is not finite, the state
-        stays and the last y_m is repeated.
+        The law tracks the last sample until this one comes, so over skipped samples the dead
+        reckoning uses the last rates. If a step raises an exception or gives a value that is not
+        finite, the state stays and the last y_m is repeated.
         """
         tracked: FloatArray = model.output(self._x_m, self._model)
         while self._number < number:
@@ -91,7 +91,7 @@ class Reference:
         return self._failures.count
 
     def pop_failure(self) -> Refusal | None:
-        """Return why steps have failed since the last call; None if there is no news."""
+        """Return why steps have failed, or None if there is nothing new to report."""
         failure, self._failure = self._failure, None
         return failure
 
@@ -138,7 +138,7 @@ class Reference:
     def _block(self, number: int) -> FloatArray:
         """Compute the profile's commands at the starts, middles and ends of BLOCK steps.
 
-        A block is ten times faster than BLOCK calls.
+        Computing a block at once is ten times faster than computing each step.
         """
         u_m: FloatArray = command(
             seconds(self.period_ns) * (number + np.arange(2 * BLOCK + 1) / 2.0), self._profile

@@ -21,8 +21,8 @@ EXPECTED = "a CSV file whose first line is time,value"
 def read_stick(file: str, key: str) -> dict[str, Any]:
     """Read `time`, s, and `value` from a file.
 
-    `key` names the file in a sentence. Raises ParameterError if the file cannot be read, has
-    another header, or has a row that is not two numbers.
+    `key` names the file in the message of an error. Raises ParameterError if the file cannot be
+    read, has another header, or has a row that is not two numbers.
     """
     where = f"{key}: {file}"
     content = read_file(Path(file), where, EXPECTED)
