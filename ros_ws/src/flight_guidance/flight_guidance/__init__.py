@@ -2,5 +2,5 @@
 # SPDX-License-Identifier: Apache-2.0
 """Guidance of the RISE-DI flight stack, outside the control law.
 
-Attitude, altitude, course and routes.
+It commands attitude, altitude and course, and flies routes.
 """

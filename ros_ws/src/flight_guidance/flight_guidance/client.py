@@ -31,17 +31,20 @@ from flight_ros.topics import (
     Topic,
 )
 
-TARGET_TIMEOUT = 3.0  # s, within which guidance takes a target at its ticks
+TARGET_TIMEOUT = 3.0  # s, in which guidance takes a target at one of its ticks
 TARGET_PERIOD = 0.2  # s, between two equal targets
-LINK_PERIOD = 1.0  # s, between two targets without channels, which keep the link
-REFUSED = "sample refused: "  # stands before the reason in the log of a node
-ROUTE_TIMEOUT = 3.0  # s, within which the middleware of guidance confirms a route
+LINK_PERIOD = 1.0  # s, between two targets without channels, which keep the operator's link
+REFUSED = "sample refused: "  # text before the reason in the log of a node
+ROUTE_TIMEOUT = 3.0  # s, in which the middleware of guidance confirms a route
 ROUTE_POLL_PERIOD = Duration(seconds=0.05)
 NAME = "guidance"
 
 
 class GuidanceClient(Client):
-    """Commands the guidance of a running flight. Methods return why something is refused."""
+    """Commands the guidance of a running flight.
+
+    A method returns the reason if guidance refuses the command, else None.
+    """
 
     def __init__(
         self, name: str = "operator", namespace: str = "", parent: Client | None = None
@@ -100,7 +103,7 @@ class GuidanceClient(Client):
     ) -> Refusal | None:
         """Wait until guidance has taken a message or refused it, and return the reason.
 
-        The reason is `unknown` after TARGET_TIMEOUT.
+        If guidance has done neither within TARGET_TIMEOUT, return `unknown`.
         """
         reasons: list[Refusal] = []
 
@@ -155,7 +158,7 @@ class GuidanceClient(Client):
 
 
 class TargetClient(GuidanceClient):
-    """Commands what guidance holds."""
+    """Commands the targets that guidance holds, and keeps the operator's link."""
 
     def __init__(self, namespace: str = "", parent: Client | None = None) -> None:
         super().__init__("operator", namespace, parent)
@@ -168,7 +171,7 @@ class TargetClient(GuidanceClient):
     def send(self, values: Mapping[str, float]) -> Refusal | None:
         """Publish commands by channel until guidance has them in force.
 
-        Returns why they are not.
+        Returns the reason if guidance does not take them, else None.
         """
         self._spin_until(lambda: bool(self._received()), self._silent)
         self._log.take()

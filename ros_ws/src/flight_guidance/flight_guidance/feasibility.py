@@ -44,7 +44,8 @@ class Performance(NamedTuple):
 def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
     """Return the airspeeds on the legs to the waypoints, m/s.
 
-    Each is that of the waypoint, or of the leg before, or `first` if none is named yet.
+    It is the airspeed of the waypoint. If this has none, it is that of the leg before, and on the
+    first leg `first`.
     """
     leg_speeds = []
     for waypoint in waypoints:
@@ -57,12 +58,12 @@ def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
 class FlyableRoute:
     """The legs of a route, and the waypoints that they fly.
 
-    Waypoints that are cut are missing, and steep legs have loiters.
+    Waypoints that are left out for short legs are missing, and steep legs have loiters.
     """
 
     legs: tuple[Leg, ...]
     waypoints: tuple[Waypoint, ...]
-    notes: tuple[str, ...]  # sentences on what differs from the waypoints given
+    notes: tuple[str, ...]  # sentences on what differs from the given waypoints
 
 
 @lru_cache(maxsize=8)  # checks, nodes, replay and report ask for the same route
@@ -72,13 +73,13 @@ def flyable(
     """Plan the legs of a route with fillets of `radius`, m, and path following with `period`, s.
 
     If a leg is too short for the fillets, one waypoint is left out, provided that the route still
-    passes within `radius`, or 1 s of flight, of it. If a change of altitude exceeds the climb or
-    sink along the straight part of the leg with the wind from behind, it is flown on a circle: a
-    climb round the waypoint before, a descent round the waypoint after. Raises ParameterError for a
-    waypoint that is not finite or beyond LARGEST, an altitude or a speed beyond the bounds, a speed
-    of at most HEADWIND times the wind, a period below the rule, a radius below (V + W)^2 / (g
-    tan(0.8 phi_max)), and a leg too short for the fillets. phi_max is the largest bank at V for the
-    stall speed.
+    passes it within `radius` or within 1 s of flight. If a change of altitude exceeds the climb or
+    sink along the straight part of the leg with a tailwind, it is flown on a circle: a climb round
+    the waypoint at the start of the leg, a descent round the waypoint at its end. Raises
+    ParameterError for a waypoint that is not finite or beyond LARGEST, an altitude or a speed
+    beyond the bounds, a speed of at most HEADWIND times the wind, a period below the rule, a radius
+    below (V + W)^2 / (g tan(0.8 phi_max)), and a leg too short for the fillets. phi_max is the
+    largest bank at V for the stall speed.
     """
     require_bounds(waypoints, can)
     leg_speeds = speeds(waypoints, can.speed)
@@ -108,8 +109,8 @@ def as_route(
 ) -> Route:
     """Make the route of legs through waypoints; `speed`, m/s, holds if no waypoint names one.
 
-    A fillet leads to the next waypoint; a leg leaves the waypoint before. An orbit changes the
-    altitude at its waypoint.
+    A fillet belongs to the leg to the next waypoint, and a leg starts at the waypoint before. In an
+    orbit the altitude changes at its waypoint.
     """
     leg_speeds = speeds(waypoints, speed)
     numbers = path.leads(legs)
@@ -146,9 +147,9 @@ def _legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[L
 def _without_short_legs(
     waypoints: Sequence[Waypoint], radius: float, least: float
 ) -> tuple[list[tuple[int, Waypoint]], tuple[str, ...]]:
-    """Return the waypoints with their numbers, without those left out for short legs.
+    """Return the waypoints with their numbers, except those left out for short legs.
 
-    A note names each one that is left out. Raises ShortLegError if none can be left out.
+    A note names each waypoint that is left out. Raises ShortLegError if none can be left out.
     """
     remaining = list(enumerate(waypoints))
     refusal = None
@@ -174,7 +175,7 @@ def _without_short_legs(
                 )
             ]
         except ParameterError as error:
-            # The rest has corners of its own, whose legs may be too short.
+            # Without the waypoint there are other corners, and their legs may be too short.
             raise refusal or error from None
     numbers = {number for number, _ in remaining}
     notes = []
@@ -207,7 +208,7 @@ def _with_circles(
 ) -> FlyableRoute:
     """Add a circle to the route for each change of altitude that the leg does not allow.
 
-    Such a change is beyond the climb or sink along the leg. Waypoints are by number.
+    Such a change exceeds the climb or sink along the leg. `by_number` has the waypoints by number.
     """
     numbers = list(by_number)
     waypoints = list(by_number.values())
@@ -320,13 +321,13 @@ def require_inside(route: Route, fence: Fence, margin: float) -> None:
 
 
 TURN_BACK = 3.0
-"""Radii within which an aircraft joins the next leg after a corner without a fillet; the osprey
-took 2.0."""
+"""Distance within which an aircraft joins the next leg after a corner without a fillet, in radii of
+the fillets. The osprey needed 2.0."""
 
 POINT_DISTANCE = 0.05
 """Distance of the points of a line at which the fence is checked, in radii of the fillets."""
 
 
 def _up(value: float, step: float) -> float:
-    """Round a value up to a multiple of a step, which is still feasible."""
+    """Round a value up to a multiple of a step, so that it is still feasible."""
     return math.ceil(value / step) * step

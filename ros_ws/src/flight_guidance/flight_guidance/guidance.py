@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance without ROS: the step of `modes`, with state, the last samples and the program.
+"""Guidance without ROS: the step of `modes` with its state, the last samples and the program.
 
 The node and the simulation in one process use the same class `Guidance`.
 """
@@ -54,9 +54,9 @@ class GuidanceOutput(NamedTuple):
 
 
 def u_m(state: GuidanceState) -> FloatArray:
-    """Return what is published as u_m.
+    """Return the values that are published as u_m.
 
-    These are the commands in the order of the parameters' outputs, then ATTITUDE.
+    They are the commands in the order of the parameters' outputs, then ATTITUDE.
     """
     return np.array([*state.u_m, state.phi, state.theta - state.alpha])
 
@@ -64,7 +64,7 @@ def u_m(state: GuidanceState) -> FloatArray:
 def step(
     state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
 ) -> tuple[GuidanceState, StepCommands]:
-    """Step the kind of aircraft that flies, by `modes.step` or `multicopter.step`."""
+    """Take a step by `modes.step`, or by `multicopter.step` for a multicopter."""
     step_of_kind = modes.step if params.multicopter is None else multicopter.step
     return step_of_kind(state, inputs, route, params)
 
@@ -75,7 +75,7 @@ def digest(route: Route | None) -> int:
 
 
 class Guidance:
-    """`modes.step` with state, the last pose and y, the route and the program of targets."""
+    """Guidance with its state, the last pose and y, the route and the program of targets."""
 
     def __init__(self, parameters: GuidanceConfig) -> None:
         self._params: GuidanceParams = parameters.params()
@@ -97,11 +97,11 @@ class Guidance:
         self._paused = False
         self._begin = Begin.HOLD
         self._notices = parameters.notices()
-        # Since when guidance has waited for a pose that is young enough, or for a step that does
-        # not fail.
+        # The instant from which guidance has waited for a pose that is young enough, or for a step
+        # that does not fail; None if it does not wait.
         self._waits_from_ns: int | None = None
         self._failures = Failures()
-        self._failure: str | None = None  # of the last step; None if it waits for a pose
+        self._failure: str | None = None  # why the last step failed; None if it waits for a pose
         # The instant of the operator's last message, or of the first step.
         self._operated_ns: int | None = None
         self._link_lost = False
@@ -172,7 +172,7 @@ class Guidance:
         Raises ChannelError.
         """
         targets.read_target(values, self._params, self.route, degrees=True)
-        # A lateral or vertical command replaces the command of the mode before.
+        # A lateral or vertical command replaces the waiting command of another mode.
         channels = self._params.channels
         for table in (channels.lateral, channels.vertical):
             if any(name in table for name in values):
@@ -184,11 +184,11 @@ class Guidance:
     def take_route(self, route: Route) -> None:
         """Fly a route from its first leg on.
 
-        While guidance is off, the route waits for the engagement. Commands from before the route
-        that no step has taken yet are void, and so are the legs of the program.
+        While guidance is off, the route waits for the engagement. Earlier commands
+        that no step has taken yet are void, and so are the legs in the program.
         """
         self.route = route
-        self._lander = None  # the lander of the parameters is for their route
+        self._lander = None  # the lander is only for the route of the parameters
         self._digest = digest(route)
         self._commands = {}
         self._route_waits = True
@@ -201,12 +201,12 @@ class Guidance:
         self.take_target({"leg": 0.0})
 
     def keep_link(self) -> None:
-        """Note that an operator is there: the age of the link counts from the next step on."""
+        """Note a message of the operator: the age of the link counts from the next step on."""
         self._operated_ns = None
         self._link_lost = False
 
     def hold(self) -> bool:
-        """Hold the present heading, altitude and airspeed, or for a multicopter the place.
+        """Hold the present heading, altitude and airspeed, or the place of a multicopter.
 
         Returns False if guidance does not fly.
         """
@@ -228,7 +228,7 @@ class Guidance:
     def skip(self) -> bool:
         """Leave out the waypoint ahead and fly to the next one.
 
-        Returns False if no route is flown, and on the last leg.
+        Returns False if no route is flown, or if the route has no further leg.
         """
         state = self._state
         route = self.route
@@ -251,7 +251,7 @@ class Guidance:
     def resume(self) -> bool:
         """Fly the last leg again from the nearest point.
 
-        Returns False if the route is flown already, and if there is none.
+        Returns False if the route is being flown, or if there is none.
         """
         state = self._state
         route = self.route
@@ -268,7 +268,7 @@ class Guidance:
         return True
 
     def engage(self, *, engaged: bool) -> None:
-        """Engage with the heading, altitude and airspeed at that moment, or command nothing."""
+        """Engage with the present heading, altitude and airspeed, or command nothing."""
         if engaged and not self._is_engaged:
             self._begin = Begin.HOLD
             self._forget_commands()
@@ -277,7 +277,8 @@ class Guidance:
     def pause(self, *, paused: bool, forget: bool) -> None:
         """Command nothing while the controller does not fly.
 
-        With `forget`, hold what is measured afterwards; otherwise go on as before.
+        With `forget`, guidance then holds the heading, altitude and airspeed that it measures when
+        it flies again; otherwise it goes on as before.
         """
         if forget:
             self._begin = Begin.HOLD
@@ -288,7 +289,7 @@ class Guidance:
     def _forget_commands(self) -> None:
         """Forget commands given while guidance did not fly, except a route.
 
-        Before the first step, commands wait.
+        Commands from before the first step are kept.
         """
         if self._state is not None:
             self._commands = {
@@ -317,10 +318,10 @@ class Guidance:
         }
 
     def reason_to_wait(self, now_ns: int) -> Refusal | None:
-        """Say why there is no u_m.
+        """Return why there is no u_m, or None.
 
-        There is a reason once guidance has waited STALE_TIME for a young pose, or for a step that
-        does not fail.
+        There is a reason if guidance has waited for STALE_TIME: for a young pose, or for a step
+        that does not fail.
         """
         since = self._waits_from_ns
         pose = self._pose
@@ -333,7 +334,7 @@ class Guidance:
         return Refusal(f"no u_m: pose is {age:.2f} s old, guidance.max_age {limit:g} s")
 
     def _watch_link(self, now_ns: int) -> None:
-        """Fly home, once, if the age of the operator's link exceeds the limit."""
+        """Begin to fly home if the age of the operator's link exceeds the limit."""
         if not self._params.link_timeout_ns:
             return
         if self._operated_ns is None:
@@ -358,7 +359,7 @@ class Guidance:
         self._authority = self._authority._replace(roll=0.0 if self._roll.ignored else UNKNOWN)
 
     def _land(self) -> None:
-        """Add the commands of the landing, unless an operator or the program has others."""
+        """Add the commands of the landing, unless the operator or the program gives other ones."""
         state = self._state
         if self._lander is None or self.route is None or state is None:
             return
@@ -373,7 +374,7 @@ class Guidance:
     def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
         """Take a step at an instant and flight time t.
 
-        Returns None without a fresh y, before the first pose, and while disengaged. After such
+        Returns None if y is not fresh, if no pose has come yet, or while disengaged. After such
         steps the filters start again at the measured values. If a step raises an exception or gives
         a value that is not finite, the state stays, commands wait for the next step, and the last
         u_m goes on until the age limit.
@@ -381,7 +382,7 @@ class Guidance:
         try:
             return self._step(now_ns, t_ns)
         except Exception as error:
-            # Whatever it is, try the next step.
+            # Whatever the error is, try the next step.
             is_said = self._failures.add(seconds(t_ns))
             return self._last_goes_on(now_ns, sentence(error), is_said=is_said)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The log of guidance: a step as a row of channels, and the step from a row."""
+"""The log of guidance: writes a step as a row of channels, and restores the step from a row."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import chain
@@ -36,12 +36,12 @@ WIND = ("north", "east")
 
 
 class GuidanceSample(NamedTuple):
-    """What a step leaves for the log: inputs, state after the step, commands."""
+    """Content of the log for a step: its inputs, the state after it, and its commands."""
 
     inputs: Inputs
     state: GuidanceState
     commands: StepCommands
-    route: int  # a `digest`
+    route: int  # `guidance.digest` of the route
     link_age: float  # s since the last message of an operator, 0 without a limit
     failed: int  # number of failed steps
 
@@ -65,7 +65,7 @@ class LogChannels(NamedTuple):
 
     names: Sequence[str]
     attribute: str
-    kind: Callable[..., Any] = float  # makes the attribute of the logged numbers
+    kind: Callable[..., Any] = float  # builds the attribute from the logged numbers
 
     def logged(self, sample: GuidanceSample) -> Sequence[float]:
         """Return the numbers of the channels."""

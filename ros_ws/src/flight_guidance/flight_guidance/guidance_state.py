@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The words of guidance: modes, targets, parameters, and the inputs and the state of a step."""
+"""Types of guidance: modes, targets, parameters, and the inputs and the state of a step."""
 
 from collections.abc import Collection, Mapping
 from enum import IntEnum
@@ -21,8 +21,8 @@ from flight_guidance.steering.vertical import (
 from flight_guidance.steering.wind import Wind
 
 LARGEST = 1e9
-"""Largest value of pose, y and target, SI. The squares of larger values overflow; the orbit of the
-moon is 4e8 m away."""
+"""Largest value of pose, y and target, SI. The squares of much larger values overflow. The orbit of
+the moon is 4e8 m away."""
 
 
 class GuidanceMode(IntEnum):
@@ -35,18 +35,18 @@ class GuidanceMode(IntEnum):
 
 
 class Lateral(IntEnum):
-    """What the bank serves."""
+    """What the bank controls."""
 
     PHI = 0
     HEADING = 1
     COURSE = 2
     ORBIT = 3
     ROUTE = 4
-    PLACE = 5  # of a multicopter: to a place, and hover there
+    PLACE = 5  # only of a multicopter: fly to a place, and hover there
 
 
 class Vertical(IntEnum):
-    """What the pitch serves."""
+    """What the pitch controls."""
 
     THETA = 0
     CLIMB = 1
@@ -55,7 +55,7 @@ class Vertical(IntEnum):
 
 
 class Target(NamedTuple):
-    """Commands by channel; the channels of the modes in force act."""
+    """Commands by channel, of which those of the active modes take effect."""
 
     phi: float = 0.0  # rad
     heading: float = 0.0  # rad from true north
@@ -68,9 +68,9 @@ class Target(NamedTuple):
     climb: Scalar = 0.0  # m/s
     altitude: Scalar = 0.0  # m
     V: Scalar = 0.0  # airspeed, m/s, absolute
-    # m along a line of the route from the start, where the aircraft joins the line.
+    # m, distance from the start of a line of the route at which the aircraft joins the line.
     along: float = 0.0
-    r: float = 0.0  # rad/s beside phi, more than the r of a coordinated turn
+    r: float = 0.0  # rad/s, with phi: added to the r of a coordinated turn
 
 
 TARGETS = Target._fields
@@ -97,8 +97,8 @@ class TargetChannels(NamedTuple):
 
     lateral: Mapping[str, Lateral]
     vertical: Mapping[str, Vertical]
-    further: tuple[str, ...]  # of no mode
-    together: Mapping[Lateral, tuple[str, ...]]  # channels of a mode that come together
+    further: tuple[str, ...]  # channels that belong to no mode
+    together: Mapping[Lateral, tuple[str, ...]]  # channels of a mode that must come together
 
     def known(self) -> tuple[str, ...]:
         """Return all of these channels, in the order of TARGETS."""
@@ -123,23 +123,23 @@ MULTICOPTER = TargetChannels(
 class MulticopterParams(NamedTuple):
     """Gains and limits of a multicopter's guidance."""
 
-    drag: float  # d, deceleration over airspeed, 1/s
-    k_tilt: float  # of the direction of the thrust, 1/s
-    k_psi: float  # of the heading, 1/s
-    k_v: float  # of the velocity, 1/s
-    k_p: float  # of the place, 1/s
-    lead: float  # s, of the tilt behind its command
-    braking: float  # m/s^2, towards a place and in a fillet
+    drag: float  # d, deceleration divided by the airspeed, 1/s
+    k_tilt: float  # gain of the direction of the thrust, 1/s
+    k_psi: float  # gain of the heading, 1/s
+    k_v: float  # gain of the velocity, 1/s
+    k_p: float  # gain of the place, 1/s
+    lead: float  # s, delay of the tilt behind its command
+    braking: float  # m/s^2, largest acceleration for a stop and in a fillet
     tilt_rate: float  # rad/s
     yaw_rate: float  # rad/s
 
 
 class Home(NamedTuple):
-    """Where an aircraft goes in the end."""
+    """The place to which an aircraft flies home."""
 
     north: float = 0.0  # m
     east: float = 0.0  # m
-    altitude: float | None = None  # m; None: the altitude of then
+    altitude: float | None = None  # m; None: the altitude at which it turns home
     after_loss: bool = False  # whether the aircraft flies home when pose returns after a loss
 
 
@@ -149,7 +149,7 @@ class CommandLimits(NamedTuple):
     bank: float  # rad
     least_pitch: float  # rad
     largest_pitch: float  # rad
-    floor: float  # m/s, of the airspeed
+    floor: float  # m/s, least airspeed
     stall_speed: float  # m/s
     radius: float  # m, least radius of an orbit
     largest_speed: float  # m/s
@@ -163,7 +163,7 @@ class GuidanceParams(NamedTuple):
     outputs: tuple[str, ...]  # order of u_m
     period_ns: int
     speed: float  # trim speed V0, m/s
-    k_chi: float  # of heading and course, 1/s
+    k_chi: float  # gain of heading and course, 1/s
     attitude: AttitudeParams
     vertical: VerticalParams
     path: PathParams
@@ -171,35 +171,35 @@ class GuidanceParams(NamedTuple):
     slew: tuple[float, ...]  # largest derivatives of u_m
     max_age_ns: int
     hold_ns: int
-    turn_lag: float = 0.0  # s, of the turn behind the bank, beyond `attitude.turn_lead`
+    turn_lag: float = 0.0  # s, lag of the turn behind the bank that `attitude.turn_lead` leaves
     fence: Fence | None = None
     home: Home = Home()
-    link_timeout_ns: int = 0  # of the operator's link; 0: no limit
-    dead: tuple[str, ...] = ()  # outputs without an input with an effect: no command asks for them
-    rolls: bool = True  # else the yaw rate flies the bank
+    link_timeout_ns: int = 0  # largest age of the operator's link; 0: no limit
+    dead: tuple[str, ...] = ()  # outputs whose inputs have no effect, which get no command
+    rolls: bool = True  # whether the ailerons roll; if not, the yaw rate controls the bank
     channels: TargetChannels = AIRPLANE
-    multicopter: MulticopterParams | None = None  # None: of an airplane
+    multicopter: MulticopterParams | None = None  # None: an airplane
 
 
 class Begin(IntEnum):
-    """Whether the filters begin at what is measured."""
+    """Whether the filters start again at the measured values."""
 
     NO = 0
     AGAIN = 1  # modes and commands stay (bumpless transfer)
-    HOLD = 2  # with the heading, the altitude and the airspeed of now
+    HOLD = 2  # hold the present heading, altitude and airspeed
 
 
 class Inputs(NamedTuple):
-    """What a step takes."""
+    """Inputs of a step."""
 
     t_ns: int
     begin: Begin
     pose: tuple[float, ...]  # the last pose, in the order of POSE
     pose_age_ns: int
     y: tuple[float, ...]  # the last y, in the order of u_m
-    # Commands that are new, by channel of Target; they name the modes.
+    # New commands by channel of Target. Their channels also choose the modes.
     commands: Mapping[str, float]
-    authority: Authority = Authority()  # of the inputs, as learned and tested in flight
+    authority: Authority = Authority()  # what the inputs can do, as learned and tested in flight
 
 
 class GuidanceState(NamedTuple):
@@ -210,21 +210,22 @@ class GuidanceState(NamedTuple):
     lateral: Lateral
     vertical: Vertical
     target: Target
-    leg: int  # of the route
+    leg: int  # number of the leg of the route
     phi: float  # attitude, by dead reckoning while pose is stale, rad
     theta: float
     alpha: float  # estimated angle of attack, rad
-    alpha_trim: float  # the same at the start
-    slip: float  # what a sideslip takes from a turn, m/s^2
+    alpha_trim: float  # the same at the first step
+    slip: float  # acceleration of a turn that a sideslip takes away, m/s^2
     climb_c: float  # m/s
     V_c: float  # m/s
     u_m: tuple[float, ...]
-    joining: Side = Side.NONE  # of the circle onto the leg
-    wind: Wind = (0.0, 0.0)  # estimated, where the air moves to: north, east, m/s
+    joining: Side = Side.NONE  # side of the circle onto the leg
+    wind: Wind = (0.0, 0.0)  # estimated velocity of the air: north, east, m/s
     fence: FenceAction = FenceAction.NONE
-    loitered: float = 0.0  # share of the turns or the wait of a loiter that is flown
+    loitered: float = 0.0  # fraction of the turns or the wait of a loiter that is flown
     psi: Scalar = 0.0  # estimated heading, rad
-    velocity: Wind = (0.0, 0.0)  # of the pose of the step, for the wind of a multicopter, m/s
+    # velocity in the pose of this step, for the wind of a multicopter, m/s
+    velocity: Wind = (0.0, 0.0)
 
 
 class StepCommands(NamedTuple):
@@ -235,9 +236,9 @@ class StepCommands(NamedTuple):
     xtrack: float = 0.0  # cross-track error, m, positive to the right of the path
     to_go: float = 0.0  # m, to the end of the leg, or to the point where the aircraft joins the leg
     track: float = 0.0  # course of the path at the nearest point, rad
-    # m, distance from the end of the leg that ended at this step; 0 where the leg was flown.
+    # m, distance from the end of a leg that ended at this step and was missed, else 0.
     missed: float = 0.0
-    clearance: float = LARGEST  # m, from the fence
+    clearance: float = LARGEST  # m, distance from the fence
     predicted: float = LARGEST  # m, least clearance of the better turn away from the fence
     bank_limited: bool = False
     theta_limited: bool = False
@@ -252,7 +253,8 @@ def bits(names: Collection[str]) -> int:
 
 
 CARRIED = ("mode", "lateral", "vertical", "target", "leg", "joining", "fence", "loitered")
-"""What filters that begin again leave: the mode, since after a lost pose the wings are levelled."""
+"""Fields of the state that stay if the filters start again. The mode is one of them, because the
+wings are levelled after a lost pose."""
 
 
 def begun_again(
@@ -262,7 +264,7 @@ def begun_again(
     params: GuidanceParams,
     *further: str,
 ) -> GuidanceState:
-    """Return the state `holding` with what an earlier state leaves, and more values by name.
+    """Return the state `holding` with the fields CARRIED and `further` of an earlier state.
 
     Up to the age limit of u_m, the reference model still flies the last u_m.
     """

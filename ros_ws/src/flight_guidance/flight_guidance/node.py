@@ -63,17 +63,17 @@ from flight_ros.topics import (
     publisher_qos,
 )
 
-# Of a full ROS 2, or of `make messages`
+# The package comes with a full ROS 2, or from `make messages`.
 TFMessage: Any = resolve_name("tf2_msgs.msg:TFMessage") if find_spec("tf2_msgs") else None
 
-TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # as tf2_ros has it
-MAX_TARGETS = 16  # messages of target per tick; later ones wait, so that a storm delays no u_m
-MAX_ROUTE_SIZE = 65_536  # bytes, 900 waypoints: decoding takes 0.14 ms a waypoint
+TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # as in tf2_ros
+MAX_TARGETS = 16  # messages of target per tick; later ones wait, so that a flood delays no u_m
+MAX_ROUTE_SIZE = 65_536  # bytes, for 900 waypoints: decoding takes 0.14 ms per waypoint
 CONTROLLER = "controller"  # the node of `internals` and `authority`
-FEWEST_AUTHORITIES = 3  # periods, in which one sample may be late and one lost
+FEWEST_AUTHORITIES = 3  # periods: one sample may be late, and one lost
 ODOMETRY_PERIOD_NS = NANOSECONDS // 10
 PATH_PERIOD_NS = NANOSECONDS
-PATH_LENGTH = 120  # poses of the flown path, one a second
+PATH_LENGTH = 120  # number of poses of the flown path, one per second
 
 SENTENCES: Mapping[GuidanceMode, str] = {
     GuidanceMode.OFF: "no u_m: disengaged, or pose or y is missing",
@@ -81,7 +81,7 @@ SENTENCES: Mapping[GuidanceMode, str] = {
     GuidanceMode.DEAD_RECKONING: "pose is stale: wings are levelled by the rates of y",
     GuidanceMode.POSE_LOST: "pose is lost: all rates are zero",
 }
-# Further modes have WARN.
+# All other modes have the level WARN.
 LEVELS = {
     GuidanceMode.ENGAGED: DiagnosticStatus.OK,
     GuidanceMode.POSE_LOST: DiagnosticStatus.ERROR,
@@ -104,8 +104,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._y = self._receive(Y, Decoder(outputs).decode, self._guidance.take_y)
         self._named = NamedDecoder()
         self._pose = self._receive(POSE, self._decode_pose, self._guidance.take_pose)
-        # An operator has the system clock, not simulated time. A target from before a stop of
-        # guidance is void, because the operator knows that it failed.
+        # An operator uses the system clock, so with simulated time there is no age limit. Otherwise
+        # a target from before a stop of guidance is void, because the operator knows of the stop.
         max_age_ns = None if self.parameters.lockstep or self.simulated else self._max_age_ns
         self._target = self.receive(
             TARGET, self._named.decode, self._take_target, max_age_ns=max_age_ns, qos=NEWEST_SAMPLES
@@ -119,7 +119,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._wait_reason: Refusal | None = None
         self._authority = self._receive_authority()
         self._authorities = deque[StampedVector]()
-        self._authority_ns = -1  # stamp of the last one; -1 if there is none, or it is void
+        # stamp of the last `authority`; -1 if there is none, or if it is void
+        self._authority_ns = -1
         self._has_authority = True
         if self.parameters.lockstep:
             y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
@@ -188,7 +189,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             if y is not None:
                 self._y.accept(y, now_ns)
             for pose in poses:
-                # A pose without channels says that no pose of the instant will come.
+                # A pose without channels says that there is no pose of this instant.
                 if pose.value.size:
                     self._pose.accept(pose, now_ns)
             if due and (output := self._step(now_ns, now_ns)) is not None:
@@ -217,8 +218,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self._has_authority
 
     def _step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
-        # One of the instant of the step itself may come before or after it, so in lockstep it acts
-        # from the next step on.
+        # An `authority` with the stamp of this step may come before or after the step. In lockstep
+        # it therefore acts from the next step on.
         while self._authorities and (
             self._authorities[0].stamp_ns < now_ns or not self.parameters.lockstep
         ):
@@ -280,7 +281,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return nanoseconds(self.parameters.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Return the timeouts of the publishers of y, pose and internals."""
+        """Return the ages above which a publisher of y, pose or internals has timed out, ns."""
         return self._max_age_ns(), self._max_age_ns() + nanoseconds(self.parameters.hold)
 
     def _take_target(self, sample: NamedSample, now_ns: int) -> None:
@@ -317,7 +318,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     def _receive_authority(self) -> Receiver[StampedVector] | None:
         """Make the receiver of `authority`; None in a flight without a learner.
 
-        In such a flight only an unexpected publisher would send it.
+        Without a learner only an unexpected publisher would send it.
         """
         rate = self.parameters.authority_rate
         self._authority_period_ns = period_ns(rate, "authority_rate") if rate else 0
@@ -328,13 +329,13 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             Decoder(AUTHORITY_CHANNELS).decode,
             self._take_authority,
             max_age_ns=None if self.parameters.lockstep else self._max_age_ns,
-            # In real time it is that of `internals`, the controller that flies.
+            # In real time, `_take_authority` takes it only from the publisher of `internals`.
             lock=LockstepLock() if self.parameters.lockstep else None,
             qos=LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES,
         )
 
     def _controller(self) -> str | None:
-        """Name the controller that flies; None before its first sample."""
+        """Return the name of the controller that flies, or None before its first sample."""
         # In lockstep the sender has no process in its name.
         if self.parameters.lockstep:
             return f"{self.get_namespace().rstrip('/')}/{CONTROLLER}"
@@ -343,7 +344,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     def _poll_authority(self, now_ns: int) -> None:
         """In real time, take `authority`.
 
-        The last sample is void after FEWEST_AUTHORITIES periods and the age limit.
+        The last sample is void after FEWEST_AUTHORITIES periods plus the age limit.
         """
         if self._authority is None:
             return
@@ -360,7 +361,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     def _take_authority(self, sample: StampedVector, now_ns: int) -> None:
         controller = self._controller()
         if controller is None:
-            # Nothing flies yet, and the next sample will say the same.
+            # Nothing flies yet, and the next sample will have the same content.
             return
         require_sender(sample.sender, controller)
         if np.any(sample.value < 0.0):
@@ -374,7 +375,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     def _take_mode(self, sample: StampedVector, now_ns: int) -> None:
         """Fly while the controller is ENGAGED.
 
-        After INACTIVE, hold what is measured; after a failsafe, continue.
+        After INACTIVE, guidance holds the measured heading, altitude and airspeed. After a failsafe
+        it continues.
         """
         try:
             mode = Mode(int(sample.value[0]))
@@ -418,13 +420,13 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return message
 
     def _view(self, topic: Topic, period_ns: int = ODOMETRY_PERIOD_NS) -> Any:
-        """Make the publisher of a topic for tools."""
+        """Create the publisher of a topic for maps and 3-D views."""
         return self.create_publisher(topic.type, topic.name, publisher_qos(period_ns))
 
     def _publish_sensors(self, odometry: Odometry) -> None:
         """Publish attitude and rates, the place on the Earth, and the estimated wind.
 
-        The place is published only if an origin is given. The wind says where the air moves to.
+        The place is published only if an origin is given. The wind is the velocity of the air.
         """
         place = odometry.pose.pose
         twist = odometry.twist.twist
@@ -494,7 +496,7 @@ def _service(
 ) -> Callable[[Any, Any], Any]:
     """Make a service callback whose response is True, or a sentence of refusal.
 
-    `called` is told of each call.
+    `called` is called first at each call of the service.
     """
 
     def callback(request: Any, response: Any) -> Any:

@@ -21,7 +21,7 @@ from flight_guidance.modes.landing import Landing
 from flight_guidance.reach import Authority
 
 DWELL = 10.0
-"""Time for which a condition must last before a notice, and be over before another one, s."""
+"""A condition must last this long before a notice, and be over as long before the next one, s."""
 
 LEARNED = tuple(f"authority.{name}" for name in Authority._fields)
 """Channels of `guidance`: what the inputs can do, as learned in flight."""
@@ -35,11 +35,11 @@ LINK_AGE = "age.link"
 """Channel of `guidance`: time since the last message of an operator, s, 0 without a limit."""
 
 TILTED = math.radians(8.0)
-"""A multicopter that exceeds its largest tilt by this much does not follow: a step of the command
-to the largest tilt, 30 deg, overshoots by 1 deg."""
+"""A multicopter whose tilt exceeds its limit by this much does not follow its commands: a step of
+the command to the largest tilt, 30 deg, overshoots by only 1 deg."""
 
 STALE_TIME = 2.0
-"""The same for a pose older than its limit, s."""
+"""Time for which a pose must be older than its limit before a notice, s."""
 
 
 class Notice(NamedTuple):
@@ -52,7 +52,7 @@ class Notice(NamedTuple):
 def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
     """Return whether an aircraft that flies ahead along a path goes back along it over ground.
 
-    It flies ahead through the air. `log` has the channels of `guidance`, as values or arrays.
+    Through the air it flies ahead. `log` has the channels of `guidance`, as values or arrays.
     """
     track = log["track"]
     lateral = log["mode.lateral"]
@@ -69,9 +69,9 @@ TURNS = {FenceAction.RIGHT, FenceAction.LEFT}
 
 
 class _Lasting:
-    """Tells whether a condition has lasted for `dwell`.
+    """Decides when a notice is due, because a condition has lasted for `dwell`.
 
-    It is due once, and again after the condition has been away for `dwell`.
+    The notice is due once, and again only after the condition has been over for `dwell`.
     """
 
     def __init__(self, dwell: float = DWELL) -> None:
@@ -146,7 +146,7 @@ class Notices:
         self._strong = _Lasting()
         self._leg = 0
         self._action = FenceAction.NONE
-        # NaN while inside
+        # flight time of leaving the fence, s; NaN while inside
         self._outside_from = math.nan
         self._farthest = 0.0
 
@@ -178,7 +178,7 @@ class Notices:
             self._reach_text = self._reach(authority)
             if self._reach_text != earlier:
                 texts.append(f"from now on {self._reach_text or 'own limits again'}")
-        # The conditions that have lasted: the link, the pose, the tilt, the wind.
+        # The conditions that must last: the link, the pose, the tilt, the wind.
         if self._link.due(t, holds=log[LINK_AGE] > self._link_timeout):
             texts.append(f"no message of an operator for {self._link_timeout:g} s: home")
         if self._stale.due(t, holds=log["age.pose"] > self._max_age):
@@ -207,7 +207,7 @@ class Notices:
     def _outside(self, t: float, clearance: float) -> list[str]:
         """Return the sentence if the aircraft leaves the fence, or is back inside.
 
-        While pose is lost, neither is known.
+        While pose is lost, there is no sentence, because neither is known.
         """
         if clearance >= LARGEST:
             return []

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pose as odometry of REP 103.
 
-The map frame is east, north, up, the body frame forward, left, up.
+The axes of the map frame are east, north and up; those of the body frame forward, left and up.
 """
 
 import math

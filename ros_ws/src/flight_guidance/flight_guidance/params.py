@@ -86,7 +86,7 @@ class GuidanceConfig(SteeringConfig):
                 f"{self.rate:g} Hz",
                 f"a whole fraction of y_rate ({self.y_rate:g} Hz)",
             )
-        # Check the altitudes, and that home is between them.
+        # Check the altitude limits, and that home is between them.
         lowest, highest = self.altitudes()
         require(
             lowest < highest, "ceiling", f"{highest:g} m", f"more than altitude_floor, {lowest:g} m"
@@ -99,7 +99,7 @@ class GuidanceConfig(SteeringConfig):
             self._check_multicopter()
         else:
             self._check_airplane()
-        # Check route, landing and program, which need the numbers of the equations.
+        # Check route, landing and program. For this the numbers of the equations are needed.
         params = self.params()
         route = None if self.route is None else self.plan(self.waypoints())
         if self.landing is not None:
@@ -158,7 +158,7 @@ class GuidanceConfig(SteeringConfig):
             require(False, "home", turn, f"at least {margin:.0f} m inside; {size}")
 
     def _at_home(self) -> Motion:
-        """Return the level aircraft over home, with the turns of the fence."""
+        """Return the motion in level flight over home, from which turns are predicted."""
         params = self.params()
         limits = params.limits
         bank = protection.bank_limit(limits.bank, limits.stall_speed, self.speed)
@@ -193,7 +193,7 @@ class GuidanceConfig(SteeringConfig):
     def fence_margin(self, speed: float) -> float:
         """Return the least distance that a route must keep from the fence at an airspeed, m.
 
-        It is MARGIN of flight with the wind from behind.
+        It is MARGIN of flight with a tailwind.
         """
         return MARGIN * (speed + self.wind)
 
@@ -212,7 +212,7 @@ class GuidanceConfig(SteeringConfig):
         )
 
     def notices(self) -> Notices:
-        """Return what the notices of a flight depend on."""
+        """Return the notices of a flight with these parameters."""
         link_timeout = self.home.link_timeout or math.inf
         if self.drag is not None:
             strongest = GRAVITY * math.tan(self.bank) / self.drag
@@ -328,7 +328,7 @@ class GuidanceConfig(SteeringConfig):
         return landing_at(waypoints[number].point, route, section, box, self.params())
 
     def lander(self, route: Route | None) -> Lander | None:
-        """Make what lands on the route of the parameters; None if there is no landing."""
+        """Return the lander for the route of the parameters; None if there is no landing."""
         landing = None if route is None else self.landing_on(route)
         return None if landing is None else Lander(landing, self.params())
 

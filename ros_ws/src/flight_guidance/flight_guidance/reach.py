@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of commands by what the inputs can do.
+"""Limits of commands that follow from the authority of the inputs.
 
-At the start they follow by rule, later from a model that is learned in flight.
+At the start the authority is given by rule, later by a model that is learned in flight.
 """
 
 import math
@@ -15,58 +15,60 @@ from flight_core.units import GRAVITY
 
 CLIMB = 0.7
 SINK = 0.5
-"""Fractions of the throttle's authority for a climb and a sink; the rest holds the airspeed."""
+"""Fractions of the throttle's authority for a climb and for a sink. The rest holds the airspeed."""
 
 REVERSALS = 9.3
-"""Least period of path following over bank / roll rate. A bank reversal takes 2 bank / roll rate.
-With a period of 3.5 reversals the osprey cycled in turbulence, so 4.65 are required."""
+"""Least period of path following, divided by bank / roll rate. A reversal of the bank takes
+2 bank / roll rate. With a period of 3.5 reversals the osprey went into a limit cycle in turbulence,
+so 4.65 are required."""
 
 
 LEAST = 1e-3
-"""units/s; an input with less authority has no effect."""
+"""Authority below which an input counts as without effect, units of y / s."""
 
 
 YAWED_BANK = math.radians(10.0)
-"""Largest bank without an aileron: the rudder also flies its turn with level wings, in a sideslip
-of 6 deg of the osprey."""
+"""Largest bank without an aileron. The rudder alone can fly the turn of this bank even with level
+wings, on the osprey in a sideslip of 6 deg."""
 
 
 MEMORY = 10.0
-"""s, over which the roll rate is compared with its command."""
+"""Time over which the roll rate is compared with its command, s."""
 
 ASKED = 2.0
-"""s of the largest roll rate: how much command is evidence. Without an aileron the osprey is then
-40 deg from its bank, or 7 deg for MEMORY. A turn of the osprey onto a course asks for less."""
+"""Least amount of command that is evidence, in s of the largest roll rate. Without an aileron the
+osprey is by then 40 deg off its commanded bank, or 7 deg for a time of MEMORY. A turn of the osprey
+onto a course needs less command."""
 
 IGNORED = 0.3
 """Largest fraction of a command that counts as ignored. In strong turbulence the osprey, the c172p
-and the 737 of JSBSim have at least 0.8, and 0.75 with 0.3 of the aileron; without an aileron at
-most 0.05."""
+and the 737 of JSBSim follow at least 0.8 of it, at least 0.75 if the aileron has 0.3 of its effect,
+and at most 0.05 without an aileron."""
 
 FOLLOWED = 0.7
-"""Least fraction that counts as followed again. `attitude.yaw_for_bank` alone rolls with up to half
-of the command."""
+"""Least fraction of a command that counts as followed again. `attitude.yaw_for_bank` alone
+rolls with up to half of the command."""
 
 
 class Authority(NamedTuple):
-    """Least change of an output by its input from trim, units/s.
+    """Rate at which each input can at least change its output from trim, units of y / s.
 
-    It is 0 without an effect, and UNKNOWN without a learned model.
+    It is 0 if the input has no effect, and UNKNOWN if no model is learned.
     """
 
     q: float = UNKNOWN  # rad/s^2
     p: float = UNKNOWN  # rad/s^2
-    down: float = UNKNOWN  # of V, m/s^2
-    up: float = UNKNOWN
-    roll: float = UNKNOWN  # 0 if the measured p ignores its command, by `RollTest`
+    down: float = UNKNOWN  # deceleration of V, m/s^2
+    up: float = UNKNOWN  # acceleration of V, m/s^2
+    roll: float = UNKNOWN  # 0 if the measured p ignores its command according to `RollTest`
 
 
 class RollTest(NamedTuple):
-    """Tells whether p follows its command p_m, without a model and without u.
+    """Test whether p follows its command p_m, without a model and without u.
 
         a_dot = p_m^2 - a / MEMORY,   f_dot = p_m p - f / MEMORY
 
-    f / a is the fraction of the command that the aircraft flies, by least squares.
+    By least squares, f / a is the fraction of the command that the aircraft follows.
     """
 
     asked: float = 0.0  # a, rad^2/s
@@ -76,7 +78,7 @@ class RollTest(NamedTuple):
     def after(self, dt: float, command: float, p: float, largest: float) -> "RollTest":
         """Return the test after a step of a command, at most `largest`, and a measured p, rad/s.
 
-        Without ASKED of evidence the verdict stays.
+        If there is less evidence than ASKED, the verdict stays.
         """
         memory = math.exp(-dt / MEMORY)
         asked = memory * self.asked + dt * command**2
@@ -92,7 +94,7 @@ AUTHORITY = tuple(f"{side}.{name}" for side, name in product(SIDES, ("q", "p", "
 
 
 def authority_of(channels: Mapping[str, float]) -> Authority:
-    """Read the channels of the topic; q and p count with the lesser of both ways."""
+    """Read the channels of the topic; for q and p the lesser of both directions counts."""
     q = min(channels[f"{side}.q"] for side in SIDES)
     p = min(channels[f"{side}.p"] for side in SIDES)
     return Authority(q, p, *(channels[f"{side}.V"] for side in SIDES))
@@ -101,7 +103,7 @@ def authority_of(channels: Mapping[str, float]) -> Authority:
 def climb_rates(down: float, up: float, speed: float) -> tuple[float, float]:
     """Compute the climb and sink rate that full throttle up and down gives, m/s.
 
-    They are a V0 / g, times the fractions CLIMB and SINK.
+    They are a V0 / g times the fractions CLIMB and SINK; a is the authority of the throttle.
     """
     return CLIMB * up * speed / GRAVITY, SINK * down * speed / GRAVITY
 

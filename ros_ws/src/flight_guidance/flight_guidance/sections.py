@@ -142,7 +142,8 @@ class ZoneConfig(Config):
 class HomeConfig(Config):
     """Where the aircraft goes at a fence and by `guidance/home`.
 
-    If you choose so, it also goes there after a loss of pose or of the operator's link.
+    By `after_loss` and `link_timeout` it also goes there after a loss of pose or of the operator's
+    link.
     """
 
     north: Number = Field(default=0.0, description="distance to the north of the origin, m")
@@ -160,9 +161,9 @@ class HomeConfig(Config):
 
 
 class LandingConfig(Config):
-    """A landing at a waypoint of the route, on the line to the waypoint, which is the glide path.
+    """A landing at a waypoint of the route; the line to the waypoint is the glide path.
 
-    The line goes straight on to the next waypoint, which is that of a go-around.
+    The next line must go straight on. The aircraft flies along it in a go-around.
     """
 
     waypoint: Annotated[int, Field(ge=1, le=10_000)] = Field(

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of steering: limits and gains of an aircraft.
 
-What you leave out follows by rule from the reference model, the throttle and the speeds.
+A parameter that is left out follows by rule from the reference model, the throttle and the speeds.
 """
 
 import math
@@ -30,25 +30,28 @@ from flight_guidance.steering.vertical import VerticalParams, path_lag
 
 BY_RULE = ("outputs", "natural_frequency", "speed", "throttle_authority", "roll_authority")
 FLOOR_FRACTION = 0.8
-"""Speed floor over the trim speed if no stall speed is known."""
+"""Ratio of the speed floor to the trim speed if no stall speed is known."""
 
 FASTEST_ROLL = 0.35
-"""rad/s, 20 deg/s."""
+"""Largest roll rate by rule, rad/s: 20 deg/s."""
 
 ALTITUDE_GAIN = 0.2
 ALPHA_TIME = 2.0
-"""1/s and s, for a flight path that follows the pitch within two seconds."""
+"""Gain k_h, 1/s, and time constant of the angle of attack, s, for an aircraft whose flight path
+follows the pitch within two seconds."""
 
 TURN_LEAD = 2.4
-"""r leads the bank by this over the frequency of the reference model of r: 1.8 is the lag of the
-model with a damping of 0.9, the rest is that of the sideslip in a roll of the osprey."""
+"""r leads the bank by this number divided by the natural frequency of r in the reference model. 1.8
+is for the lag of the model at a damping of 0.9, the rest for the lag that the sideslip causes when
+the osprey rolls."""
 
 RUDDERLESS = 1.5
-"""Factor on the period without rudder, because no lead makes up for the lag of the turn. The X8
-cycled with the period of an aircraft with rudder, but not with 1.4 times that."""
+"""Factor on the period of path following without a rudder, because then no lead compensates the lag
+of the turn. The X8 had a limit cycle with the period of an aircraft with a rudder, but not with 1.4
+times this period."""
 
 STEEPEST = 0.1
-"""Largest climb and sink rate over the trim speed."""
+"""Largest climb and sink rate by rule, as a fraction of the trim speed."""
 
 
 class SteeringConfig(NodeConfig):
@@ -192,9 +195,9 @@ class SteeringConfig(NodeConfig):
     def climb_limits(self) -> tuple[float, float]:
         """Return the largest climb and sink rate, m/s.
 
-        They are 0.7 and 0.5 of what full throttle gives, a V0 / g, and at most a tenth of V0. The
-        rest of the throttle holds the airspeed. If that is too little, `protection.climb_range`
-        reduces the climb.
+        By rule they are 0.7 and 0.5 of the rates a V0 / g that full throttle gives, and at most a
+        tenth of V0. The rest of the throttle holds the airspeed. If this rest is too small,
+        `protection.climb_range` reduces the climb.
         """
         steepest = STEEPEST * self.speed
         down, up = self.throttle_authority or (math.inf, math.inf)
@@ -211,7 +214,7 @@ class SteeringConfig(NodeConfig):
         climb, sink = self.climb_limits()
         roll = frequency["p"] / 4.0
         pitch = frequency["q"] / 4.0
-        # Without rudder the turn follows the roll.
+        # Without a rudder the turn follows the bank.
         yaw = frequency.get("r", frequency["p"])
         lead = TURN_LEAD / yaw if "r" in frequency else 0.0
         turn = GRAVITY * math.tan(self.bank) / self.speed
@@ -303,9 +306,9 @@ class SteeringConfig(NodeConfig):
     def _vertical(self, climb: float, sink: float) -> VerticalParams:
         """Return the altitude loop.
 
-        If the lag T_L of the flight path is known, T >= T_L and k_h <= 0.4 / T_L. The flight path
-        then has a damping of at least 0.5, and the altitude a gain margin of 2.5 by Routh's
-        criterion.
+        If the lag T_L of the flight path is known, then by rule T >= T_L and k_h <= 0.4 / T_L. The
+        flight path then has a damping of at least 0.5, and the altitude a gain margin of 2.5 by
+        Routh's criterion.
         """
         lag = path_lag(self.stall_speed, self.speed) if self.stall_speed else 0.0
         gain = min(ALTITUDE_GAIN, 0.4 / lag) if lag else ALTITUDE_GAIN

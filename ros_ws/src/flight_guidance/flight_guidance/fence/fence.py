@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fence: zones to stay in and zones to keep out of, kept by the last safe turn.
+"""Fence: zones to stay in and zones to keep out of, enforced by the last safe turn.
 
 Each step predicts the turn at the largest bank to either side, until the course points along the
 way home. Once the better of the two turns comes nearer to the fence than MARGIN of flight, the
-aircraft flies that turn, then home. If it is outside, it flies back inside the shortest way, then
-home. Functions take Python floats, or arrays with an element per aircraft of a fleet.
+aircraft flies that turn, then home. If it is outside, it first flies the shortest way back inside,
+then home. Functions take Python floats, or arrays with an element per aircraft of a fleet.
 """
 
 import math
@@ -25,29 +25,29 @@ from flight_guidance.steering.protection import forward
 __all__ = ["Fence", "Zone", "clearance"]
 
 MARGIN = 0.5
-"""s of flight over ground: the largest cross-track error that guidance claims in wind and
-turbulence."""
+"""Least distance to the fence, in s of flight over ground. It is the largest cross-track error that
+guidance promises in wind and turbulence."""
 
 HOMEWARD = math.radians(20.0)
-"""Angle before the bearing of the way home at which a turn ends."""
+"""A turn ends when the course is this angle short of the bearing of the way home."""
 
 AHEAD = math.radians(60.0)
 """Largest angle between the course and the bearing of the way home at which an aircraft flies along
 the way."""
 
 LEAST_TURN = math.radians(5.0)
-"""Bank of the longest turn that is predicted: 2 min at 20 m/s.
+"""Bank of the longest turn that is predicted, which takes 2 min at 20 m/s.
 
-A turn at a smaller bank is predicted for as long. At a bank of 0, which is the limit at 1.1 V_s and
-below, the prediction is the straight way.
+If the bank is smaller, the prediction still ends after this time. At 1.1 V_s and below the largest
+bank is 0, and the prediction is a straight line.
 """
 
 SHARES = (1.0, 1.0 - LARGEST_SLIP)
-"""Fractions of the coordinated turn for which turns are predicted; the nearer one counts.
+"""Fractions of the coordinated turn for which turns are predicted. The nearer turn counts.
 
-r follows psi' = g tan(phi) / V, but the aircraft flies along chi = psi + beta: a growing sideslip,
-and k_beta beta in r_m, reduce the turn. On the osprey with every entry of A and B off by up to 30 %
-the sideslip takes 0.19, on JSBSim's f16 0.09.
+r follows psi' = g tan(phi) / V, but the aircraft flies along chi = psi + beta. A growing sideslip,
+and k_beta beta in r_m, reduce the turn. The sideslip takes a fraction of 0.19 on the osprey if
+every entry of A and B is off by up to 30 %, and of 0.09 on JSBSim's f16.
 """
 
 
@@ -56,13 +56,13 @@ class Motion(NamedTuple):
 
     north: Scalar  # m
     east: Scalar  # m
-    phi: Scalar  # rad, once a roll that is under way has ended
+    phi: Scalar  # rad, bank after a roll that is under way has ended
     heading: Scalar  # rad, psi + beta
     speed: Scalar  # airspeed, m/s
-    wind: tuple[Scalar, Scalar]  # towards which the air moves: north, east, m/s
+    wind: tuple[Scalar, Scalar]  # velocity of the air: north, east, m/s
     bank: Scalar  # largest bank, rad
     roll_rate: float  # rad/s
-    # s, of the turn behind the commanded bank: half of 1 / k_phi, and `turn_lag`.
+    # s, lag of the turn behind the commanded bank: half of 1 / k_phi, plus `turn_lag`.
     lag: float
 
 
@@ -83,8 +83,8 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
         phi' = p_max after the lag, to the largest bank;  chi' = share g tan(phi) / V;
             [n, e]' = V [cos, sin](chi) + W
 
-    until the course is HOMEWARD before the way home, at the latest after nearly a full turn at
-    LEAST_TURN or more. It is integrated by the trapezoidal rule over POINTS.
+    The turn ends when the course is HOMEWARD short of the way home, at the latest after nearly a
+    full turn at LEAST_TURN or more. It is integrated by the trapezoidal rule over POINTS.
     """
     xp = array_namespace(motion.phi)
     axes = (1,) * np.ndim(motion.phi)
@@ -123,9 +123,9 @@ COURSES = 24
 def room_at_home(fence: Fence, motion: Motion, wind: float) -> float:
     """Compute the least clearance of the better turn from home onto the orbit, m.
 
-    It is the least over COURSES courses in a wind, m/s, from COURSES sides. `motion` is that of the
-    aircraft at home. An aircraft may come over home on any course, and its turn onto the orbit
-    leaves the orbit by up to twice the radius of the turn.
+    It is the least over COURSES courses and COURSES directions of a wind, m/s. `motion` is that of
+    the aircraft at home. An aircraft may come over home on any course, and its turn onto the orbit
+    may lead outside of the orbit by up to twice the radius of the turn.
     """
     angles = np.linspace(0.0, 2.0 * math.pi, COURSES, endpoint=False)
     from_sides = angles if wind else angles[:1]
@@ -165,19 +165,20 @@ class Escape(NamedTuple):
     """Result of `last_safe_turn`."""
 
     action: Any  # FenceAction, or an array of its values
-    begins: Any  # whether the fence begins to act
-    clearance: Any  # m, at present
+    begins: Any  # whether the fence begins to act at this step
+    clearance: Any  # m, present clearance
     predicted: Any  # m, least clearance along the best way
-    course: Any  # rad, over ground: of the way home
+    course: Any  # rad, course of the way home over ground
 
 
 def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
     """Choose the action of the fence after a step, given the action before.
 
     A turn begins when the better turn comes nearer to the fence than MARGIN of flight. It ends
-    HOMEWARD before the way home, or later if the way is not free yet. On the way home a turn begins
-    only if it keeps farther from the fence than the way that is flown, provided that the present
-    clearance is enough. Outside no turn begins: the aircraft flies back until it is MARGIN inside.
+    when the course is HOMEWARD short of the way home, or later if this way is not free yet. On the
+    way home a turn begins only if it keeps a larger clearance than the way, and if both clearances
+    are below MARGIN of flight and below the present clearance. Outside no turn
+    begins: the aircraft flies back until it is MARGIN inside.
     """
     if isinstance(motion.phi, float):
         north, east, phi = map(np.float64, (motion.north, motion.east, motion.phi))

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ways home inside a fence, and back inside from outside.
 
-They are a map of square cells, made once for a fence. It has Dijkstra's shortest ways over cells
-that stay inside, with room for a turn if there is any. Each cell has an aim: a place on the way,
-about a radius ahead. An aircraft comes home if it always flies the course to the aim of the cell
-that it is in.
+The ways are a map of square cells, made once for a fence. It contains the shortest ways over cells
+that stay inside the fence and, where possible, leave room for a turn. Each cell has an aim, a place
+on the way about a radius ahead. An aircraft comes home if it always flies the course to the aim of
+the cell that it is in.
 """
 
 import math
@@ -26,10 +26,10 @@ MOST_CELLS = 100
 second."""
 
 STEPS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
-"""Neighbours of a cell."""
+"""Steps in rows and columns from a cell to its neighbours."""
 
 POINTS = 64
-"""Number of points of a line at which the clearance is taken."""
+"""Number of points of a line, or of a turn, at which the clearance is computed."""
 
 
 class Ways(NamedTuple):
@@ -47,7 +47,7 @@ class Ways(NamedTuple):
     def aim(self, fence: Fence, north: Array, east: Array) -> tuple[Array, Array, Array]:
         """Return the aim of places, north and east, m, and whether the straight way home is free.
 
-        Beside the map the nearest cell counts.
+        For a place outside of the map, the aim is the nearest cell.
         """
         xp = array_namespace(north)
         rows, columns = self.straight.shape
@@ -72,7 +72,7 @@ class Ways(NamedTuple):
 def onto_orbit(fence: Fence, north: Array, east: Array) -> tuple[Array, Array]:
     """Return where the tangent from a place touches the clockwise orbit round home.
 
-    Within the orbit this is a place 1 m further along it.
+    Within the orbit the result is the place 1 m ahead along it.
     """
     xp = array_namespace(north)
     x = fence.home[0] - north
@@ -101,13 +101,14 @@ def line_clearance(
 def ways(fence: Fence) -> Ways:
     """Make the map of a fence.
 
-    A cell is open if a circle of half a cell fits inside the fence there. Ways lead from open cell
-    to open cell if the fitting circles overlap, so that the line between the cells stays inside. A
-    metre of the way costs `radius / clearance`, at least 1.
+    A cell is open if its centre has a clearance of more than half a cell. A way leads from one open
+    cell to the next if their circles of clearance overlap, so that the line between them stays
+    inside. A metre of the way costs `radius / clearance`, at least 1.
 
-    The aim of an open cell is on the way home, about a radius ahead. If there is no way home, it is
-    the roomiest cell around, for a hold. From a closed cell inside, the way leads away from the
-    border. The aim of a cell outside is the nearest cell with a way home.
+    The aim of an open cell is on the way home, about a radius ahead. If there is no way home, the
+    aim leads to a cell with the largest clearance around, where the aircraft holds. From a closed
+    cell inside, the way leads away from the border. The aim of a cell outside is the nearest cell
+    with a way home.
     """
     north, east, cell = _cells(fence)
     room = clearance(fence.zones, north, east)
@@ -175,7 +176,7 @@ def _cells(fence: Fence) -> tuple[FloatArray, FloatArray, float]:
 
 
 def _neighbours(values: FloatArray, fill: float) -> list[FloatArray]:
-    """Return the values of the neighbours at STEPS, and `fill` beside the map."""
+    """Return the values of the neighbours at STEPS, with `fill` outside of the map."""
     padded = np.pad(values, 1, constant_values=fill)
     rows, columns = values.shape
     return [
@@ -200,7 +201,7 @@ def _shortest(
     """Find the weighted length of the shortest way to a seed, and the next cell on the way.
 
     For a seed, or if there is no way, the next cell is the cell itself. The method is that of
-    Bellman and Ford: the lengths of all cells at once, until none becomes shorter.
+    Bellman and Ford: update the lengths of all cells at once, until none becomes shorter.
     """
     lengths = [cell * math.hypot(*step) for step in STEPS]
     costs = _neighbours(cost, math.inf)
@@ -227,7 +228,7 @@ def _shortest(
 def _nearest(
     north: FloatArray, east: FloatArray, to_north: FloatArray, to_east: FloatArray
 ) -> NDArray[np.intp]:
-    """Return the number of the nearest of some places for each place."""
+    """Return for each place the index of the nearest of the other places."""
     rows = [
         np.argmin((to_north - n) ** 2 + (to_east - e) ** 2)
         for n, e in zip(north, east, strict=True)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Zones of a fence, and the distance from the fence.
 
-Functions take arrays, of NumPy or of JAX, of any shape.
+The functions take NumPy or JAX arrays of any shape.
 """
 
 import math
@@ -15,12 +15,12 @@ import numpy as np
 from flight_core.vectors import Array, FloatArray, array_namespace
 
 CHORDS = 180
-"""Chords that replace a circle among several groups. They depart from it by 0.15 thousandths of the
-radius."""
+"""Number of chords that replace a circle if there are several groups. They are off the circle by at
+most 0.15 thousandths of the radius."""
 
 SEAM = 1e-3
-"""m. Two groups that share a border are one region; a gap between them is wider than this. A
-position in m has more digits."""
+"""Groups with a gap of at most this between them share a border and are one region, m. The rounding
+of positions is smaller."""
 
 
 class Zone(NamedTuple):
@@ -28,9 +28,9 @@ class Zone(NamedTuple):
 
     north: tuple[float, ...]  # m
     east: tuple[float, ...]  # m
-    radius: float = 0.0  # m, 0 of a polygon
+    radius: float = 0.0  # m, 0 for a polygon
     exclude: bool = False  # whether the aircraft must keep out
-    group: int | None = None  # of a zone to stay in; None for a group of its own
+    group: int | None = None  # number of the group of a zone to stay in; None: its own group
 
 
 class Fence(NamedTuple):
@@ -41,7 +41,7 @@ class Fence(NamedTuple):
 
     zones: tuple[Zone, ...]
     home: tuple[float, float] = (0.0, 0.0)  # north, east, m
-    radius: float = 0.0  # of the orbit round home, m
+    radius: float = 0.0  # m, radius of the orbit round home
 
 
 def inside(zone: Zone, north: Array, east: Array) -> Array:
@@ -87,7 +87,7 @@ def clearance(zones: tuple[Zone, ...], north: Array, east: Array) -> Array:
     if not groups:
         return reduce(xp.minimum, out)
     stay = _deepest(groups, north, east)
-    # A border inside another group is no border.
+    # A border of one group that lies inside another group does not count.
     if len(groups) > 1:
         stay = xp.where(
             stay >= 0.0, xp.maximum(stay, _distance(*_border(groups), north, east)), stay
@@ -124,7 +124,7 @@ def _border(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Compute the border of all groups together: starts and lengths of edges, m, shapes (M,).
 
-    They are to the north and to the east. Each edge of a zone is cut where other edges cross or
+    All have a north and an east part. Each edge of a zone is cut where other edges cross or
     touch it. A piece belongs to the border if only one side of it is inside.
     """
     groups = tuple(tuple(map(_polygon, group)) for group in groups)

@@ -25,7 +25,7 @@ from flight_guidance.steering import path
 from flight_guidance.steering.path import Line, Point, Route, Side
 
 FLARE = 5.0
-"""s of sink on the glide path, as height of the flare. The flight path lags the pitch by 2 s."""
+"""Height of the flare, in s of sink on the glide path. The flight path lags the pitch by 2 s."""
 
 STRAIGHT_DEG = 1.0
 STRAIGHT = math.radians(STRAIGHT_DEG)
@@ -35,26 +35,27 @@ WING_LOW = math.radians(5.0)
 """Largest bank near the ground, rad: a low wing of 2.5 m per metre of height touches at 22 deg."""
 
 YAW_GAIN = 1.0
-"""1/s, from the angle between the nose and the line to the yaw rate: 2 s take the crab out."""
+"""Gain from the angle between the nose and the line to the yaw rate, 1/s. In 2 s the crab angle is
+gone."""
 
 FASTEST_YAW = math.radians(6.0)
-"""rad/s."""
+"""Largest yaw rate of the landing, rad/s."""
 
 
 class Landing(NamedTuple):
     """A landing at the end of a line of a route."""
 
-    leg: int  # the line
-    around: int  # the line of a go-around
-    place: Point  # its end, on the ground
-    ground: float  # m, altitude there
-    course: float  # rad
-    slope: float  # of the glide path, below 0
+    leg: int  # number of the line that is the glide path
+    around: int  # number of the line that a go-around flies
+    place: Point  # end of the glide path, on the ground
+    ground: float  # m, altitude of this place
+    course: float  # rad, course of the glide path
+    slope: float  # slope of the glide path, 1, below 0
     flare: float  # m, height at which the flare begins
-    sink: float  # m/s, at the touch
+    sink: float  # m/s, sink rate at touchdown
     decrab: float  # m, height below which the nose turns along the line
-    V: float  # m/s, from the flare on
-    box: Zone | None  # where the aircraft is to touch; None: anywhere
+    V: float  # m/s, airspeed from the flare on
+    box: Zone | None  # where the aircraft must touch down; None: anywhere
 
 
 def landing_at(
@@ -66,7 +67,7 @@ def landing_at(
     """
     key = f"landing.waypoint {section.waypoint}"
     lines = [k for k, leg in enumerate(route.legs) if isinstance(leg, Line)]
-    # A fillet of a corner takes so much of the line.
+    # The fillet of the largest permitted corner cuts off this much of the line, m.
     fillet = max(route.radius * math.tan(STRAIGHT / 2.0), 1.0)
     pairs = [
         (leg, around)
@@ -98,7 +99,7 @@ def landing_at(
 def flare_climb(height: float, path_sink: float, landing: Landing) -> float:
     """Compute the climb rate commanded in the flare, m/s.
 
-    It goes from the rate of the glide path to -sink in proportion to the height, m.
+    In proportion to the height, m, it changes from the rate of the glide path to -sink.
     """
     share = min(max(height / landing.flare, 0.0), 1.0)
     return -(landing.sink + max(path_sink - landing.sink, 0.0) * share)
@@ -119,7 +120,7 @@ class Lander:
         self._flares = False
 
     def leave(self) -> None:
-        """Leave the landing to commands of an operator."""
+        """Stop the flare, because the operator or the program commands something else."""
         self._flares = False
 
     def commands(
@@ -150,7 +151,7 @@ class Lander:
         return commands | self._along_line(pose, math.sin(course - landing.course) * ground_speed)
 
     def _misses(self, height: float, path_sink: float, pose: Mapping[str, float]) -> bool:
-        """Return whether the aircraft would touch outside of the box."""
+        """Return whether the aircraft would touch down outside of the box."""
         if self._landing.box is None:
             return False
         time = time_to_touch(height, path_sink, self._landing)
@@ -160,13 +161,13 @@ class Lander:
         return float(clearance((self._landing.box,), north, east)[0]) < 0.0
 
     def _go_around(self, pose: Mapping[str, float], route: Route) -> dict[str, float]:
-        """Fly the line of a go-around, from its nearest point on."""
+        """Return the commands to fly the line of the go-around, from its nearest point on."""
         leg = self._landing.around
         along = path.nearest(route.legs[leg], (pose["north"], pose["east"]))
         return {"leg": float(leg), "along": along}
 
     def _along_line(self, pose: Mapping[str, float], drift: float) -> dict[str, float]:
-        """Point the nose along the line, and lower the upwind wing against the drift, m/s.
+        """Return the commands that turn the nose along the line and lower the upwind wing.
 
         r = k (course - psi),  g tan(phi) = -w^2 e - 2 zeta w drift,  w = 2 pi / P
         """

@@ -40,7 +40,7 @@ def lateral_bank(
     route: Route | None,
     params: GuidanceParams,
 ) -> tuple[float, PathError, float]:
-    """Compute the bank of the lateral mode, rad, with the error beside the path.
+    """Compute the bank of the lateral mode, rad, with the error from the path.
 
     Also returns the distance to the end of the leg, m.
     """
@@ -136,10 +136,10 @@ def follow(
 ) -> Scalar:
     """Compute the bank that follows a path, rad, before protection.
 
-    `entry` is the curvature of the following leg at its start, 1/m. It replaces the curvature of
-    the leg early, by the lag of the bank: as soon as `is_entered` holds for the position a mean lag
-    ahead. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi): a ramp,
-    then the loop of the bank. Without rudder, the lag of the turn behind the bank is added.
+    `entry` is the curvature of the following leg at its start, 1/m. Because the bank lags, it
+    replaces the curvature of the leg early: as soon as `is_entered` is true for the position a mean
+    lag ahead. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi), for the
+    ramp and for the loop of the bank. `turn_lag`, of the turn behind the bank, is added.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)
@@ -161,9 +161,10 @@ def escaping_bank(
     speed: Scalar,
     params: GuidanceParams,
 ) -> Scalar:
-    """Compute the bank for the action of the fence, rad, in place of `bank` of the lateral mode.
+    """Compute the bank for the action of the fence, rad.
 
-    It is the bank of a turn, or of a course.
+    It is the bank of a turn, or of a course home. If the fence does not act, it is `bank`, that of
+    the lateral mode.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)

@@ -18,20 +18,20 @@ from flight_guidance.steering import path
 from flight_guidance.steering.path import Arc, Leg, Loiter, Point, Route, Side
 
 EXIT = 0.5
-"""s of flight beyond the end of a circle within which an aircraft leaves it; later it flies another
-turn."""
+"""An aircraft leaves a circle up to this many seconds of flight beyond its end. Later it flies
+another turn."""
 
 
 LEVEL = 5.0
-"""m, largest distance from the altitude at which an aircraft may leave a loiter."""
+"""Largest difference from the altitude of the leg at which an aircraft may leave a loiter, m."""
 
 
 def along_route(
     state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
 ) -> tuple[GuidanceState, float]:
-    """Put the state on the leg once it is joined, and return the distance missed by, m.
+    """Put the state on the leg once it is joined, and on the next leg once it is passed.
 
-    The next leg begins once the leg is passed.
+    Also returns the distance by which the end of the leg is missed, m, else 0.
     """
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
@@ -49,7 +49,7 @@ def along_route(
         return on_leg(state, state.leg + 1, route) if ends else state, 0.0
     if leg.end is None or not path.is_passed(leg, position):
         return state, 0.0
-    # After a sharp corner, the next leg is joined too.
+    # After a sharp corner, the aircraft must join the next leg by a circle.
     distance = math.dist(leg.end, position)
     return joining_state(
         state, state.leg + 1, 0.0, pose, route
@@ -61,7 +61,7 @@ def _loitering(
 ) -> GuidanceState:
     """Update the fraction of a loiter that is flown.
 
-    It counts once the aircraft is within 1 s of flight of the circle.
+    The loiter begins when the aircraft is within 1 s of flight of the circle.
     """
     error, (course, ground_speed) = (
         path.error(leg, (pose["north"], pose["east"])),
@@ -82,7 +82,7 @@ def has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) 
 
 
 def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
-    """Return whether a position is beyond the end of a circle, on the course there.
+    """Return whether a position is beyond the end of a circle, and the course fits.
 
     `reach` is the largest distance from the end, m.
     """
@@ -102,10 +102,10 @@ def with_commands(
 ) -> tuple[GuidanceState, float]:
     """Put the modes and commands in force.
 
-    If a leg is passed, those of the next leg by `follow` come first; then the commands given
-    follow. `join` makes the state on the way to a leg, from a distance along it. A lateral command
-    ends the leg, because it may come with a new route, and so with new legs. Also returns the
-    distance from the end of a leg that ends here and is missed, m.
+    If a leg is passed, `follow` first sets those of the next leg; then the given commands are set.
+    `join` returns the state on the way to a point of a leg. With a lateral command the leg is not
+    followed any more, because the command may come with a new route and so with new legs. Also
+    returns the distance by which the end of a leg is missed at this step, m.
     """
     lateral_names = channels.lateral.keys() & commands.keys()
     miss = 0.0
@@ -149,7 +149,7 @@ def on_profile(
 ) -> GuidanceState:
     """Set the altitude and the climb rate of the leg.
 
-    They are those at the nearest point, or where the aircraft joins the leg.
+    They are those at the nearest point of the leg, or at the point where the aircraft joins it.
     """
     flies = (
         state.mode is GuidanceMode.ENGAGED
@@ -180,7 +180,7 @@ def joining_state(
     """
     state = on_leg(state, leg, route)
     leg_path = route.legs[leg]
-    # The law for circles leads to an orbit from afar.
+    # Path following leads to an orbit from afar, without a joining circle.
     if path.is_orbit(leg_path):
         return state
     start, course = route.start(leg, along)
@@ -189,7 +189,7 @@ def joining_state(
     side = Side(
         int(path.joining(start, course, route.radius, route.near(leg), position, course_flown))
     )
-    # The joining circle is that of the arc itself.
+    # For an arc, the joining circle is the circle of the arc itself.
     is_near = side is Side.NONE
     if isinstance(leg_path, Arc) and not is_near:
         side = Side.RIGHT if leg_path.radius > 0.0 else Side.LEFT

@@ -51,8 +51,8 @@ from flight_guidance.steering.vertical import (
 from flight_guidance.steering.wind import Wind, wind_estimate, wind_of
 
 LONGEST_LEAD = 0.5
-"""s. Largest age of a pose whose attitude is still brought forward to the present: the rates change
-within a second."""
+"""Longest time over which the attitude of a pose is brought forward to the present, s: the rates
+change within a second."""
 
 
 def holding(
@@ -60,7 +60,7 @@ def holding(
 ) -> GuidanceState:
     """Return the state before the first step, at t.
 
-    The present heading, altitude and airspeed are held.
+    It holds the present heading, altitude and airspeed.
     """
     alpha = pose["theta"] - path_angle(pose["climb"], speed)
     return GuidanceState(
@@ -84,7 +84,7 @@ def holding(
 
 
 def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -> GuidanceState:
-    """Return the state before a step; if the filters begin, they have the measured values."""
+    """Return the state before a step, with the measured values if the filters start again."""
     if state is not None and inputs.begin is Begin.NO:
         return state
     holding_state = holding(
@@ -111,7 +111,7 @@ def true_airspeed(V: Scalar, params: GuidanceParams) -> Scalar:
 
 
 def yaw_rate(y: Mapping[str, Scalar], phi: Scalar, theta: Scalar, speed: Scalar) -> Scalar:
-    """Return the measured r, or that of a coordinated turn without a rudder, rad/s."""
+    """Return the measured r, rad/s; without a rudder that of a coordinated turn."""
     return y["r"] if "r" in y else turn_rate(phi, theta, 0.0, speed)
 
 
@@ -180,7 +180,7 @@ def _wanted_rates(
     rates = body_rates(
         phi_c, theta_c, state.phi, state.theta, r, 0.0 if flat else beta, speed, attitude
     )
-    # Here the sideslip is wanted.
+    # In this case the sideslip is intended.
     if flat:
         rates = rates._replace(r=rates.r + state.target.r)
     if state.mode is GuidanceMode.POSE_LOST:
@@ -201,8 +201,8 @@ def command(
 ) -> tuple[GuidanceState, StepCommands]:
     """Apply protection and compute u_m of `step`, from the bank of the lateral mode, rad.
 
-    `t_ns` of the state stays. The values may be arrays with an element per aircraft of a fleet; the
-    modes hold for the whole fleet.
+    `t_ns` of the state stays. The values may be arrays with an element per aircraft of a fleet; all
+    aircraft then have the same modes.
     """
     speed = true_airspeed(y["V"], params)
     limits = params.limits
@@ -272,10 +272,10 @@ def _with_estimates(
 def _with_attitude(
     state: GuidanceState, inputs: Inputs, dt: float, params: GuidanceParams
 ) -> GuidanceState:
-    """Update mode and attitude, from pose or by dead reckoning."""
+    """Update the mode and the attitude, from pose or by dead reckoning."""
     pose = dict(zip(POSE, inputs.pose, strict=True))
     if inputs.pose_age_ns <= params.max_age_ns:
-        # The aircraft may be anywhere by now.
+        # While pose was lost, the aircraft may have flown anywhere.
         if state.mode is GuidanceMode.POSE_LOST:
             if params.home.after_loss:
                 after_loss = home(pose, params)
@@ -315,7 +315,7 @@ def motion_of(
     speed: Scalar,
     params: GuidanceParams,
 ) -> Motion:
-    """Return what the fence predicts a turn from.
+    """Return the motion from which the fence predicts a turn.
 
     A roll that is under way continues for the lag of the bank, 1 / (2 k_phi).
     """
@@ -388,7 +388,7 @@ def _climb(
 ) -> tuple[Scalar, Any]:
     """Return the commanded climb rate, m/s, and whether protection limits it."""
     if state.vertical is Vertical.THETA:
-        # This is the start value for the modes CLIMB and ALTITUDE.
+        # In the mode THETA this is only the start value for the modes CLIMB and ALTITUDE.
         return pose["climb"], False
     vertical = params.vertical
     target = state.target
@@ -419,7 +419,7 @@ def _pitch_within(
 ) -> Scalar:
     """Return the commanded pitch, rad, within the range that the altitudes allow.
 
-    The range is that of the climb rates to the least and the largest altitude.
+    It is the range of pitch for the climb rates of `_climb_within`.
     """
     if not any(map(math.isfinite, (params.limits.lowest, params.limits.highest))):
         return state.target.theta
@@ -431,9 +431,9 @@ def _pitch_within(
 
 
 def _climb_within(altitude: Scalar, params: GuidanceParams) -> tuple[Scalar, Scalar]:
-    """Return least and largest climb rate for the least and the largest altitude, m/s.
+    """Return the least and the largest climb rate that the altitude limits allow, m/s.
 
-    They are the rates of `climb_for` to these bounds.
+    They are the rates of `climb_for` towards these limits.
     """
     vertical = params.vertical
     limits = params.limits

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The targets that an operator may command, to hold and to fly home.
+"""The targets that an operator may command, and those to hold and to fly home.
 
-Their limits are those of the parameters and of a learned model.
+Their limits follow from the parameters and from a learned model.
 """
 
 import math
@@ -23,11 +23,12 @@ from flight_guidance.steering.path import Route
 def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams:
     """Lower the limits of the parameters to those of a model learned in flight.
 
-    The rules are those of an airplane; the limits of a multicopter are its own. Climb and sink
+    The rules hold for an airplane; the limits of a multicopter stay. Climb and sink
     follow from the throttle, and the roll rate from the aileron, by the rules of the parameters.
     Reversals of the bank fit into the period of path following, and orbits have the radius for the
-    bank. If p has no aileron, or ignores its command, the largest bank is YAWED_BANK. Without a
-    throttle there is no climb, and the sink stays: pitch then flies the airspeed at the floor.
+    bank. If the aileron has no effect, or p ignores its command, the largest bank is YAWED_BANK.
+    If the throttle has no effect, there is no climb, and the limit of the sink stays: the pitch
+    then controls the airspeed at the floor.
     """
     if authority == Authority() or params.multicopter is not None:
         return params
@@ -45,7 +46,7 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
     if rolls:
         rate = min(rate, reach.roll_rate(authority.p, 4.0 * attitude.k_phi))
         bank = limits.bank * min(1.0, params.path.period / reach.least_period(limits.bank, rate))
-    # The airspeed flies the climb, so its command moves by the bandwidth of V for each m/s.
+    # The airspeed controls the climb, so its command may change at the bandwidth of V for each m/s.
     if "q" in dead:
         faster = tuple(
             4.0 * rate if name == "V" else rate
@@ -63,9 +64,9 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
 
 
 def reach_sentence(params: GuidanceParams, authority: Authority) -> str | None:
-    """Write the limits that follow from what is learned in flight, in a sentence.
+    """Write the limits that follow from what is learned in flight, in words.
 
-    Returns None if the aircraft's own limits are lower.
+    Returns None if the limits of the parameters are lower.
     """
     now = within_reach(params, authority)
     parts = [
@@ -94,7 +95,7 @@ def reach_sentence(params: GuidanceParams, authority: Authority) -> str | None:
 
 
 DEAD = {"p": "roll rate", "q": "pitch rate"}
-"""Commands that end where an output has no input with an effect."""
+"""Commands that are no longer given if the input of the output has no effect, by output."""
 
 
 ANGLES = ("phi", "heading", "course", "theta", "r")
@@ -113,8 +114,9 @@ def read_target(
 ) -> None:
     """Refuse commands that guidance cannot fly, by ChannelError.
 
-    These are commands of no mode or of two modes, of no leg of the route, or beyond the limits.
-    With `degrees`, the sentence gives angles in degrees, as an operator types them; otherwise in
+    These are commands that belong to no mode or to two modes, that name a leg which the route does
+    not have, or that are beyond the limits.
+    With `degrees`, the message gives angles in degrees, as an operator types them; otherwise in
     rad.
     """
     channels = params.channels
@@ -218,10 +220,10 @@ def permitted_speed(speed: Scalar, params: GuidanceParams) -> Scalar:
 
 
 def permitted(commands: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
-    """Return commands of a pose, each limited to what `read_target` takes.
+    """Return commands made from a pose, each limited to what `read_target` accepts.
 
-    An aircraft that holds or flies home may be above its highest altitude; it then descends to
-    that.
+    An aircraft that holds or flies home may be above its highest altitude. It then descends to
+    this altitude.
     """
     limits = params.limits
     inside = {name: min(max(value, -LARGEST), LARGEST) for name, value in commands.items()}
@@ -233,7 +235,7 @@ def permitted(commands: Mapping[str, float], params: GuidanceParams) -> dict[str
 def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
     """Return commands to orbit home clockwise on the least radius, or to hover there.
 
-    A multicopter hovers. The altitude is that of home, or the present one.
+    A multicopter hovers. The altitude is that of home; if home has none, it is the present one.
     """
     place = params.home
     altitude = pose["altitude"] if place.altitude is None else place.altitude

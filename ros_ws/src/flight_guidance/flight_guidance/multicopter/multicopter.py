@@ -47,30 +47,30 @@ from flight_guidance.steering.path import Arc, Point, Route, Side
 from flight_guidance.steering.vertical import VerticalParams, climb_for, slewed
 
 NEAR = 0.5
-"""s of flight from a place within which the place counts as reached; at least 0.5 m."""
+"""A place counts as reached within this many seconds of flight, and within 0.5 m."""
 
 ACROSS = math.sin(math.radians(60.0))
 """Largest fraction of the speed towards a path, as in the guidance of airplanes."""
 
 WIND_TIME = 3.0
-"""T, s: long against a leg's end, short against a leg."""
+"""T, time constant of the estimated wind, s: longer than the end of a leg, shorter than a leg."""
 
 LONGEST_LEAD = 0.5
-"""s, largest age of a pose whose attitude is still brought forward to the present."""
+"""Longest time over which the attitude of a pose is brought forward to the present, s."""
 
 
 class MotionCommand(NamedTuple):
-    """What a lateral mode asks for. Complex numbers are vectors: north and i east."""
+    """The motion that a lateral mode commands; complex numbers are vectors, north + i east."""
 
     velocity: complex = 0.0  # m/s, over ground
-    ahead: complex = 0.0  # m/s, the velocity once the tilt has followed
-    acceleration: complex = 0.0  # m/s^2, of the way itself
+    ahead: complex = 0.0  # m/s, velocity at the time when the tilt has followed
+    acceleration: complex = 0.0  # m/s^2, acceleration of the path itself
     error: PathError = PathError(0.0, 0.0, 0.0)
     to_go: float = 0.0  # m
 
 
 def _gains(params: GuidanceParams) -> MulticopterParams:
-    assert params.multicopter is not None  # noqa: S101 - `guidance.step` has looked
+    assert params.multicopter is not None  # noqa: S101 - `guidance.step` has checked it
     return params.multicopter
 
 
@@ -99,7 +99,7 @@ def _parts(vector: complex) -> tuple[float, float]:
 
 
 def _stop(pose: Mapping[str, float], gains: MulticopterParams) -> complex:
-    """Return where the aircraft stops, m."""
+    """Return the place where the aircraft can stop, m."""
     v = _velocity(pose)
     return _place(pose) + (gains.lead + abs(v) / (2.0 * gains.braking)) * v
 
@@ -117,10 +117,10 @@ def step(
     stale, the thrust is vertical; after `hold` the rates are 0 until pose returns. 2. The commands
     are those of the next leg once a leg ends, then those given. 3. The fence acts on the place
     where the aircraft stops: if it is not inside, the aircraft flies the way home. 4. W, the wind,
-    follows by `_with_wind`: what holds the aircraft back is drag in a wind. 5. The climb rate
+    follows by `_with_wind`: an unexplained deceleration is drag in a wind. 5. The climb rate
     follows from the altitude, as for an airplane.
 
-    a_ff and v_ff are those of the path `lead` ahead, because the tilt comes later by that much.
+    a_ff and v_ff are those of the path `lead` ahead, because the tilt follows later by this time.
     """
     gains = _gains(params)
     pose = dict(zip(POSE, inputs.pose, strict=True))
@@ -134,7 +134,7 @@ def step(
         route,
         params.channels,
         lambda state, route: _along_route(state, pose, dt, route),
-        # It flies straight to the leg: either side says that it is on the way.
+        # The aircraft flies straight to the leg. Either side would say that it is on the way.
         lambda state, leg, _, route: on_leg(state, leg, route)._replace(joining=Side.RIGHT),
     )
     state = _with_wind(state, pose, dt, params)
@@ -184,7 +184,7 @@ def _begin(
 ) -> GuidanceState:
     """Return the state before a step.
 
-    If the filters begin, it is that of a hover where the aircraft stops.
+    If the filters start again, it is the state of a hover at the place where the aircraft stops.
     """
     if state is not None and inputs.begin is Begin.NO:
         return state
@@ -218,9 +218,9 @@ def _with_attitude(
     dt: float,
     params: GuidanceParams,
 ) -> GuidanceState:
-    """Update mode and attitude, from pose or by dead reckoning.
+    """Update the mode and the attitude, from pose or by dead reckoning.
 
-    A pose that returns after a loss begins a hover, or the way home.
+    When pose returns after a loss, the aircraft hovers or flies home.
     """
     age_ns = inputs.pose_age_ns
     since = dt
@@ -255,7 +255,7 @@ def _is_near(state: GuidanceState, pose: Mapping[str, float], place: Point) -> b
 def _stops(route: Route, number: int) -> bool:
     """Return whether an aircraft stops at the end of a leg.
 
-    It stops before a hover, and if a corner has no fillet.
+    It stops if the next leg is a hover, or if the corner has no fillet.
     """
     following = next(iter(route.legs[number + 1 :]), None)
     hovers = following is not None and path.is_orbit(following)
@@ -265,9 +265,10 @@ def _stops(route: Route, number: int) -> bool:
 def _along_route(
     state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
 ) -> tuple[GuidanceState, float]:
-    """Put the state on the leg once its start is reached, and return the distance missed by, m.
+    """Put the state on the leg once its start is reached, and on the next leg once it ends.
 
-    The next leg begins once the leg is passed or the wait there is over.
+    A leg ends when it is passed, or when the wait there is over. Also returns the distance by which
+    the end of the leg is missed, m, else 0.
     """
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
@@ -296,7 +297,7 @@ def _within_fence(
 ) -> tuple[GuidanceState, Escape]:
     """Apply the action of the fence to the state; home becomes the target once the action begins.
 
-    It begins when the way to a stop comes nearer to the fence than MARGIN of flight.
+    It begins when the stopping distance comes nearer to the fence than MARGIN of flight.
     """
     fence = params.fence
     if fence is None or state.mode is not GuidanceMode.ENGAGED:
@@ -322,7 +323,7 @@ def _within_fence(
 
 
 def _action(fence: Fence, position: tuple[Any, Any], now: float) -> FenceAction:
-    """Choose the action of a fence that acts: home in a straight line or around, or back inside."""
+    """Choose the action of the fence: home in a straight line, home around, or back inside."""
     if now < 0.0:
         return FenceAction.BACK
     is_straight = bool(ways(fence).aim(fence, *position)[2])
@@ -336,7 +337,7 @@ def _wanted(
     escape: Escape,
     params: GuidanceParams,
 ) -> MotionCommand:
-    """Return what the lateral mode asks for, or instead the way around a fence."""
+    """Return the motion that the lateral mode commands, or else the way around a fence."""
     gains = _gains(params)
     target = state.target
     place = (target.north, target.east)
@@ -360,7 +361,7 @@ def _wanted(
 def _approach(distance: float, speed: float, gains: MulticopterParams) -> tuple[float, float]:
     """Return the speed towards a place at a distance, m/s, and its slope over distance, 1/s.
 
-    It is `climb_for` with `k_p`, falling by `braking`.
+    It follows by `climb_for` with the gain `k_p` and the deceleration `braking`.
     """
     params = VerticalParams(
         k_h=gains.k_p, acceleration=2.0 * gains.braking, climb=speed, sink=speed, alpha_time=0.0
@@ -373,7 +374,7 @@ def _approach(distance: float, speed: float, gains: MulticopterParams) -> tuple[
 def _to_place(
     place: complex, state: GuidanceState, pose: Mapping[str, float], gains: MulticopterParams
 ) -> MotionCommand:
-    """Fly towards a place, with the deceleration of the way."""
+    """Return the motion towards a place, with the deceleration on the way."""
     distance, course = cmath.polar(place - _place(pose))
     speed, slope = _approach(distance, state.V_c, gains)
     velocity = cmath.rect(speed, course)
@@ -391,7 +392,7 @@ def _to_place(
 def _on_path(
     state: GuidanceState, pose: Mapping[str, float], route: Route, gains: MulticopterParams
 ) -> MotionCommand:
-    """Fly along a line or a fillet of the route."""
+    """Return the motion along a line or a fillet of the route."""
     leg = route.legs[state.leg]
     position = (pose["north"], pose["east"])
     error = path.error(leg, position)
@@ -401,7 +402,7 @@ def _on_path(
     if _stops(route, state.leg):
         speed, slope = _approach(max(to_go, 0.0), speed, gains)
     across = -clip(gains.k_p * error.e, ACROSS * speed)
-    velocity = complex(math.sqrt(speed**2 - across**2), across)  # along, and i to the right
+    velocity = complex(math.sqrt(speed**2 - across**2), across)  # along the path + i to the right
     later = _parts(_place(pose) + gains.lead * _velocity(pose))
     entered_leg = leg
     if path.is_passed(leg, later) and not _stops(route, state.leg):
@@ -432,8 +433,8 @@ def _with_wind(
         W' = (v' - (g + d climb) tan(tilt) + d (v - W)) / (d T)
 
     This is a low-pass of the wind that explains the acceleration of the pose. The tilt is that of
-    the pose, so commands that are not flown do not move the wind. W stays within what the largest
-    tilt can hold.
+    the pose, so commands that are not flown do not change the wind. W stays within the wind in
+    which the largest tilt can still hover.
     """
     gains = _gains(params)
     v = _velocity(pose)
@@ -486,7 +487,7 @@ def _attitude_for(
 def _with_climb(
     state: GuidanceState, pose: Mapping[str, float], dt: float, params: GuidanceParams
 ) -> tuple[GuidanceState, bool]:
-    """Command a climb rate, and return whether the altitudes limit it."""
+    """Set the commanded climb rate, and return whether the altitude limits reduce it."""
     vertical_params = params.vertical
     climb = 0.0
     bounded_climb = 0.0
@@ -507,7 +508,7 @@ def _rates(
 ) -> dict[str, float]:
     """Compute the body rates that turn the thrust to its direction by the shortest way, rad/s.
 
-    They turn the heading at its own rate, by the inverse of `kinematics.heading_rate`:
+    r turns the heading at the rate for it, by the inverse of `kinematics.heading_rate`:
 
         [p, q] = k_tilt angle [d_y, -d_x] / sqrt(d_x^2 + d_y^2),  angle = atan2(sqrt(..), -d_z)
 

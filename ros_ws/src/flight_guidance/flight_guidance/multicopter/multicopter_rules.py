@@ -15,12 +15,12 @@ from flight_guidance.steering import path
 from flight_guidance.steering.path import Arc, Leg, Loiter, Route
 
 BRAKING = 0.3
-"""Fraction of the acceleration at the largest tilt that is used in a fillet and for a stop: the
-drag and the errors take the rest."""
+"""Fraction of the acceleration at the largest tilt that is used in a fillet and for a stop. The
+rest is left for drag and errors."""
 
 CLIMB = 0.5
 SINK = 0.3
-"""Largest climb and sink rate over the speed if the parameters have none."""
+"""Largest climb and sink rate as fractions of the speed, if the parameters have none."""
 
 
 def gains(
@@ -31,9 +31,9 @@ def gains(
         k_tilt = w / 4,  k_v = k_tilt / 3,  k_p = k_v / 2,  lead = 1 / k_tilt,  k_psi = w_r / 4,
             braking = BRAKING g tan(bank)
 
-    with the lesser w of p and q. With a reference of damping 0.9 the tilt has a phase margin of 65
-    deg; velocity and place together have 44 deg and a largest sensitivity of 1.5. The lead is the
-    delay of the tilt behind a ramp.
+    w is the lesser frequency of p and q. With a reference of damping 0.9 the tilt has a phase
+    margin of 65 deg; velocity and place together have 44 deg and a largest sensitivity of 1.5. The
+    lead is the delay of the tilt behind a ramp.
     """
     w = min(frequency["p"], frequency["q"])
     k_tilt = w / 4.0
@@ -57,8 +57,8 @@ def route_through(
 ) -> Route:
     """Plan lines with fillets through waypoints, with a hover at the last one and at each `wait`.
 
-    The aircraft reaches a hover by a line without a fillet; its leg is a circle with the radius of
-    the fillets within which the place counts as reached. Altitudes change along the lines.
+    The aircraft reaches a hover by a line without a fillet. The leg of a hover is a circle with the
+    radius of the fillets; its centre is the place of the hover. Altitudes change along the lines.
     `braking`, m/s^2, bounds the curvature. Raises ParameterError for a waypoint beyond the bounds,
     and for circles, which a multicopter does not fly.
     """

@@ -12,7 +12,7 @@ from flight_guidance.routes.route_places import Above, HomePlace, Place, Places
 
 FRAMES = {0: Above.SEA, 5: Above.SEA, 3: Above.HOME, 6: Above.HOME}  # MAV_FRAME
 TERRAIN = (10, 11)
-# MAV_CMD, and SPEED_TYPE
+# values of MAV_CMD, and of SPEED_TYPE (AIRSPEED)
 WAYPOINT = 16
 LAND = 21
 SPLINE = 82
@@ -57,7 +57,7 @@ MEANINGS = {
     179: "heights above the home stay above the first home, and not above that of DO_SET_HOME",
     601: "DO_JUMP_TAG repeats items, which are flown once here",
 }
-# Commands after which an autopilot flies no item: a loiter without end, the return, the landings.
+# Commands after which an autopilot flies no other item: endless loiter, return, landings.
 LAST = (UNLIMITED, 20, LAND, 85)
 OTHER_WAYS = (34, 35, 36, 94)  # other ways to a place, neither a line nor a loiter
 
@@ -69,20 +69,20 @@ class Item:
     name: str  # "NAV_LAND (item 5)"
     frame: int
     command: int
-    params: Sequence[Any]  # seven
+    params: Sequence[Any]  # its seven parameters
     number: Any  # number by which a DO_JUMP names the item
-    goes_on: bool = True  # autocontinue: without it an autopilot waits for the pilot after the item
+    goes_on: bool = True  # autocontinue; if false, an autopilot waits for the pilot after the item
 
 
 def named(command: int, number: int) -> str:
     """Name a command with the number of its item.
 
-    pymavlink has the name if COMMANDS lacks the command.
+    If COMMANDS lacks the command, the name is that of pymavlink.
     """
     name = COMMANDS.get(command, f"MAV_CMD {command}")
     if command not in COMMANDS:
         with suppress(ModuleNotFoundError):
-            from pymavlink.dialects.v20 import ardupilotmega  # noqa: PLC0415 - an extra
+            from pymavlink.dialects.v20 import ardupilotmega  # noqa: PLC0415 - an optional dependency
 
             enum_entry = ardupilotmega.enums["MAV_CMD"].get(command)
             if enum_entry is not None:
@@ -96,9 +96,10 @@ MOST_ITEMS = 20_000
 def _in_order(key: str, items: Sequence[Item]) -> list[int]:
     """Return the positions of the items in the order of flight, up to an item of LAST.
 
-    Jumps are followed. A DO_JUMP leads to an item as often as it says, with a negative number for
-    ever; a jump back for ever ends the order. Raises ParameterError for a jump to no item, for a
-    loop inside a loop, which PX4 begins again but ArduPilot does not, and for more than MOST_ITEMS.
+    Jumps are followed. A DO_JUMP leads to its item as often as it says, or for ever if the number
+    is negative. An endless jump back ends the order. Raises ParameterError for a jump to no item,
+    for a loop inside a loop, which PX4 starts again but ArduPilot does not, and for more than
+    MOST_ITEMS steps.
     """
     places = {items[k].number: k for k in reversed(range(len(items)))}
     repetitions: dict[int, float] = {}  # how often each jump has been repeated
@@ -152,7 +153,7 @@ def mission_route(
     """
     places: list[Place] = []
     route_items: set[int] = set()
-    circles: list[str] = []  # of a radius of their own
+    circles: list[str] = []  # circles with their own radius
     speed: Any = None
     for k in _in_order(key, items):
         item = items[k]
@@ -167,7 +168,7 @@ def mission_route(
             place = _mission_place(key, item, speed, before)._replace(
                 **loiter.get(item.command, {})
             )
-            # MAVLink: a negative radius flies the circle counter-clockwise, 0 is the default
+            # In MAVLink a negative radius means counter-clockwise, and 0 the default radius.
             radius = item.params[1 if item.command == TO_ALTITUDE else 2]
             if item.command in LOITERS and radius:
                 place = place._replace(left=radius < 0.0)
@@ -182,7 +183,7 @@ def mission_route(
         elif item.command != JUMP:
             continue
         route_items.add(k)
-    # The notes say what is not flown as the mission has it.
+    # The notes say what is flown differently from the mission, or not at all.
     skipped_names = [_skipped_name(item) for k, item in enumerate(items) if k not in route_items]
     sentences = [f"not flown: {', '.join(dict.fromkeys(skipped_names))}"] * bool(skipped_names)
     sentences += [
@@ -198,14 +199,14 @@ def mission_route(
 
 
 def _skipped_name(item: Item) -> str:
-    """Name an item that is not flown; if it is at 0, 0, also say so."""
+    """Return the name of an item that is not flown, and whether it is at 0, 0."""
     is_place = item.command in (WAYPOINT, SPLINE, *LOITERS)
     nowhere = is_place and not any(item.params[4:6])
     return f"{item.name}, at latitude and longitude 0" if nowhere else item.name
 
 
 def _mission_place(key: str, item: Item, speed: Any, before: Place | None) -> Place:
-    """Return the place of an item; a loiter without latitude and longitude takes the one before."""
+    """Return the place of an item; a loiter without a position takes that of `before`."""
     latitude, longitude, altitude = item.params[4:7]
     if not (latitude or longitude) and before is not None:
         latitude = before.latitude

@@ -86,17 +86,18 @@ def _plan_item(entry: Any, number: int, key: str) -> Item:
     )
 
 
-SAME_ANGLE = 1e-6  # deg, 0.1 m: programs write six digits or more
+SAME_ANGLE = 1e-6  # deg, about 0.1 m: programs write six digits or more
 SAME_ALTITUDE = 0.01  # m
 FRAMES_OF_MODES = MappingProxyType({2: (0, 5), 3: (0, 5), 4: (10, 11)})
-"""By AltitudeMode of QGroundControl: above the sea, above the sea by a model of the terrain, above
-the terrain. 0 and 1 had another meaning before version 4."""
+"""Permitted frames by AltitudeMode of QGroundControl: 2 is above the sea, 3 above the sea by a
+model of the terrain, 4 above the terrain. 0 and 1 are left out, because they had another meaning
+before version 4."""
 
 
 def _require_one_place(entry: Any, params: Sequence[Any], frame: int, key: str) -> None:
     """Refuse an item whose further members state another place than its params and its frame.
 
-    QGroundControl reads the params. Other programs write `coordinate` beside them, or change one
+    QGroundControl reads only the params. Other programs also write `coordinate`, or change only one
     of the two.
     """
     latitude, longitude, altitude = params[4:7]
@@ -141,9 +142,9 @@ def has_first_fence(tree: Any) -> bool:
     )
 
 
-# complexItemType, with the waypoints that QGroundControl made.
+# values of complexItemType whose items are the waypoints that QGroundControl made
 TRANSECTS = ("survey", "CorridorScan")
-LANDINGS = ("fwLandingPattern", "vtolLandingPattern")  # as NAV_LAND, not flown
+LANDINGS = ("fwLandingPattern", "vtolLandingPattern")  # like NAV_LAND, not flown
 
 
 def _plan_items(as_list: Sequence[Any], key: str) -> Iterator[tuple[int, Any]]:
@@ -167,7 +168,7 @@ def _plan_items(as_list: Sequence[Any], key: str) -> Iterator[tuple[int, Any]]:
 
 WPL = "QGC WPL"
 WPL_COLUMNS = 12
-COMMA = re.compile(r"-?\d+,\d+")  # written by a program in a language with decimal commas
+COMMA = re.compile(r"-?\d+,\d+")  # a number written in a language with decimal commas
 
 
 def read_wpl(content: bytes, key: str, line: str | None = None) -> Places:
@@ -208,7 +209,7 @@ def wpl_items(content: bytes, key: str) -> tuple[list[Item], HomePlace | None]:
         index, _, frame, command, *params = (
             value for value in numbers[:-1] if isinstance(value, float)
         )
-        # ArduPilot's item 0 is the home
+        # in files for ArduPilot, item 0 is the home
         if index == 0 and frame == 0 and command == WAYPOINT and not items:
             home = (
                 HomePlace(latitude=params[4], longitude=params[5], altitude=params[6])
@@ -233,9 +234,9 @@ class Area(NamedTuple):
     """A zone of a fence in a file: the corners of a polygon, or the centre of a circle."""
 
     places: list[Place]
-    radius: Any  # m; None of a polygon
+    radius: Any  # m; None for a polygon
     exclude: bool
-    group: Any = None  # of a zone to stay in
+    group: Any = None  # group of a zone to stay in
 
 
 class FencePlaces(NamedTuple):
@@ -273,7 +274,7 @@ def plan_fence(tree: Any, key: str) -> FencePlaces:
 def _grouped(area: Area, group: Any = 0) -> Area:
     """Put a zone of an autopilot into its group, if the aircraft must stay in it.
 
-    A plan only has the group 0. MAVLink, MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION and
+    In a plan every zone is in group 0. MAVLink, MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION and
     MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION, parameter 2, Inclusion Group: "Vehicle must be inside ALL
     inclusion zones in a single group, vehicle must be inside at least one group".
     """
@@ -284,7 +285,7 @@ def json_fence(tree: Any, key: str) -> FencePlaces:
     """Read polygons, whose holes are excluded, and Points with the property `radius`.
 
     The property `exclude` excludes a zone. Zones with the same property `group` form a group;
-    otherwise each zone is one by itself.
+    without this property, each zone is a group by itself.
     """
     require_wgs84(tree, key)
     zones: list[Area] = []

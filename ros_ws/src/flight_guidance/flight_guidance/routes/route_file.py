@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Route files as waypoints in the local tangent plane.
 
-`route_formats` reads the formats with latitudes and longitudes. A YAML file holds the list `route`
-of [north, east, altitude], [north, east, altitude, V] or a mapping with north and east, or latitude
-and longitude, altitude, and perhaps V, turns, wait, leave and left of `Waypoint`.
+`route_formats` reads the formats with latitudes and longitudes. A YAML file holds the list `route`.
+Each entry is [north, east, altitude], [north, east, altitude, V] or a mapping. The mapping has
+north and east, or latitude and longitude, then altitude, and perhaps V, turns, wait, leave and left
+of `Waypoint`.
 """
 
 import math
@@ -27,11 +28,11 @@ from flight_guidance.steering.path import Point
 
 SEMI_MAJOR = 6378137.0
 FLATTENING = 1.0 / 298.257223563
-"""a in m and f of the ellipsoid WGS84. Source: NGA.STND.0036 (2014)."""
+"""Semi-major axis a, m, and flattening f of the ellipsoid WGS84. Source: NGA.STND.0036 (2014)."""
 
 MAX_DISTANCE = 100e3
-"""m from the origin. There the plane's north and east are 4 m short of the distance on the ground
-(d^3 / 6 R^2)."""
+"""Largest distance from the origin, m. There the distance in the plane is 4 m shorter than that on
+the ground (d^3 / 6 R^2)."""
 
 
 class Waypoint(NamedTuple):
@@ -42,11 +43,11 @@ class Waypoint(NamedTuple):
     altitude: float  # m, counted as in `pose`
     # Airspeed on the leg to the waypoint, m/s; None: as on the leg before.
     speed: float | None = None
-    turns: float = 0.0  # turns round the waypoint before the aircraft flies on, 1
+    turns: float = 0.0  # number of turns round the waypoint before the aircraft flies on
     wait: float = 0.0  # time on the circle round the waypoint, or in a hover, s
     # Altitude at which the aircraft leaves a circle round the waypoint, m; None: `altitude`.
     leave: float | None = None
-    # Whether circles round the waypoint are counter-clockwise; None: not said, so clockwise.
+    # Whether circles round the waypoint are counter-clockwise; None: not given, so clockwise.
     left: bool | None = None
 
     @property
@@ -69,11 +70,11 @@ class RouteFile(NamedTuple):
     """The content of a route file."""
 
     waypoints: tuple[Waypoint, ...]
-    notes: tuple[str, ...]  # sentences on what in the file is not flown
+    notes: tuple[str, ...]  # sentences on the content of the file that is not flown
 
 
 class Origin(NamedTuple):
-    """Where north = east = 0."""
+    """Position at which north and east are 0."""
 
     latitude: float  # deg
     longitude: float  # deg
@@ -92,7 +93,7 @@ def local(latitude: float, longitude: float, origin: Origin) -> Point:
             N = a / sqrt(1 - e^2 sin(lat)^2)
 
     The difference of two vectors [x, y, z] is turned to north and east at the origin. Altitude
-    takes no part, because the altitude of an aircraft follows the curved Earth. Source: IOGP
+    is not used, because the altitude of an aircraft follows the curved Earth. Source: IOGP
     publication 373-7-2, methods EPSG:9602 and 9836.
     """
     lat = math.radians(origin.latitude)
@@ -120,7 +121,7 @@ def geographic(north: float, east: float, origin: Origin) -> Origin:
 def _is_above(latitude: float, longitude: float, origin: Origin) -> bool:
     """Return whether a position is on the half of the Earth around the origin.
 
-    The antipodal half has the same north and east.
+    A position on the other half would have the same north and east as one on this half.
     """
     lat = math.radians(origin.latitude)
     turn = math.radians(longitude - origin.longitude)
@@ -156,13 +157,14 @@ def read_route_file(
     """Read the waypoints of a route file, whose ending is one of ENDINGS.
 
     Latitudes and longitudes are turned to north and east of the origin, by default the home in the
-    file. `altitude` is the height in m to fly at if the file has none, and the height of the ground
-    or of the home if the file counts from there. `above_sea` says whether the altitudes of `pose`
-    count from the sea, or else from the start, which is the home in the file; it is None if that is
-    not known, nor the start. Equal successive positions are one waypoint. Waypoints within
-    `simplify` in m of the line without them are left out. `line` is the number from 1 on, or the
-    name, of the line to fly in a file with several. Raises ParameterError for an unreadable file, a
-    geometry that is no route, a value missing or out of range, and latitudes without an origin.
+    file. `altitude` is the height to fly at, m, if the file has no altitudes. If the file counts
+    altitudes from the ground or from the home, it is the height of these. `above_sea` says whether
+    the altitudes of `pose` count from the sea; if not, they count from the start, which is the home
+    in the file. It is None if neither this nor the start is known. Equal successive positions are
+    one waypoint. Waypoints within `simplify`, m, of the line without them are left out. In a file
+    with several lines, `line` chooses one by its number from 1 on, or by its name. Raises
+    ParameterError for an unreadable file, a geometry that is no route, a value missing or out of
+    range, and latitudes without an origin.
     """
     suffix = path.suffix.lower()
     require(
@@ -203,7 +205,7 @@ def read_route_file(
 def _merged(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
     """Merge successive waypoints at one place into a single waypoint with all circles.
 
-    The aircraft leaves at the last altitude. The airspeed of the last one is for the next leg.
+    The aircraft leaves it at the altitude of the last one, and with its airspeed.
     Raises ParameterError for circles in both directions at a place.
     """
     places: list[Waypoint] = []
@@ -234,9 +236,9 @@ def read_fence_file(
 ) -> dict[str, Any]:
     """Read the sections `fence` and `home` of guidance from a file.
 
-    The arguments are as for `read_route_file`. Home is the rally point nearest to the origin;
-    without rally points it is the return point of the fence, without both the home in the file;
-    otherwise it is missing in the result. Raises ParameterError for an unreadable file, a file
+    The arguments are as for `read_route_file`. Home is the rally point nearest to the origin.
+    If there is none, it is the return point of the fence, or else the home in the file. If the file
+    has none of them, the result has no home. Raises ParameterError for an unreadable file, a file
     without a zone, and a number missing or out of range.
     """
     suffix = path.suffix.lower()
@@ -263,7 +265,7 @@ def read_fence_file(
         corners = _merged([_placed(place, origin, _Heights()) for place in flat])
         points = [waypoint.point for waypoint in corners]
         if len(points) > 1 and points[0] == points[-1]:
-            del points[-1]  # a ring ends with its first point
+            del points[-1]  # a ring repeats its first point at the end
         zones[key] = {
             "north": [point[0] for point in points],
             "east": [point[1] for point in points],
@@ -297,9 +299,9 @@ def placed_lines(content: bytes, key: str, origin: Origin) -> list[list[Point]]:
 def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
     """Drop the waypoints within a distance in m of the line between the others.
 
-    Waypoints with circles stay, and those where the airspeed changes; each has the airspeed of its
-    leg. Source: Douglas and Peucker (1973), Algorithms for the reduction of the number of points
-    required to represent a line.
+    Waypoints with circles, and those at which the airspeed changes, stay. Each waypoint has the
+    airspeed of its leg. Source: Douglas and Peucker (1973), Algorithms for the reduction of the
+    number of points required to represent a line.
     """
     speed: float | None = None
     waypoints_with_speed = [
@@ -330,7 +332,7 @@ def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
 
 
 class _Heights:
-    """Turns the altitude of a place to the altitude of `pose`."""
+    """Converts the altitude of a place to an altitude counted as in `pose`."""
 
     def __init__(
         self,
@@ -349,7 +351,7 @@ class _Heights:
     def altitude(self, place: Place) -> Any:
         """Return the altitude in m, not validated yet.
 
-        Raises ParameterError if the file does not tell it.
+        Raises ParameterError if it does not follow from the file.
         """
         altitude = place.altitude
         above = place.above
@@ -403,7 +405,7 @@ def _home_of_fence(
 def _require_order(places: Sequence[Place], origin: Origin | None) -> None:
     """Refuse latitudes and longitudes that are exchanged.
 
-    They are exchanged if the places are near the origin only after exchanging them back.
+    They count as exchanged if the places are near the origin only with both exchanged.
     """
     if origin is None:
         return

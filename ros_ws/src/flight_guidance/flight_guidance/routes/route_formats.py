@@ -31,7 +31,7 @@ from flight_guidance.routes.route_xml import read_gpx, read_kml, read_kmz
 def read_places(content: bytes, key: str, suffix: str, line: str | None = None) -> Places:
     """Read the route in the content of a file; `key` names the file in errors.
 
-    `line` is the number from 1 on, or the name, of the line to fly in a file with several. Raises
+    In a file with several lines, `line` chooses one by its number from 1 on, or by its name. Raises
     ParameterError.
     """
     route = FORMATS[suffix](content, key, line)

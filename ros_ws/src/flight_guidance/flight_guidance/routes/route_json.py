@@ -26,9 +26,9 @@ def parsed_json(content: bytes, key: str) -> Any:
 
 
 def _whole(digits: str) -> int | float:
-    """Read a whole number; with more digits than a float holds it becomes a float.
+    """Read a whole number, as a float if it has more digits than a float holds.
 
-    Beyond the range of a float it is infinite.
+    If it is beyond the range of a float, it is infinite.
     """
     return int(digits) if len(digits) < 16 else float(digits)
 
@@ -67,7 +67,7 @@ def json_route(tree: Any, key: str, line: str | None) -> Places:
 def read_lines(content: bytes, key: str) -> list[list[Place]]:
     """Read the lines, rings and points of a GeoJSON, in the order of the file.
 
-    Raises ParameterError as `read` does.
+    Raises ParameterError for invalid JSON, another coordinate system or an unknown geometry.
     """
     tree = parsed_json(content, key)
     require_wgs84(tree, key)
@@ -116,7 +116,7 @@ PARTS = {
     "Polygon": "ring of a Polygon",
     "MultiPolygon": "ring of a MultiPolygon",
 }
-"""Names for one of several parts."""
+"""Name of one of several parts, by the type of the geometry."""
 
 
 def nodes(tree: Any) -> Iterator[tuple[Any, Any]]:
@@ -140,7 +140,7 @@ def nodes(tree: Any) -> Iterator[tuple[Any, Any]]:
 def require_wgs84(tree: Any, key: str) -> None:
     """Refuse a member `crs` of another system.
 
-    RFC 7946 only has WGS84, but GDAL used to write others.
+    RFC 7946 permits only WGS84, but older versions of GDAL wrote others.
     """
     crs = member(tree, "crs")
     name = str(member(member(crs, "properties"), "name") or "")
@@ -161,16 +161,16 @@ def member(tree: Any, name: str) -> Any:
 
 
 def entries(tree: Any, name: str, key: str) -> list[Any]:
-    """Return a member of a JSON object that is a list; empty if it is absent."""
+    """Return a member of a JSON object that must be a list; empty if it is absent."""
     value = member(tree, name)
     require(value is None or isinstance(value, list), key, f"{name}: {short_repr(value)}", "a list")
     return list(value or ())
 
 
 def flag(tree: Any, name: str, absent: bool | None, key: str) -> bool:
-    """Return a member of a JSON object that is true or false, also as 1 or 0.
+    """Return a member of a JSON object that must be true or false, or 1 or 0.
 
-    `absent` is its value if the object lacks it.
+    If the object lacks it, return `absent`.
     """
     value = absent if member(tree, name) is None else tree[name]
     require(value in (True, False), key, f"{name}: {short_repr(value)}", "true or false")

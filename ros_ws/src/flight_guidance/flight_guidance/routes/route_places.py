@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Positions of a route file, not validated yet, and the one route of several lines or points."""
+"""Positions of a route file, not validated yet, and the choice of the route among its lines."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -16,9 +16,9 @@ A_ROUTE = "a route file"
 
 
 class Above(Enum):
-    """The zero of an altitude."""
+    """The reference from which an altitude counts."""
 
-    AS_POSE = 0  # counted as in `pose`, so the number stands
+    AS_POSE = 0  # as in `pose`, so the number is not converted
     SEA = 1
     HOME = 2
     GROUND = 3
@@ -33,12 +33,12 @@ class Place(NamedTuple):
     altitude: Any  # m; None without an altitude
     speed: Any = None  # m/s
     above: Above = Above.AS_POSE
-    altitude_text: str = ""  # what the file has in place of an altitude, for a sentence
-    turns: Any = 0.0  # number of turns round the place, 1
+    altitude_text: str = ""  # what the file has in place of an altitude, for messages
+    turns: Any = 0.0  # number of turns round the place
     wait: Any = 0.0  # time on a circle round the place, s
-    # Whether the altitude is reached round the place, and not on the way to the place.
+    # Whether the aircraft climbs or sinks to the altitude round the place, not on the way to it.
     climbs: bool = False
-    left: bool | None = None  # whether circles are counter-clockwise; None: not said
+    left: bool | None = None  # whether circles are counter-clockwise; None: not given
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ class Places(NamedTuple):
     """The route of a file."""
 
     places: list[Place]
-    notes: tuple[str, ...] = ()  # what is not flown
+    notes: tuple[str, ...] = ()  # sentences on what is not flown
     home: HomePlace | None = None
 
 
@@ -69,9 +69,9 @@ class Geometry(NamedTuple):
 def one_route(
     key: str, geometries: Sequence[Geometry], others: Sequence[str] = (), line: str | None = None
 ) -> Places:
-    """Return the only line, or the one of `line`; if there is no line, the points.
+    """Return the only line, or the one that `line` chooses; if there is no line, the points.
 
-    Raises ParameterError that names what is there.
+    Otherwise raises a ParameterError that lists what the file has.
     """
     joined_lines = _joined([geometry for geometry in geometries if geometry.kind not in POINTS])
     lines = [geometry for geometry in joined_lines if geometry.places]
@@ -112,7 +112,7 @@ def one_route(
 
 
 def _choice(lines: Sequence[Geometry]) -> str:
-    """Say what `--line` may name: "--line 1 (north), 2 or 3 (south)"."""
+    """Write what `--line` can choose: "--line 1 (north), 2 or 3 (south)"."""
     names = [
         f"{k} ({geometry.name})" if geometry.name else f"{k}"
         for k, geometry in enumerate(lines[:SHOWN], start=1)
@@ -155,7 +155,7 @@ def _joined(lines: Sequence[Geometry]) -> list[Geometry]:
 
 
 def _meets(end: Place, begin: Place) -> bool:
-    """Return whether both are one position on the antimeridian."""
+    """Return whether both are the same position on the antimeridian."""
     try:
         return bool(
             abs(end.longitude) == 180.0
@@ -166,7 +166,7 @@ def _meets(end: Place, begin: Place) -> bool:
 
 
 def number_of(text: str | None) -> float | str | None:
-    """Return the number in a text; any other text as it is."""
+    """Return the number in a text, or the text itself if it is no number."""
     try:
         return None if text is None else float(text)
     except ValueError:
@@ -174,7 +174,7 @@ def number_of(text: str | None) -> float | str | None:
 
 
 def is_position(value: Any) -> bool:
-    """Return whether a value is a list of two or three."""
+    """Return whether a value is a list of two or three entries."""
     return isinstance(value, list) and 2 <= len(value) <= 3
 
 

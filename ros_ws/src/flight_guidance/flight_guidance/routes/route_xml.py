@@ -27,9 +27,9 @@ from flight_guidance.routes.route_places import (
 
 
 class _NoDoctype(TreeBuilder):
-    """Refuses a document type, the only place in which entities can be declared.
+    """Refuses a document type, because entities can be declared only there.
 
-    No entity is ever expanded or fetched.
+    So no entity is ever expanded or fetched.
     """
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
@@ -42,7 +42,7 @@ def _parsed_xml(content: bytes, key: str, kind: str) -> Element:
         parser.feed(content)
         root: Element = parser.close()
     except (ParseError, ValueError, LookupError) as error:
-        # ValueError and LookupError come from an encoding.
+        # ValueError and LookupError come from an unknown or wrong encoding.
         raise ParameterError(f"{key}: found {error}, expected the XML of {kind}") from None
     return root
 
@@ -53,9 +53,9 @@ def _kind(element: Element) -> str:
 
 
 KML_LINES = ("LineString", "LinearRing", "Track")
-KML_OTHERS = ("Model", "NetworkLink")  # their geometry is elsewhere
+KML_OTHERS = ("Model", "NetworkLink")  # their geometry is in another file
 KML_VIEWS = ("Tour", "GroundOverlay", "PhotoOverlay", "ScreenOverlay")  # no geometry
-# in the namespace of DJI's missions, which have heights and speeds of their own
+# part of the namespace of DJI's missions, which write heights and speeds in their own elements
 DJI = "dji.com/wpmz"
 KML_MODES = {
     "absolute": Above.AS_POSE,
@@ -83,12 +83,12 @@ def read_kml(content: bytes, key: str, line: str | None = None) -> Places:
     polygons = _outer_elements(kinds, "Polygon")
     tracks = _outer_elements(kinds, "Track")
     marks = _outer_elements(kinds, "Placemark")
-    # A Model beside a route is only a sign.
+    # A Model in a Track is only a symbol.
     others = [kind for kind, element in kinds if kind in KML_OTHERS and element not in tracks]
     geometries: list[Geometry] = []
     for kind, element in kinds:
         if kind == "Point" and has_line:
-            geometries.append(Geometry(kind, []))  # a mark, at any altitude
+            geometries.append(Geometry(kind, []))  # only a mark beside the line, at any altitude
         elif kind in (*KML_LINES, "Point"):
             # The altitudeMode of a Polygon holds for its rings.
             name = _text(marks.get(element), "name") or ""
@@ -101,7 +101,7 @@ def read_kml(content: bytes, key: str, line: str | None = None) -> Places:
 
 
 def _outer_elements(kinds: Sequence[tuple[str, Element]], outer: str) -> dict[Element, Element]:
-    """Find the element of a kind that encloses each element in it."""
+    """Return for each element inside an element of the kind `outer` the outer element."""
     outers: dict[Element, Element] = {}
     for kind, element in kinds:
         if kind == outer:
@@ -144,9 +144,9 @@ def _kml_places(key: str, kind: str, element: Element, polygon: Element | None) 
 
 
 def read_kmz(content: bytes, key: str, line: str | None = None) -> Places:
-    """Return the KML file of a KMZ archive: doc.kml, or the only one.
+    """Read the route in the KML file of a KMZ archive: doc.kml, or the only one.
 
-    If the root has one, it is that (OGC 12-007r2, Annex C).
+    Files in the root of the archive come before those in folders (OGC 12-007r2, Annex C).
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -182,17 +182,17 @@ def read_kmz(content: bytes, key: str, line: str | None = None) -> Places:
 
 
 EARTH_RADIUS = 6371e3
-"""m, mean radius R_1 of GRS80."""
+"""Mean radius R_1 of the Earth by GRS80, m."""
 
 LARGEST_GAP = 1000.0
-"""m. Segments of a track that are nearer than this are one track: GPX begins a new segment when the
+"""Largest gap over which the segments of a track are joined, m. GPX begins a new segment when the
 receiver has lost its satellites."""
 
 
 def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
-    """Read a route (rte); without one a track (trk); without both the waypoints (wpt).
+    """Read a route (rte); if there is none a track (trk), or else the waypoints (wpt).
 
-    With `line` it is one of all routes and tracks.
+    `line` chooses one of all routes and tracks.
     """
     root = _parsed_xml(content, key, "a GPX file")
     marks = _gpx_places(root, "wpt")
@@ -210,7 +210,7 @@ def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
         geometries = routes + tracks
     else:
         geometries = routes
-    # Lines and marks are geometries; the rest goes to the notes.
+    # Lines and marks become geometries; everything else is named in the notes.
     lines = [
         Geometry(_kind(element), [*chain(*segments)], (_text(element, "name") or "").strip())
         for element, segments in geometries
@@ -252,9 +252,9 @@ def _gpx_segments(line: Element, kind: str) -> list[list[Place]]:
 
 
 def _gap(end: Place, begin: Place) -> float:
-    """Return the distance of two near positions on a sphere, m.
+    """Return the distance between two near positions on a sphere, m.
 
-    It is 0 if one of them is no position, which is refused later.
+    It is 0 if one of them is no valid position, because this is refused later.
     """
     values = (end.latitude, end.longitude, begin.latitude, begin.longitude)
     if not all(isinstance(value, float) and math.isfinite(value) for value in values):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Attitude: body rates to hold or reach a bank and a pitch, in a coordinated turn."""
+"""Attitude: body rates that reach and hold a bank and a pitch, in a coordinated turn."""
 
 import math
 from typing import NamedTuple
@@ -12,32 +12,33 @@ from flight_core.vectors import Scalar, array_namespace
 from flight_guidance.steering.protection import forward
 
 YAW_TO_BANK = 1.5
-"""1/s. A yaw rate of 0.1 rad/s rolls the osprey by 0.02 rad/s, and by 0.004 if A and B are 30 % off
-for the worse."""
+"""Gain from the error of the bank to the yaw rate, 1/s. A yaw rate of 0.1 rad/s rolls the osprey at
+0.02 rad/s, and at 0.004 rad/s in the worst case if A and B are 30 % off."""
 
 SKIDDING = 1.6
-"""Bank of the osprey in a turn by the rudder over that of a coordinated turn at the same rate,
-because the sideslip rolls it until then. It is 1.3 to 1.7 if A and B are 30 % off."""
+"""Bank of the osprey in a turn by the rudder, divided by that of a coordinated turn at the same
+rate. It is above 1 because the sideslip rolls the aircraft further, and 1.3 to 1.7 if A and B are
+30 % off."""
 
 LARGEST_YAW = math.radians(20.0)
-"""Bank whose turn rate limits the yaw rate: the rudder of the osprey is then at half of its
-stop."""
+"""The yaw rate is limited to the turn rate of this bank, at which the rudder of the osprey is
+deflected by half of its range."""
 
 
 class AttitudeParams(NamedTuple):
     """Gains and limits of the attitude loop."""
 
-    k_phi: float  # 1/s, a quarter of the reference's bandwidth of p: damping 0.74
-    k_theta: float  # 1/s, a quarter of the bandwidth of q
+    k_phi: float  # 1/s, a quarter of the natural frequency of p in the model: damping 0.74
+    k_theta: float  # 1/s, a quarter of the natural frequency of q
     roll_rate: float  # largest phi_dot, rad/s
     load: float  # largest change of the load factor, 1
     n_alpha: Scalar  # slope of the load factor over the angle of attack, 1/rad
     k_beta: float  # 1/s, 0 if beta is not measured
-    turn_lead: float = 0.0  # s, by which r leads the bank
+    turn_lead: float = 0.0  # s, time by which r leads the bank
 
 
 class BodyRates(NamedTuple):
-    """Commands of the reference model, rad/s, FRD."""
+    """Commands to the reference model, rad/s, in body axes (FRD)."""
 
     p: Scalar
     q: Scalar
@@ -65,10 +66,10 @@ def body_rates(
         q_m = (theta_dot_c + r sin(phi)) / cos(phi) + phi_dot_c tan(phi) / (cos(phi) n_alpha)
         p_m = phi_dot_c - tan(theta) (q_m sin(phi) + r cos(phi))
 
-    with the measured r, in case r is not tracked exactly. `turn_lead` makes up for the lag of the
-    turn behind the bank, caused by the reference model of r and by the sideslip in a roll. The last
-    term of q_m leads the angle of attack of the turn. Angles are in rad, `speed` V in m/s. Source:
-    R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters 2 and 9.
+    q_m and p_m use the measured r, in case r is not tracked exactly. `turn_lead` makes up for the
+    lag of the turn behind the bank, caused by the reference model of r and by the sideslip in a
+    roll. The last term of q_m leads the angle of attack of the turn. Angles are in rad, `speed` V
+    in m/s. Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters 2 and 9.
     """
     speed = forward(speed)
     phi_dot = clip(params.k_phi * (phi_c - phi), params.roll_rate)

@@ -14,21 +14,21 @@ from flight_core.vectors import Scalar, array_namespace
 from flight_guidance import reach
 from flight_guidance.steering.protection import forward
 
-# Largest share of a turn lost to a sideslip; the f16 of JSBSim in an orbit, with the rudder at the
-# stop: 0.09.
+# Largest fraction of a turn that a sideslip takes away. It is 0.09 for the f16 of JSBSim in an
+# orbit, with the rudder at its stop.
 LARGEST_SLIP = 0.2
 
 HEADING_TIME = 2.0
-"""s. This covers ten poses of a receiver of 5 Hz; a bias of the gyro of 1 mrad/s then turns the
-heading by 0.1 deg."""
+"""Time constant of `heading_estimate`, s. It covers ten poses of a receiver of 5 Hz. With it, a
+gyro bias of 1 mrad/s causes an error of the heading of 0.1 deg."""
 
 
 class PathError(NamedTuple):
-    """Where the aircraft is beside a path."""
+    """Position of the aircraft relative to a path."""
 
     e: Scalar  # cross-track error, m, positive to the right of the path
     track: Scalar  # course of the path at its nearest point, rad
-    curvature: Scalar  # of the path there, 1/m, positive to the right
+    curvature: Scalar  # curvature of the path at this point, 1/m, positive to the right
 
 
 class PathParams(NamedTuple):
@@ -40,9 +40,9 @@ class PathParams(NamedTuple):
 
 
 def turn_towards(difference: Scalar) -> Scalar:
-    """Normalise the turn for a difference of courses to +-1: the sine up to 90 deg, +-1 beyond.
+    """Return the turn for a difference of courses: its sine up to 90 deg, and +-1 beyond.
 
-    The sine alone would leave an aircraft on the opposite course.
+    With the sine alone, an aircraft on the opposite course would not turn.
     """
     xp = array_namespace(difference)
     sine = xp.sin(difference)
@@ -50,14 +50,15 @@ def turn_towards(difference: Scalar) -> Scalar:
 
 
 def heading_estimate(psi: float, measured: float | None, psi_dot: float, dt: float) -> float:
-    """Advance the heading by a step, rad, from the heading rate of y, rad/s, and that of pose.
+    """Advance the estimated heading by a step, rad.
 
-    The heading of pose is None if pose is stale.
+    `psi_dot` is the heading rate that follows from y, rad/s. `measured` is the heading of pose, or
+    None if pose is stale.
 
         psi+ = psi + dt psi_dot + (1 - exp(-dt/T)) (measured - psi - dt psi_dot),  T = HEADING_TIME
 
-    This is a complementary filter: it smooths the noise of pose, and the gyro has no lag. A bias of
-    the gyro turns the heading by T times the bias.
+    This is a complementary filter: it smooths the noise of pose, and through the gyro it has no
+    lag. A bias of the gyro causes an error of T times the bias.
     """
     heading = psi + dt * psi_dot
     innovation = 0.0 if measured is None else math.remainder(measured - heading, 2.0 * math.pi)
@@ -67,7 +68,7 @@ def heading_estimate(psi: float, measured: float | None, psi_dot: float, dt: flo
 
 
 def course_acceleration(course_c: float, course: float, speed: float, k: float) -> float:
-    """Compute a = k V turn_towards(course_c - course), m/s^2; also for a heading."""
+    """Compute a = k V turn_towards(course_c - course), m/s^2, for a course or a heading."""
     return float(k * speed * turn_towards(math.remainder(course_c - course, 2.0 * math.pi)))
 
 
@@ -84,9 +85,9 @@ def path_acceleration(
     Outside a circle of radius R, at the distance d from the centre, 1 - kappa e = d / R. acos(R /
     d) is the angle between the tangent to the circle and the track, so an aircraft from afar flies
     along the tangent. Near a line e'' + 2 zeta w e' + w^2 e = 0 with w = 2 pi / P. The velocity is
-    that over ground, so a wind changes nothing. On the inner side of an arc, e is limited to half
-    of the radius. Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp, without the
-    adaptation to wind.
+    that over ground, so the same equations hold in a wind. On the inner side of an arc, e is
+    limited to half of the radius. Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp,
+    without the adaptation to wind.
     """
     e, track, kappa = error
     xp = array_namespace(e)
@@ -119,9 +120,9 @@ def slip_estimate(
         within +-LARGEST_SLIP abs(turn)
 
     `rolling` is abs(p) / p_max. Since the turn lags the bank by the reference model of r, a roll
-    looks like a sideslip. A bias of the gyro of r looks like a sideslip too; the bound is 0 in
-    straight flight and keeps the bias out there. Added to the acceleration of a path, the estimate
-    keeps an aircraft on an arc in a turn that is not coordinated.
+    looks like a sideslip. A bias of the gyro of r looks like a sideslip, too. The bound is 0 in
+    straight flight, so there the bias has no effect. Path following adds the estimate to its
+    acceleration, so that an aircraft stays on an arc in a turn that is not coordinated.
     """
     steady = array_namespace(slip).maximum(1.0 - rolling / 0.2, 0.0)
     return clip(
@@ -147,7 +148,7 @@ def least_period(speed: float, bank: float, roll_rate: float) -> float:
 
 
 def largest_wind(speed: float, wind: float, bank: float) -> float:
-    """Compute the wind in which a circle of `least_radius` for `wind` takes the whole bank, m/s.
+    """Compute the wind in which a circle of `least_radius` for `wind` needs the whole bank, m/s.
 
     (V + W) sqrt(tan(b) / tan(0.8 b)) - V.
     """

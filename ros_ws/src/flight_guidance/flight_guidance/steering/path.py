@@ -20,24 +20,24 @@ from flight_guidance.steering.lateral import PathError
 Point = tuple[Scalar, Scalar]  # north, east, m
 
 SHARPEST = math.radians(150.0)
-"""Largest turn of a fillet, which cuts the corner by 2.8 radii. A sharper corner is passed, and the
-next leg joined."""
+"""Largest turn of a fillet, which cuts the corner by 2.8 radii. At a sharper corner the aircraft
+passes the waypoint, and then joins the next leg."""
 
 JOINED = math.radians(30.0)
-"""Largest difference between the course flown and that of a leg where an aircraft leaves the
-joining circle for the leg."""
+"""Largest difference between the course flown and the course of the leg at which an aircraft may
+leave the joining circle for the leg."""
 
 OPPOSITE = math.radians(120.0)
-"""Difference of courses beyond which an aircraft near the start of a leg turns onto the leg by the
-joining circle too."""
+"""An aircraft near the start of a leg needs a joining circle, too, if the course flown differs from
+that of the leg by more than this."""
 
 SLACK = 0.1
-"""rad. If a tangent touches the joining circle by less than this beyond the point of the leg, no
-further turn of 360 deg is needed."""
+"""If a tangent touches the joining circle by less than this angle beyond the point of the leg, no
+further turn of 360 deg is counted, rad."""
 
 SHORTEST = 1e-3
-"""m. A fillet whose ends are nearer to the waypoint is left out: waypoints on a straight line have
-a fillet only by rounding."""
+"""A fillet whose ends are nearer to the waypoint than this is left out, m: between legs on a
+straight line it would come only from rounding."""
 
 
 class Line(NamedTuple):
@@ -50,17 +50,17 @@ class Line(NamedTuple):
 class Loiter(NamedTuple):
     """What an aircraft does on a circle before it flies on.
 
-    At the end it is at the altitude of the leg.
+    It flies on only at the altitude of the leg.
     """
 
-    turns: float = 0.0  # 1
-    wait: float = 0.0  # s
+    turns: float = 0.0  # number of turns
+    wait: float = 0.0  # time on the circle, s
 
 
 class Arc(NamedTuple):
     """A leg on a circle, less than a full turn.
 
-    Without an end it is an orbit; with a loiter it is an orbit until the loiter is flown.
+    Without an end it is an orbit for ever. With a loiter it is an orbit until the loiter is over.
     """
 
     centre: Point
@@ -73,15 +73,15 @@ Leg = Line | Arc
 
 
 class Route(NamedTuple):
-    """Legs, with altitudes and airspeeds per leg, taken from the waypoint at the end of the leg."""
+    """Legs with an altitude and an airspeed each, those of the waypoint at the end of the leg."""
 
     legs: tuple[Leg, ...]
     altitude: tuple[float, ...]  # m
     V: tuple[float, ...]  # m/s
-    from_altitude: tuple[float, ...] = ()  # m, of the waypoint that the leg leaves
-    from_V: tuple[float, ...] = ()  # m/s, the same
-    slopes: bool = False  # whether the altitude changes along a line, or else where a leg begins
-    notes: tuple[str, ...] = ()  # sentences on what is flown differently than the waypoints say
+    from_altitude: tuple[float, ...] = ()  # m, altitude at the waypoint where the leg begins
+    from_V: tuple[float, ...] = ()  # m/s, airspeed at this waypoint
+    slopes: bool = False  # whether the altitude changes along a line; if not, at its start
+    notes: tuple[str, ...] = ()  # sentences on what is flown differently from the waypoints
 
     @property
     def radius(self) -> float:
@@ -112,7 +112,7 @@ class Route(NamedTuple):
     def profile(self, leg: int, along: float) -> tuple[float, float]:
         """Return the altitude at a distance along a leg, m, and its slope, 1.
 
-        The altitude is a straight line from waypoint to waypoint, or a step.
+        With `slopes` the altitude changes linearly from waypoint to waypoint, otherwise in a step.
         """
         altitude = self.altitude[leg]
         distance = length(self.legs[leg])
@@ -129,7 +129,7 @@ class Route(NamedTuple):
 
 
 def is_orbit(leg: Leg) -> bool:
-    """Return whether a leg is a full circle, with a loiter or for good."""
+    """Return whether a leg is a full circle, flown for a loiter or for ever."""
     return isinstance(leg, Arc) and (leg.end is None or leg.loiter is not None)
 
 
@@ -161,7 +161,7 @@ def course_of(start: Point, end: Point) -> float:
 def error(leg: Leg, position: Point) -> PathError:
     """Compute the cross-track error of a position.
 
-    Course and curvature are those of the leg at the nearest point.
+    It comes with the course and the curvature of the leg at the nearest point.
     """
     if isinstance(leg, Line):
         return line_error(leg.start, course_of(leg.start, leg.end), position)
@@ -169,7 +169,7 @@ def error(leg: Leg, position: Point) -> PathError:
 
 
 def line_error(start: Point, track: Scalar, position: Point) -> PathError:
-    """Compute the `error` beside a line from a point on a course, rad."""
+    """Compute the `error` from a line through a point with a course, rad."""
     xp = array_namespace(track)
     north = position[0] - start[0]
     east = position[1] - start[1]
@@ -177,12 +177,12 @@ def line_error(start: Point, track: Scalar, position: Point) -> PathError:
 
 
 def circle_error(centre: Point, radius: Scalar, position: Point) -> PathError:
-    """Compute the `error` beside a circle, radius in m, positive to the right."""
+    """Compute the `error` from a circle; the radius, m, is positive to the right."""
     xp = array_namespace(radius)
     north = position[0] - centre[0]
     east = position[1] - centre[1]
     side = xp.copysign(1.0, radius)
-    # This is the bearing from the centre.
+    # bearing of the position from the centre
     bearing = xp.atan2(east, north)
     return PathError(
         side * (abs(radius) - xp.hypot(north, east)), bearing + side * math.pi / 2.0, 1.0 / radius
@@ -244,7 +244,7 @@ def to_go(leg: Leg, position: Point) -> float:
 
 
 class Side(IntEnum):
-    """The side of the joining circle: the sign of its radius."""
+    """Side of the joining circle, which is the sign of its radius."""
 
     NONE = 0  # on the leg, or near its point: no circle
     RIGHT = 1
@@ -265,9 +265,9 @@ def joining_length(
 ) -> Scalar:
     """Compute the length of the way onto a course, m: R abs(turn) + sqrt(d^2 - R^2) + R sweep.
 
-    turn leads from the course flown to the tangent; d is the distance from the centre of the
-    joining circle; sweep leads from the point where the tangent touches the circle to the point of
-    the leg. `course_flown` and `course` are in rad.
+    turn is the angle from the course flown to the tangent, and d the distance from the centre of
+    the joining circle. sweep is the angle on the circle from the point where the tangent touches it
+    to the point of the leg. `course_flown` and `course` are in rad.
     """
     xp = array_namespace(radius)
     centre = joining_centre(point, course, radius)
@@ -293,8 +293,8 @@ def joining(
 ) -> Scalar:
     """Choose the side of the shorter joining circle onto a course at a point.
 
-    Return a value of `Side` for each place. No circle is needed within `near`, m, and within
-    OPPOSITE of the course.
+    Return a value of `Side` for each place. No circle is needed if the place is within
+    `near`, m, and the course flown within OPPOSITE of the course.
     """
     right_way, left_way = (
         joining_length(point, course, side * radius, position, course_flown)
@@ -359,7 +359,7 @@ def route_outline(route: Route) -> list[tuple[float, float, float]]:
 
 
 def lengths_after(route: Route) -> list[float]:
-    """Return the length of the legs after each leg, m, without the last orbit, which has no end."""
+    """Return the length of the legs after each leg, m; the last orbit has none."""
     lengths = []
     point = route.start(0)[0]
     for leg in route.legs[:-1]:
@@ -409,7 +409,7 @@ def turns_back(leg: Leg, following: Leg | None) -> bool:
 def leads(legs: Sequence[Leg]) -> list[int]:
     """Return the numbers of the waypoints at the ends of the legs of a route.
 
-    A fillet at a waypoint leads to the next waypoint.
+    For a fillet at a waypoint, this is the next waypoint.
     """
     numbers = []
     number = 0
@@ -436,14 +436,14 @@ def route(
 ) -> tuple[Leg, ...]:
     """Plan legs through waypoints, then an orbit round the last waypoint.
 
-    The corners have fillets of a radius, m. A corner with the turn tau begins and ends radius
-    tan(tau / 2) from the waypoint; one beyond SHARPEST has no fillet. At a waypoint of `loiters`,
-    by number, a circle round the waypoint takes the place of the fillet. Circles and the orbit are
-    clockwise, at the waypoints of `left` counter-clockwise. Lines touch them; a line too short for
-    a tangent leads to the waypoint. Raises ParameterError for fewer than two waypoints, a radius
-    below `least` (`lateral.least_radius`), a waypoint within the circle of a loiter, and circles of
-    opposite sides that overlap; ShortLegError for a leg too short for the fillets. Source: R. W.
-    Beard, T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
+    The corners have fillets of a radius, m. The fillet of a turn tau begins and ends at radius
+    tan(tau / 2) from the waypoint; a corner beyond SHARPEST has no fillet. At a waypoint of
+    `loiters`, by number, a circle round the waypoint replaces the fillet. Circles and the orbit
+    are clockwise, but counter-clockwise at the waypoints of `left`. Lines are tangents to them; a
+    line too short for a tangent leads to the waypoint. Raises ParameterError for fewer than two
+    waypoints, a radius below `least` (`lateral.least_radius`), a waypoint within the circle of a
+    loiter, and circles of opposite sides that overlap; ShortLegError for a leg too short for the
+    fillets. Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
     """
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
     require(
@@ -492,7 +492,7 @@ def tangent(centres: tuple[Point, Point], radius: float, sides: tuple[int, int])
 def _between_circles(
     waypoints: Sequence[Point], radius: float, first: int, sides: tuple[int, int]
 ) -> list[Leg]:
-    """Plan lines and fillets from a circle round the first waypoint onto one round the last.
+    """Plan lines and fillets from a circle round the first waypoint to one round the last.
 
     `sides` are as for `tangent`; the first is 0 if there is no circle. `first` is the number of the
     first waypoint.

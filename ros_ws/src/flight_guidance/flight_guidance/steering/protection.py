@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Protection: limits of bank, speed and climb, in this order.
+"""Protection: limits of the bank, the airspeed and the climb rate, applied in this order.
 
 They follow from the stall speed and the commanded airspeed.
 """
@@ -9,21 +9,22 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
 
 STALL_MARGIN = 1.1
-"""Least ratio of the speed to the stall speed of a turn."""
+"""Least ratio of the airspeed to the stall speed in a turn."""
 
 FLOOR = 1.15
-"""Speed floor over the stall speed."""
+"""Ratio of the speed floor to the stall speed."""
 
 FASTEST = 1.4
-"""Largest airspeed over the trim speed if no limit of the aircraft is given."""
+"""Ratio of the largest airspeed to the trim speed if the aircraft has no given limit."""
 
 SHORTFALL = 0.05
-"""Largest error of V over the trim speed before the climb or sink is limited; at twice this value
-the limit is zero."""
+"""Fraction of the trim speed by which V may differ from its command before climb or sink is
+limited. At twice this value the limit is zero."""
 
 
 LEAST_SPEED = 0.1
-"""m/s, for a divisor: no aircraft flies there, and a flow from behind counts as none."""
+"""Least airspeed used as a divisor, m/s. No aircraft flies at it, and a flow from behind counts as
+no flow."""
 
 
 def forward(speed: Scalar) -> Scalar:
@@ -55,8 +56,8 @@ def _share(value: Scalar) -> Scalar:
 def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scalar:
     """Compute the largest climb rate, m/s: ratio climb - (1 - ratio) sink.
 
-    ratio = clip((V - 0.9 V_floor) / (0.1 V_floor), 0, 1). Below the floor, pitch flies the speed:
-    at nine tenths of the floor the aircraft sinks at the largest rate.
+    ratio = clip((V - 0.9 V_floor) / (0.1 V_floor), 0, 1). Below the floor, the pitch controls the
+    airspeed: at nine tenths of the floor the aircraft sinks at the largest rate.
     """
     ratio = _share((speed - 0.9 * floor) / (0.1 * floor))
     return ratio * climb - (1.0 - ratio) * sink
@@ -65,8 +66,8 @@ def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scala
 def sink_limit(climb: float, sink: float, speed: Scalar, largest: float) -> Scalar:
     """Compute the least climb rate, m/s: (1 - ratio) climb - ratio sink.
 
-    ratio = clip((1.1 V_max - V) / (0.1 V_max), 0, 1). This mirrors `climb_limit`: beyond the
-    largest airspeed, pitch flies the speed.
+    ratio = clip((1.1 V_max - V) / (0.1 V_max), 0, 1). This mirrors `climb_limit`: above the
+    largest airspeed, the pitch controls the airspeed.
     """
     ratio = _share((1.1 * largest - speed) / (0.1 * largest))
     return (1.0 - ratio) * climb - ratio * sink
@@ -82,8 +83,8 @@ def climb_range(
         -sink clip(2 + shortfall / d, 0, 1),  climb clip(2 - shortfall / d, 0, 1),
             d = max(0.05 V0, g climb / (0.4 V0))
 
-    `speed` is V0, m/s. With V_dot = -g climb / V, the second term of d bounds the bandwidth of V by
-    climb to 0.4 rad/s.
+    `speed` is V0, m/s. With V_dot = -g climb / V, the second term of d limits the bandwidth with
+    which the climb controls V to 0.4 rad/s.
     """
     margins = (max(SHORTFALL * speed, GRAVITY * rate / (0.4 * speed)) for rate in (sink, climb))
     ratios = (sign * shortfall / d for sign, d in zip((-1.0, 1.0), margins, strict=True))

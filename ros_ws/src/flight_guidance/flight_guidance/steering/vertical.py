@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Vertical: climb rate from the altitude, pitch from the climb rate."""
+"""Vertical guidance: the climb rate for an altitude, and the pitch for a climb rate."""
 
 import math
 from typing import NamedTuple
@@ -31,14 +31,14 @@ class VerticalParams(NamedTuple):
 
 
 def climb_for(error: Scalar, params: VerticalParams) -> Scalar:
-    """Compute the climb rate for an error of altitude (command less altitude, m), in m/s.
+    """Compute the climb rate, m/s, for an altitude error (command minus altitude), m.
 
     It stays within -sink and climb:
 
         k_h e  near,  sign(e) sqrt(a (abs(e) - e_l / 2))  from e_l = a / (2 k_h^2) on
 
-    The two branches and their slopes agree at e_l. Far away the climb rate falls by a/2 a second,
-    slowly enough for the aircraft.
+    The two branches and their slopes agree at e_l. Far away the climb rate falls by a / 2 per
+    second, which the aircraft can follow.
     """
     k_h = params.k_h
     a = params.acceleration
@@ -62,8 +62,8 @@ def alpha_estimate(
 
         alpha+ = alpha + (1 - exp(-dt/T)) (theta - gamma - alpha)
 
-    The filter replaces an integrator: it is bumpless, has no windup, and is right at any bank,
-    speed or trim.
+    The filter replaces an integrator. It is bumpless, has no windup, and is correct at any bank,
+    airspeed or trim.
     """
     return alpha + (1.0 - math.exp(-dt / params.alpha_time)) * (
         theta - path_angle(climb, speed) - alpha
@@ -76,7 +76,7 @@ def pitch_for(climb: Scalar, speed: Scalar, alpha: Scalar) -> Scalar:
 
 
 def climb_speed(error: Scalar, speed: Scalar) -> Scalar:
-    """Compute how much to raise the airspeed, m/s, for an error of the climb rate.
+    """Compute by how much to raise the airspeed, m/s, for an error of the climb rate, m/s.
 
     It is K V / (2 g) error, for an aircraft without an elevator. At a constant angle of attack the
     lift grows with V^2, so h_ddot = 2 g dV / V, and the error decays at K = CLIMB_BANDWIDTH.
@@ -89,8 +89,8 @@ def path_lag(stall_speed: float, speed: float) -> float:
 
         T_L = V alpha_1 / g,  alpha_1 = 0.3 rad (V_s / V)^2
 
-    V gamma_dot = g (alpha - alpha_1) / alpha_1 near level flight; alpha_1 is the angle of attack
-    there, from zero lift.
+    V gamma_dot = g (alpha - alpha_1) / alpha_1 near level flight. alpha_1 is the angle of attack
+    in level flight, counted from zero lift.
     """
     return STALL_ANGLE * stall_speed**2 / (GRAVITY * speed)
 

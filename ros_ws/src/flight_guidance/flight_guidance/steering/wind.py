@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Wind: the velocity over ground less the velocity through the air.
+"""Wind: the velocity over ground minus the velocity through the air.
 
-It is given to the north and to the east.
+It has a north and an east part.
 """
 
 import math
@@ -10,10 +10,10 @@ import math
 from flight_core.vectors import Scalar, array_namespace
 
 WIND_TIME = 5.0
-"""Time constant of the estimated wind, s. It is long against a gust that the aircraft flies
-through, and short against a leg."""
+"""Time constant of the estimated wind, s. It is longer than a gust that the aircraft flies
+through, and shorter than a leg."""
 
-Wind = tuple[Scalar, Scalar]  # where the air moves to: north, east, m/s
+Wind = tuple[Scalar, Scalar]  # velocity of the air: north, east, m/s
 
 
 def wind_of(v_north: Scalar, v_east: Scalar, climb: Scalar, heading: Scalar, speed: Scalar) -> Wind:
