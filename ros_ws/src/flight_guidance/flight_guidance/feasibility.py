@@ -109,7 +109,7 @@ def as_route(
 ) -> Route:
     """Make the route of legs through waypoints; `speed`, m/s, holds if no waypoint names one.
 
-    A fillet belongs to the leg to the next waypoint, and a leg starts at the waypoint before. In an
+    A fillet belongs to the way to the next waypoint, and a leg starts at the waypoint before. In an
     orbit the altitude changes at its waypoint.
     """
     leg_speeds = speeds(waypoints, speed)

@@ -184,8 +184,8 @@ class Guidance:
     def take_route(self, route: Route) -> None:
         """Fly a route from its first leg on.
 
-        While guidance is off, the route waits for the engagement. Earlier commands
-        that no step has taken yet are void, and so are the legs in the program.
+        While guidance is off, the route waits for the engagement. Earlier commands that
+        no step has taken yet are void, and so are the legs in the program.
         """
         self.route = route
         self._lander = None  # the lander is only for the route of the parameters

@@ -163,7 +163,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     def start_ns(self) -> int:
         """Return a start BEHIND_NS after a whole period of the system clock, ns.
 
-        If half a period is shorter than BEHIND_NS, it is half a period after.
+        If half a period is shorter than BEHIND_NS, the start is half a period after it.
         """
         return self.next_period_ns() + min(BEHIND_NS, self.period_ns() // 2)
 

@@ -313,7 +313,7 @@ class RiseDiConfig(ControllerConfig):
     def checks(self) -> Iterator[None]:
         """Check the controller, at several speeds if it has models at two more speeds.
 
-        They are the trim speed, the two speeds, and the speeds halfway from it to each of the two.
+        These speeds are the trim speed, the two others, and those halfway between.
         """
         if self.schedule is None or not self.schedule.models:
             yield from super().checks()

@@ -177,8 +177,8 @@ def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
     A turn begins when the better turn comes nearer to the fence than MARGIN of flight. It ends
     when the course is HOMEWARD short of the way home, or later if this way is not free yet. On the
     way home a turn begins only if it keeps a larger clearance than the way, and if both clearances
-    are below MARGIN of flight and below the present clearance. Outside no turn
-    begins: the aircraft flies back until it is MARGIN inside.
+    are below MARGIN of flight and below the present clearance. Outside no turn begins: the aircraft
+    flies back until it is MARGIN inside.
     """
     if isinstance(motion.phi, float):
         north, east, phi = map(np.float64, (motion.north, motion.east, motion.phi))

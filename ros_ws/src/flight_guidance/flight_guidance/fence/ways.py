@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ways home inside a fence, and back inside from outside.
 
-The ways are a map of square cells, made once for a fence. It contains the shortest ways over cells
-that stay inside the fence and, where possible, leave room for a turn. Each cell has an aim, a place
-on the way about a radius ahead. An aircraft comes home if it always flies the course to the aim of
-the cell that it is in.
+The ways are stored in a map of square cells, which is made once for a fence. It has the shortest
+ways over cells that stay inside the fence and, where possible, leave room for a turn. Each cell has
+an aim, a place on the way about a radius ahead. An aircraft comes home if it always flies the
+course to the aim of the cell that it is in.
 """
 
 import math

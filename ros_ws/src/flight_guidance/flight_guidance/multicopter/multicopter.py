@@ -47,7 +47,7 @@ from flight_guidance.steering.path import Arc, Point, Route, Side
 from flight_guidance.steering.vertical import VerticalParams, climb_for, slewed
 
 NEAR = 0.5
-"""A place counts as reached within this many seconds of flight, and within 0.5 m."""
+"""A place counts as reached within this many seconds of flight; at low speed within 0.5 m."""
 
 ACROSS = math.sin(math.radians(60.0))
 """Largest fraction of the speed towards a path, as in the guidance of airplanes."""

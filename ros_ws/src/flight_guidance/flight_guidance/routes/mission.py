@@ -199,7 +199,7 @@ def mission_route(
 
 
 def _skipped_name(item: Item) -> str:
-    """Return the name of an item that is not flown, and whether it is at 0, 0."""
+    """Return the name of an item that is not flown, with a remark if it is at 0, 0."""
     is_place = item.command in (WAYPOINT, SPLINE, *LOITERS)
     nowhere = is_place and not any(item.params[4:6])
     return f"{item.name}, at latitude and longitude 0" if nowhere else item.name

@@ -293,8 +293,8 @@ def joining(
 ) -> Scalar:
     """Choose the side of the shorter joining circle onto a course at a point.
 
-    Return a value of `Side` for each place. No circle is needed if the place is within
-    `near`, m, and the course flown within OPPOSITE of the course.
+    Return a value of `Side` for each place. No circle is needed if the place is within `near`, m,
+    and the course flown within OPPOSITE of the course.
     """
     right_way, left_way = (
         joining_length(point, course, side * radius, position, course_flown)

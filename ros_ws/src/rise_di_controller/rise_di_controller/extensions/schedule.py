@@ -141,8 +141,8 @@ def observer_of(
 def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
     """Stack the matrices of a feedforward side by side, with the inverse divided by `scale`.
 
-    They are [A, gravity, B, path A, path gravity, inverse'], the last with zeros to fill
-    n rows.
+    They are [A, gravity, B, path A, path gravity, inverse'], the last one with zeros in the rows
+    from m to n.
     """
     n, m = nominal.B.shape
     inverse = np.zeros((n, m))

@@ -16,14 +16,16 @@ from flight_core.vectors import FloatArray
 # s, time constant of the mean square of e: a few periods of the slowest oscillation that servos
 # allow
 MEMORY = 1.0
-FACTOR = 3.0  # on the largest rms error under the first law: later gusts are up to twice as strong
+# an output diverges above this multiple of its largest rms error under the first law; later gusts
+# are up to twice as strong
+FACTOR = 3.0
 LEAST = {"V": 1.0}  # m/s, rms error that does not yet count as a divergence
 # rad/s, the same limit of every other output: five times the rms error of the law alone in moderate
 # turbulence
 LEAST_RATE = 0.1
 
-# s, length of the record of e, and of each mean in it: a loop with servos oscillates more slowly
-# than these means
+# s, length of the record of e, and time over which each value in it is averaged: no loop with
+# servos oscillates so fast
 WINDOW = 10.0
 STEP = 0.02
 TEST = 50  # means between two tests for an oscillation, 1 s

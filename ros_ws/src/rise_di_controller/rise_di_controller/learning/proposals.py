@@ -117,8 +117,8 @@ class Updates:
     """Decides when proposals are due: at the first tick, and at given times counted from it.
 
     At the first tick the rough model is proposed as it is. Between those times, and after the last
-    of them, the aircraft is tested every `learn.check`, unless one of them is less than another
-    `learn.check` away.
+    of them, the aircraft is tested every `learn.check`, unless one of these times follows
+    the test within another `learn.check`.
     """
 
     def __init__(self, settings: LearnConfig) -> None:
