@@ -20,8 +20,9 @@ from flight_ros.subscriptions import PolledSubscription
 T = TypeVar("T")
 
 SERVICE_TIMEOUT = 10.0  # s
-DISCOVERY_TIMEOUT = 3.0  # s, until an aircraft of this namespace is known where others are
-NODES = ("controller", "guidance", "bridge", "aircraft")  # of an aircraft
+# s, after which a wait ends if only aircraft of other namespaces have been found
+DISCOVERY_TIMEOUT = 3.0
+NODES = ("controller", "guidance", "bridge", "aircraft")  # names of the nodes of one aircraft
 
 
 def start_middleware() -> None:
@@ -40,10 +41,10 @@ def start_middleware() -> None:
 
 
 class Client:
-    """A node in the default context.
+    """A client with a node in the default context.
 
-    With a `parent` it is a node in the parent's context, whose cancellation ends the waits of both.
-    Use it as a context manager, so that the middleware always shuts down.
+    With a `parent` it uses the node of the parent. If one of them is cancelled, the waits of both
+    end. Use it as a context manager, so that the middleware always shuts down.
     """
 
     def __init__(
@@ -84,7 +85,7 @@ class Client:
     def _decoded(
         self, subscription: PolledSubscription | None, decode: Callable[[bytes], T]
     ) -> list[T]:
-        """Return the messages since the last call; none without a subscription."""
+        """Return the messages since the last call, or [] if there is no subscription."""
         if subscription is None:
             return []
         pairs = self._refused.decoded(subscription, subscription.take(), decode)
@@ -108,9 +109,9 @@ class Client:
             rclpy.spin_once(self._node, timeout_sec=0.02)
 
     def _elsewhere(self) -> list[str]:
-        """Name the namespaces of the aircraft in the graph if none is in this namespace.
+        """Name the namespaces of the aircraft in the graph if no aircraft is in this namespace.
 
-        "/" is the root.
+        The root namespace is "/".
         """
         seen = {
             namespace

@@ -33,8 +33,8 @@ from flight_ros.receiver import Refusals
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import CLOCKS, offered
 
-WINDOW = 8  # differences of a node, of which the least has the least delay
-PEERS = 100  # nodes at most: names can be forged
+WINDOW = 8  # number of differences kept of each node: the least of them has the least delay
+PEERS = 100  # largest number of nodes that are kept, because names can be forged
 FORGET_NS = 5 * NANOSECONDS  # a node that is silent so long is forgotten
 DIFFERS = 0.005
 """s. Half a period of a controller at 100 Hz, and several times the error of the estimate on a
@@ -70,7 +70,7 @@ class Peers:
     """
 
     def __init__(self, own_name: str, host: float = 0.0) -> None:
-        self.ahead = 0.0  # of the own clock
+        self.ahead = 0.0  # s, lead of the own clock over the monotonic clock
         self._own = own_name
         self._host = host
         self._seen: dict[str, deque[float]] = {}
@@ -102,9 +102,9 @@ class Peers:
             table.pop(name, None)
 
     def differences(self) -> dict[str, float]:
-        """Return the report of a node: the least difference for every peer.
+        """Return the report of this node: the least difference for every peer.
 
-        It also has the figures for nodes of this host.
+        The report also has HOST and AHEAD, from which nodes of the same host compute exact offsets.
         """
         return {HOST: self._host, AHEAD: self.ahead} | {
             name: min(seen) for name, seen in self._seen.items()
@@ -160,7 +160,7 @@ class PeerClocks:
         return self._peers.clocks()
 
     def sentence_on(self, sender: str) -> str | None:
-        """End a sentence on the stamp of a node whose clock differs.
+        """Return the end of a sentence on a stamp: how far the clock of its sender differs.
 
         Returns None if no difference is known.
         """

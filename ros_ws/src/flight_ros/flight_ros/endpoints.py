@@ -23,7 +23,7 @@ from flight_ros.throttle import Throttle
 from flight_ros.topics import CLOCK, RECORDED, START, Y
 
 DISCOVERY_POLL_PERIOD = 0.02  # s
-# y, and the topics whose messages name no publisher
+# topics that a single node must publish: y, and those whose messages do not name their publisher
 OF_ONE_NODE = (Y, START, RECORDED, CLOCK)
 LOG_PERIOD_NS = 5 * NANOSECONDS  # between two lines on one mismatch
 
@@ -53,7 +53,7 @@ def require_no_publishers(
 
 
 def mismatch(peer: TopicEndpointInfo, message_type: str, qos: QoSProfile) -> Refusal | None:
-    """Say why a peer exchanges no messages with a local endpoint of this message type and QoS."""
+    """Say why a peer cannot exchange messages with a local endpoint of this type and QoS."""
     node = f"{peer.node_namespace.rstrip('/')}/{peer.node_name}"
     publishes = peer.endpoint_type == TopicEndpointTypeEnum.PUBLISHER
     verb = "publishes" if publishes else "subscribes"
@@ -82,9 +82,9 @@ class EndpointMonitor:
         return [refusal for peer in peers if (refusal := mismatch(peer, kind, subscription.qos))]
 
     def reason_against_publishers(self, subscription: PolledSubscription) -> Refusal | None:
-        """Refuse nodes of several names that publish a topic of a single node.
+        """Refuse publishers with different names on a topic that a single node must publish.
 
-        A restarted node keeps the name.
+        A restarted node keeps its name, so it is not refused.
         """
         if subscription.topic not in OF_ONE_NODE:
             return None
@@ -97,7 +97,7 @@ class EndpointMonitor:
     def check_publishers(self, subscription: PolledSubscription) -> None:
         """Log an error for each publisher that does not match a subscription of the node.
 
-        Unexpected nodes are logged too.
+        It also logs an error if several nodes publish a topic that a single node must publish.
         """
         refusals = [*self.mismatches(subscription), self.reason_against_publishers(subscription)]
         self._log(subscription.name, refusals)
@@ -105,8 +105,8 @@ class EndpointMonitor:
     def check_subscribers(self, publisher: Publisher) -> None:
         """Log an error for each subscriber that does not match a publisher of the node."""
         topic = publisher.topic_name
-        # The graph reports the QoS of both sides in the same terms. A new publisher is not in it
-        # yet.
+        # The graph reports the QoS of both sides in the same terms. It does not have a new
+        # publisher yet.
         for endpoint in self._node.get_publishers_info_by_topic(topic):
             if endpoint.node_name == self._node.get_name():
                 peers = self._node.get_subscriptions_info_by_topic(topic)

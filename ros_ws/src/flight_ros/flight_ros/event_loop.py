@@ -38,10 +38,11 @@ from flight_ros.simulated_time import ClockRestarted
 from flight_ros.ticker import Ticker
 from flight_ros.topics import NodeState
 
-# of a lockstep flight that never begins, or that waits after a refused sample
+# longest wait of a lockstep flight for its first sample, or after a refused sample
 PEER_TIMEOUT_NS = 30 * NANOSECONDS
 
-# s, between two checks of liveliness and service calls in lockstep, and of several nodes
+# s, between two checks for service calls (and liveliness) in lockstep; longest sleep of several
+# nodes in one thread
 SERVICE_POLL_PERIOD = 0.1
 
 LATE_REQUEST_PAUSE = 10
@@ -51,7 +52,7 @@ client could take all of the time."""
 
 LONGEST_PAUSE_NS = NANOSECONDS
 
-REPORT_TIME_NS = NANOSECONDS // 2  # in which the reports of a second are done
+REPORT_TIME_NS = NANOSECONDS // 2  # the reports of each second are spread over this time
 
 STATUS_UNEXPECTED = 1  # exit status after an unexpected exception
 
@@ -60,7 +61,7 @@ TEARDOWN_TIME = 0.8
 ever there, with the interpreter held, where other participants end at the same time
 (eProsima/Fast-DDS, issue 6513). The other nodes then notice the end by the lease, 2 s."""
 
-START_POLL_PERIOD = 0.005  # s, of a node that waits for t = 0
+START_POLL_PERIOD = 0.005  # s, between two polls of a node that waits for t = 0
 
 IDLE_POLL_PERIOD = 0.02  # s, the longest sleep, so that signals and service calls are handled soon
 
@@ -83,7 +84,7 @@ def run(
     """Run a node, or several in one thread, until SIGINT, SIGTERM or SIGHUP.
 
     The exit status is then 0. Other exit statuses: 2 for invalid parameters, 3 for a flight that
-    cannot continue, 5 for a landing, 6 where another node has ended, 1 for an unexpected exception.
+    cannot continue, 5 for a landing, 6 after another node has ended, 1 for an unexpected exception.
     The `early_participant` of flight_ros.startup is destroyed once the nodes exist.
 
     Ticks run on the monotonic clock in the main thread and poll the subscriptions. In lockstep
@@ -205,7 +206,7 @@ class _AwaitedInputs:
         self._wait_sets: dict[tuple[str | None, ...], WaitSet] = {}
 
     def wait(self, duration: float) -> bool:
-        """Wait for one of them, at most `duration` s. Return whether there is one."""
+        """Wait for one of these messages, at most `duration` s, and return whether one came."""
         topics = tuple(node.awaited_topic() for node in self._nodes)
         if not any(topics):
             time.sleep(duration)
@@ -253,9 +254,9 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
 def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, has_begun: bool) -> None:
     """Raise FlightEnded if a lockstep flight would wait for ever.
 
-    It may wait for a sample that was refused, or for its first one. `advance_ns` is when it last
-    advanced. A flight that has begun may wait for a peer that is stopped, for example in a
-    debugger.
+    It would do so after a sample was refused, or if its first sample never comes. `advance_ns` is
+    the instant at which it last advanced. A flight that has begun can wait as long as it likes for
+    a peer that is stopped, for example in a debugger.
     """
     for node in nodes:
         topic = node.awaited_topic()
@@ -272,7 +273,10 @@ def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, has_begun: 
 
 
 class RealTime:
-    """A node in real time: its ticks and its reports. `spin`: busy-wait before a deadline."""
+    """The ticks and reports of a node in real time.
+
+    With `spin` a wait for a deadline ends with a busy-wait.
+    """
 
     def __init__(self, node: FlightNode[Any], start_ns: int, *, spin: bool) -> None:
         host = node.host
@@ -300,9 +304,10 @@ class RealTime:
         return True
 
     def report(self) -> None:
-        """Do the next reports, some after each tick.
+        """Do the next few reports.
 
-        Together they may exceed a period of 2 ms.
+        They are spread over several ticks, because together they can take longer than a period of
+        2 ms.
         """
         now_ns = time.monotonic_ns()
         if now_ns >= self._report_ns:
@@ -321,7 +326,10 @@ class RealTime:
 def _start_instants(
     nodes: Sequence[FlightNode[Any]], executor: SingleThreadedExecutor, stop: _Stop
 ) -> list[int]:
-    """Return the starts of the nodes, ns of the system clock, once known; none after a signal."""
+    """Return the starts of the nodes, ns of the system clock, as soon as all are known.
+
+    Returns [] after a signal.
+    """
     starts: dict[FlightNode[Any], int] = {}
     waiting = [node for node in nodes if node.waits_for_start()]
     while not stop.is_requested:

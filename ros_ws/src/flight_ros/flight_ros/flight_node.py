@@ -49,12 +49,12 @@ S = TypeVar("S", bound=Sample)
 
 NO_PUBLISHER_WARNING_NS = 3 * NANOSECONDS  # the processes of a flight start one after another
 
-# at the end of a lockstep flight, for the last messages to arrive
+# time for the last messages of a lockstep flight to arrive
 ACKNOWLEDGE_TIMEOUT = Duration(seconds=0.5)
 
-WAITING_PERIOD_NS = 2 * NANOSECONDS  # between two warnings of a topic without samples
+WAITING_PERIOD_NS = 2 * NANOSECONDS  # between two warnings about a topic without samples
 
-# a late node catches up with its missed ticks, but not with hours
+# A late node catches up with its missed ticks, but it ignores a start that is older than this.
 MAX_START_AGE_NS = 10 * NANOSECONDS
 
 SIM_TIME = "use_sim_time"
@@ -92,7 +92,7 @@ class FlightNode(Node, Generic[P]):
         self.polled_subscriptions: list[PolledSubscription] = []
         self.receivers: list[Receiver[Any]] = []
         self._flight_publishers: list[Publisher] = []
-        # by topic: last call, and when to log it next
+        # by topic: the instants of the last call of `warn_no_publisher` and of its next log line
         self._waiting: dict[str, tuple[int, int]] = {}
         self._diagnostics = self.create_publisher(
             DIAGNOSTICS.type, DIAGNOSTICS.name, offered(DIAGNOSTICS)
@@ -109,8 +109,8 @@ class FlightNode(Node, Generic[P]):
         self._is_matched = False
         self._adopted: P | None = None
         self._tick_times = TickTimes()
-        self.time_offset_ns = 0  # of the time of the ticks from the monotonic clock
-        self._clock_step_ns = 0  # of the system clock since the start
+        self.time_offset_ns = 0  # time of the ticks less the monotonic clock
+        self._clock_step_ns = 0  # last logged step of the system clock
 
     # Defined by a subclass
 
@@ -136,8 +136,9 @@ class FlightNode(Node, Generic[P]):
     def start_ns(self) -> int | None:
         """Return the system time of tick 0, ns, by the parameter `start_time`.
 
-        If it is -1, the topic `start` gives it, or None before its message. If it is 0, it is the
-        next whole period of the system clock, so that nodes of equal rates tick together.
+        If `start_time` is -1, the topic `start` gives the instant; before its message the result is
+        None. If `start_time` is 0, tick 0 is at the next whole period of the system clock, so that
+        nodes of equal rates tick together.
         """
         start_time = getattr(self.parameters, "start_time", 0.0)
         if start_time < 0.0:
@@ -280,7 +281,7 @@ class FlightNode(Node, Generic[P]):
         self.set_parameters_atomically(changes)
 
     def clock_of(self, sender: str) -> str | None:
-        """End a sentence on the stamp of a node whose clock differs; None if it does not."""
+        """Return the end of a sentence on the stamp of a node whose clock differs, else None."""
         return None if self.clocks is None else self.clocks.sentence_on(sender)
 
     def warn_no_publisher(
@@ -288,9 +289,9 @@ class FlightNode(Node, Generic[P]):
     ) -> None:
         """Warn of a topic without a publisher, at each tick without a sample.
 
-        The warning is logged after 3 s, then every 2 s. `lack` is the cause where the topic has no
-        publisher. A publisher of the user may be silent because it waits for `start`, as it does in
-        a flight by a launch file.
+        The warning is logged after 3 s, then every 2 s. It gives `lack` as the cause if the topic
+        has no publisher. A publisher that the user wrote may be silent because it waits for
+        `start`, as nodes do in a flight by a launch file.
         """
         now_ns = time.monotonic_ns()
         last_ns, log_ns = self._waiting.get(subscription.name, (0, 0))
@@ -337,7 +338,10 @@ class FlightNode(Node, Generic[P]):
     # Called by the event loop
 
     def _received_start_ns(self) -> int | None:
-        """Return the instant on the topic `start`, ns; an old one is of an earlier flight."""
+        """Return the instant from the topic `start`, ns, or None if no recent one has come.
+
+        An old instant belongs to an earlier flight.
+        """
         if self._start_subscription is None:
             return None
         if messages := self._start_subscription.take():
@@ -347,7 +351,7 @@ class FlightNode(Node, Generic[P]):
         return next((stamp_ns for stamp_ns in instants if stamp_ns > oldest_ns), None)
 
     def match(self) -> None:
-        """Publish, once and in real time, that every input has a publisher."""
+        """Publish the state MATCHED, once and in real time, when every input has a publisher."""
         awaited = [
             *self.inputs(),
             *([self._start_subscription] if self._start_subscription is not None else []),
@@ -370,7 +374,7 @@ class FlightNode(Node, Generic[P]):
     def check_clock(self) -> None:
         """Log an error after a step of the system clock.
 
-        The node keeps its time; a node with a later start has the new time.
+        The node keeps its own time. A node that starts later uses the new time.
         """
         step_ns = self.host.time_ns() - self.now_ns()
         if abs(step_ns - self._clock_step_ns) > CLOCK_STEP_NS:

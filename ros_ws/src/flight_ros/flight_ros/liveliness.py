@@ -25,7 +25,7 @@ REPORT_TIMEOUT = Duration(seconds=0.2)
 """Longest wait until all peers have a report, after which the node ends. The lost peer never
 acknowledges it."""
 
-ROLES = NODES[:-1]  # a bridge flies in real time alone
+ROLES = NODES[:-1]  # without the bridge, which flies in real time only
 
 
 class LivelinessMonitor:

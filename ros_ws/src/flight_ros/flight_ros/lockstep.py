@@ -21,7 +21,7 @@ class Instant(NamedTuple):
 class LockstepInputs:
     """y and a second signal, brought together.
 
-    A step waits for the y of its instant and the second signal up to it.
+    A step waits for the y of its instant, and for the second signal up to this instant.
     """
 
     def __init__(
@@ -32,13 +32,16 @@ class LockstepInputs:
         receive_other: Callable[[], Iterable[StampedVector | None]],
         is_ready: Callable[[int], bool] = lambda now_ns: True,
     ) -> None:
-        """Take the inputs; `is_ready` tells whether what else a step needs has come."""
+        """Take the inputs, and `is_ready`, which tells whether all else that a step needs is there.
+
+        `is_ready` gets the instant of the step, ns.
+        """
         self._is_ready = is_ready
         self._y_period_ns = y_period_ns
         self._period_ns = period_ns
         self._receive_y = receive_y
         self._receive_other = receive_other
-        self._number = 0  # of the next y
+        self._number = 0  # index of the next y
         self._y_due: deque[StampedVector | None] = deque()
         self._others_due: deque[StampedVector] = deque()
 

@@ -30,7 +30,7 @@ BYTE_ORDERS: Mapping[bytes, Literal["big", "little"]] = MappingProxyType(
 )
 STAMP = struct.Struct("<iI")  # seconds and nanoseconds; they follow the encapsulation
 STAMP_PLACE = len(ENCAPSULATION)
-LENGTH_PLACE = STAMP_PLACE + STAMP.size  # of the length of header.frame_id
+LENGTH_PLACE = STAMP_PLACE + STAMP.size  # offset of the length of header.frame_id
 COUNT = struct.Struct("<I")  # length of a sequence or a string, before its elements
 FRAME_ID_PLACE = LENGTH_PLACE + COUNT.size
 MAX_SIZE = 16_384
@@ -65,9 +65,10 @@ def from_message(message: JointState, channels: Sequence[str]) -> StampedVector:
 class Encoder:
     """Encodes the samples of a publisher as the bytes of a message.
 
-    If there are no names, the message has no channels. In lockstep it says that there is no sample
-    at this instant. Layout: CDR (OMG Common Object Request Broker Architecture, 9.3). The offset of
-    each value from the encapsulation is a multiple of its size; padding bytes are 0.
+    If there are no names, the message has no channels. In lockstep such a message says that there
+    is no sample at this instant. The layout is CDR (OMG Common Object Request Broker Architecture,
+    9.3). The offset of each value from the encapsulation is a multiple of its size. Padding bytes
+    are 0.
     """
 
     def __init__(self, names: Sequence[str], frame_id: str) -> None:
@@ -181,9 +182,10 @@ class NamedDecoder:
 
 
 def sender_of(raw: bytes) -> str | None:
-    """Return the publisher of a message that begins with a header; decode no names and values.
+    """Return the publisher of a message that begins with a header.
 
-    Returns None if the bytes are too short, or not plain CDR.
+    It does not decode the names and values. Returns None if the bytes are too short, or not plain
+    CDR.
     """
     if len(raw) < FRAME_ID_PLACE or (order := BYTE_ORDERS.get(raw[:2])) is None:
         return None
@@ -192,7 +194,7 @@ def sender_of(raw: bytes) -> str | None:
 
 
 def stamp_of(raw: bytes) -> int:
-    """Read the stamp at the beginning of a message, ns, or raise ChannelError, "malformed"."""
+    """Read the stamp at the beginning of a message, ns. Raises ChannelError, reason "malformed"."""
     order = BYTE_ORDERS.get(raw[:2])
     if order is None or len(raw) < LENGTH_PLACE:
         raise ChannelError(

@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 from flight_core.parameters import ParameterError, require
 from flight_ros.transport import LOOPBACK_PROFILE
 
-PEER_RANGE = 20  # participants of each host that are found
+PEER_RANGE = 20  # largest number of participants that discovery finds on each host
 ANNOUNCEMENT_NS = 500_000_000
 """A participant announces itself to each of the PEER_RANGE places of each host. At the 0.1 s of the
 loopback profile five nodes would send 1000 packets a second to each host."""
@@ -44,7 +44,7 @@ def addresses(text: str) -> tuple[str, ...]:
 def own_address(peers: Sequence[str], local: Collection[str]) -> str:
     """Find the address of this host among the peers, by the addresses of its interfaces.
 
-    Raises ParameterError.
+    Raises ParameterError unless exactly one of the peers is an address of this host.
     """
     matches = [address for address in peers if address in local]
     own = ", ".join(sorted(local)) or "none"

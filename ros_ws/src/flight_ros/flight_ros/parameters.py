@@ -63,8 +63,8 @@ def read_parameters(node: Node, schema: type[P]) -> P:
         elif value != ():
             node.declare_parameter(name, value, descriptor)
     for name in sorted(tunable):
-        # an optional parameter without an override, which may be set in flight; a group that has
-        # parameters is none itself
+        # Also declare an optional parameter without an override, because it can be set in flight. A
+        # group that contains parameters is no parameter itself.
         if not node.has_parameter(name) and not node.get_parameters_by_prefix(name):
             node.declare_parameter(
                 name,
@@ -129,7 +129,8 @@ def _require_no_octal(arguments: Sequence[str]) -> None:
 def changed(node: Node, parameters: P, changes: list[Parameter]) -> P:
     """Change some parameters of a set, and validate it as a whole.
 
-    Raises ParameterError, also for a parameter of `learned`.
+    Raises ParameterError for an invalid set, and for a parameter that `learned` names, because such
+    a parameter can only change at a restart.
     """
     for change in changes:
         is_own = change.name.split(".")[0] in parameters.learned()

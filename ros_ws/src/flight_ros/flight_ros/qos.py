@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Quality of service (QoS) of recorded topics.
 
-It has the strongest compatible profile, and rosbag2's form of offered profiles.
+This module finds the strongest compatible profile, and writes profiles in the form of rosbag2.
 """
 
 from collections.abc import Sequence

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keep every use of a private name of rclpy 7.1 in one place.
 
-`tests/ros/flight_ros/test_rclpy_private.py` checks them.
+`tests/ros/flight_ros/test_rclpy_private.py` checks these uses.
 """
 
 from collections.abc import Callable, Sequence
@@ -71,7 +71,7 @@ class WaitSet:
         self._wait_set = _rclpy.WaitSet(len(self._handles), 0, 0, 0, 0, 0, context.handle)
 
     def wait(self, timeout_ns: int) -> bool:
-        """Wait for a message on one of them or for the timeout.
+        """Wait for a message on one of the subscriptions, at most until the timeout.
 
         Returns whether there is a message.
         """
@@ -136,7 +136,7 @@ def refuse_foreign_parameters(node: Node) -> None:
 def ready_callback(executor: SingleThreadedExecutor) -> Callable[[], None] | None:
     """Return a callback that is ready, or None, without blocking.
 
-    Calling it raises what the callback raises.
+    If you call it, it raises the exceptions of the callback.
     """
     try:
         handler, _, _ = executor.wait_for_ready_callbacks(0, None, lambda: False)

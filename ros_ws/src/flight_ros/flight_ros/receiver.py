@@ -27,8 +27,8 @@ GROWTH = 2
 """Size of a message over that of the longest valid one. A publisher may leave channels out, as a
 bridge those of a pose that are not fresh: three of seven channels have half of the bytes."""
 
-RECENT = 9  # samples, of which the median interval is taken
-FEWEST = 3  # samples within an age limit: one of them may be late, and one lost
+RECENT = 9  # number of samples from which the median interval is taken
+FEWEST = 3  # samples that must fit into an age limit, so that one can be late and one be lost
 
 
 class Sample(Protocol):
@@ -48,7 +48,7 @@ T = TypeVar("T")
 
 
 class Source(Protocol):
-    """Where samples come from: the topic, and its full name."""
+    """A source of samples: the topic, and its full name."""
 
     topic: Topic
     name: str
@@ -60,10 +60,10 @@ class Refusals:
     def __init__(
         self, node: Node, clock_of: Callable[[str], str | None] = lambda sender: None
     ) -> None:
-        # the end of a sentence on the stamp of a sender whose clock differs
+        # returns the end of a sentence on the stamp of a sender whose clock differs
         self.clock_of = clock_of
         self.counts: Counter[str] = Counter()  # by "topic: reason"
-        # by full topic: instant on the monotonic clock, and sentence
+        # by full topic name: the instant of the last refusal on the monotonic clock, its sentence
         self.last: dict[str, tuple[int, str]] = {}
         self._node = node
         self._throttle = Throttle(LOG_PERIOD_NS)
@@ -72,7 +72,7 @@ class Refusals:
     def add(self, subscription: Source, reason: str, sentence: str) -> None:
         """Count a refused sample, and log at most one in 2 s for each topic and reason.
 
-        A conflicting publisher is an ERROR, here and in the diagnostics.
+        A conflicting publisher is logged as an ERROR, and is an ERROR in the diagnostics too.
         """
         key = f"{subscription.topic.name}: {reason}"
         self.counts[key] += 1
@@ -110,9 +110,10 @@ class Refusals:
         messages: Iterable[ReceivedMessage],
         lock: LockstepLock | None = None,
     ) -> list[int]:
-        """Return the stamps at the begin of messages, ns.
+        """Return the stamps at the beginning of messages, ns.
 
-        Refuse a message without a stamp, and with a `lock` those of a second publisher.
+        A message without a stamp is refused. With a `lock`, messages of a second publisher are
+        refused too.
         """
         stamps = []
         for stamp_ns, received in self.decoded(source, messages, stamp_of):
@@ -129,7 +130,7 @@ class Refusals:
     def since(self, subscription: PolledSubscription, begin_ns: int) -> Refusal | None:
         """Return the last refusal of a topic since an instant of the monotonic clock.
 
-        It has age and count.
+        The refusal states its age and how often it occurred.
         """
         if subscription.name not in self.last:
             return None
@@ -152,13 +153,15 @@ class Receiver(Generic[S]):
     """The samples of a topic. Checks go from cheap to costly: size, publisher, content, stamp.
 
     A message that is too long, or from a conflicting publisher, is refused without decoding names
-    and values, so that a flood of such messages costs no more than valid ones. Under the name of
-    the locked publisher, too long means GROWTH times the longest valid message, until the publisher
-    times out. `decode` returns None for a vector without channels. `take` gets a sample and the
-    present instant. `lock` admits one publisher at a time; None admits every one. `max_age_ns`
-    limits the age of a stamp and its lead over the clock; None is for a sender without the clock of
-    the flight. `max_size` in bytes is for a topic of reports, whose lengths differ by more than
-    GROWTH; None is for one of samples. Refusals are raised as ChannelError.
+    and values, so that a flood of such messages costs no more than valid ones. A message of the
+    locked publisher is too long if it exceeds GROWTH times the longest valid message. This limit
+    lasts until the publisher times out.
+
+    `decode` returns None for a vector without channels. `take` gets a sample and the present
+    instant. `lock` admits one publisher at a time; None admits all of them. `max_age_ns` limits the
+    age of a stamp and its lead over the clock. It is None if the sender does not have the clock of
+    the flight. `max_size`, in bytes, is for a topic of reports, whose lengths differ by more than
+    GROWTH. It is None for a topic of samples. Refusals are raised as ChannelError.
     """
 
     def __init__(
@@ -176,7 +179,7 @@ class Receiver(Generic[S]):
         self.lock = lock
         self._max_size = max_size or MAX_SIZE
         self._grows = max_size is not None
-        self._longest = 0  # bytes, of the valid messages
+        self._longest = 0  # bytes, length of the longest valid message
         self._stamps_ns = deque[int](maxlen=RECENT)  # of the last samples
         self._refusals = refusals
         self._decode = decode
@@ -201,7 +204,7 @@ class Receiver(Generic[S]):
     def take_message(self, raw: bytes, now_ns: int, sequence: int = 0) -> bool:
         """Check and take a message. Returns whether the message was valid.
 
-        `sequence`: as of `PublisherLock.require_alone`.
+        `sequence` is the same as for `PublisherLock.require_alone`.
         """
         try:
             sender = self._require_publisher(raw, now_ns)
@@ -219,9 +222,9 @@ class Receiver(Generic[S]):
         return True
 
     def _require_publisher(self, raw: bytes, now_ns: int) -> str:
-        """Return the sender of a message; "" where the topic has no lock.
+        """Return the sender of a message, or "" if the topic has no lock.
 
-        Raise ChannelError for a message that is too long, or of a conflicting publisher.
+        Raises ChannelError if the message is too long, or comes from a conflicting publisher.
         """
         require_size(raw, self._max_size)
         if self.lock is None:
@@ -238,7 +241,7 @@ class Receiver(Generic[S]):
         return sender
 
     def slowness(self, max_age_ns: int) -> Refusal | None:
-        """Say why samples at their rate exceed an age limit at times, unless FEWEST of them fit."""
+        """Say that samples come too slowly for an age limit, if fewer than FEWEST fit into it."""
         if (
             len(self._stamps_ns) < RECENT
             or (period_ns := float(np.median(np.diff(self._stamps_ns)))) <= 0.0
@@ -259,8 +262,9 @@ class Receiver(Generic[S]):
     def receive(self) -> list[S | None]:
         """Decode the messages of the flight's publisher in lockstep, for `accept`.
 
-        None is an instant without a sample: the publisher sent no channels, or content that is
-        refused. A message of anybody else has no effect, because each message is an instant.
+        Each message of this publisher stands for an instant. None is an instant without a sample:
+        the publisher sent no channels, or content that is refused. A message of any other publisher
+        has no effect.
         """
         samples: list[S | None] = []
         for received in self.subscription.take():
@@ -274,7 +278,7 @@ class Receiver(Generic[S]):
                 sample = self._decode(received.message)
             except ChannelError as error:
                 self._refusals.add(self.subscription, error.reason, str(error))
-                # Before the first valid message it is not known whose a message is.
+                # Before the first valid message the flight's publisher is not known.
                 if self.lock is None or self.lock.publisher is None:
                     continue
                 sample = None

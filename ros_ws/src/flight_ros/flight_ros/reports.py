@@ -57,7 +57,7 @@ def decode(raw: bytes) -> Report:
         DeserializationError,
         ValueError,
         RecursionError,
-    ) as error:  # ValueError: of json, or not one status
+    ) as error:  # ValueError: json refuses the text, or the message has not exactly one status
         raise ChannelError("malformed", " ".join(str(error).split())) from None
     stamp = message.header.stamp
     sender = message.header.frame_id

@@ -19,11 +19,11 @@ from flight_ros.receiver import Refusals
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import NEWEST_SAMPLES, SIMULATED_CLOCK
 
-# /clock may be lost for so long; a node then catches up with its missed ticks
+# /clock may be lost for this long; a node then catches up with its missed ticks
 LARGEST_JUMP_NS = 60 * NANOSECONDS
 LONGEST_WAIT_NS = NANOSECONDS // 50  # so that signals and service calls are handled in a pause
-SILENT_NS = NANOSECONDS  # without a message of /clock, before a node says that it waits
-HISTORY = 4096  # messages of /clock, by which the instants of other messages are known
+SILENT_NS = NANOSECONDS  # silence of /clock after which a node says that it waits
+HISTORY = 4096  # number of messages of /clock that are kept, to date other messages by them
 
 
 class ClockRestarted(Exception):  # noqa: N818 - an event of the simulator
@@ -38,9 +38,9 @@ class SimulatedTime:
         self.subscription = PolledSubscription(node, SIMULATED_CLOCK, NEWEST_SAMPLES, raw=True)
         self._context = node.context
         self._wait_set: WaitSet | None = None
-        self._received_ns: list[int] = []  # of the messages, by the system clock
-        self._instants_ns: list[int] = []  # and what the messages say
-        self._first = 0, 0  # of both
+        self._received_ns: list[int] = []  # receptions of the messages, by the system clock
+        self._instants_ns: list[int] = []  # the instants in these messages
+        self._first = 0, 0  # first instant, and its reception, ns
         self._jump_ns = 0
 
     def known(self) -> bool:
@@ -61,7 +61,7 @@ class SimulatedTime:
     def sleep(self, duration: float, /) -> None:
         """Wait for the next message, at most LONGEST_WAIT_NS of the host.
 
-        A duration of simulated time has no length there.
+        A duration of simulated time has no fixed length on the host, so `duration` is ignored.
         """
         self._wait_set = self._wait_set or WaitSet([self.subscription.entity], self._context)
         self._wait_set.wait(LONGEST_WAIT_NS)
@@ -83,7 +83,7 @@ class SimulatedTime:
         return instants_ns[place - 1] + round(share * step_ns)
 
     def speed(self) -> float:
-        """Return simulated time over that of the host, since the first message."""
+        """Return the ratio of simulated time to the host's time since the first message."""
         instant_ns, received_ns = self._first
         return (
             (self.time_ns() - instant_ns) / max(self._received_ns[-1] - received_ns, 1)

@@ -32,7 +32,7 @@ docs/reference/parameters.md, the topics in docs/topics.md. `rise-di fly` starts
 
 PRINT_PARAMETERS = "--print-parameters"
 
-BAD_ENVIRONMENT = 2  # exit status, as of invalid parameters
+BAD_ENVIRONMENT = 2  # exit status, the same as for invalid parameters
 
 
 def start_nodes(
@@ -40,12 +40,12 @@ def start_nodes(
 ) -> None:
     """Run nodes, each "module:class", by `flight_ros.event_loop.run`.
 
-    `--print-parameters` prints the parameter file of a node, to be filled in: `parameters` are its
-    name and the "module:class" of its set.
+    `--print-parameters` prints a parameter file for the user to fill in. `parameters` holds the
+    name of the node and the "module:class" of its parameter set.
 
-    A signal during the start ends with exit status 0 too. With `early` a DDS participant is created
-    before the imports. The real-time priority falls by `lower_by` levels, more for nodes of a
-    longer period.
+    A signal during the start also ends the process with exit status 0. With `early` a DDS
+    participant is created before the imports. The real-time priority is lowered by `lower_by`
+    levels. A node with a longer period has a larger `lower_by`.
     """
     if {"--help", "-h"} & {*sys.argv[1:]}:
         print(USAGE.format(program=os.path.basename(sys.argv[0])))  # noqa: PTH119 - pathlib takes as long to import as the rest

@@ -36,14 +36,15 @@ class ReceivedMessage(NamedTuple):
     message: Any
     sent_ns: int
     received_ns: int
-    sequence: int  # of the publisher, increases by one for each message: a gap is a loss
+    sequence: int  # the publisher increases it by one for each message, so a gap is a loss
 
 
 class PolledSubscription:
-    """A subscription that is polled by `take`; a `raw` message is its bytes, CDR.
+    """A subscription that is polled by `take`.
 
-    It has no callbacks of rclpy for publishers that do not match: `EndpointMonitor` reports them,
-    and an executor would ask for each of these events whenever it looks for a request.
+    If it is `raw`, its messages are CDR bytes. It has no callbacks of rclpy for publishers that do
+    not match. `EndpointMonitor` reports such publishers, and an executor would ask for each of
+    these events whenever it looks for a request.
     """
 
     def __init__(self, node: Node, topic: Topic, qos: QoSProfile, *, raw: bool = False) -> None:
@@ -63,7 +64,7 @@ class PolledSubscription:
     def take(self, most: int | None = None) -> list[ReceivedMessage]:
         """Return the messages since the last call, oldest first.
 
-        There are at most `most`, by default the depth of the queue.
+        It returns at most `most` messages. The default is the depth of the queue.
         """
         return [
             ReceivedMessage(

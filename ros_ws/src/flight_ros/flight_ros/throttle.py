@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Throttle of repeated log lines.
 
-rclpy's own counts by the line of code, not by topic and reason.
+The throttle of rclpy counts by line of code, not by topic and reason.
 """
 
 import time
@@ -13,7 +13,7 @@ class Throttle:
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
-        self._passed_ns: dict[str, int] = {}  # by line
+        self._passed_ns: dict[str, int] = {}  # when a line last passed, by its text
 
     def due(self, line: str) -> bool:
         """Return whether the line has not passed for a period; if so, it passes now."""

@@ -32,7 +32,7 @@ class HostTime(Protocol):
 class Tick(NamedTuple):
     """A deadline that has passed."""
 
-    number: int  # of periods since the start; an overrun skips the missed ones
+    number: int  # number of periods since the start; after an overrun it skips the missed ones
     previous: int  # number of the previous tick, 0 at the first
     late_ns: int  # how long after the deadline the tick began
 

@@ -22,7 +22,7 @@ def kept(depth: int) -> QoSProfile:
 
 
 # Publishers are reliable and keep their last samples, so that a recorder that is matched late or
-# delayed loses none. The depth is two seconds at 1 kHz, as that of the recorder; see
+# delayed loses none. The depth holds two seconds at 1 kHz, for publishers and for the recorder. See
 # `publisher_qos`.
 PUBLISH = RECORD = kept(2000)
 # Control loops use the newest samples and no retransmissions. The depth covers the samples of y_m
@@ -33,11 +33,11 @@ NEWEST_SAMPLES = QoSProfile(depth=128, reliability=ReliabilityPolicy.BEST_EFFORT
 # late. The depth is for speed: with a full history, Fast DDS requests an acknowledgement of each
 # sample.
 LOCKSTEP = kept(20_000)
-# The middleware reports the loss of liveliness. It asserts it every two thirds of the lease, so a
-# process that the host stops for less than the other third, 0.6 s, is never lost. With a lease of 1
-# s, 2 of 20 stops of 0.4 s lost the process. The lease is shorter than that of the participant, 2
-# s, which does not tell a kill from a clean end. The only message of a node is the name of the role
-# that it lost, before it ends.
+# The middleware asserts liveliness, and reports its loss. It asserts every two thirds of the lease,
+# so a process that the host stops for less than the other third, 0.6 s, is never lost. With a lease
+# of 1 s, 2 of 20 stops of 0.4 s lost the process. The lease must be shorter than the lease of the
+# participant, 2 s, because the end of the latter does not tell a kill from a clean end. A node
+# sends a single message, before it ends: the name of the role that it lost.
 LIVELINESS = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
@@ -48,8 +48,8 @@ LIVELINESS = QoSProfile(
 # recorder requests less.
 RECORD_FOREIGN = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 
-# A proposal is rare, so none may be lost. One from before the start of the controller is void. The
-# depth is as that of NEWEST_SAMPLES.
+# A proposal is rare, so none may be lost. A proposal from before the start of the controller is
+# void. The depth is the same as in NEWEST_SAMPLES.
 PROPOSALS = QoSProfile(depth=128, reliability=ReliabilityPolicy.RELIABLE)
 
 # A late subscriber gets the last state of each node. The queue of a subscriber holds the states of
@@ -67,7 +67,7 @@ def offered(topic: table.Topic) -> QoSProfile:
 
 
 def publisher_qos(period_ns: int) -> QoSProfile:
-    """Return PUBLISH at a rate, with a history of two seconds.
+    """Return the profile PUBLISH for a period, with a history of two seconds.
 
     A longer history would delay the flight when a recorder joins, because the threads that send new
     samples also send the history, all at once.

@@ -20,7 +20,7 @@ LOOPBACK_PROFILE = Path(str(files("flight_ros"))) / "loopback.xml"
 def environment() -> dict[str, str]:
     """Return the environment variables that select the loopback transport.
 
-    They are empty if the user has configured a profile.
+    Returns {} if the user has configured a profile.
     """
     if PROFILE_VARIABLE in os.environ:
         return {}
