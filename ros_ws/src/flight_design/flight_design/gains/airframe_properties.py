@@ -44,10 +44,11 @@ published data have five digits."""
 
 
 class ZeroDynamics(StrEnum):
-    """Location of the invariant zeros, the criterion of Assumption 3."""
+    """Location of the invariant zeros, which decides whether Assumption 3 holds."""
 
     STABLE = "stable"  # all in the open left half plane
-    # some on the imaginary axis, outside the theorem too: such angles need an outer loop
+    # some on the imaginary axis: outside the theorem too, since an outer loop must control these
+    # angles
     MARGINAL = "marginal"
     UNSTABLE = "unstable"  # one in the right half plane: outside the theorem
 
@@ -59,7 +60,7 @@ class AirframeFacts(NamedTuple):
     n: int
     m: int
     poles: ComplexArray  # (n,) eigenvalues of A, 1/s
-    # finite invariant zeros of (A, B, C), 1/s: n - m of them if Omega is nonsingular
+    # finite invariant zeros of (A, B, C), 1/s; there are n - m of them if Omega is nonsingular
     zeros: ComplexArray
     Omega: FloatArray  # (m, m) C B
     minors: FloatArray  # (m,) leading minors of Omega
@@ -67,11 +68,11 @@ class AirframeFacts(NamedTuple):
     coupling: float | None  # max abs(U - I) in inputs of unit response, None if D is None
     outputs: tuple[str, ...]
     inputs: tuple[str, ...]
-    # from `search`: a change to D = I, None if no order that was tried has one
+    # from `search`: the change that makes D = I; None if no order that was tried has such a change
     pairing: Pairing | None
     zero_dynamics: ZeroDynamics
     controllable: bool  # Assumption 1
-    # states that integrate outputs only: each gives a zero at the origin
+    # states that integrate nothing but outputs: each of them gives a zero at the origin
     integrated: tuple[str, ...]
 
     @property
@@ -178,9 +179,9 @@ def library() -> list[AirframeFacts]:
 def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:
     """Find the finite s, 1/s, at which Rosenbrock's pencil [[A - s I, B], [C, 0]] loses rank.
 
-    They come sorted by real part. Shapes: A (n, n), B (n, m), C (m, n); there are n - m zeros if C
-    B is nonsingular. They are the poles of the zero dynamics, which is the motion of the aircraft
-    with y = 0. Source: H. H. Rosenbrock, "State-Space and Multivariable Theory", 1970.
+    They are sorted by real part. The shapes are A (n, n), B (n, m), C (m, n). There are n - m zeros
+    if C B is nonsingular. They are the poles of the zero dynamics, which is the motion of the
+    aircraft with y = 0. Source: H. H. Rosenbrock, "State-Space and Multivariable Theory", 1970.
     """
     n, m = B.shape
     pencil = np.block([[A, B], [C, np.zeros((m, m))]])
@@ -201,8 +202,8 @@ def fastest_zero(A: FloatArray, B: FloatArray, C: FloatArray) -> float:
 def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return P (n, m), N (n, n - m) and H (n, n - m) with x = P y + N eta, eta = H' x.
 
-    y are the outputs, and eta the n - m other states. C (m, n) must have full rank, or
-    ParameterError is raised. eta consists of the states that C contains least, by a QR
+    y are the outputs, and eta the n - m other states. Raises ParameterError unless C (m, n) has
+    full rank. eta consists of the states that C contains least, by a QR
     decomposition with pivoting. If C selects states, P = C' and N = H.
     """
     m, n = C.shape

@@ -26,10 +26,14 @@ def signs_of_pairing(
     """Return D of a pairing of channels, shape (m,).
 
     Omega = C B is in the order of the channels, (m, m), with the airframe's signs of the inputs.
-    `input_signs` has -1 for an input whose sign is flipped between law and airframe, which flips
-    D_k and nothing else. The checks come in this order: the pairing has a D, and max abs(U - I) is
-    at most 10; the input signs fit the D that is given; D fits Omega. Raises ParameterError that
-    names the contradiction to Omega and a choice that fits.
+    `input_signs` has -1 for an input whose sign is flipped between law and airframe. Such a flip
+    changes the sign of D_k and nothing else. The checks are made in this order:
+
+    1. The pairing has a D, and max abs(U - I) is at most 10.
+    2. The input signs fit the D that is given.
+    3. D fits Omega.
+
+    Raises ParameterError, which names the contradiction to Omega and a choice that fits.
     """
     m = len(Omega)
     flips = np.ones(m) if input_signs is None else np.array(input_signs, dtype=np.float64)

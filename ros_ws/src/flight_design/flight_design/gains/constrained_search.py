@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A search for factors on gains with the least cost of a loop that meets a requirement.
+"""A search for factors on gains, so that a loop meets a requirement at the least cost.
 
-A place is a tuple of whole exponents of STEP, k factors of m channels, so that the search is
-deterministic. It is a pattern search: R. Hooke, T. A. Jeeves, Journal of the ACM 8(2), 1961.
+A place is a tuple of k m exponents: k factors for each of m channels. Each factor is STEP to the
+power of its exponent, a whole number, so that the search is deterministic. Source of the pattern
+search: R. Hooke, T. A. Jeeves, Journal of the ACM 8(2), 1961.
 """
 
 import math
@@ -17,30 +18,34 @@ Content = TypeVar("Content")
 Place = tuple[int, ...]
 IntArray = NDArray[np.int64]
 
-STEP = 1.05  # factor of an exponent of 1
-GAIN = 0.01  # least fall of cost or shortage that counts: a hundredth, also of a goal
-REACH = 16  # exponents, longest move from a place with a shortage: a factor of 2.2
+STEP = 1.05  # the factor that an exponent of 1 stands for
+GAIN = 0.01  # least fall of cost or shortage that counts as better: 1 % of the cost, or of a goal
+REACH = 16  # largest change of an exponent by one move while there is a shortage: a factor of 2.2
 
 
 class Moves(NamedTuple):
-    """The moves of a search, each the changes of the k exponents of a channel."""
+    """The moves of a search. A move has the changes of the k exponents of a channel."""
 
     mending: Sequence[tuple[int, ...]]  # moves that may reduce a shortage
     cheaper: Sequence[tuple[int, ...]]  # moves that may lower the cost
-    begin: int = 1  # exponents, reach of the first moves
-    is_joint: bool = False  # whether all channels may move at once while something is short
+    begin: int = 1  # reach of the first moves: the factor by which a move is multiplied
+    is_joint: bool = False  # whether all channels may move together while there is a shortage
 
 
 class Trial(NamedTuple, Generic[Content]):
-    """A place, with what the loop there lacks and costs."""
+    """A place, with the shortage and the cost of its loop."""
 
     place: Place
     shortage: float  # sum over the goals of 1 - found / needed where this is above 0
-    cost: float  # a logarithm, so that differences are ratios; infinite if there is a shortage
+    # a logarithm, so that a difference of costs stands for a ratio; infinite if there is a shortage
+    cost: float
     content: Content
 
     def is_better(self, trial: "Trial[Content]") -> bool:
-        """Return whether the shortage is less, or the cost if nothing is short, by GAIN."""
+        """Return whether this trial is better than another one by at least GAIN.
+
+        The shortages are compared, or the costs if neither trial has a shortage.
+        """
         if self.shortage == 0.0 or trial.shortage == 0.0:
             return self.shortage < trial.shortage or self.cost < trial.cost - GAIN
         return self.shortage < trial.shortage - GAIN * min(trial.shortage, 1.0)
@@ -61,11 +66,12 @@ def descend(
     lowest: IntArray,
     highest: IntArray,
 ) -> Trial[Content]:
-    """Move from a start until no move of a single channel is better, and return the last trial.
+    """Move from a start until no move of a single channel helps, and return the last trial.
 
-    `lowest` and `highest`, (k, m), bound the exponents. As long as there is a shortage, the best
-    move of all channels is taken, and the reach doubles if none helps. Without a shortage each
-    channel moves in turn, beginning with the last reach, which is halved if no move helps.
+    `lowest` and `highest`, (k, m), bound the exponents. While there is a shortage, the best move
+    among those of all channels is taken, and the reach doubles if none of them helps. If there is
+    no shortage, each channel moves in turn, beginning with the last reach. The reach is halved if
+    no move helps.
     """
     best = start
     reach = moves.begin

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Design of an allocation for the effectors of an airframe.
 
-It yields T, and the loop as the law sees it through T.
+It finds the matrix T of u = T v, and the inputs v with their limits and lags, which the law uses.
 """
 
 from collections.abc import Sequence
@@ -19,15 +19,16 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.extensions.model_sections import AllocationConfig
 
 LAW_INPUT = "v_"  # beginning of the name of an input of the law: v_q belongs to the output q
-DIGITS = 10  # of T and effect in a file: their product is I to 1e-9
-# s, added to the lags in the weights: a fast servo's, so that an ideal one does not do all
+DIGITS = 10  # digits of T and effect in a file, so that their product is I to 1e-9
+# s, lag of a fast servo. The weights add it to each lag, or else an ideal servo would do all work.
 SERVO = 0.01
-# fraction of the largest: an effector that gives less of an input of the law does not limit it
+# An effector does not limit an input of the law if it gives less than this fraction of what the
+# effector with the largest share gives.
 SMALL = 1e-9
 
 
 class Effectors(NamedTuple):
-    """The effectors of an airframe, in its order, deviations from trim, SI: shapes (p,)."""
+    """The effectors of an airframe, in its order: deviations from trim in SI, shapes (p,)."""
 
     lower: FloatArray  # end stops
     upper: FloatArray
@@ -36,10 +37,11 @@ class Effectors(NamedTuple):
 
 
 class LawInputs(NamedTuple):
-    """The inputs v of the law through an allocation, one an output; shapes (m,), units of y / s."""
+    """The inputs v of the law, one per output, before an allocation; (m,), units of y / s."""
 
     names: tuple[str, ...]
-    lower: FloatArray  # at this limit an input by itself takes the first effector to its stop
+    # limit at which the first effector reaches its stop, if all other inputs are 0
+    lower: FloatArray
     upper: FloatArray
     slew: FloatArray
     lag: FloatArray  # s
@@ -55,11 +57,11 @@ def design_allocation(
         T = W^-1 Omega' (Omega W^-1 Omega')^-1,  W = diag(((lag_j + SERVO) / range_j)^2),
             effect = Omega
 
-    v is y_dot by the input, so D = S = U = I on this airframe. T gives v with the least sum of
-    squares of (lag_j + SERVO) u_j / range_j, range_j half the way between the stops: a slow
-    effector helps a fast one little. lag_i = sum_j Omega_ij T_ji lag_j is the lag of v_i, exact to
-    first order. `priority` are outputs, the one that keeps its input the longest first; the rest
-    follow in their order.
+    v is the part of y_dot that the inputs cause, so D = S = U = I on this airframe. T gives v with
+    the least sum of squares of (lag_j + SERVO) u_j / range_j, where range_j is half the distance
+    between the stops. So a slow effector helps a fast one only a little. lag_i = sum_j Omega_ij
+    T_ji lag_j is the lag of v_i, exact to first order. `priority` lists outputs; the first one
+    keeps its input the longest. All other outputs follow in their order.
 
     Raises ParameterError for fewer effectors than outputs, for infinite stops, and for dependent
     rows of Omega. Source of the pseudo-inverse: M. W. Oppenheimer, D. B. Doman, M. A. Bolender,

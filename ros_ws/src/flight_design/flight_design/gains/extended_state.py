@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gains beside an extended state observer.
 
-It takes the aircraft for an integrator in each output, of which only sign and size are known.
+The observer takes the aircraft for one integrator per output, and knows only the sign and the size
+of its gain.
 """
 
 from collections.abc import Mapping
@@ -41,7 +42,7 @@ def extended_state_weights(outputs: tuple[str, ...], T: FloatArray) -> ExtendedS
 def integrator_model(controller: ControllerConfig, Omega: FloatArray) -> FeedforwardConfig:
     """Build the model y_dot = Omega u of a feedforward, Omega (m, m) in the law's order.
 
-    lead = lag + delay + half a period.
+    The lead of the feedforward is lag + delay + half a period.
     """
     return FeedforwardConfig(
         states=controller.outputs,

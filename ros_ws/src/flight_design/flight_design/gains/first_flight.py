@@ -33,20 +33,20 @@ from rise_di_controller.extensions.model_sections import AllocationConfig
 from rise_di_controller.law.decomposition import search
 from rise_di_controller.law.linear_loop import LoopTiming
 
-# s, servos and engine of a light aircraft, assumed
+# s, assumed lags of the servos and the engine of a light aircraft
 SURFACE_LAG = 0.05
 ENGINE_LAG = 0.3
-# rad, rad/s: 20 deg, 57 deg/s, assumed
+# rad, rad/s: assumed end stop and rate of a surface, 20 deg and 57 deg/s
 STOP = 0.35
 SURFACE_RATE = 1.0
-# m/s^2, rad/s^2: what any other input gives at its end stop, assumed
+# m/s^2, rad/s^2: assumed effect of any other input at its end stop
 AUTHORITY = {SPEED: 0.3 * GRAVITY, ANGULAR_RATE: 2.0}
 NOISE = {"V": 0.05, "u": 0.05}  # m/s
 RATE_NOISE = 0.001  # rad/s, also for any other output
 RATE = 200.0  # Hz, of y and y_m
 CONTROL_RATE = 100.0  # Hz, of the law
 DELAY = 0.003  # s, beyond sampling
-APART = 3.0  # s, from a gust to the next
+APART = 3.0  # s, time between two gusts
 
 
 def first_flight(
@@ -61,7 +61,7 @@ def first_flight(
     """Write a scenario file for the airframe in `path`, with the text of the section controller.
 
     `part` multiplies the commands, and `shortfall` becomes the first line. The commands are those
-    of `first_commands`; gusts have 3 % of the trim speed, across it.
+    of `first_commands`. The gusts blow across the flight path with 3 % of the trim speed.
     """
     V0 = airframe.speed
     stops = _stops(airframe)
@@ -179,7 +179,7 @@ def _distributed(airframe: Airframe, lag: Sequence[float]) -> tuple[AllocationCo
 
 
 def default_lags(airframe: Airframe) -> tuple[float, ...]:
-    """Return the lags of the inputs, s: a servo's for an angle, an engine's for the rest."""
+    """Return the lags of the inputs, s: a servo's lag for an angle, else the lag of an engine."""
     return tuple(SURFACE_LAG if surface else ENGINE_LAG for surface in _surfaces(airframe))
 
 
@@ -217,9 +217,10 @@ def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
 
 
 def pairing(airframe: Airframe) -> tuple[int, ...]:
-    """Return the input of every output by the smallest change to D = I within MAX_COUPLING.
+    """Return the index of every output's input, by the smallest change that makes D = I.
 
-    If there is none, the inputs stay in their order.
+    The coupling must stay within MAX_COUPLING. If there is no such change, the inputs stay in their
+    order.
     """
     best = search(airframe.matrix_c() @ airframe.matrix_b(), MAX_COUPLING)
     if best is None:

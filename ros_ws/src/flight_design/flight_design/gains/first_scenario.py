@@ -31,36 +31,40 @@ LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identi
 # rad/s, largest natural frequency of the reference model, as in osprey_gust
 FASTEST = {"q": 4.0, "p": 5.0, "r": 4.0}
 FASTEST_SPEED = 1.2  # rad/s, the same for an airspeed, a climb, and any other output
-OF_BANDWIDTH = 0.5  # fraction of the bandwidth of the loop, which it follows without a model
-# fraction of the authority for the command; the rest is for climbs, turns and gusts
+# natural frequency of the reference model as a fraction of the loop's bandwidth: the loop follows
+# it without a feedforward
+OF_BANDWIDTH = 0.5
+# fraction of the authority that a command may use; the rest is for climbs, turns and gusts
 OF_AUTHORITY = 1.0 / 3.0
 SIZE = {"q": 0.05, "p": 0.15, "r": 0.05, "climb": 1.0}  # rad/s, m/s
-HOVER = 0.15  # rad/s, of a rate if there is no airspeed
-OF_SPEED = 0.03  # of V0: dynamic pressure changes by 6 %, within what the gains allow
+HOVER = 0.15  # rad/s, size of a command of a rate if there is no airspeed
+# size of a command of airspeed as a fraction of V0. The dynamic pressure then changes by 6 %, which
+# the gains allow.
+OF_SPEED = 0.03
 LARGEST_SPEED = 2.0  # m/s, largest change of an airspeed
-SEEN = 5.0  # times the noise: size from which the error of a command shows
+SEEN = 5.0  # least size of a command in units of the noise, so that its error shows
 SPEEDS = {"V", "u", "climb"}  # motions that thrust moves: slow, without overshoot
 
-RISE = 0.2  # s, edge of a pulse, which bounds u_m_dot: short beside the filters
+RISE = 0.2  # s, length of a pulse's edges, which bounds u_m_dot; short beside the filters
 REST = 2.0  # s, before the first command
 TURNS = ((0.0, 1.0), (2.0, -1.0), (5.0, -1.0), (7.0, 1.0))
 """Starts, s, and directions of the pulses of a rate: the second pair restores the flight path."""
-PULSE = 1.0  # s, of a rate
-TURNS_TIME = 9.0  # s, of the four pulses
-SPEED_PULSE = 20.0  # s, of an airspeed or a climb
-LAST = 20.0  # s, after the last command, for a gust and the way back
-COMMANDED = "osprey_servo"  # commands and gusts of gains without a scenario of their own
+PULSE = 1.0  # s, length of a pulse of a rate
+TURNS_TIME = 9.0  # s, length of the four pulses
+SPEED_PULSE = 20.0  # s, length of a pulse of airspeed or climb
+LAST = 20.0  # s, after the last command, for a gust and the return to trim
+COMMANDED = "osprey_servo"  # its commands and gusts are for gains that have no scenario
 GAINS = {"k_g", "k_d", "Lambda", "beta", "omega", "input_scale", "D"}  # that are selected
 
 
 class Channel(NamedTuple):
-    """What the commands of an output follow from, in SI."""
+    """The properties of an output from which its commands follow, in SI."""
 
     motion: str  # q, p, r, V or climb; any other output has no size of its own
-    authority: float  # y_dot that the input gives at its nearer end stop
-    bandwidth: float  # rad/s, of the loop, from lags, delay and rate
-    noise: float = 0.0  # rms a sample
-    damping: float = 0.0  # 1/s, with which y returns
+    authority: float  # y_dot that the input causes at its nearer end stop
+    bandwidth: float  # rad/s, bandwidth of the loop, which follows from lags, delay and rate
+    noise: float = 0.0  # rms per sample
+    damping: float = 0.0  # 1/s, rate at which y decays by itself
 
     @property
     def is_speed(self) -> bool:
@@ -79,8 +83,8 @@ class Channel(NamedTuple):
             reach (frequency / e + damping) = OF_AUTHORITY authority
 
         A critically damped filter of second order answers a step A with a rate of at most A
-        frequency / e, at the time 1 / frequency; A damping holds it at the end. The size of a pitch
-        rate is at most 1 g / V0.
+        frequency / e, at the time 1 / frequency. To hold A at the end, the input must give A
+        damping. The size of a pitch rate is at most 1 g / V0.
         """
         reach = OF_AUTHORITY * self.authority / (self.frequency / math.e + self.damping)
         return max(min(_largest(self.motion, speed), reach), SEEN * self.noise)
@@ -125,8 +129,8 @@ def first_commands(
     is V0, m/s, or None in hover; `rate` is that of the reference model, Hz; `wait` is the time
     before all commands, s.
 
-    A reference slower than the loop, within the authority of the input: K. J. Astrom, R. M.
-    Murray, "Feedback Systems", 12.2 (two degrees of freedom).
+    The reference is slower than the loop, and stays within the authority of the input. Source:
+    K. J. Astrom, R. M. Murray, "Feedback Systems", 12.2 (two degrees of freedom).
     """
     names = {channel.motion: name for name, channel in channels.items()}
     turn = banks and speed is not None and {"p", "r"} <= set(names)
@@ -197,9 +201,10 @@ def scenario_to_design(scenario: FilePath | Scenario) -> Scenario:
 
 
 def scenario_to_check(scenario: FilePath | Scenario) -> Scenario:
-    """Load a scenario, or that of the commands if a file has only the section controller.
+    """Load a scenario, or COMMANDED if a file has only the section controller.
 
-    COMMANDED then gives the commands, gusts and rate limits, and need not fly the controller.
+    COMMANDED then gives the commands, gusts and rate limits. Its aircraft may differ from the one
+    that the controller is for.
     Raises ParameterError.
     """
     controller = controller_alone(scenario)

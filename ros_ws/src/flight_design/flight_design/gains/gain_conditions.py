@@ -146,9 +146,9 @@ def failing(conditions: Sequence[GainCondition]) -> tuple[GainCondition, ...]:
 def bound_U(Omegas: FloatArray) -> FloatArray:
     """Find the largest abs(U_ij), j > i, over samples of Omega; all other entries are zero.
 
-    Omegas has shape (N, m, m), the result (m, m). U is that of Omega = S D U (11). The result
-    bounds the off-diagonal entries of D U D as well, because their sizes are the same. Raises
-    DecompositionError for a sample without decomposition.
+    Omegas has shape (N, m, m), the result (m, m). U comes from the decomposition Omega = S D U
+    (11). The result bounds the off-diagonal entries of D U D as well, because their magnitudes are
+    the same. Raises DecompositionError if a sample has no such decomposition.
     """
     return np.asarray(np.max([np.triu(np.abs(decompose(Omega).U), 1) for Omega in Omegas], axis=0))
 
@@ -297,8 +297,8 @@ def engineering_gains(
 ) -> tuple[GainSet, FloatArray]:
     """Compute gains for a loop with lag from bandwidths (rad/s); all arguments have shape (m,).
 
-    The second result is response_i, which is abs(Omega_ii) in scaled inputs: 1, or less in a
-    channel that is too slow for (22).
+    The second result is response_i, which is abs(Omega_ii) in scaled inputs. It is less than 1 in a
+    channel that is too slow for (22), and 1 in all others.
 
         K_m = max(bandwidth_m, 1.5),  K_i = max(bandwidth_i, K_m),  response_i = bandwidth_i / K_i
         Lambda_i = bandwidth_i / (4 slower_i)

@@ -74,7 +74,7 @@ BY_RULE = "gains by a rule from the lags, a start"
 STABLE = Requirement(phase=1e-3, gain=1.001, sensitivity=1e3, damping=1e-3, worst_phase=0.0)
 """What gains from a file need: only a stable loop."""
 DIAGONAL, FULL = MIXINGS = ("diagonal", "full")
-MESSAGES = 3.0  # periods of y: the least age limit of the law
+MESSAGES = 3.0  # least age limit of the law, in periods of y
 RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
 MAX_SAMPLES = 10_000
 PERFECT_VANE = 1e-4  # rad, noise of a vane that is called perfect
@@ -129,16 +129,16 @@ def select_gains(
         feedforward: Whether the engineering gains use the airframe as the model of a feedforward.
         observer: Whether a feedforward and an observer are added to the gains.
         model: Airframe that the observer takes as its model; None for `airframe`.
-        margin: Least delay margin of the nominal loop with the observer, s.
+        margin: Least delay margin that the nominal loop with the observer must have, s.
         speeds: Two fractions of the trim speed, one below 1 and one above, with models of their
             own. A schedule then flies the observer from one to the other. If it is empty, the
             observer holds only at the trim speed.
         weights: File of gains and weights from which the search for the margins begins
             (`observer_gains.read_gains`); with `accept` they are taken as they are. None for those
             of a search for the scenario, or of a rule.
-        phase_margin: Least phase margin of the nominal loop behind servos, deg. The gain margin
-            must be 6 dB, the sensitivity at most 2 and the damping 0.4. 35 deg with the observer.
-        accept: Whether less than 40 deg are accepted.
+        phase_margin: Least phase margin of the nominal loop behind servos, deg; with the observer
+            it is 35 deg. The gain margin must be 6 dB, the sensitivity at most 2, the damping 0.4.
+        accept: Whether a `phase_margin` below 40 deg is accepted.
         mixing: "diagonal", one input per output, or "full": an allocation u = T v distributes the
             inputs v by the pseudo-inverse of C B, as always with more inputs than outputs.
         progress: Called with a sentence before each step of the search for the observer.
@@ -283,8 +283,8 @@ def study(
 ) -> Study:
     """Study the airframe as the law of a controller sees it, and uncertain airframes around it.
 
-    They fly along the commands and gusts of a scenario. With `flown`, lags and delay are those of
-    an aircraft, otherwise those that the controller was told. Raises ParameterError.
+    The airframes fly the commands and gusts of a scenario. With `flown`, lags and delay are those
+    of an aircraft, otherwise those that the controller was told. Raises ParameterError.
     """
     timing = loop_of(controller) if flown is None else flown.comparison.timing
     matrices, _ = of_matrices_and_lags(spread, timing, controller.inputs)
@@ -313,8 +313,8 @@ def _loop(
 ) -> LoopSetting:
     """Return the loop of a scenario with another rate of the law or of y, Hz, lag or delay, s.
 
-    The law steps with each y, so the lag of sampling is 1.5 periods of y, while those of the law
-    are counted from its own rate. Raises ParameterError.
+    The law steps with each y, so sampling lags by 1.5 periods of y. The loop only counts 1.5
+    periods of the law, so the difference is added to the delay. Raises ParameterError.
     """
     loop = gain_selection.loop_setting(scenario)
     if rate is not None:
@@ -369,7 +369,7 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
 def _pairing(
     inputs: str | Sequence[str], controller: ControllerConfig, airframe: Airframe
 ) -> tuple[str, ...]:
-    """Return the input of each output as asked for, or as the controller pairs them, or ().
+    """Return the input of each output: that of `inputs`, or else of the controller, or else ().
 
     The pairs of the controller count only if it has the same inputs as the airframe.
     """
@@ -471,14 +471,13 @@ def selected_observer(
 
     The gains are those of the file `weights` if there is one. Otherwise they are those that
     `rise-di compare --tune` found in the scenario, or in a shipped one with the same airframe and
-    lags, if the model has the same states and no total lag is SLOWER times the one of the search.
-    If there are none, a rule derives them from the lags. From there the search for the least error
-    begins, once for each gain set; gains of a file and those beside a sketch are only relaxed, if
-    the margins need it. With `uncertain` the phase margin of uncertain aircraft counts too, with
-    `sketched` the gains are those for a model from a sketch, and `speeds` are two ratios to the
-    trim speed, with models there. `margin`, `is_free`, `activity`, `progress` and `earlier_design`
-    are as for `with_aircraft_observer`; channels that are not free keep the gains of the earlier
-    design.
+    lags. They only count if the model has the same states and no total lag is SLOWER times the one
+    of the search. If there are none, a rule derives gains from the lags. The search for the least
+    error begins at each of these gain sets. Gains of a file or beside a sketch are only relaxed, if
+    the margins need it. With `uncertain` the phase margin of uncertain aircraft counts too. With
+    `sketched` the gains are those for a model from a sketch. `speeds` are two ratios to the trim
+    speed, each with its own model. `margin`, `is_free`, `activity`, `progress` and `earlier_design`
+    are as for `with_aircraft_observer`. Channels that are not free keep their earlier gains.
     """
     seen = through_allocation(model, controller)
     noise, vanes = _noise(controller, scenario, seen)
@@ -546,7 +545,7 @@ def _gain_sets(
     *,
     sketched: bool,
 ) -> list[tuple[ObserverGains, str]]:
-    """Return the gain sets from which the margins choose, each with where it comes from."""
+    """Return the gain sets at which the search begins, each with a sentence on its origin."""
     axes = tuple(model.gusts)
     if sketched:
         gains = gains_beside_sketch(nominal, controller.outputs, axes, model.speed)

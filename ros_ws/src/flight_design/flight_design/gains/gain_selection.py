@@ -227,10 +227,10 @@ def gain_sets(study: Study, setting: LoopSetting) -> Selection:
 def gain_candidates(
     study: Study, setting: LoopSetting
 ) -> Callable[[FloatArray, FloatArray], Candidate[RiseDiConfig]]:
-    """Return a function from `slower` and `lower`, (m,), to the engineering gains and the loop.
+    """Return a function that builds the engineering gains and the loop for `slower` and `lower`.
 
-    The bandwidth is divided by `lower`, and the integral gain by both. Raises ParameterError as
-    `gain_sets` does.
+    Both have shape (m,). The bandwidth is divided by `lower`, and the integral gain by both. Raises
+    ParameterError as `gain_sets` does.
     """
     pairs = _paired(study, setting)
     limits = (
@@ -255,7 +255,7 @@ class _Paired(NamedTuple):
     channels: ChannelPairing
     rows: list[int]  # of the outputs, in the airframe's order
     columns: list[int]  # of the inputs
-    bandwidth: FloatArray  # (m,) rad/s, where the search begins
+    bandwidth: FloatArray  # (m,) rad/s, at the start of the search
     D: FloatArray  # (m,)
     unit: FloatArray  # (m,) 1 / abs(Omega_ii)
     spread: FloatArray  # (m,) largest abs(Omega_ii) of the samples
@@ -304,8 +304,8 @@ def _literal(study: Study, setting: LoopSetting, pairs: _Paired) -> RiseDiConfig
         study, pairs.rows, pairs.columns, pairs.unit, pairs.D, ones, setting.gamma_2
     )
     sufficient = gain_conditions.theorem_gains(bounds, ones)
-    # The theorem may demand gains beyond those that a controller takes, as k_d of 2e17 1/s for the
-    # f16 of JSBSim.
+    # The theorem may demand gains beyond those that a controller takes: for the f16 of JSBSim, k_d
+    # is 2e17 1/s.
     rows = (sufficient.k_d, sufficient.Lambda, sufficient.beta)
     accepted = GainSet(
         min(sufficient.k_g, LARGEST), *(np.minimum(values, LARGEST) for values in rows)
@@ -325,7 +325,7 @@ def _controller(
 ) -> RiseDiConfig:
     """Build the controller with the gains.
 
-    The integral is slower by `slower`, and abs(Omega_ii) is `response` in the scaled inputs.
+    The integral gain is divided by `slower`, and abs(Omega_ii) is `response` in the scaled inputs.
     """
     channels = pairs.channels
     scale = pairs.unit * response
@@ -400,7 +400,7 @@ def assess_scenario(
 
 
 def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
-    """Return the loop of a scenario; the tighter rate limit of controller and actuator counts."""
+    """Return the loop of a scenario. The lower rate limit of controller and actuator counts."""
     controller = scenario.controller
     rates = scenario.aircraft.actuators.rate
     slew = dict(zip(controller.inputs, controller.slew or (), strict=bool(controller.slew)))
@@ -537,7 +537,7 @@ def response(study: Study, controller: ControllerConfig) -> FloatArray:
 def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
     """Return the largest V / V0 up to which the delay margin stays positive with the same gains.
 
-    The response to every input but that of V grows with V^2, and everything else stays as in trim.
+    The response to every input but the one of V grows with V^2. Everything else stays as in trim.
     The result is rounded down to SPEED_STEP. It is 0 if there is no delay margin in trim, and
     infinite if the linear loop is stable up to MAX_SPEED_RATIO. Raises ParameterError for the
     literal sign.
@@ -567,8 +567,8 @@ def _bounds(
 ) -> tuple[Bounds, NDArray[np.bool_], NDArray[np.bool_]]:
     """Compute the bounds of Theorem 1 for inputs divided by `scale`, with two masks of samples.
 
-    `scale` is (m,). The first mask has the samples whose Omega has the signs D, the second those of
-    them that have stable zeros as well.
+    `scale` is (m,). The first mask has the samples whose Omega has the signs D. The second mask has
+    those of these samples that have stable zeros as well.
     """
     C = study.C[rows]
     Omegas = C @ study.B[:, :, columns] * scale

@@ -60,8 +60,8 @@ def yaml_flow(value: Any, precision: int = 6) -> str:
 def yaml_template(text: str) -> Template:
     """Make a template of a YAML file.
 
-    "{{ value | flow }}" is `yaml_flow`, "| digits(3)" writes a number with three digits, and "|
-    line" a text without a line end.
+    "{{ value | flow }}" writes a value by `yaml_flow`. "| digits(3)" writes a number with three
+    digits, and "| line" a text without a line end.
     """
     environment = Environment(
         trim_blocks=True,
@@ -135,7 +135,7 @@ def selection_yaml(selection: Selection, *, theorem: bool = False) -> str:
     as_instance(selection, Selection, "selection", "a Selection, as select_gains returns one")
     assessed = selection.theorem if theorem else selection.engineering
     controller = assessed.controller
-    # a part of 0 is for an observer that a learner designs later
+    # an observer with a part of 0 does not fly; a learner designs it later
     has_observer = controller.observer is not None and controller.observer.part > 0.0
     engineering = "beside an observer" if has_observer else "by the engineering procedure"
     comments = _comments(selection, controller)
@@ -189,7 +189,7 @@ def _comments(selection: Selection, controller: RiseDiConfig) -> dict[str, str]:
 
 
 def _within(uncertainty: float) -> str:
-    """Say over which uncertain aircraft a value is the largest; "" if there are none."""
+    """Say over which uncertain aircraft a value is the largest, or return "" if there are none."""
     return f", the largest within +-{100 * uncertainty:g} %" if uncertainty else ""
 
 
@@ -270,7 +270,7 @@ def chatter_sentence(controller: ControllerConfig, margins: LoopMargins | None) 
 def _shown_response(responses: FloatArray) -> str:
     """Write the factors of 1 / abs(Omega_ii).
 
-    They are 1, or less in a channel that is too slow for a K of (22).
+    A factor is less than 1 in a channel that is too slow for a K of (22), and 1 in all others.
     """
     factors = [f"{value:.3g}" for value in responses]
     return "1" if set(factors) == {"1"} else f"({', '.join(factors)})"

@@ -57,14 +57,14 @@ class ChannelPairing(NamedTuple):
 
 
 class Effected(NamedTuple):
-    """An airframe file with uncertain entries, whose effectors an allocation moves, u = T v."""
+    """An airframe file with uncertain entries. An allocation u = T v moves its effectors."""
 
     airframe: Airframe
     T: FloatArray  # (p, m)
 
 
 class Flown(NamedTuple):
-    """The flight of a study: its aircraft, compared with what the controller was told."""
+    """The aircraft that flies in a study, and how it differs from what the controller was told."""
 
     scenario: Scenario
     comparison: Comparison
@@ -89,11 +89,14 @@ class Study(NamedTuple):
     uncertainty: float
     effected: Effected | None = None  # None: the entries of `airframe` are uncertain
     seed: int = 1
-    spread: Spread = UNIFORM  # with the lags too
-    flown: Flown | None = None  # None: a loop that flies no aircraft yet
+    spread: Spread = UNIFORM  # deviations of the entries, and of the lags
+    flown: Flown | None = None  # None if the loop does not fly an aircraft yet
 
     def timing_of(self, controller: ControllerConfig) -> LoopTiming:
-        """Return lags, delay and period that fly, or else those that the controller was told."""
+        """Return lags, delay and period of the aircraft that flies.
+
+        If none flies, they are those that the controller was told.
+        """
         return loop_of(controller) if self.flown is None else self.flown.comparison.timing
 
     @property
@@ -109,7 +112,7 @@ class Study(NamedTuple):
 
 
 def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
-    """Extract the commands and gusts of a scenario that an airframe has channels and gust axes for.
+    """Extract the commands and gusts of a scenario for the channels and gust axes of an airframe.
 
     A coordinated turn stays if the airframe has both of its channels, at the airframe's own speed.
     Raises ParameterError if the scenario has no command for an output.
@@ -162,9 +165,8 @@ def study_airframe(
 
     The first rates belong to the airframe as published, the others to uncertain airframes.
 
-    The ideal control keeps y on y_m. With x = P y_m + N eta, where eta are the states beside the
-    outputs
-    (`output_coordinates`):
+    The ideal control keeps y on y_m. x = P y_m + N eta, where eta are the states beside the outputs
+    (`output_coordinates`). Then
 
         eta_dot = H' (I - B Omega^-1 C) (A x + f(x, t)) + H' B Omega^-1 y_m_dot
             the zero dynamics, eta(0) = 0
@@ -193,7 +195,7 @@ def study_airframe(
     # The last column is the nominal airframe without gusts: their speed is 0 there.
     A = np.concatenate([A, A[:1]])
     B = np.concatenate([B, B[:1]])
-    # One that overflows is refused, or counted below, in words of its own.
+    # An aircraft that overflows is refused or counted below, so NumPy must not warn of it.
     with np.errstate(over="ignore", invalid="ignore"):
         u_dot = _ideal_rates(
             _ideal_plant(airframe, manoeuvre, A, B), _references(manoeuvre, airframe)

@@ -22,8 +22,8 @@ from rise_di_controller.law.linear_loop import (
 HORIZON = 20.0  # s, of turbulence and noise: longer than the slowest mode that counts
 GUST_HORIZON = 8.0  # s, over which the response to a gust counts
 FLIGHT = 60.0  # s, over which the errors of the gusts, one for each axis, are averaged
-TURBULENT = 0.5  # weight of turbulence, because its errors are about twice those in the gusts
-MEAN = math.sqrt(2.0 / math.pi)  # of the magnitude of a normal value, in standard deviations
+TURBULENT = 0.5  # weight of errors in turbulence, which are about twice those in the gusts
+MEAN = math.sqrt(2.0 / math.pi)  # mean magnitude of a normal value, in standard deviations
 
 GUST_TIME = 0.6  # s, from the entry of a gust to its peak
 GUST_LENGTHS = (9.1, 106.7)  # m, from the entry to the peak, CS 25.341 (a)(3): 30 to 350 ft
@@ -62,7 +62,8 @@ def discrete_gust(speed: float) -> tuple[float, float]:
 class AirResponse(NamedTuple):
     """What a loop does in wind and noise."""
 
-    error: FloatArray  # (m,) SI: rms of the outputs in gusts, and TURBULENT times in turbulence
+    # (m,) SI: rms of the outputs in gusts, together with TURBULENT times their rms in turbulence
+    error: FloatArray
     activity: FloatArray  # (m,) mean abs(u_dot) in turbulence, SI
 
 
@@ -71,7 +72,7 @@ def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air)
 
         z+ = A z + N n,  P+ = A P A' + N N',  n white with unit variance
 
-    The covariance P after 2^j periods follows from that after 2^(j-1). Noise only counts in
+    The covariance P after 2^j periods follows from P after 2^(j-1) periods. Noise only counts in
     turbulence.
     """
     none = np.zeros(len(loop.lag))

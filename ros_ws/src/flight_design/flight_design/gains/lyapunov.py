@@ -6,8 +6,8 @@ They are evidence for the theorem, not part of the law.
 
 All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), with
 Omega = C B in these inputs. Time derivatives are central differences over the samples of a flight.
-At a sample, y_dot jumps with u; the difference is then the mean of both sides. They are exact up to
-terms that vanish with the sampling period.
+At a sample y_dot jumps with u, and the difference gives the mean of both sides. The differences are
+exact up to terms that vanish with the sampling period.
 """
 
 from collections.abc import Callable
@@ -139,7 +139,7 @@ def evidence(
 
     C^+ is the pseudo-inverse: C^+ e_dot is the part of x_dot that appears in e_dot. Lemma 2 claims
     P >= 0 for the zeta_b of `lemma_2`; with the default 0, P and V2 are known up to a constant.
-    Shapes as in the fields. Raises DecompositionError if Omega has no such decomposition.
+    The shapes are those of the fields. Raises DecompositionError if Omega has no S D U.
     """
     S, D, U = decompose(plant.C @ plant.B)
     M = np.linalg.inv(S)

@@ -15,20 +15,21 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import LoopTiming
 
 SIZES = {SPEED: 1.0, LENGTH: 1.0}  # m/s, m: the "sizes" in which weights measure states
-ANGLE_SIZE = 0.1  # rad (/s), also for states without a dimension
-ERROR_SHARE = 0.1  # of a size: the unit of an error in a score, 0.1 m/s or 0.01 rad/s
+ANGLE_SIZE = 0.1  # size of an angle, rad, of a rate, rad/s, and of a state without a dimension
+ERROR_SHARE = 0.1  # unit of an error in a score as a share of a size: 0.1 m/s or 0.01 rad/s
 
 # mean abs(u_dot) that costs as much as one unit of error
 SURFACE_ACTIVITY = np.deg2rad(60.0)  # rad/s
 THROTTLE_ACTIVITY = 6.0  # 1/s: 600 %/s
-THRUST_ACTIVITY = 12.0  # 1/s, of the thrust in trim: 600 %/s where trim needs half of the throttle
+# 1/s, relative to the thrust in trim: 600 %/s of the throttle if trim needs half of it
+THRUST_ACTIVITY = 12.0
 
 
 def activity_units(airframe: Airframe) -> FloatArray:
     """Return the mean abs(u_dot) of each input that costs as much as a unit of error, (p,).
 
-    It is in SI per s. A thrust in newtons costs nothing, an infinite unit, if its file has no
-    `no_thrust`.
+    It is in SI per s. If the file has no `no_thrust`, a thrust in newtons has an infinite unit, so
+    that its activity costs nothing.
     """
     units = []
     channels = zip(airframe.inputs.values(), airframe.no_thrust(), strict=True)
@@ -57,8 +58,8 @@ def airframe_model(
 ) -> NominalModel:
     """Build the model of an airframe with channels in this order, without limits.
 
-    D = I until the caller sets D. `noise` is that of the outputs, (m,), rms per sample, and `loop`
-    is in this order too.
+    D is I until the caller sets it. `noise` is the noise of the outputs, (m,), rms per sample.
+    `loop` is in this order too.
     """
     rows = [airframe.outputs.index(name) for name in outputs]
     columns = [list(airframe.inputs).index(name) for name in inputs]

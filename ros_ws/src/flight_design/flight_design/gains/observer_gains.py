@@ -19,7 +19,7 @@ from flight_core.files import read_yaml
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
-# of the integral gain of PI, which becomes Lambda; the rest is the slope of the softened sign
+# share of the integral gain of PI that becomes Lambda; the rest is the slope of the softened sign
 SHARE = 0.9
 
 
@@ -89,8 +89,8 @@ def gains_beside_sketch(
 def read_gains(path: Path, T: FloatArray, axes: int, states: int) -> ObserverGains:
     """Read gains from a file with the fields of ObserverGains and of Weights by name, each a list.
 
-    T is the total lag, (m,), s; `axes` of the wind and `states` of the model are counts. Raises
-    ParameterError.
+    T is the total lag, (m,), s. `axes` is the number of axes of the wind, and `states` the number
+    of states of the model. Raises ParameterError.
     """
     m = len(T)
     lengths: dict[str, tuple[int, ...]]
@@ -112,8 +112,8 @@ def read_gains(path: Path, T: FloatArray, axes: int, states: int) -> ObserverGai
 def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> ObserverGains:
     """Convert gains that `rise-di compare --tune` finds for rise_observer or pi_observer, by name.
 
-    T is the total lag, (m,), s. PI with K and Lambda equals RISE-DI inside its softened sign with
-    the same K, SHARE Lambda, and 1 / (softening T) for the rest.
+    T is the total lag, (m,), s. Inside its softened sign, RISE-DI equals a PI with K and Lambda if
+    it has the same K, and SHARE times this Lambda, and if 1 / (softening T) is the rest.
     """
     values = {name: np.array(row, dtype=np.float64) for name, row in gains.items()}
     weights = Weights(**{name: values[name] for name in Weights._fields})

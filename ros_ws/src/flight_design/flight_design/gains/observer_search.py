@@ -63,10 +63,10 @@ MOVES = Moves(mending=((1,),), cheaper=((-1,), (1,)), begin=4, is_joint=True)
 SLOWER = Moves(mending=((1,),), cheaper=((-1,),), is_joint=True)
 """Moves of the relaxation of a channel: both ways, or only where the margins need it."""
 
-RESOLUTION = 3e-4  # s: of the delay margin, and of the effect of its digits in a file
+RESOLUTION = 3e-4  # s, of the delay margin; the digits of gains in a file change it by less
 
-MAX_RELAXATION = 18.0  # most of a channel
-MAX_QUICKENING = 4.0  # most of a channel, for inputs that act four times as much
+MAX_RELAXATION = 18.0  # largest relaxation of a channel
+MAX_QUICKENING = 4.0  # 1 / least relaxation of a channel, for inputs with a fourth of the effect
 MEND = (
     "give the loop less delay or lag, ask for a smaller delay margin, or fly the law without "
     "an observer"
@@ -80,11 +80,11 @@ class SelectedObserver(NamedTuple):
     controller: RiseDiConfig
     delay_margin: float  # s, of the nominal linear loop, including the declared delay
     phase_margin: float  # rad, the least of the nominal linear loop
-    # (m,) factors that raise `effort`, and lower K and the integral; 1: as the gains say
+    # (m,) factors by which `effort` is multiplied, and by which K and the integral are divided
     relaxation: FloatArray
     cost: float  # in wind and noise, a logarithm
     place: int = 0  # number of its gain set
-    origin: str = ""  # where its gains come from, a sentence
+    origin: str = ""  # a sentence on where its gains come from
     left_out: int = 0  # number of uncertain aircraft that no gains can hold
 
     def not_counted(self) -> str:
@@ -112,7 +112,7 @@ class AtSpeed(NamedTuple):
         return SpeedConfig(ratio=self.ratio, **nominal, **_matrices(self.design(slower)))
 
     def flown(self, controller: RiseDiConfig, slower: FloatArray) -> RiseDiConfig:
-        """Return what flies at this speed; it is not checked."""
+        """Return the controller that flies at this speed, without checking its parameters."""
         assert controller.observer is not None  # noqa: S101 - it was designed
         values = {
             "observer": controller.observer.model_copy(update=_matrices(self.design(slower))),
@@ -127,7 +127,7 @@ class _Loops(NamedTuple):
 
     controller: RiseDiConfig
     relaxation: FloatArray
-    # first at the trim speed, and first with all vanes in use
+    # in order of speed, the trim speed first, and at each speed with all vanes in use first
     around: list[tuple[LinearPlant, LinearLaw]]
 
 
@@ -146,7 +146,7 @@ class ObserverSearch(NamedTuple):
     # None: the gains stay, unless the margins need slower ones
     air: Air | None = None
     activity_unit: FloatArray | float = math.inf  # (m,) of mean abs(u_dot) in the cost, SI
-    # the design at whose loop the search begins; None: it begins at a relaxation of 1
+    # the search begins at the loop of this design; if it is None, it begins at a relaxation of 1
     earlier_design: SelectedObserver | None = None
     # (m,) whether the relaxation may change; None: in every channel
     is_free: Sequence[bool] | None = None
@@ -162,7 +162,7 @@ class ObserverSearch(NamedTuple):
         return LoopTiming(self.model.lag, 0.0, self.model.period)
 
     def best(self, progress: Callable[[str], None] = lambda _: None) -> Trial[_Loops]:
-        """Find the trial with the least error that has the margins, or that lacks least of them.
+        """Find the trial that meets the margins with the least error, or lacks least of them.
 
         The damping that is required is at most that of the zeros of the aircraft, because no
         feedback moves a zero. Without `air`, the least relaxed trial is best. `progress` gets a
@@ -176,7 +176,7 @@ class ObserverSearch(NamedTuple):
         highest_of = (free * exponent(MAX_RELAXATION)).astype(np.int64)
         requirement = above_zeros(self.needed, self.nominal)
         trials: dict[Place, Trial[_Loops]] = {}
-        least = math.inf  # cost of a trial with the margins
+        least = math.inf  # least cost so far of a trial that meets the margins
 
         def assess(places: Sequence[Place]) -> list[Trial[_Loops]]:
             nonlocal least
@@ -230,7 +230,7 @@ class ObserverSearch(NamedTuple):
         )
 
     def _loops(self, place: Place) -> _Loops:
-        """Build the loops of a place; the start has those of the earlier design."""
+        """Build the loops of a place. At the start they are those of the earlier design."""
         earlier = self.earlier_design
         begin = np.ones(len(place)) if earlier is None else earlier.relaxation
         relaxation = begin * STEP ** np.array(place, dtype=np.float64)
@@ -248,12 +248,15 @@ class ObserverSearch(NamedTuple):
         return _Loops(controller, relaxation, around)
 
     def _is_tolerant(self, loops: _Loops) -> bool:
-        """Return whether each loop is stable with the inputs late by their margins."""
+        """Return whether each loop is stable if every input is late by its delay margin."""
         late = self.margin + RESOLUTION
         return all(is_stable(plant, law, self.loop, late) for plant, law in loops.around)
 
     def _delay_fraction(self, plant: LinearPlant, law: LinearLaw) -> float:
-        """Return the delay margin over what is needed, each input late by its share; at most 1."""
+        """Return the delay margin divided by the needed one, at most 1.
+
+        Each input is late in proportion to the delay margin that it needs.
+        """
         longest = float(self.margin.max())
         if longest == 0.0 or is_stable(plant, law, self.loop, self.margin + RESOLUTION):
             return 1.0
@@ -274,7 +277,7 @@ class ObserverSearch(NamedTuple):
     def _cost(self, loops: _Loops) -> float:
         """Sum the logarithms of error and activity in wind and noise over the channels.
 
-        They are in units of a score. Without `air`, only the relaxation counts.
+        Both are in the units of a score. Without `air`, only the relaxation counts.
         """
         if self.air is None:
             return float(np.log(loops.relaxation).sum())
@@ -324,9 +327,9 @@ class ObserverSearch(NamedTuple):
 def least_error(
     searches: Sequence[ObserverSearch], progress: Callable[[str], None] = lambda _: None
 ) -> SelectedObserver:
-    """Return the best of the searches of several gain sets.
+    """Return the best result of the searches of several gain sets.
 
-    Raises ParameterError if none has the margins.
+    Raises ParameterError if no result meets the margins.
     """
     trials = [search.best(progress) for search in searches]
     place = 0

@@ -59,16 +59,18 @@ from rise_di_controller.law.linear_loop import LinearPlant
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# deviation of the uncertain aircraft, whose least phase margin counts
+# relative deviation of the uncertain aircraft, the least of whose phase margins counts
 WORST_UNCERTAINTY = 0.3
-# 1/s, of a zero on the right, at which an aircraft diverges while its outputs are held
+# 1/s. An aircraft with a zero to the right of this diverges while its outputs are held.
 FASTEST = 1e-3
 WORST_SEED = 1
 
-# factor on the noise of the wind of a filter that has a vane: with 10 u moves three times as much
+# factor on the noise of the wind in a filter that has a vane; with a factor of 10, u moves three
+# times as much
 GUST_WITH_VANE = 2.0
-SPAN_TIME = 0.12  # s, wing span over trim speed for an airframe without a span: the osprey's
-STILL = 1.4  # times the noise of a vane: less motion counts as none
+# s, wing span over trim speed, if the airframe has no span: that of the osprey
+SPAN_TIME = 0.12
+STILL = 1.4  # motion of a vane that counts as none, in units of its noise
 
 
 def model_for(airframe: Airframe, controller: ControllerConfig, noise: FloatArray) -> NominalModel:
@@ -111,20 +113,20 @@ def with_aircraft_observer(
 
     The gains of the law are selected beside the observer.
 
-    The gains are relaxed, or made faster, channel by channel, until the error of the linear loop in
-    moderate turbulence with the noise of the sensors is the least with which the loop has its
+    The gains are relaxed, or made faster, channel by channel. The search minimises the error of the
+    linear loop in moderate turbulence with the noise of the sensors. The loop must have its
     margins. If there are several gain sets, the one with the least error is taken. `margin` is the
     least delay margin, s, of all inputs or of each, (m,). `vanes` has the noise of each vane, rms
     per sample in rad, by its channel, alpha or beta. If the airframe is `uncertain`, WORST_OF
-    uncertain aircraft must have the phase margin too; those with a zero on the right do not count,
-    because no gains can hold all of their outputs. `speeds` are two ratios to the trim speed: the
-    controller then has a schedule, and the margins at these speeds too. With `keeps_gains` the
-    gains are only relaxed, if the margins need it. The search begins at the loop of the
-    `earlier_design`, with the new feedforward, and changes the relaxation of the channels that are
-    free, so this loop stays if no change has less error. `activity` is the weight of the activity
-    of u against the error. `progress` gets a sentence for each loop. Raises ParameterError for an
-    airframe with another D or without wind, one that a feedforward refuses, and for margins that no
-    relaxation reaches.
+    uncertain aircraft must have the phase margin too. Aircraft with a zero on the right do not
+    count, because no gains can hold all of their outputs. If `speeds` has two ratios to the trim
+    speed, the controller has a schedule, and must have the margins at these speeds too. With
+    `keeps_gains` the gains are only relaxed, if the margins need it. The search begins at the loop
+    of the `earlier_design` with the new feedforward. It changes the relaxation of free channels
+    only, so this loop stays if no change lowers the error. `activity` is the weight of the activity
+    of u against the error. `progress` gets a sentence for each loop. Raises ParameterError for
+    margins that no relaxation reaches, and for an airframe that has another D, has no wind, or
+    cannot be the model of a feedforward.
     """
     activity_unit = law_activity_unit(airframe, controller) / activity
     airframe = through_allocation(airframe, controller)
@@ -167,7 +169,7 @@ def law_activity_unit(airframe: Airframe, controller: ControllerConfig) -> Float
 
         unit_i = min_j unit_j / abs(T_ji),  u = T v
 
-    unit_j is that of the effector j, by `activity_units`.
+    unit_j is the unit of effector j, by `activity_units`.
     """
     T = distribution(airframe, controller)
     cost = (np.abs(T) / activity_units(airframe)[:, None]).max(axis=0)
@@ -265,7 +267,7 @@ class _AircraftDesigns(NamedTuple):
     def plant(self, count: int, vanes: Iterable[str]) -> LinearPlant:
         """Return the nominal aircraft, and the controllable ones of `count` uncertain aircraft.
 
-        Vanes come below the outputs.
+        In C, the rows of the vanes come below those of the outputs.
         """
         A, B = nominal_and_sampled(self.airframe, WORST_UNCERTAINTY, count, WORST_SEED)
         _, columns = law_order(self.airframe, self.base)
@@ -281,7 +283,10 @@ class _AircraftDesigns(NamedTuple):
     def observer(
         self, model: NominalModel, gains: ObserverGains
     ) -> Callable[[FloatArray], ObserverDesign]:
-        """Return a function from relaxation, (m,), to the observer of a model; only u_o changes."""
+        """Return a function that designs the observer of a model for a relaxation, (m,).
+
+        The relaxation only changes u_o.
+        """
         observer = aircraft_observer(model, self.names, gains.weights)
         model_by_tick = ObserverModel(observer.states, observer.Phi, observer.Gamma, observer.H)
         return lambda slower: observer._replace(
@@ -324,7 +329,7 @@ def _vanes(
     weights: Weights,
     vanes: Mapping[str, float],
 ) -> VanesConfig:
-    """Build the section of the vanes: alpha and beta less the wind along their axes over V0."""
+    """Build the section of the vanes, which read alpha and beta minus (wind on their axes / V0)."""
     model_by_tick = aircraft_model(model, names, weights.wind_time)
     H = []
     L = []
@@ -349,14 +354,14 @@ def with_extended_state_observer(
     margin: float,
     requirement: Requirement = OBSERVER_REQUIREMENT,
 ) -> SelectedObserver:
-    """Give a controller an observer that knows only Omega and lags: no A, no f, no wind.
+    """Give a controller an observer that knows only Omega and the lags, and no A, f or wind.
 
     Its gains stay, unless the margin needs slower ones.
 
-    The model of its feedforward is y_dot = Omega u, that of its observer y_dot = diag(Omega) u:
-    with all of Omega the elevator would correct V, and turn the aircraft for it. Omega (m, m) is in
-    the law's order; `noise` is that of the outputs, (m,), rms per sample; `size` (m,) holds their
-    units, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer` does.
+    The model of its feedforward is y_dot = Omega u, and the model of its observer is y_dot =
+    diag(Omega) u. With all of Omega the elevator would correct V, and turn the aircraft. Omega (m,
+    m) is in the law's order. `noise` (m,) is that of the outputs, rms per sample. `size` (m,) holds
+    their units, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer` does.
     """
     m = len(controller.outputs)
     require_same_signs(Omega, controller.D, "Omega")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a loop without the margins of its requirement lacks, and what gives the margins."""
+"""Say which margins of its requirement a loop lacks, and which change would give it the margins."""
 
 import math
 from collections.abc import Sequence
@@ -19,14 +19,14 @@ def binding(selection: Selection) -> GainCondition:
 
 
 def reason_against_gains(selection: Selection, *, options: Sequence[str] = ()) -> Refusal | None:
-    """Say what binds the best gains of the search, unless every condition is met.
+    """Say which bound limits the best gains of the search, unless every condition is met.
 
     The sentences name the binding bound, every unmet condition, and every change of the loop that
     reaches the margins.
 
-    A change is a smaller goal, half of the lags, no delay or twice the rate; the function searches
-    the gains for each. `options` are those of the calling command, out of phase_margin, lag, delay
-    and rate: a sentence names a change by its option if the command has one.
+    A change is a smaller goal, half of the lags, no delay or twice the rate. The gains are searched
+    for each change. `options` are those of phase_margin, lag, delay and rate that the calling
+    command has. A sentence names a change by its option if the command has this option.
     """
     assessed = selection.engineering
     if not assessed.unmet:

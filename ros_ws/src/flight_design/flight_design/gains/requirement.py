@@ -4,10 +4,10 @@
 
 Every margin is a condition, and the search measures the margins themselves.
 
-They are those of the sampled loop with actuators, delay and hold
-(`flight_analysis.linear_loop.input_margins`). 45 degrees and 6 dB are those of MIL-F-9490D,
-3.1.3.6.1, for an aerodynamic surface; a sensitivity of at most 2 is that of K. J. Astrom, R. M.
-Murray, "Feedback Systems", 12.3.
+The margins are those of the sampled loop with actuators, delay and hold
+(`flight_analysis.linear_loop.input_margins`). 45 degrees and 6 dB come from MIL-F-9490D, 3.1.3.6.1,
+for an aerodynamic surface. A sensitivity of at most 2 comes from K. J. Astrom, R. M. Murray,
+"Feedback Systems", 12.3.
 """
 
 import math
@@ -42,11 +42,12 @@ Controller = TypeVar("Controller", bound=ControllerConfig)
 
 PHASE_MARGIN = 45.0  # deg, the default
 ACCEPTED_PHASE_MARGIN = 40.0  # deg: a requirement below this must be accepted explicitly
-# deg, range of a requirement: a loop that integrates behind a lag has less than 90
+# deg, range of a required phase margin: a loop that integrates behind a lag has less than 90
 PHASE_MARGINS = (5.0, 80.0)
 
-# largest factors of the search by which the integral and the bandwidth fall. A throttle that is
-# weak near its stop has a bandwidth 200 times below the integral of the rule: 1000 leave V 85 deg
+# largest factors by which the search divides the integral and the bandwidth. A throttle that is
+# weak near its stop has a bandwidth 200 times below the integral of the rule. With a factor of
+# 1000, V still has a phase margin of 85 deg.
 MAX_SLOWER = 1000.0
 MAX_LOWER = 18.0
 # Exponents of `slower` and `lower` of all channels.
@@ -66,8 +67,8 @@ NO_ERROR = 1e-12  # SI: an error below it costs nothing
 WORST_STEP = math.radians(2.5)
 MAX_WORST_STEPS = 8
 
-OF_ZERO = 0.98  # fraction of the damping of a zero that is required; 1/s
-NO_MOTION = 1e-3  # motion of a zero that counts as at the origin
+OF_ZERO = 0.98  # required damping as a fraction of the damping of the zeros
+NO_MOTION = 1e-3  # 1/s: a zero this close to the origin, or to the real axis, has no motion
 
 
 class Requirement(NamedTuple):
@@ -76,9 +77,10 @@ class Requirement(NamedTuple):
     phase: float = math.radians(PHASE_MARGIN)  # rad, nominal aircraft
     gain: float = 10.0 ** (6.0 / 20.0)  # factor, up or down: 6 dB
     sensitivity: float = 2.0  # the largest abs(S_ii)
-    damping: float = 0.4  # of the slow modes
+    damping: float = 0.4  # damping ratio of the slow modes
     worst_phase: float = math.radians(30.0)  # rad, of the uncertain aircraft, by samples
-    # by a search over the corners: in the shipped loops, 30 deg of samples leave this much there
+    # rad, of the worst aircraft that a search over the corners of the uncertainty finds: shipped
+    # loops that have 30 deg by samples have at least this much there
     searched_phase: float = math.radians(28.0)
 
     @property
@@ -132,10 +134,11 @@ def above_zeros(requirement: Requirement, plant: LinearPlant) -> Requirement:
 def fractions(
     margins: Margins, requirement: Requirement
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compute what is found over what is needed, for m inputs, (..., m), (..., m), (...).
+    """Compute found / needed of the margins of m inputs, with shapes (..., m), (..., m), (...).
 
-    A fraction is at least 1 if the requirement holds. The first is the lesser of phase and
-    sensitivity, the second that of the gain, in dB, the third that of the damping.
+    A fraction is at least 1 if the requirement holds. The first result is the smaller fraction of
+    phase and sensitivity, the second the fraction of the gain, in dB, and the third the fraction of
+    the damping.
     """
     with np.errstate(divide="ignore"):
         phase = np.minimum(
@@ -219,13 +222,14 @@ def within_requirement(
 
     If there is none, the candidate with the least shortage is returned.
 
-    `build(slower, lower)` makes a controller whose integral is slower by both factors and whose
-    bandwidth is lower by the second, one factor per channel, (m,), at least 1, which is the rule.
-    The error is the product over the outputs of `linear_error` along `u_dot` (T, m), inputs in the
-    law's order. The damping that is required is that of `above_zeros`. The search begins with the
-    bandwidths of the rule and the fastest integrals that have the margins of their own channel, and
-    tries other starts if it ends with a margin missing. While the worst uncertain aircraft has less
-    than `worst_phase`, the nominal loop must have 2.5 degrees more.
+    `build(slower, lower)` makes a controller whose integral is divided by both factors and whose
+    bandwidth is divided by `lower`. There is one factor per channel, (m,). It is at least 1, and 1
+    gives the gains of the rule. The error is the product over the outputs of `linear_error` along
+    `u_dot` (T, m), inputs in the law's order. The required damping is that of `above_zeros`. The
+    search begins with the bandwidths of the rule, and with the fastest integrals that have the
+    margins of their own channel. If it ends with a margin missing, it tries other starts. While the
+    worst uncertain aircraft has less than `worst_phase`, the required phase margin of the nominal
+    loop is raised in steps of 2.5 degrees.
     """
     loops = _Loops(build, u_dot)
     target = above_zeros(requirement, loops.start.loop.nominal)
@@ -246,13 +250,13 @@ def within_requirement(
 
 class _Measured(NamedTuple, Generic[Controller]):
     candidate: Candidate[Controller]
-    reached: FloatArray  # (m,) found over needed, for each channel by itself
+    reached: FloatArray  # (m,) found / needed, for each channel by itself
 
 
 class _Loops(Generic[Controller]):
     """The loops of a search, each built and measured once.
 
-    A place has the exponents of `slower`, then those of `lower`.
+    A place has the exponents of `slower`, followed by those of `lower`.
     """
 
     def __init__(
@@ -290,7 +294,8 @@ class _Loops(Generic[Controller]):
         for place in places:
             candidate, margins = self._measured[place]
             phase, gain, damping = fractions(margins, requirement)
-            # each channel integrates: if it has no crossover, that lies below the frequencies seen
+            # Each channel integrates, so a channel without a crossover has it below the frequencies
+            # that were evaluated.
             is_certain = margins.stable & np.isfinite(margins.phase)
             fraction = np.where(is_certain, np.minimum(phase, gain), 0.0)
             goals = np.append(fraction, damping if margins.stable else 0.0)
@@ -335,8 +340,8 @@ class _Loops(Generic[Controller]):
         """
         highest = self.highest[0]
         rule = np.zeros(self.m, dtype=np.int64)
-        short = rule - 1  # the largest exponents at which a margin is missing
-        enough = highest + 1  # the least exponents at which none is
+        short = rule - 1  # the largest exponents so far at which a margin is missing
+        enough = highest + 1  # the least exponents so far at which no margin is missing
         tried = rule
         while True:
             (trial,) = assess([(*tried.tolist(), *rule.tolist())])

@@ -22,7 +22,7 @@ class TradeRow(NamedTuple):
     """The engineering gains for a phase margin."""
 
     phase_margin: float  # deg, the requirement
-    reached: float  # deg, the least of the loop
+    reached: float  # deg, the least phase margin of the loop
     delay_margin: float  # s
     # (m,) rms error of the linear loop along the manoeuvre, SI, by output of the law
     rms: FloatArray

@@ -22,9 +22,9 @@ class TuningResult(NamedTuple):
 
     gains: dict[str, list[float]]
     cost: float
-    seed: int  # of the best
-    costs: list[float]  # of all seeds
-    evaluations: int  # of each
+    seed: int  # seed of the best search
+    costs: list[float]  # cost of each seed
+    evaluations: int  # number of evaluations for each seed
 
 
 class _Dumper(yaml.SafeDumper):
@@ -45,7 +45,7 @@ def tuned_file(scenario: Scenario) -> Path:
 
 
 def load(path: Path) -> dict[str, dict[str, TuningResult]]:
-    """Load tuned gains by law and objective; empty if there is no file.
+    """Load tuned gains by law and objective. Returns {} if there is no file.
 
     Raises ParameterError if the file cannot be read.
     """
