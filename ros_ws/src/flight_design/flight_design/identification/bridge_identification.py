@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The way from a channel map to gains, without a model.
+"""The steps from a channel map to gains, without a model of the aircraft.
 
-It leads over the scenario of an experiment to a scenario that flies the aircraft.
+The first result is the scenario of an experiment, and the second a scenario that flies the
+aircraft.
 
 The experiment excites the inputs in turn, open loop. `identify_response` estimates Omega, lags and
 delays from its log. The airframe of the scenarios is y_dot = Omega u, because nothing else is known
@@ -59,8 +60,8 @@ EXCITATIONS: Mapping[str, Excitation] = {
 """Excitations by the motion that the input causes. Any other input turns the aircraft."""
 PAUSE = 1.5  # s, between the inputs
 
-# Failsafe of the controller: ratio of its age limit to the largest one of the bridge, which acts
-# first.
+# Ratio of the controller's age limit to the largest age limit of the bridge. The failsafe of the
+# bridge must act first.
 AGE = 1.5
 HOLD = 0.5  # s
 RAMP = 2.0  # s
@@ -70,8 +71,8 @@ WAIT = 30.0  # s before the first command of the flight, in which the user engag
 def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
     """Pair each output with the input that drives it, and return the signs of the effects, (m,).
 
-    The motions of the map decide. Raises ParameterError if an output has no input, or one of the
-    opposite sign.
+    The motions of the map decide. Raises ParameterError if an output has no input, or if the sign
+    of an output is opposite to that of the stack.
     """
     drivers: dict[str, tuple[str, int]] = {}
     for name, row in channel_map.inputs.items():
@@ -193,7 +194,7 @@ WHOLE = 0.95  # share of the planned duration; reports of the engagement are lat
 def reason_against_experiment(engagements: Sequence[Engagement], duration: float) -> Refusal | None:
     """Say when and why the bridge released before the end of an experiment.
 
-    Arguments: the engagements of the log; the planned duration, s.
+    `engagements` are those of the log, and `duration` is the planned one, s.
     """
     lengths = [
         math.inf if part.stop_ns is None else (part.stop_ns - part.start_ns) / NANOSECONDS
@@ -214,8 +215,8 @@ def channel_models(
     """Identify the channels of a map from the log of an experiment, in `spans` of engagement.
 
     A channel without a model is None. `speed` is the airspeed in trim, m/s, or None in hover. V
-    gets no model unless a climb is measured: thrust also excites the phugoid, which would be taken
-    for a response to thrust. A climb in hover is of first order. Source: G. D. Padfield,
+    only gets a model if a climb is measured, because thrust also excites the phugoid, which would
+    be taken for a response to thrust. A climb in hover is of first order. Source: G. D. Padfield,
     "Helicopter Flight Dynamics", 2007, 4.3 (heave).
     """
     pairing, sign = channel_pairs(channel_map)
@@ -241,7 +242,7 @@ def channel_models(
 
 
 def gravity_along_path(pose: Signal, speed: float) -> Signal | None:
-    """Return V_dot by gravity, -g climb / speed, m/s^2, at the stamps of a pose.
+    """Return the part of V_dot that gravity causes, -g climb / speed, m/s^2, at a pose's stamps.
 
     Returns None if the pose has no climb.
     """
@@ -258,7 +259,7 @@ class IdentifiedChannels(NamedTuple):
     """What is known about m channels, where input i drives output i; SI."""
 
     Omega: FloatArray  # (m, m)
-    Omega_deviation: FloatArray  # (m,) of its diagonal
+    Omega_deviation: FloatArray  # (m,) standard deviations of its diagonal
     lag: FloatArray  # (m,) s
     delay: FloatArray  # (m,) s
     damping: FloatArray  # (m,) 1/s; 0 if none is known
@@ -329,9 +330,9 @@ def join(
 
 
 def over_link(channels: IdentifiedChannels, link_delay: float) -> IdentifiedChannels:
-    """Return channels from a log of the autopilot's board as the law meets them over the link.
+    """Add the delay of the link, s, to channels from a log that the autopilot wrote on board.
 
-    Their delay becomes delay + link_delay, s.
+    The law flies over the link, so it meets this longer delay.
     """
     return channels._replace(delay=channels.delay + link_delay)
 
@@ -398,7 +399,7 @@ def within_range(
 def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -> str:
     """Write a channel map with the measured trims as text.
 
-    A trim that is captured is measured again at every engagement.
+    A captured trim is measured again at every engagement.
     """
     values = channel_map.model_dump(exclude_unset=True)
     values["source"] = f"{values['source']}; trims measured in {source}"
@@ -476,7 +477,7 @@ def airframe_yaml(
 
 
 def signs_alone(sign: FloatArray) -> IdentifiedChannels:
-    """Return channels of which only the signs are known."""
+    """Return channels of which nothing but the signs is known."""
     none = 0.0 * sign
     return IdentifiedChannels(
         Omega=np.diag(sign),

@@ -22,14 +22,15 @@ from flight_design.identification.model_refusals import (
     in_time,
 )
 
-# Of the variance of an output, by its own input: 0.2 in doublets of yaw, and 0.01 or less without.
+# Least share of an output's variance that its own input must explain. In doublets of yaw the share
+# is 0.2, and without them 0.01 or less.
 LEAST_SHARE = 0.05
-CLEAR_SHARE = 0.2  # below this an output is flown again, if another one has to be
-WINDY = 1.0  # times moderate turbulence, from which on gusts hide the effects of the inputs
+CLEAR_SHARE = 0.2  # an output with less is flown again if another output has to be flown again
+WINDY = 1.0  # gusts above this hide the effects of the inputs, in units of moderate turbulence
 FORGETTING = 0.5  # 1/s, taken from the poles, so that what a neutral aircraft integrates fades
-FEWEST = 3  # doublets on an axis
-LENGTH = 0.5  # s, of half a doublet if the scenario has none
-SIZE = 0.3  # rad/s, of a doublet if the scenario has none
+FEWEST = 3  # least number of doublets on an axis
+LENGTH = 0.5  # s, length of half a doublet, if the scenario has no pulses
+SIZE = 0.3  # rad/s, size of a doublet, if the scenario has no pulses
 APART = 2.0  # s between doublets
 YAW_RATES = "FW_ACRO_YAW_EN"
 
@@ -89,9 +90,10 @@ def own_shares(
 
 
 def to_set(outputs: Iterable[str], parameters: Mapping[str, float]) -> str:
-    """Say which parameter of PX4 lets its own controller fly the doublets; "" if none is missing.
+    """Say which parameter of PX4 to set so that its controller flies the doublets, or return "".
 
-    Source: PX4 1.16, fw_rate_control: without it the yaw rate of a setpoint is not controlled.
+    Source: PX4 1.16, fw_rate_control, which without this parameter does not control the yaw rate of
+    a setpoint.
     """
     if "r" not in outputs or parameters.get(YAW_RATES) != 0.0:
         return ""
@@ -101,10 +103,10 @@ def to_set(outputs: Iterable[str], parameters: Mapping[str, float]) -> str:
 def to_fly(
     outputs: Mapping[str, float], scenario: Scenario, airframe: Airframe, y: FloatArray
 ) -> str:
-    """Say which doublets show outputs, each of which needs a factor on its amplitude so far.
+    """Say which doublets would show some outputs, given the factor on the amplitude of each.
 
-    They have the size and length of the pulses of the scenario, at least what the log has, y (T,
-    m). "" if there are no outputs.
+    The doublets have the size and length of the scenario's pulses. Their size is at least that of
+    the motion in the log, y (T, m). Returns "" if there are no outputs.
     """
     pulses = scenario.reference_model.pulses
     texts = []
@@ -120,9 +122,10 @@ def to_fly(
 
 
 def gust_warning(part: Part) -> str:
-    """Warn of a part that flew in gusts, which the deviations do not count; "" in calmer air.
+    """Warn of a part that flew in gusts, or return "" if the air was calmer.
 
-    In gusts of 0.5 m/s the effects of a light airplane came out a fifth too weak.
+    The deviations do not count the error that gusts cause. In gusts of 0.5 m/s the effects of a
+    light airplane came out a fifth too weak.
     """
     if part.wind < WINDY:
         return ""
@@ -134,9 +137,10 @@ def gust_warning(part: Part) -> str:
 
 
 def factors_of(parts: Iterable[Part]) -> dict[str, float]:
-    """Return the outputs of which no effect is known to MAX_DEVIATION, by motion that they lack.
+    """Return the outputs that need more motion, each with the factor on its amplitude.
 
-    Each has the factor on its amplitude. What a delay makes uncertain, no motion mends.
+    No effect on such an output is known to MAX_DEVIATION. An output is left out if a delay makes
+    its effects uncertain, because more motion would not help.
     """
     return {
         effect.row: excitation_factor(effect)

@@ -51,7 +51,7 @@ from rise_di_controller.law.law import Sign
 from rise_di_controller.law.linear_loop import LoopTiming
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# s, in which u may move from trim to its limit; this bounds beta from below
+# s, least time in which u can move from trim to its limit; it bounds beta from below
 FULL_RANGE_TIME = 1.0
 # relative deviation of the uncertain aircraft whose phase margin counts
 UNCERTAINTY = 0.3
@@ -67,9 +67,10 @@ class Flyable(NamedTuple):
     """A controller for an identified aircraft, and the files for its flight."""
 
     controller: RiseDiConfig
-    # s, around the identified channels with lags and delay; None without a softened sign
+    # s, of the loop around the identified channels with lags and delay; None without a softened
+    # sign
     delay_margin: float | None
-    lack: Refusal | None  # required margins that the loop does not have
+    lack: Refusal | None  # the required margins that the loop does not reach
     airframe: str  # text of the airframe file
     scenario: str  # text of the scenario file
 
@@ -139,7 +140,7 @@ class _Identified(NamedTuple):
 
     @property
     def loop(self) -> LoopTiming:
-        """The loop with one delay. What a channel has beyond it counts as its lag."""
+        """The loop with one delay for all channels. Further delay of a channel counts as lag."""
         channels = self.channels
         delay = float(np.min(channels.delay))
         return LoopTiming(channels.lag + channels.delay - delay, delay, 1.0 / RATE)
@@ -159,7 +160,7 @@ class _Identified(NamedTuple):
         return np.array([min(-row.lower, row.upper) for row in rows])
 
     def commands(self) -> FirstCommands:
-        """Return commands within reach of the loop, which begin after WAIT: `first_commands`."""
+        """Return the `first_commands`, which the loop can follow, and which begin after WAIT."""
         crossover = bandwidths(self.loop, np.array(list(self.products.values())))
         authority = np.abs(np.diag(self.channels.Omega)) * self.reach
         channels = {
@@ -214,10 +215,10 @@ class _Identified(NamedTuple):
 def _within_margins(
     controller: RiseDiConfig, study: Study, requirement: Requirement
 ) -> tuple[RiseDiConfig, LoopMargins | None]:
-    """Slow the integrals and lower the bandwidths of a controller until its loop has the margins.
+    """Lower the integrals and bandwidths of a controller until its loop has the margins.
 
-    The loop is around the airframe of a study. Return the controller and the margins. A lower
-    bandwidth goes into the input scale, so that the K of (22) stays.
+    The loop is around the airframe of a study. Returns the controller and the margins. The input
+    scale is divided by the same factor as the bandwidth, so that the K of (22) stays.
     """
     if controller.sampled_sign()[0] is not Sign.SOFT:
         return controller, None
@@ -243,10 +244,10 @@ def _within_margins(
 
 
 def _without_sideslip(channels: IdentifiedChannels, pairing: ChannelPairing) -> IdentifiedChannels:
-    """Return the channels with nothing but damping in r.
+    """Return the channels, with the channel r reduced to its damping.
 
     The stiffness of r is N_beta, which acts in straight flight. In a coordinated turn beta_dot = -r
-    + g / V phi is 0: a rudder that works against the stiffness would skid.
+    + g / V phi is 0, and a rudder that worked against the stiffness would make the aircraft skid.
     """
     turns = np.array([name == "r" for name in pairing.outputs])
     damping = np.where(turns, channels.damping - channels.zero, channels.damping)
@@ -263,7 +264,7 @@ def _with_integrals(
     channels: IdentifiedChannels,
     loop: LoopTiming,
 ) -> RiseDiConfig:
-    """Give the controller integrals that keep the crossover of y_dot = Omega u with the models.
+    """Give the controller integrals for the models, at the crossover of y_dot = Omega u.
 
     The slope of the softened sign is 1 / (softening total lag). Lambda and this slope are the
     integrals of K (s + integral) / s. In a first-order channel, the integral is the damping, and

@@ -27,18 +27,18 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.nominal import airframe_model, unit_sizes
 from rise_di_controller.law.linear_loop import LoopTiming
 
-# s at the start of a recording in which innovations do not count, because the filter starts from y
-# alone
+# s at the start of a recording. Innovations in this time do not count, because the filter starts
+# from y alone.
 TRANSIENT = 0.5
-MOST_GAPS = 10.0  # largest length of a log, gaps included, as a multiple of its samples of u
+MOST_GAPS = 10.0  # largest ratio of the length of a log, gaps included, to the time with a u
 # Small noises of the filter apart from the wind, as in `observer_design.Weights`.
 DRIFT = 0.003
 LOOSE = 1.5e-4
 # Least noise of y in the filter, in units of 1 m/s or 0.1 rad/s. Even with a perfect sensor the
 # model leaves something out.
 MIN_NOISE = 1e-2
-LEAK = 1e-3  # times observer_design.LEAK: the filter must not forget its angles within a minute
-HOLD = 5  # periods of a block, over which sin(x) - x is held, because it changes slowly
+LEAK = 1e-3  # factor on observer_design.LEAK: the filter must not forget its angles in a minute
+HOLD = 5  # periods of a block; sin(x) - x is held over a block, because it changes slowly
 # s, decay of the rate of a gust, and of the change of that rate
 GUST_TIME = 0.5
 RATE_TIME = 0.2
@@ -73,7 +73,7 @@ class FlightData(NamedTuple):
 def coarser(recorded: FlightData, factor: int) -> FlightData:
     """Average a flight over `factor` periods.
 
-    u lies between the middles of two means of y.
+    A mean of u is over the time between the middles of two means of y.
     """
     count = len(recorded.t) // factor
     leads = [
@@ -88,7 +88,7 @@ def coarser(recorded: FlightData, factor: int) -> FlightData:
 
 
 class Actuation(NamedTuple):
-    """What lies between u and the aircraft."""
+    """The lags and the delay between u and the aircraft."""
 
     lag: FloatArray  # (m,) time constants of the actuators in the airframe's order, s
     delay: float  # s
@@ -97,9 +97,9 @@ class Actuation(NamedTuple):
 def recording(tape: Tape, airframe: Airframe) -> FlightData:
     """Return y and u of a tape at the rate of u, from the first u on.
 
-    y is the sample nearest to the instant, within half a period, and u is the last one. Raises
-    ParameterError if the log lacks a channel of the airframe, is shorter than ten times the
-    transient, or has gaps beyond MOST_GAPS.
+    At each instant y is the nearest sample, within half a period, and u is the last sample. Raises
+    ParameterError if the log lacks a channel of the airframe, is shorter than ten times TRANSIENT,
+    or has gaps beyond MOST_GAPS.
     """
     y = tape["y"]
     u = tape["u"]
@@ -157,7 +157,8 @@ def filter_model(airframe: Airframe, actuation: Actuation, recorded: FlightData)
 def delayed(u: FloatArray, periods: float) -> FloatArray:
     """Return u, (T, m), some periods later.
 
-    Between two samples it is the mean that acts within a period.
+    If the delay is not a whole number of periods, the result is the mean of the u that acts within
+    a period.
     """
     full_periods = int(periods)
     part = periods % 1.0
@@ -168,8 +169,8 @@ def delayed(u: FloatArray, periods: float) -> FloatArray:
 def measured_noise(y: FloatArray, size: FloatArray) -> FloatArray:
     """Estimate the noise of each channel, rms of a sample, from the third differences of y, (T, m).
 
-    Their variance is 20 times that of y. The noise is at least MIN_NOISE of `size`, the unit of the
-    channel.
+    The variance of these differences is 20 times that of the noise. The result is at least
+    MIN_NOISE times `size`, the unit of the channel.
     """
     third = np.diff(y, n=3, axis=0)
     spread = np.nanmedian(np.abs(third), axis=0) / 0.6745  # for a normal distribution
@@ -202,7 +203,7 @@ class FilterBank(NamedTuple):
     def lifted(self, level: int, seen: Sequence[bool]) -> FloatArray:
         """Return HOLD periods as one step, (N, HOLD m + s, ..).
 
-        The map leads from z, then y and u of the periods, then sin(x) - x, to r and z.
+        The map takes z, the y and u of the periods, and sin(x) - x, in this order, to r and z.
         """
         H = self.sampled.H
         Phi = self.sampled.Phi[:, 0]
@@ -227,8 +228,8 @@ class Passage:
 
         r = y - H z,  z+ = Phi (z + L r) + Gamma u + period gravity (sin(x) - x)
 
-    without an update if y is lost. A block of HOLD periods has a `level`, (T / HOLD,). sin(x) - x
-    is held over a block, so that blocks are linear: those with the same level and the same lost
+    There is no update if y is lost. A block of HOLD periods has one `level`, (T / HOLD,). sin(x) -
+    x is held over a block, so that a block is linear. Blocks with the same level and the same lost
     samples have the same matrix.
     """
 
@@ -302,8 +303,8 @@ class Passage:
 def in_rolling_air(airframe: Airframe) -> Airframe:
     """Add the rotary gust in roll to an airframe whose span is known.
 
-    The rotary gust in pitch follows the vertical wind, see `filter_bank`. That in yaw is small
-    compared with the lateral wind.
+    The rotary gust in pitch follows from the vertical wind, see `filter_bank`. The rotary gust in
+    yaw is small compared with the lateral wind.
     """
     return airframe if airframe.span is None else airframe.with_rotary_gusts(ROTARY[:1])
 
@@ -313,10 +314,10 @@ def wind_model(
 ) -> tuple[FloatArray, FloatArray]:
     """Return time constants, s, and noises, m/s per root s, of winds of first order, (G,) each.
 
-    The winds resemble Dryden's moderate turbulence: they have its spectrum at low and at high
-    frequencies. With T = L / V0 that is 2 sigma^2 T / (1 + (T omega)^2) along the flight and
-    sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across it. The rotary gust in roll, rad/s,
-    is that of `roll_gust`. `speed` is V0 and `span` the span, both in SI.
+    The winds resemble Dryden's moderate turbulence, whose spectrum they have at low and at high
+    frequencies. With T = L / V0 this spectrum is 2 sigma^2 T / (1 + (T omega)^2) along the flight
+    path, and sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across it. The rotary gust in
+    roll, rad/s, is that of `roll_gust`. `speed` is V0 and `span` the wing span, both in SI.
     """
     if not axes:
         # A multicopter hovers at a speed of 0.
@@ -429,10 +430,10 @@ def filter_bank(
         q_g = (w - l) / (V0 T),  l_dot = (w - l) / T
         alpha_dot -= shear_1 q_g,  q_dot -= shear_2 A[q, q] q_g
 
-    A frozen field of wind has the shear (0, -1). The specification has the opposite sign, and other
-    models of the air move alpha, too. The noises are those of `levels` of LEVELS times `strength`
-    (N, G); `drift` is as in `observer_design.Weights`. If the models are `near` the first one,
-    their gains are exact to first order.
+    A frozen field of wind has the shear (0, -1). The specification has the opposite sign, and in
+    other models of the air the slope also moves alpha. The noises are those of `levels` of LEVELS
+    times `strength` (N, G). `drift` is as in `observer_design.Weights`. If the models are `near`
+    the first one, their gains are computed from its gains, exact to first order.
     """
     air = FilterAir(names, speed, span, shear)
     m = model.B.shape[-1]

@@ -67,8 +67,8 @@ from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiCo
 
 CONTROL_RATE = 100.0
 STEP = 0.005
-# s, delay over topics. At a tick y is up to 5 ms old, and u waits up to 5 ms. This is half of both,
-# and 1 ms of transport.
+# s, delay over topics. At a tick y is up to 5 ms old, and u waits up to 5 ms. The delay is half of
+# both together, and 1 ms for transport.
 DELAY = 0.006
 
 THROTTLE = list(INPUTS).index("throttle")
@@ -76,11 +76,11 @@ THROTTLE = list(INPUTS).index("throttle")
 # ratio of an output's unit to the noise that an observer expects: 1 mrad/s, 0.01 m/s
 NOISE_SHARE = 100.0
 
-# s, least delay margin. Without A, the model of an observer has no damping, and less margin than
-# the aircraft has.
+# s, least delay margin. The model of an observer without A has no damping, so its loop has less
+# margin than the loop around the aircraft.
 STEP_MARGIN = 0.015
 LATERAL = ("beta", "p", "r")
-HELD_FACTOR = 2.0  # times an unstable zero of sideslip: it becomes as stable as it was unstable
+HELD_FACTOR = 2.0  # damping that is added, in units of the unstable zero: its sign is reversed
 APART = 5.0  # s, from one gust to the next
 
 NOISE = {"q": 0.001, "V": 0.05, "p": 0.001, "r": 0.001}
@@ -116,7 +116,7 @@ class IdentifiedAircraft(NamedTuple):
 
     @property
     def condition(self) -> FlightCondition:
-        """The flight condition. A rudder that moves nothing is not in it."""
+        """The flight condition, without the rudder if that moves nothing."""
         return self.linear.condition
 
     @property
@@ -135,7 +135,7 @@ class IdentifiedAircraft(NamedTuple):
     def failure(self) -> Refusal | None:
         """Why the aircraft does not fly.
 
-        It flies if every flight completes, and in calm air the errors are below the commands.
+        It flies if every flight completes, and if in calm air the errors are below the commands.
         """
         for title, flight in self.flights.items():
             if flight.outcome != str(COMPLETED):
@@ -285,8 +285,9 @@ def with_sideslip_held(airframe: Airframe, zero: float) -> Airframe:
 def airspeed_slew(bandwidth: float, effect: float) -> float:
     """Return the throttle slew behind beta, 1/s, for a bandwidth of V, rad/s, and an effect, m/s^2.
 
-    V contains the wind itself. With beta = K bandwidth / 4 sigma, the sign moves the throttle in
-    light turbulence of LIGHT_SIGMA no faster than the Lambda of the rule would, bandwidth / 4.
+    The airspeed V contains the wind itself. With beta = K bandwidth / 4 sigma, where sigma is
+    LIGHT_SIGMA, the sign moves the throttle in light turbulence no faster than the Lambda of the
+    rule, bandwidth / 4, would.
     """
     return bandwidth**2 / 4.0 * LIGHT_SIGMA / (gain_selection.BETA_TO_SLEW * effect)
 
@@ -294,7 +295,8 @@ def airspeed_slew(bandwidth: float, effect: float) -> float:
 def _too_weak(linear: Linearization) -> str:
     """Say which outputs are moved too weakly by their own input, in sentences after a "; ".
 
-    At full travel, their own input moves them less than a tenth as much as another input does.
+    At full travel, the own input of such an output moves it less than a tenth as much as another
+    input does.
     """
     inputs = linear.condition.inputs()
     reach = linear.Omega * linear.travel()
@@ -371,8 +373,8 @@ def learning_selection(
 def _study(airframe: Airframe, commands: FirstCommands) -> Study:
     """Study an airframe along the commands and gusts, without any uncertain aircraft.
 
-    The equations are those that fly. An aircraft whose entries are 30 % off may have an unstable
-    zero of sideslip, and then no gains could hold its outputs.
+    The study uses the equations of the aircraft that flies. An aircraft whose entries are 30 % off
+    can have an unstable zero of sideslip, and then no gains could hold its outputs.
     """
     reference = ReferenceModelConfig.validate_mapping(commands.reference, "reference_model")
     gusts = {
@@ -402,8 +404,8 @@ def airspeed_bandwidth(authority: float, lag: float) -> float:
 
     It is min(0.46 / total, authority / sigma). V contains the wind along the path itself. In
     moderate turbulence, sigma = 3.05 m/s rms, the throttle then moves by its authority rms. With
-    more bandwidth it would go from stop to stop, and V would be off by twice the wind, as on the
-    737.
+    more bandwidth it would go from stop to stop, and the error of V would be twice the wind. This
+    happened on the 737.
     """
     return min(
         FASTEST_V / float(total_lag(np.array(lag), DELAY, 1.0 / CONTROL_RATE)),
@@ -471,7 +473,7 @@ def _commands(linear: Linearization, setting: LoopSetting) -> FirstCommands:
 def _text(
     linear: Linearization, commands: FirstCommands, selection: Selection, stall: float | None
 ) -> str:
-    """Write the scenario file. `stall` is V_s, m/s; without it the flight is not guided."""
+    """Write the scenario file. `stall` is V_s, m/s, or None if the flight is not guided."""
     condition = linear.condition
     learns = selection.chosen.learn is not None
     reference = dict(commands.reference)

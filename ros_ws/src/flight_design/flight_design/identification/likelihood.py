@@ -36,8 +36,8 @@ from flight_design.identification.innovation_filters import (
 PRIOR = 0.29  # standard deviation of a relative error before the flight: uniform within +-50 %
 SHEAR_PRIOR = 1.0  # the same for the effects of the slope of the vertical wind
 WIND_PRIOR = 1.0  # the same for the logarithm of the strength of the wind along an axis
-MAX_ERROR = 0.6  # lower bound of a relative error is minus this: two standard deviations
-# bound of the error of the delay in standard deviations: 60 ms for one of 15 ms
+MAX_ERROR = 0.6  # two standard deviations; minus this is the lower bound of a relative error
+# bound of the error of the delay, in standard deviations: 60 ms for a deviation of 15 ms
 MAX_DELAY_ERROR = 4.0
 # Largest ratio of a value to the nominal one, 1 / (1 - MAX_ERROR): a rough model errs by a factor
 # either way.
@@ -45,13 +45,13 @@ MAX_FACTOR = 2.5
 # Unit of an entry that is 0, relative to the largest effect on its row. It gives a deviation of
 # 10 % before the flight.
 COUPLING = 0.34
-CHANGE = 3.0  # of log-likelihood that a span must gain by a stronger wind: odds of 20 to 1
+CHANGE = 3.0  # gain of log-likelihood that a stronger wind must bring in a span: odds of 20 to 1
 # Mean square of the innovations of a span relative to the median one, above which no level of the
 # wind explains the span.
 UNEXPLAINED = 5.0
-FEW = 0.25  # share of the spans: so few gusts do not count, because a gust is not noise
-RECOVERY = 2  # spans after such a one that do not count either, while the estimates recover
-SPAN = 1.0  # s, within which the level of the wind is constant
+FEW = 0.25  # if less than this share of the spans has gusts, they do not count: no gust is noise
+RECOVERY = 2  # spans after one that does not count; these do not count while estimates recover
+SPAN = 1.0  # s, length of a span, within which the level of the wind is constant
 # Every third span is held out, so that each command and gust is in both parts. The last third of a
 # flight may have no command.
 HELD_OUT = 3
@@ -110,22 +110,23 @@ class Models(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """Standard deviations of what else is identified; 0 if it is known.
+    """Standard deviations of what is identified beside A and B, or 0 for what is known.
 
-    They are the deviations of B and the noise of the disturbances. The rows of hidden states, such
-    as alpha, are known if they follow from mass and lift while y has nothing but the rates.
+    The class also has the deviations of the entries of A and B, and the noise of the disturbances.
+    The rows of hidden states, such as alpha, count as known if they follow from mass and lift while
+    y has nothing but the rates.
     """
 
-    delay: float = 0.0  # s, of u
-    angle: float = 0.0  # rad, of pitch and bank at the beginning of the recording
-    effect: float = PRIOR  # 1, of an entry of B before the flight
-    error: float = PRIOR  # 1, of an entry of A
-    drift: float = DRIFT  # sizes/s per root s, of the disturbances
+    delay: float = 0.0  # s, deviation of the delay of u
+    angle: float = 0.0  # rad, deviation of pitch and bank at the beginning of the recording
+    effect: float = PRIOR  # relative deviation of an entry of B before the flight
+    error: float = PRIOR  # relative deviation of an entry of A before the flight
+    drift: float = DRIFT  # sizes/s per root s, noise of the disturbances
     has_hidden_rows: bool = True  # whether the rows of states that are no outputs are identified
 
     @property
     def factor(self) -> float:
-        """Largest ratio of an entry to the nominal one, either way: MAX_FACTOR at PRIOR."""
+        """Largest factor between an entry and the nominal one, up or down: MAX_FACTOR at PRIOR."""
         roughness = max(self.error, self.effect, PRIOR) / PRIOR
         return float(MAX_FACTOR**roughness)
 
@@ -150,9 +151,9 @@ class Fit(NamedTuple):
 def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:
     """Return the units of the errors of A and B, SI; 0 for a known entry.
 
-    They are the nominal values, and 0 in the rows of angles. If `coupled`, an entry that is 0 has
-    the unit COUPLING times the largest effect on its row, in units of motion; the columns of angles
-    stay 0.
+    The units are the nominal values, and 0 in the rows of angles. If `coupled`, an entry that is 0
+    gets the unit COUPLING times the largest effect on its row, in units of motion. The columns of
+    angles stay 0.
     """
     free = model.kinematic[:, None] == 0.0
     is_dynamic = model.kinematic == 0.0
@@ -463,7 +464,7 @@ class Likelihood:
         return names + others[: len(self.prior) - len(names)]
 
     def model_errors(self, airframe: Airframe) -> FloatArray:
-        """Return the theta, (p,), of a model in the winds and with the delay of theta = 0."""
+        """Return the theta, (p,), of a model, with the winds and the delay that theta = 0 has."""
         A = airframe.matrix_a()
         B = airframe.matrix_b()
         inputs = list(airframe.inputs)
@@ -535,7 +536,7 @@ class Likelihood:
         square = np.array(
             [np.nansum(e[span] ** 2) / max(np.isfinite(e[span]).sum(), 1) for span in self._spans]
         )
-        # At rest, without noise, it is 0.
+        # The mean square is 0 at rest without noise.
         largest = UNEXPLAINED * np.median(square[square > 0.0]) if square.any() else np.inf
         unexplained, gusts = (
             np.convolve(spans, np.ones(RECOVERY + 1))[: len(levels)] > 0.0

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from flight_core.vectors import FloatArray
 from flight_design.identification.likelihood import Fit, Innovations, Likelihood
 
-DIFFERENCE = 1e-4  # of a parameter, for the derivatives
-LATER = 1e-3  # s, of the delay, for the same
-BLOCK = 4.0  # s, of the parts of a log that are compared with each other: more than a doublet
+DIFFERENCE = 1e-4  # step of a parameter in the finite differences of the derivatives
+LATER = 1e-3  # s, step of the delay in these finite differences
+BLOCK = 4.0  # s, longer than a doublet: length of the blocks of a log over which scores are summed
 # Share of the decrease that the quadratic model predicts. From this on, the undamped step is taken
 # and no damped one is tried.
 GOOD = 0.7
@@ -32,7 +32,7 @@ SIGNS = (-1.0, 1.0)  # of the effect of the vertical wind's slope on q, in two m
 START_STEPS = 8
 STEPS = 12
 REFINED = 2  # largest number of starts from which the search goes on
-CLOSE = 100.0  # by which the cost of such a start may exceed that of the best one
+CLOSE = 100.0  # largest excess of the cost of such a start over that of the best start
 # A start, or the search, ends when a step lowers the cost, a log-likelihood, by less than this.
 START_PROGRESS = 5.0
 PROGRESS = 0.3
@@ -48,19 +48,19 @@ class SearchEnd(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """The innovations of a theta over their rms, with their derivatives."""
+    """The innovations of a theta divided by their rms, with their derivatives."""
 
     cost: float
     e: FloatArray  # (samples, m)
-    J: FloatArray  # (p, samples m), of e
-    half_log_det: FloatArray  # (p,) of the sum of log det S / 2
+    J: FloatArray  # (p, samples m), derivatives of e
+    half_log_det: FloatArray  # (p,) derivatives of the sum of log det S / 2
 
 
 class Doubt(NamedTuple):
-    """What the deviations of a fit count beside the noise of the innovations."""
+    """Two sources of error that the deviations of a fit count beside the innovations' noise."""
 
-    timing: float  # s, deviation of the delay of u, which is not identified
-    whiteness: FloatArray  # (m,) of the innovations of the held-out samples
+    timing: float  # s, standard deviation of the delay of u, which is not identified
+    whiteness: FloatArray  # (m,) `whiteness` of the innovations of the held-out samples
 
 
 class Search(Likelihood):
@@ -239,9 +239,9 @@ class Search(Likelihood):
     ) -> tuple[FloatArray, FloatArray, float]:
         """Return theta after a step of Gauss-Newton with damping, and the Hessian before it.
 
-        The third result is the decrease of the cost. The derivatives are differences, with the
-        filters side by side. The Hessian is J'J + prior^-2, where J has the derivatives of the
-        innovations over their rms. Source: L. Ljung, "System Identification", 7.4 and 10.2.
+        The third result is the decrease of the cost. The derivatives are finite differences, from
+        filters that run side by side. The Hessian is J'J + prior^-2, where J has the derivatives of
+        the innovations over their rms. Source: L. Ljung, "System Identification", 7.4 and 10.2.
         """
         slopes = self._slopes(theta, levels, used, free)
         hessian = slopes.J @ slopes.J.T + np.diag(self.prior**-2)
@@ -297,14 +297,15 @@ class Search(Likelihood):
 
             covariance = H^-1 (M + prior^-2) H^-1 + s s' timing^2,  s = -H^-1 J j
 
-        H is the Hessian, and J has the derivatives by theta of the innovations e over their rms. M
-        is J J' for a right model. Here it is the larger one of two: the sum over blocks of the log
-        of the outer products of J e; and J J' times the whiteness of each output, as in Birge's
-        ratio. s is the change of theta with the delay of u, by which e has the derivative j.
+        H is the Hessian, and J has the derivatives by theta of the innovations e over their rms. If
+        the model were right, M would be J J'. Here M is the larger one of two matrices. One is the
+        sum of the outer products of J e over blocks of the log. The other is J J' times the
+        whiteness of each output, as in Birge's ratio. s is the change of theta with the delay of u,
+        and j is the derivative of e by this delay.
         Sources: H. White, Econometrica 50(1), 1982; R. T. Birge, Phys. Rev. 40(2), 1932; S. F.
         Schmidt, Advances in Control Systems 3, 1966, for a delay that is not estimated.
 
-        Returns the fit, and the part of the entries' deviations that the delay makes, (p - G,).
+        Returns the fit, and the part of the entries' deviations that the delay causes, (p - G,).
         """
         theta, used = fit.theta, self.fitted()
         slopes = self._slopes(theta, fit.levels, used, np.ones(len(theta), dtype=bool))
@@ -337,9 +338,9 @@ class Search(Likelihood):
         return self.predicted(theta, self.levels(theta))
 
     def joined(self, parts: Iterable[tuple[Likelihood, Fit]]) -> FloatArray:
-        """Return a theta, (p,), without errors, with the parts' mean winds, angles and delays.
+        """Return a theta, (p,), with the parts' mean winds, angles and delays, and errors of 0.
 
-        A part that is searched apart from those with which it couples has wrong errors.
+        If a part was searched apart from the parts with which it couples, its errors are wrong.
         """
         values: dict[str, list[float]] = {}
         for part, fit in parts:

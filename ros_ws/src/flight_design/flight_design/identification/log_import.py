@@ -40,11 +40,11 @@ AIRBORNE = 0.5
 # We take this percentile as the typical value: a log may have more time on the ground than in the
 # air.
 TYPICAL = 90.0
-LEAST = 2.0  # s, of the shortest stretch that is imported
+LEAST = 2.0  # s, length of the shortest stretch that is imported
 # s. If the speed is too low for at most this long, the aircraft still counts as in the air, because
 # no landing is as short.
 BRIDGED = 1.0
-AROUND = 5  # samples, of which the median is never a damaged value
+AROUND = 5  # number of samples whose median is taken: it is never a damaged value
 
 FLOWN_AS = LogField("vehicle_status", "vehicle_type")
 VEHICLE_TYPES = {COPTER: 1.0, PLANE: 2.0}  # PX4, VehicleStatus.msg
@@ -55,9 +55,10 @@ Stamps = NDArray[np.int64]
 
 
 class Window(NamedTuple):
-    """What is taken of a log, s since its first sample of the output that the map calls `instant`.
+    """The part of a log that is imported, in s.
 
-    None means the beginning or the end of the flight that is found.
+    Time 0 is the first sample of the output that the map calls `instant`. None means the beginning
+    or the end of the flight that is found in the log.
     """
 
     start: float | None
@@ -94,14 +95,14 @@ def imported(
 
     y and the pose hold the newest values, at the stamps of the map's `instant` and of the first
     channel of the pose. u is the command minus its median. The command is the setpoint of the map
-    (PX4) or of the rate controllers (ArduCopter), or else the stick in MANUAL; with `servos` it is
-    the position of the servo, scaled as the stick. Without a window the longest stretch in the air
-    is taken; for sticks it must be in MANUAL. `show` gets the comparison of the log with the map
-    before a mismatch is refused.
+    (PX4) or of the rate controllers (ArduCopter), or else the stick in MANUAL. With `servos` it is
+    the position of the servo, scaled like the stick. Without a window the longest stretch in the
+    air is taken. If the command is the stick, the stretch must be in MANUAL. `show` gets the
+    comparison of the log with the map before a mismatch is refused.
 
     Raises ParameterError if the log lacks a channel, is of another vehicle or has no such stretch,
-    or if its parameters differ from the map or change between the samples. If the log has
-    lost data, the message of the error ends with that.
+    or if its parameters differ from the map or change between the samples. If the log has lost
+    data, the message of the error says so at its end.
     """
     start_ns = log.start_ns(channel_map.outputs[channel_map.instant].motion[0])
     losses = [] if log.loss is None else [log.loss.sentence(start_ns)]
@@ -177,7 +178,7 @@ def _speed(
     stamps: Stamps,
     servos: bool,
 ) -> FloatArray | None:
-    """Return the airspeed or a multicopter's thrust, from which one sees when the aircraft flies.
+    """Return the airspeed, or a multicopter's thrust, which shows when the aircraft flies.
 
     Returns None if the map has neither.
     """
@@ -335,9 +336,9 @@ def _commands(
 
 
 def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
-    """Read the output of a multicopter's rate controller, normalised as PX4's is.
+    """Read the output of a multicopter's rate controller, normalised in the same way as PX4's.
 
-    In no mode are the sticks of a multicopter the commands of its inputs.
+    The sticks of a multicopter do not command its inputs in any mode.
     """
     quantity, sign = row.motion
     sources = log.format.torques.get(quantity, ()) if log.format else ()
@@ -362,7 +363,7 @@ def _flight(
 ) -> tuple[tuple[int, int], str | None]:
     """Return the first and the last instant that are taken, and a sentence on other flights.
 
-    The window is taken, or else the longest stretch in the air; for sticks it must be in MANUAL.
+    The window is taken, or else the longest stretch in the air. With sticks it must be in MANUAL.
     """
     start_ns = int(stamps[0])
     keep = np.ones(len(stamps), dtype=bool)
@@ -377,7 +378,7 @@ def _flight(
         "no sample",
         f"a part of the {1e-9 * (stamps[-1] - start_ns):.0f} s of the log",
     )
-    # Without a window, the flight is the time in which the speed is high enough for one.
+    # Without a window, the flight is the time in which the speed is high enough to fly.
     if speed is not None and window.start is None and window.stop is None:
         require(
             bool(np.isfinite(speed).any()),

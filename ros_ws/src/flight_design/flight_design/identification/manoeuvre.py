@@ -17,12 +17,12 @@ from flight_core.tape import Tape
 RATE = 200.0  # Hz, of y and y_m
 HEIGHTS = {"q": 0.05, "V": 2.0, "p": 0.15, "r": 0.05}
 """Units of the outputs in the coupling; also the largest errors of a flight in calm air, SI."""
-# m/s down, and m to the peak: 100 ft, which is within the 30 to 350 ft of FAR/CS 25.341
+# m/s, downwards, and length in m to the peak: 100 ft, within the 30 to 350 ft of FAR/CS 25.341
 GUST_SPEED = 5.0
 GUST_LENGTH = 30.48
 TURN = math.pi / 2.0  # rad
-CLIMB = 100.0  # m; turn and climb are the targets of guidance in place of the pulses
-# s, when they begin
+CLIMB = 100.0  # m; with guidance, a turn and a climb are commanded in place of the pulses
+# s, instants at which the turn and the climb begin
 TURN_START = 2.0
 CLIMB_START = 30.0
 
@@ -48,9 +48,9 @@ class ManoeuvreResult(NamedTuple):
     """The result of a simulation of the manoeuvre in one process."""
 
     outcome: str
-    rms: dict[str, float]  # of the error by output, SI
-    largest: dict[str, float]  # abs(u) by input
-    # by input, the share of the ticks with the input at its limit, if LEAST_SHARE or more
+    rms: dict[str, float]  # rms of the error by output, SI
+    largest: dict[str, float]  # largest abs(u) by input
+    # by input, the share of the ticks with the input at its limit, if it is LEAST_SHARE or more
     at_stop: dict[str, float]
 
     @property

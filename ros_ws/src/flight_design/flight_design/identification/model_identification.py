@@ -72,11 +72,13 @@ from flight_design.identification.model_refusals import (
     reason_against_timing,
 )
 
-# `correlation` from which innovations follow the u of another part: uncoupled aircraft have up to 3
+# Innovations follow the u of another part if their `correlation` is at least this. Aircraft without
+# coupling have up to 3.
 FOLLOWS = 10.0
-# gain in log-likelihood of held-out samples that coupling must bring: uncoupled aircraft have -20
+# Least gain in the log-likelihood of held-out samples for a model with coupling. Aircraft without
+# coupling have -20.
 COUPLED_GAIN = 20.0
-# largest number of searches about what was found; each allows a factor of 2.5
+# largest number of further searches about the last result; each allows another factor of 2.5
 AGAIN = 2
 
 
@@ -86,15 +88,16 @@ class Part(NamedTuple):
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     entries: tuple[Entry, ...]
-    before: Prediction  # that of the nominal model
-    after: Prediction
+    before: Prediction  # by the nominal model
+    after: Prediction  # by the identified model
     refusal: Refusal | None  # why this part must not be used
     latest: tuple[float, ...]  # s, the delay of each input plus two standard deviations
-    gusts: bool  # whether a share of FEW or more of its seconds has gusts
+    gusts: bool  # whether its seconds with gusts are a share of FEW or more
     delays: tuple[float, ...] = ()  # s, the delay of each input
-    advantage: float = 0.0  # of the model `flown` over the nominal one, see `identify_model`
-    wind: float = 0.0  # of most of its seconds, relative to moderate turbulence
-    # of the deviation of each entry, the part that an uncertain delay makes
+    # advantage of the model `flown` over the nominal one, see `identify_model`
+    advantage: float = 0.0
+    wind: float = 0.0  # wind in most of its seconds, relative to moderate turbulence
+    # the part of the deviation of each entry that an uncertain delay causes
     by_timing: tuple[float, ...] = ()
 
 
@@ -104,7 +107,7 @@ class Identification(NamedTuple):
     airframe: Airframe
     recorded: FlightData
     held_out: NDArray[np.bool_]  # (T,)
-    # (T, m) each, those of the nominal model and of this one, units of y
+    # (T, m) each, units of y: innovations of the nominal model, then of the identified one
     innovations: tuple[FloatArray, FloatArray]
     before: Prediction
     after: Prediction
@@ -122,11 +125,11 @@ class Identification(NamedTuple):
 
 
 class _Study(NamedTuple):
-    """What the searches of all parts share."""
+    """The data and settings that the searches of all parts share."""
 
     recorded: FlightData
     airframe: Airframe
-    delay: float  # s, of u
+    delay: float  # s, delay of u
     unknown: Unknown
     validating: NDArray[np.bool_]  # (T,)
     later: NDArray[np.bool_]  # (T,) samples on which the model `flown` is tested
@@ -202,11 +205,10 @@ class _Study(NamedTuple):
     def again(
         self, search: Search, fit: Fit, used: NDArray[np.bool_], flown: Airframe | None
     ) -> Fit:
-        """Fit again about a fit that has too many entries at a bound, because the file was rough.
+        """Search again about a fit with too many entries at a bound, because the file was rough.
 
-        Effects of inputs stay within the bounds about the file. No law of the file flies with
-        effects beyond them, and a part that couples with another one looks as if it had such
-        effects.
+        Effects of inputs must stay within the bounds about the file. Beyond these bounds no law of
+        the file flies, and a part that couples with another part seems to have such effects.
         """
         for _ in range(AGAIN * self.searches_again):
             entries = search.about_centre(search.entries(fit))
@@ -251,7 +253,7 @@ class _Study(NamedTuple):
     ) -> tuple[Fit, Part] | None:
         """Fit the aircraft as one part.
 
-        Returns None unless this predicts better than its parts `apart`.
+        Returns None unless this fit predicts better than the parts `apart`.
         """
         search = self.search(model, whole_aircraft(model), coupled=True)
         fit = self.again(search, search.fit(used, begin=search.joined(fits)), used, None)
@@ -287,22 +289,22 @@ def identify_model(
     Args:
         recorded: The flight.
         airframe: The nominal airframe.
-        actuation: What lies between u and the aircraft.
+        actuation: Lags and delay between u and the aircraft.
         channels: Channels in the law's order, whose D the model must keep; by default they are in
             the airframe's order.
         progress: Takes the steps `completed` and their largest number `total`.
         bound_count: How many entries of a part may lie at their bound.
-        unknown: What else is identified.
+        unknown: Deviations of all that is identified, such as delays.
         flown: The model in flight, which is one more start. Its advantage over the nominal model is
             computed.
         after: The advantage counts only samples after this flight time, s.
-        may_couple: Whether parts may become one.
+        may_couple: Whether the parts may be joined to one if they couple.
         quick: Whether the search of a part begins only once, provided that the air is the same in
             every span and the model may be used.
         searches_again: Whether a part with too many entries of A at their bounds is searched again,
             about what was found.
-        timing: Standard deviation of the delay in `actuation`, s. With it, even 0, the deviations
-            also hold for a model that is not right (`Search.with_doubt`).
+        timing: Standard deviation of the delay in `actuation`, s. If it is given, even as 0, the
+            deviations also hold for a model that is not right (`Search.with_doubt`).
 
     Raises:
         ParameterError: An output does not move.

@@ -14,18 +14,18 @@ from flight_core.outcome import Refusal
 from flight_core.vectors import FloatArray
 from flight_design.identification.likelihood import Innovations
 
-# White innovations have 1, with a deviation of 0.3. A model with more than this leaves out
-# something that the aircraft does.
+# largest `whiteness`. White innovations have 1, with a deviation of 0.3. A model with more than
+# MAX_WHITENESS leaves out something that the aircraft does.
 MAX_WHITENESS = 3.0
 LAGS = 20  # lags of the autocorrelation in the figure of whiteness: 0.2 s at 100 Hz
 
 
 class Prediction(NamedTuple):
-    """How well a model predicts the held-out samples a period ahead."""
+    """Quality of a model's predictions of the held-out samples, one period ahead."""
 
     rms: FloatArray  # (m,) rms of the innovations, units of y
     whiteness: FloatArray  # (m,) 1 for white noise, see `whiteness`
-    log_likelihood: float  # mean of a sample, up to a constant
+    log_likelihood: float  # mean over the samples, up to a constant
 
 
 def prediction(innovations: Innovations, held_out: NDArray[np.bool_]) -> Prediction:
@@ -68,10 +68,11 @@ def advantage(
         t = sum d_k / sqrt(K var d),  d_k the difference of log-likelihood of span k of K
         z = Phi^-1(F_(K-1)(t)),  F of Student's distribution, Phi of the normal one
 
-    If both models are equally far from the aircraft, z has a standard normal distribution,
-    whichever is simpler, and even if both are wrong. Source: Q. H. Vuong, Econometrica 57(2), 1989,
-    here with spans of `span` samples, whose d_k are nearly independent. K is small, hence Student's
-    t. Only samples of the mask `counts`, (T,), count. With fewer than two spans z is 0.
+    If both models are equally far from the aircraft, z has a standard normal distribution. This
+    holds whichever model is simpler, and even if both are wrong. Source: Q. H. Vuong, Econometrica
+    57(2), 1989, here with spans of `span` samples, whose d_k are nearly independent. K is small,
+    hence Student's t. Only samples of the mask `counts`, (T,), count. With fewer than two spans z
+    is 0.
     """
     end = len(counts) // span * span
     d = np.where(counts, first.log_likelihood - second.log_likelihood, 0.0)[:end]
@@ -91,10 +92,10 @@ class NoBetter(Refusal):
 def reason_against_prediction(
     before: Prediction, after: Prediction, outputs: Sequence[str]
 ) -> NoBetter | None:
-    """Refuse a model that predicts the held-out samples no better than before.
+    """Refuse a model that predicts the held-out samples no better than the nominal one.
 
-    A model is refused, too, if the innovations of one of its outputs are neither white nor whiter
-    than before.
+    A model is also refused if the innovations of one of its outputs are neither white nor whiter
+    than those of the nominal model.
     """
     if after.log_likelihood <= before.log_likelihood:
         return NoBetter(

@@ -13,11 +13,11 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.likelihood import MAX_ERROR, MAX_FACTOR, PRIOR, largest_error
 
-# Largest deviation of the best known effect of an input on each output: two deviations are a fifth
-# of the loop gain.
+# Largest relative deviation of the best known effect of an input on each output. Two such
+# deviations are a fifth of the loop gain.
 MAX_DEVIATION = 0.1
-# The same for the part of this deviation that an uncertain delay of u makes: with it, the guarantee
-# has to cover 30 % of the loop gain.
+# Largest part of this deviation that an uncertain delay of u may cause. The guarantee then has to
+# cover 30 % of the loop gain.
 MAX_BY_TIMING = 0.15
 
 
@@ -73,10 +73,10 @@ def at_bound(entries: Iterable[Entry], factor: float = MAX_FACTOR) -> list[Entry
 def reason_against_airframe(
     entries: Iterable[Entry], name: str, allowed: int = 0, factor: float = MAX_FACTOR
 ) -> Refusal | None:
-    """Refuse the airframe of a name if more than `allowed` entries are at a bound of the search.
+    """Refuse the airframe `name` if more than `allowed` entries are at a bound of the search.
 
-    A single one is too many if the record shows it, with at most half of its deviation before: then
-    the aircraft lies beyond the bound.
+    A single entry is too many if the record shows it clearly, with at most half of the deviation
+    that it had before. Then the aircraft lies beyond the bound.
     """
     found = at_bound(entries, factor)
     is_shown = any(entry.deviation < PRIOR / 2.0 for entry in found)
@@ -113,7 +113,7 @@ def reason_against_signs(
 
 
 def in_time(entries: Iterable[Entry], by_timing: Iterable[float]) -> list[Entry]:
-    """Return the entries with the deviations that they have if the delay of u is known."""
+    """Return the entries with the deviations that they would have if the delay of u were known."""
     return [
         entry._replace(deviation=float(np.sqrt(max(entry.deviation**2 - late**2, 0.0))))
         for entry, late in zip(entries, by_timing, strict=True)
@@ -123,9 +123,9 @@ def in_time(entries: Iterable[Entry], by_timing: Iterable[float]) -> list[Entry]
 def reason_against_timing(
     entries: Sequence[Entry], by_timing: Sequence[float], outputs: Iterable[str]
 ) -> Refusal | None:
-    """Refuse a part whose best known effect of an input hangs on when u acts.
+    """Refuse a part if its best known effects depend too much on the delay of u.
 
-    `by_timing` is the part of the deviation of each entry that an uncertain delay of u makes.
+    `by_timing` is the part of the deviation of each entry that an uncertain delay of u causes.
     """
     late = dict(zip((entry.name for entry in entries), by_timing, strict=False))
     worst = max(best_known(entries, outputs), key=lambda effect: late.get(effect.name, 0.0))

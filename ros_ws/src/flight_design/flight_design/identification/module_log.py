@@ -36,7 +36,8 @@ class ModuleChange(NamedTuple):
 class ModuleFlight(NamedTuple):
     """y, y_m, u and `internals` of the ticks of a module.
 
-    `equal` of the ticks have the u of Python to the bit, and `lost` ticks follow a gap of the log.
+    In `equal` ticks, u has the same bits in Python. `lost` ticks follow a gap of the log, so that
+    Python cannot compute them.
     """
 
     tape: Tape
@@ -102,7 +103,10 @@ class _Ticks:
         )
 
     def flown(self) -> list[list[int]]:
-        """Return the rows of the ticks by stretch: from an engagement to a gap or the next one."""
+        """Return the rows of the ticks by stretch.
+
+        A stretch begins at an engagement, and ends at a gap or at the next engagement.
+        """
         stretches: list[list[int]] = []
         last: int | None = None  # number of the tick before; None if the stretch has ended
         for k in np.flatnonzero(self._ticked).tolist():

@@ -5,9 +5,9 @@
     lag v_dot = u(t - delay) - v,    z'' + damping z' + stiffness z = v,    y = Omega z' + slow z
 
 The excitation is open loop. The output error is fitted: the model is simulated from u alone, and
-the squares of y minus its output are minimised. Without stiffness the response does not tell lag
-from 1 / damping; the lag is then the smaller of the two, that of the faster pole. Source: L. Ljung,
-"System Identification", 1999, 4.2 and 10.2.
+the squares of y minus its output are minimised. Without stiffness the response does not tell the
+lag from 1 / damping. The lag is then the smaller of the two, which belongs to the faster pole.
+Source: L. Ljung, "System Identification", 1999, 4.2 and 10.2.
 
 Thrust also moves the airspeed through the climb that follows, the phugoid. If the climb is
 measured, the model of V excludes the phugoid:
@@ -32,18 +32,18 @@ from flight_core.vectors import FloatArray
 from flight_design.identification.response_identification import BRIDGED
 
 STEP = 0.004  # s, step of the simulation
-# s around the excitation of an input that count, too
+# s before and after the excitation of an input that count too
 BEFORE = 0.3
 AFTER = 0.5
-MIN_CERTAINTY = 5.0  # standard errors: from as many on, the sign of Omega is certain
-LOOP_FREQUENCY = 0.5  # times 1 / (delay + lag): about where loops of `rise-di gains` cross 1
+MIN_CERTAINTY = 5.0  # the sign of Omega is certain if Omega is this many standard errors
+LOOP_FREQUENCY = 0.5  # in 1 / (delay + lag): about the crossover of the loops of `rise-di gains`
 MAX_ZERO_LAG = 0.5  # largest product of zero and lag; at 1 they cancel
-# 1/s: a feedforward of 100 Hz follows no faster one (rise_di_controller.params, _check_nominal)
+# 1/s, fastest zero that a feedforward of 100 Hz follows (rise_di_controller.params, _check_nominal)
 FASTEST_ZERO = 25.0
-# A second order must lower the misfit to this share, which noise alone does not achieve in 10 s.
+# A model of second order must lower the misfit to this share. In 10 s noise alone does not do so.
 MIN_GAIN = 0.85
-# Delay s, lag s, damping 1/s, stiffness 1/s^2, zero 1/s: a slow response to slow servos, a
-# short-period or Dutch roll mode of a transport and that of a model aircraft
+# Starts of delay s, lag s, damping 1/s, stiffness 1/s^2 and zero 1/s: a short-period or Dutch roll
+# mode of a transport, the same behind slow servos, and such a mode of a model aircraft
 STARTS = ((0.03, 0.03, 5.0, 30.0, 6.0), (0.1, 0.1, 5.0, 30.0, 6.0), (0.03, 0.01, 30.0, 400.0, 1.0))
 # Bounds of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow.
 LOWER = np.array([0.0, 0.003, -np.inf, 0.0, 0.0, -np.inf])
@@ -79,9 +79,9 @@ class ChannelModel(NamedTuple):
 
     @property
     def usable(self) -> bool:
-        """Whether gain and phase of the loop are certain, and a feedforward can fly the zero.
+        """Whether gain and phase of the loop are certain, and a feedforward can follow the zero.
 
-        The noise may even be as large as y.
+        A model can be usable even if the noise is as large as y.
         """
         gain, phase = self.at_loop_frequency()
         is_certain = gain.is_certain and phase.deviation <= 1.0 / MIN_CERTAINTY
@@ -132,7 +132,7 @@ def fit_channel(
 
     Returns None if there is no excitation, or if the output is constant. The search begins with an
     Omega of this sign, and may end with the opposite one. `gravity` is a channel that measures the
-    part of y_dot without u. With it, or with `first_order`, the model is of first order.
+    part of y_dot that gravity causes. With `gravity` or `first_order`, the model is of first order.
     """
     # Take the time of the excitation, and a little before and after it.
     excited = np.flatnonzero(u[name] != 0.0)
@@ -188,7 +188,7 @@ def _settled(t: FloatArray) -> NDArray[np.bool_]:
 
 
 def _decay(t: FloatArray, damping: float) -> FloatArray:
-    """Return the third function of time, next to a constant and t.
+    """Return the third function of time that is fitted beside a constant and t.
 
     It is the decay of an initial value, exp(-damping t), or t^2 if the damping is 0.
     """

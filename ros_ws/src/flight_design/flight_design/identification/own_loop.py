@@ -20,7 +20,7 @@ from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.vectors import FloatArray
 
-STEPS = 8  # steps of the aircraft in a period of the law
+STEPS = 8  # integration steps of the aircraft in a period of the law
 SCALING_SPEED = 15.0  # m/s, the default of ArduPlane
 END = math.radians(45.0)  # a full deflection of ArduPlane, whose gains give an angle
 FIXED_WING = {name: (f"FW_{k}R_", f"FW_{k}R_IMAX") for name, k in zip("pqr", "RPY", strict=True)}
@@ -49,7 +49,7 @@ class OwnLoop(NamedTuple):
     source: str  # the parameters from which they come
 
     def in_place(self, scenario: Scenario) -> Scenario:
-        """Return the scenario with the feedback of this loop as the law `pi`: u = end torque."""
+        """Return the scenario with this loop's feedback as the law `pi`, where u = end * torque."""
         controller = scenario.rise_di()
         end = _ends(scenario)
         gain = end * self.P / np.array(controller.input_scale)
@@ -116,7 +116,7 @@ def _ends(scenario: Scenario) -> FloatArray:
 
 
 def own_loop(parameters: Mapping[str, float], scenario: Scenario, autopilot: str) -> OwnLoop | None:
-    """Read the loop of an autopilot from the parameters in its log; None unless all are there.
+    """Read the rate loop of an autopilot from its log, or return None if a parameter is missing.
 
     PX4 and ArduPlane scale P and I by the square of a speed over the airspeed, and FF by this
     ratio. Here the gains are those at the trim speed.
