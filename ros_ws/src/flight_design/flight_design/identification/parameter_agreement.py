@@ -30,10 +30,11 @@ AXES: Mapping[str, str] = {"p": "ROLL", "q": "PITCH", "V": "THROTTLE", "r": "YAW
 FUNCTIONS = {"ROLL": 4, "PITCH": 19, "THROTTLE": 70, "YAW": 21}
 SAME_LINE = LinearConversion(1, 1.0, 0.0)
 
-# Share of half the range. The effect differs by as much, less than the standard errors of
-# `identify`.
+# Largest difference of an end, as a share of half the range. The effect of the input differs by the
+# same share, which is less than the standard errors of `identify`.
 END_TOLERANCE = 0.01
-# Share of half the range. The effects on either side of the trim differ from their mean by as much.
+# Largest difference of the trim, as a share of half the range. The effects on either side of the
+# trim differ from their mean by the same share.
 TRIM_TOLERANCE = 0.05
 
 DECISIVE = re.compile(r"RCMAP_\w+|(RC|SERVO)\d+_(FUNCTION|MIN|MAX|TRIM|REVERSED)|(CA|PWM)_\w+")
@@ -56,7 +57,7 @@ MENDS = {  # by part of the parameter's name; no remedy reverses what the pilot'
 
 
 class Stick(NamedTuple):
-    """What a map says of an input and of its channel of the transmitter.
+    """The statements of a map about an input and its channel of the transmitter.
 
     `trim_line` turns the pulse, us, into the raw value.
     """
@@ -73,7 +74,7 @@ class Stick(NamedTuple):
         return self.axis != "THROTTLE"
 
     def parameters(self) -> dict[str, tuple[float, float]]:
-        """Return value and tolerance of the parameters with which ArduPilot agrees with the map."""
+        """Return the parameters by which ArduPilot agrees with the map: (value, tolerance)."""
         low, high = sorted(to_raw(raw, self.trim_line) for raw in self.raw_range)
         half = (high - low) / 2.0
         name = f"RC{self.channel}"
@@ -133,7 +134,10 @@ class Servo(NamedTuple):
     is_reversed: bool
 
     def deflection(self, pulse: FloatArray, stick: Stick) -> FloatArray:
-        """Return the fraction of full deflection at a pulse, us: -1 to 1, for a throttle 0 to 1."""
+        """Return the fraction of full deflection at a pulse, us.
+
+        It is -1 to 1, and for a throttle 0 to 1.
+        """
         if not stick.is_centred:
             part = (pulse - self.low) / (self.high - self.low)
             return 1.0 - part if self.is_reversed else part
@@ -144,8 +148,8 @@ class Servo(NamedTuple):
 def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
     """Return the first servo that has the function of an input.
 
-    `values` are the parameters at the samples. Raises ParameterError if there is none, or if a
-    parameter of it is missing.
+    `values` are the parameters at the samples. Raises ParameterError if there is no such servo, or
+    if one of its parameters is missing.
     """
     function = FUNCTIONS[stick.axis]
     outputs = [
@@ -197,8 +201,8 @@ def compared(
 ) -> list[Agreement]:
     """Compare the transmitter's parameters in a log with a map.
 
-    `values` are those at the samples. If a parameter has no value there, its first record after
-    them is compared; no default stands in for it.
+    `values` are the parameters at the samples. If a parameter has no value there, its first record
+    after the samples is compared. No default value replaces it.
     """
     parameters = {name: records[0].value for name, records in recorded.items()} | dict(values)
     rows = []
@@ -246,7 +250,7 @@ def change_sentences(recorded: Parameters, start_ns: int, first_ns: int, last_ns
     """Say which decisive parameters change before or after the samples.
 
     `first_ns` and `last_ns` are the first and the last sample, and `start_ns` is the beginning of
-    the log. Raises ParameterError if one changes between the samples.
+    the log. Raises ParameterError if a parameter changes between the samples.
     """
     between = []
     outside = []

@@ -36,14 +36,14 @@ SLOWEST, FASTEST = (
     1.6,
 )  # times the trim speed: c_export.autopilots clips the dynamic pressure there
 PERIOD = 0.008  # s, least period of the identification: more samples make the search longer
-SPARSE = 1.5  # periods of the law; a log with a longer period does not have every u
+SPARSE = 1.5  # a log with a longer period, in periods of the law, does not have every u
 # Hz. Behind a filter with this cut-off, the noise of samples a PERIOD apart is white.
 BROAD = 90.0
-OVER = 2.2  # times a cut-off: the least rate of a log from which the filter can be removed
-PERIODS = 6.0  # of a cut-off; then the impulse response of the filter is below 1e-5
+OVER = 2.2  # least rate of a log from which the filter can be removed, in units of the cut-off
+PERIODS = 6.0  # after so many periods of the cut-off, the filter's impulse response is below 1e-5
 
-MOST_SURFACES = 8  # of PX4, without CA_SV_CS_COUNT in the log
-SAME_END = 1e-3  # the largest deviation from 1 of a servo at the torque 1, by rounding
+MOST_SURFACES = 8  # most surfaces of PX4; their number if the log lacks CA_SV_CS_COUNT
+SAME_END = 1e-3  # largest rounding error of a servo at the torque 1, where it must be 1
 AXES: Mapping[str, str] = MappingProxyType({"R": "roll", "P": "pitch", "Y": "yaw"})
 """The axis that a letter of PX4's parameters stands for."""
 
@@ -53,12 +53,12 @@ class RatesLog(NamedTuple):
 
     recorded: FlightData
     taken: Imported
-    rate: float  # of the samples of y, Hz
+    rate: float  # rate of the samples of y, Hz
     cutoff: float  # of the gyro's second-order low-pass, Hz; 0 if the log names none
-    advance: float  # s, by which y comes earlier than behind that filter
-    # s, deviation of the instant at which u acts, which lies anywhere within a period of the log
+    advance: float  # s, time by which y is earlier than the y behind this filter
+    # s, standard deviation of the instant at which u acts: it is anywhere in a period of the log
     timing: float
-    every: float  # s, from one sample of u to the next
+    every: float  # s, time between two samples of u
 
 
 def rates_map(scenario: Scenario, autopilot: str) -> ChannelMap:
@@ -173,12 +173,14 @@ def scaled_torques(parameters: Mapping[str, float]) -> list[str]:
 
 
 def broadened(recorded: FlightData, cutoff: float) -> tuple[FlightData, float]:
-    """Exchange the gyro's low-pass at `cutoff` for one at BROAD, Hz; tell how much earlier y is, s.
+    """Replace the gyro's low-pass at `cutoff` by one at BROAD, Hz.
 
         y' = F_BROAD(z) / F_cutoff(z) y,  F of Butterworth's, of second order
 
+    The second result is the time in s by which y is earlier.
+
     Behind a narrow filter the noise of y is coloured, and so are the innovations. The zeros of both
-    filters at z = -1 cancel. Samples that a lost one reaches count as lost.
+    filters at z = -1 cancel. A sample counts as lost if it depends on a lost sample.
     """
     rate = 1.0 / recorded.period
     narrow = signal.butter(2, cutoff, fs=rate)

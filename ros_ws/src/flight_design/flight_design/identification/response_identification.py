@@ -37,16 +37,16 @@ from flight_design.identification.step_response_fit import (
 # s, width of the windows over which u and older y are averaged; it is shorter than a servo's lag
 WINDOW = 0.02
 RECENT = 4  # newest samples of y, which the predictor takes one by one
-# s before a sample that windows of equal width cover: the longest delay and a lag
+# s before a sample that windows of equal width cover. It contains the longest delay and a lag.
 FINE_Y = 0.2
 FINE_U = 0.45
-# s before a sample that windows of doubling width cover: the memory of disturbances and of a
-# controller
+# s before a sample that windows of doubling width cover. It contains the memory of disturbances and
+# of a controller.
 FAR = 2.0
-HORIZON = 0.8  # s of the step response
+HORIZON = 0.8  # s, length of the step response
 DRAWS = 200  # draws of the predictor's coefficients, for the covariance of the step response
-# Size of a coefficient before the fit: it turns a typical y or u into this many typical changes of
-# y within a window.
+# Standard deviation of a coefficient before the fit. Such a coefficient turns a typical y or u into
+# this many typical changes of y within a window.
 PRIOR = 10.0
 MEMORY = 0.2  # s, decay of the coefficients of the predictor before the fit
 MIN_ROWS_PER_COEFFICIENT = 5.0
@@ -60,14 +60,15 @@ LOOP_MEMORY = 8.0  # s before an instant in which the excitation has an effect o
 LOOP_FINE = 6  # number of windows of PERIOD
 PERIOD = 0.05  # s
 FOLDS = 6  # parts of a flight, each of which is predicted from the others
-# The better ridge counts. Few commands need the first one, many disturbances the other.
+# The ridge that predicts better is used. The first one is for few commands, the other for many
+# disturbances.
 RIDGES = (1e-4, 1e-2)
 # s, in a closed loop. An earlier response is the reaction of u to y, because no servo is as fast.
 LEAST_DELAY = 0.01
-ITERATIONS = 3  # of estimating the variance of a prediction and the coefficients in turn
+ITERATIONS = 3  # number of times that the variance and then the coefficients are estimated
 # s without a sample of y that a straight line bridges; no prediction looks across a longer gap
 BRIDGED = 0.1
-MIN_RATIO = 5.0  # standard errors: from as many on, the sign of Omega is certain
+MIN_RATIO = 5.0  # the sign of Omega is certain if the response is this many standard errors
 
 
 Spans = Sequence[tuple[int, int]]
@@ -85,7 +86,7 @@ class Response(NamedTuple):
     inputs: tuple[str, ...]
     Omega: FloatArray  # (m, m) rows as outputs, columns as inputs
     Omega_deviation: FloatArray  # (m, m) standard errors
-    lag: FloatArray  # (m,) s, of each input
+    lag: FloatArray  # (m,) s, lag of each input
     lag_deviation: FloatArray  # (m,)
     delay: FloatArray  # (m,) s, from u to the stamp of y
     delay_deviation: FloatArray  # (m,)
@@ -124,8 +125,8 @@ def identify_response(
     """Return Omega, lag and delay of every channel of a log with standard errors, or a refusal.
 
     Args:
-        y: The outputs at their stamps of a clock, regular or not.
-        u: The inputs after their limits, likewise.
+        y: The outputs at their stamps, at regular intervals or not.
+        u: The inputs after their limits, at regular intervals or not.
         outputs: The outputs of the channels.
         inputs: The inputs of the channels, in pairs with the outputs.
         excitation: What moves u from outside in a closed loop, such as y_m. It is None if u
@@ -167,7 +168,7 @@ def identify_response(
 
 
 class Layout(NamedTuple):
-    """What the predictor of y(k) takes: samples of y, and windows of samples before k.
+    """The regressors of the predictor of y(k): samples of y, and windows of samples before k.
 
     The ends of the windows are in sample periods.
     """
@@ -194,7 +195,7 @@ class Layout(NamedTuple):
 
     @property
     def past(self) -> int:
-        """How many samples of y come before the first one that is predicted."""
+        """Number of samples of y before the first one that is predicted."""
         return self.y_windows[-1][1]
 
     def y_decay(self) -> FloatArray:

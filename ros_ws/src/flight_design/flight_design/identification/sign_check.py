@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Check the signs: does D of the controller agree with what moves the aircraft?
+"""Check whether D of the controller agrees with what moves the aircraft.
 
 D is compared with the signs of a channel map, an airframe and a recorded flight.
 """
@@ -32,15 +32,16 @@ OPEN_LOOP = "excitation"  # the law that does not use y
 
 
 class ChannelSign(NamedTuple):
-    """The signs of a channel of the law, through the map."""
+    """The signs of a channel of the law, as they follow from the map."""
 
     output: str
     input: str
     effect: float  # Omega_ii of the controller's channels, SI
-    D: int  # by the airframe and the map
+    D: int  # sign that follows from the airframe and the map
     D_controller: int
     measured: float | None  # Omega_ii of a recorded flight, NaN if the input never moves
-    # response in the recorded flight in standard errors; from MIN_RATIO on, the sign is certain
+    # response in the recorded flight, in standard errors; if it is MIN_RATIO or more, the sign is
+    # certain
     ratio: float | None
 
 
@@ -75,7 +76,7 @@ def check_scenario(
 ) -> SignCheck:
     """Check a channel map against a scenario's controller, for an airframe.
 
-    A recorded flight is checked too, if there is one. `namespace` selects the aircraft if its log
+    If there is a recorded flight, it is checked too. `namespace` selects the aircraft if the log
     has several.
     """
     controller = scenario.controller
@@ -118,10 +119,11 @@ def recorded_response(
 ) -> Response:
     """Identify the response of the aircraft in a log, from the time in which u acted.
 
-    That is the whole flight, or the engagements of a bridge. In a flight under a law, y_m excites
-    the loop. Without y_m, and under the law `excitation`, u itself is the excitation. Raises
-    ParameterError if the log has no y and u, if its bridge was never engaged, if it was under
-    guidance, whose y_m follows y, or if it was imported by other rows than those of `channel_map`.
+    This time is the whole flight, or the engagements of a bridge. In a flight under a law, y_m
+    excites the loop. Without y_m, and under the law `excitation`, u itself is the excitation.
+    Raises ParameterError if the log has no y and u, if its bridge was never engaged, if the flight
+    was under guidance, whose y_m follows y, or if the log was imported by other rows than those of
+    `channel_map`.
     """
     recorded = read_run(bag, namespace)
     tape = recorded.tape
@@ -174,9 +176,9 @@ def check_signs(
 ) -> SignCheck:
     """Compare D of diag(output signs) Omega diag(input signs) with the controller's D.
 
-    A recorded flight is compared too, if there is one. Omega = C B of the airframe, (m, m), is in
-    the map's order; the channels and D are in the controller's. Raises ParameterError if the map
-    does not fit the airframe, or if Omega has no D.
+    If there is a recorded flight, it is compared too. Omega = C B of the airframe, (m, m), is in
+    the map's order. The channels and D are in the controller's order. Raises ParameterError if the
+    map does not fit the airframe, or if Omega has no D.
     """
     mapped = _through(channel_map, Omega, outputs, inputs)
     D_mapped = [int(sign) for sign in signs(mapped)]
@@ -237,8 +239,8 @@ def check_effectors(
 ) -> SignCheck:
     """Check the signs of the effectors against the `effect` of an allocation, (m, p).
 
-    For each effector the output that it moves most decides, where each output counts by the largest
-    effect on it. `Omega` is as in `check_signs`, (m, p). D of a channel is the sign of its effect.
+    Each effector is checked by the output that it moves most, relative to the largest effect on
+    this output. `Omega` is as in `check_signs`, (m, p). D of a channel is the sign of its effect.
     """
     mapped = _through(channel_map, Omega, outputs, effectors)
     largest = np.argmax(np.abs(effect) / np.abs(effect).max(axis=1, keepdims=True), axis=0).tolist()

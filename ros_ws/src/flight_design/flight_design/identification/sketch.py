@@ -48,8 +48,8 @@ def sketch(
         r_dot     = 6 |Omega_r| beta - 0.05 P p - R r + Omega_r u,  R = 0.95 sqrt(11 n |Omega_r|)
 
     11 is the lift slope divided by the lift coefficient, 0.17 is in 1/s, and 0.05 is the angle of
-    attack in trim, rad. V depends on no other state: the airspeed contains the wind itself, and
-    beside the wind y hardly shows what alpha and theta do to V. The factors are geometric means
+    attack in trim, rad. V depends on no other state. The airspeed contains the wind itself, so y
+    hardly shows what alpha and theta do to V. The factors are geometric means
     over the twelve aircraft of `benchmarks.jsbsim_gains`, from differences of their accelerations
     in trim. The entries of a single aircraft differ from them by a factor of 1.3 to 3. Omega (m, m)
     has rows `outputs` and columns `inputs`; input i drives output i. Raises ParameterError for

@@ -11,10 +11,12 @@ from scipy.optimize import least_squares
 from flight_core.vectors import FloatArray
 
 MAX_DELAY = 0.3  # s
-RANK = 1e-10  # times the largest eigenvalue of the normal equations: smaller ones are rounding
+# An eigenvalue of the normal equations below this fraction of the largest one is rounding.
+RANK = 1e-10
 MAX_LAG = 1.0  # s
 RESOLUTION = 0.025  # s between the points of the step response that are fitted
-FLOOR = 0.01  # of a step response's largest value, which windows and a linear model leave out
+# error that windows and a linear model leave, as a share of a step response's largest value
+FLOOR = 0.01
 STARTS_DELAY = (0.02, 0.1, 0.2)  # s
 STARTS_LAG = (0.03, 0.2)  # s; the search starts from each pair
 # Bounds of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2 and slow part. Omega and the slow
@@ -23,9 +25,9 @@ LOWER = np.array([0.0, 0.003, -np.inf, -2.0, -20.0, -np.inf])
 UPPER = np.array([MAX_DELAY, MAX_LAG, np.inf, 300.0, 5000.0, np.inf])
 SCALE = np.array([0.05, 0.05, 5.0, 5.0, 50.0, 50.0])
 SPREAD = np.array([1.0, 0.2, 1e3, 50.0, 2500.0, 5000.0])  # standard deviations before the fit
-# Which of them are free: for an integrator, for the first and for the second order.
+# Which of these parameters are free: in an integrator, in a first and in a second order.
 ORDERS = ((1, 1, 1, 0, 0, 0), (1, 1, 1, 1, 0, 0), (1, 1, 1, 1, 1, 1))
-MIN_GAIN = 6.0  # of chi squared that a higher order must gain for each more parameter
+MIN_GAIN = 6.0  # decrease of chi squared that a higher order must bring per additional parameter
 # Relative change of chi squared at which a search ends. It is far below what MIN_GAIN or a standard
 # error can show.
 TOLERANCE = 1e-6
@@ -65,12 +67,12 @@ def second_order_response(
 
         y'' + damping y' + stiffness y = v' and = v,   lag v' = u(t - delay) - v
 
-    The first has v' on the right, the second v.
+    The first response has v' on the right-hand side, the second has v.
     """
     begin = np.maximum(t - delay, 0.0)
     # z, z', v; y = z' or z
     A = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]])
-    # The eigenvalues are then distinct.
+    # The small terms make the eigenvalues distinct.
     values, vectors = np.linalg.eig(A + np.diag([0.0, 1e-3, 2e-3]))
     parts = np.linalg.solve(vectors, np.array([0.0, 0.0, 1.0 / lag]))
     product = values[:, None] * begin
@@ -132,8 +134,8 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
 def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
     """Return whether a fitted response has the sign of Omega up to EARLY after delay and lag.
 
-    If not, the slow part is the whole response: two poles stand for a pole and a lag, and Omega is
-    about 0.
+    If it does not, the slow part is the whole response. Two poles then stand for a pole and a lag,
+    and Omega is about 0.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     first, second = second_order_response(
@@ -143,9 +145,9 @@ def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 -
 
 
 def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size: float) -> float:
-    """Return chi squared of no response against the fitted one, minus the number of parameters.
+    """Return by how much a fitted response lowers chi squared, minus the number of parameters.
 
-    The time up to EARLY after delay and lag counts.
+    Only the time up to EARLY after delay and lag counts.
     """
     early = t <= theta[0] + theta[1] + EARLY
     first, second = second_order_response(t[early], *theta[[0, 1, 3, 4]])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in flight: identify A and B from the ticks of the controller, design for them, propose.
+"""Learning in flight: A and B are identified from the controller's ticks, and designs proposed.
 
 Between two identifications the aircraft is tested for damage.
 """

@@ -33,15 +33,15 @@ from flight_design.identification.model_refusals import MAX_DEVIATION
 # s, length of the flight that is tested. With 10 s, losses showed up to 4 s later, and halved
 # effects did not show at all.
 RECORD = 4.0
-# Share of an input's effect: up to two deviations of an accepted model, a loss is no change.
+# Share of an input's effect. A loss up to this, two deviations of an accepted model, is no change.
 LOSS = 2.0 * MAX_DEVIATION
-# Gain of log-likelihood, 4.9 standard deviations, see `change_test`. Healthy surfaces with a gust
-# every 3 s had gains up to 10.3, and once 17.4, because a gust is no normal process. Surfaces with
-# half their effect had gains of 18 and more.
+# Gain of log-likelihood above which a change is found. It stands for 4.9 standard deviations, see
+# `change_test`. Healthy surfaces with a gust every 3 s had gains up to 10.3, and once 17.4, because
+# a gust is no normal process. Surfaces with half their effect had gains of 18 and more.
 MAX_GAIN = 12.0
 # rad, standard deviation of pitch and bank at the beginning of the record, which may be in a turn
 ANGLE = 0.3
-# rad, the same for alpha and beta. With 0.3, a gust before the record looked like a loss of effect.
+# rad, the same for alpha and beta. With 0.3 rad, a gust before the record looked like a loss.
 FLOW = 0.03
 # Standard deviation of the relative change of an effect, in both hypotheses: half of the effect
 # and none of it are about as probable.
@@ -50,8 +50,8 @@ REVERSED = -2.0  # least relative change of an effect: the input acts the other 
 DEAD = -1.0  # relative change of an effect that is lost
 MOST = 2.0  # largest relative change of an effect
 NONE = MAX_DEVIATION  # share of an effect that counts as none: it is known no better than that
-# Log-likelihood: if an input without effect is this close to the best loss, it explains the flight
-# as well.
+# Difference of log-likelihood up to which an input without effect explains the flight as well as
+# the best loss does.
 DEAD_WITHIN = 4.0
 
 
@@ -59,8 +59,8 @@ class Change(NamedTuple):
     """The test of a part of the aircraft that does not couple with the rest."""
 
     outputs: tuple[str, ...]
-    gain: float  # of log-likelihood, if an effect may be lost by more than LOSS
-    # the most probable effect of each input, as a share of that in the model
+    gain: float  # gain of log-likelihood if losses of effect above LOSS are allowed
+    # the most probable effect of each input, as a share of its effect in the model
     left: Mapping[str, float]
     dead: str  # the input without any effect; empty if there is none
 
@@ -85,15 +85,16 @@ def change_test(
 
     with the normalised innovations e and their covariance S, as in `Search.fit`. A fault of an
     effector changes its column by a factor, so that a part has as many unknowns as inputs. A is
-    known. The winds and the angles at the beginning are free in both J, which have the same winds.
+    known. The winds and the angles at the beginning are free in both minima, but both have the same
+    winds.
 
-    G is 0 while the losses are within LOSS. If a loss lies z standard deviations beyond, 2 G = z^2,
-    by S. S. Wilks (Ann. Math. Statist. 9(1), 1938). An input with a loss of LOSS exceeds G = 12
-    with a probability of 5e-7, and an input with a smaller loss does so even more seldom.
+    G is 0 while the losses are within LOSS. If a loss is z standard deviations larger than LOSS,
+    2 G = z^2, by S. S. Wilks (Ann. Math. Statist. 9(1), 1938). An input with a loss of LOSS exceeds
+    G = 12 with a probability of 5e-7, and an input with a smaller loss even more seldom.
 
-    The input j is dead if J with abs(kappa_j + 1) <= NONE is lower than the first J by more than
-    MAX_GAIN, and at most DEAD_WITHIN above the second. Arguments: `delays` are the delays of u by
-    the outputs of a part, s, by default the delay of `actuation`; `drift` is the noise of the
+    The input j is dead if J with abs(kappa_j + 1) <= NONE is lower than the first minimum by more
+    than MAX_GAIN, and at most DEAD_WITHIN above the second one. `delays` are the delays of u, s, by
+    the outputs of a part. The default is the delay of `actuation`. `drift` is the noise of the
     disturbances, as in `Unknown`.
     """
     changes = []
@@ -107,7 +108,7 @@ def change_test(
         dead = ""
         lost = effects.most_probable()
         if lost.theta[: len(inputs)].min() < -LOSS:
-            # If another wind explains it, it is no change.
+            # A loss that another wind explains is no change.
             kept = least_of(
                 effects.most_probable(-LOSS), effects.least(lost.theta, -LOSS, levels=lost.levels)
             )
@@ -144,7 +145,7 @@ class Effects(Search):
         delay: float | FloatArray,
         drift: float = DRIFT,
     ) -> None:
-        """Set up the search: `delay` is that of u, s, and `drift` the noise of the disturbances."""
+        """Set up the search for the delay of u, s, and `drift`, the noise of the disturbances."""
         model = filter_model(flown, actuation, recorded)
         unknown = Unknown(angle=ANGLE, drift=drift)
         super().__init__(recorded, model, block, flown, delay, unknown, factor=1)

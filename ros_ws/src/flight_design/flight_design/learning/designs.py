@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a design needs from the learner: the margins to keep, and the deviations of B."""
+"""The inputs of a design that come from the learner: margins to keep, and deviations of B."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -20,8 +20,9 @@ from rise_di_controller.rise_di_config import LEAST_MARGIN, RiseDiConfig
 
 # s, delay margin beyond the latest delay. A loop with 30 ms flew well while u was 20 ms late.
 DELAY_LEFT = 0.01
-# Weight of the activity of u in the cost of a learned model; a model with errors has 1. With 1, the
-# loops kept 5 ms more than that of the file and had 2 % more error; 0 gained nothing beyond 0.5.
+# Weight of the activity of u in the cost of a design for a learned model. For a model with errors
+# it is 1. With 1 for learned models, the loops had 5 ms more delay margin than the loop of the
+# file, and 2 % more error. 0 was no better than 0.5.
 ACTIVITY = 0.5
 ROUNDED = 1.001  # factor on the margins of a loop, so that the loop keeps them despite rounding
 
@@ -76,11 +77,11 @@ def goal(
     """Return the goal of a design for a model of which some parts are learned.
 
     A part keeps the delay margin that the loop of the file has around the model, but at least
-    LEAST_MARGIN and at most that of the start. Without a file it keeps the margin of the start, and
-    if `learn.margin` is set it keeps that. Each input keeps at least DELAY_LEFT beyond its latest
-    delay, s, by name. A `dead` output flies without this design, so that it asks for nothing. With
-    a file, the sensitivity is at most 2, or that of the loop of the file; this bounds the phase
-    margin and the gain margin (Astrom, Murray, "Feedback Systems", 10.5).
+    LEAST_MARGIN and at most the margin of the start. Without a file it keeps the margin of the
+    start. If `learn.margin` is set, it keeps this margin. Each input keeps at least DELAY_LEFT
+    beyond its latest delay, s, by name. A `dead` output flies without this design, so it needs no
+    margin. With a file, the sensitivity is at most 2, or that of the loop of the file. This bounds
+    the phase and gain margins (Astrom, Murray, "Feedback Systems", 10.5).
     """
     outputs = start.outputs
     margin = np.full(len(outputs), margin_of(start))
@@ -101,7 +102,7 @@ def goal(
             if part in parts:
                 kept = max(kept, min(LEAST_MARGIN, margin_of(start)))
             else:
-                kept -= RESOLUTION  # Its gains stay, so that its margin stays what it is.
+                kept -= RESOLUTION  # the gains of this part stay, and so its margin stays
             margin = np.where(share > 0.0, max(kept, 0.0), margin)
         margins = input_margins(linear.nominal, linear.law, linear.loop, together=False)
         if margins.stable:
@@ -122,7 +123,7 @@ def goal(
 
 
 def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> RiseDiConfig:
-    """Set a controller's margin to that of its loop around a model, but to `most` at most."""
+    """Set a controller's margin to the one that its loop has around a model, at most to `most`."""
     linear = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
     undelayed = linear.loop._replace(delay=0.0)
     kept = delay_margin(linear.nominal, linear.law, undelayed) - RESOLUTION
@@ -134,8 +135,8 @@ def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> R
 def with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:
     """Put the standard deviations of B into the model of a controller's feedforward.
 
-    They are relative to the entries, and have their names. An entry that no flight has shown has
-    PRIOR.
+    They are relative, and `deviation` has them by the names of the entries. An entry that no flight
+    has shown gets PRIOR.
     """
     model = designed.feedforward
     assert model is not None  # noqa: S101 - a design has one

@@ -18,8 +18,8 @@ from flight_design.identification.innovation_filters import FlightData
 from rise_di_controller.learning import divergence
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# Largest rms of the airspeed about its mean, relative, in a record of one speed: the effects of the
-# surfaces then vary by 4 %.
+# Largest rms deviation of the airspeed from its mean, relative to the mean, in a record of one
+# speed. The effects of the surfaces then vary by 4 %.
 SPREAD = 0.02
 
 
@@ -100,8 +100,8 @@ class FlightRecord:
     def fell_back(self, after_ns: int, proposals: Collection[int]) -> bool:
         """Return whether the law fell back after an instant.
 
-        It did if the parameters that flew changed to others than those of a proposal; `proposals`
-        has their digests.
+        It did if the parameters that flew changed to parameters that are no proposal. `proposals`
+        has the digests of the proposals.
         """
         flown = [sample.flown for sample in self._after(after_ns)]
         return any(new != old and new not in proposals for old, new in pairwise(flown))
@@ -142,7 +142,7 @@ def about(recorded: FlightData, airframe: Airframe, x: FloatArray, u: FloatArray
 def at_trim(
     entries: tuple[Entry, ...], airframe: Airframe, powers: Exponents, ratio: float
 ) -> tuple[Entry, ...]:
-    """Reduce entries at a ratio to the trim speed to this speed.
+    """Convert entries from a speed, given as its ratio to the trim speed, to the trim speed.
 
     Their relative errors and deviations stay.
     """
