@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learning in the air: identify A and B from the last seconds of a flight, check and design.
 
-A log is identified in the same way (`model_identification.identify_model`), about a rough airframe.
+A log is identified in the same way (`model_identification.identify_model`), from a rough airframe.
 The design is an observer and a feedforward. If a check fails, the model is refused with a sentence.
 The controller checks the parameters again when it loads them, and may refuse them.
 """
@@ -73,15 +73,15 @@ from rise_di_controller.learning.learned_channels import (
 from rise_di_controller.learning.proposals import UNVERIFIED
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# entries that may lie at their bound: the right model may have one, wrong models have two to six
+# number of entries that may lie at a bound: the right model may have one, wrong ones have 2 to 6
 AT_BOUND = 1
-# s, of a record: it then has two held-out seconds of the six that `identify` needs
+# s, shortest record: it has two of the six held-out seconds that `identify` needs
 SHORTEST = 20.0 * TRANSIENT
-# s, from a fallback to the next identification, which is about what flies since then
+# s, from a fallback to the next identification, whose record is of what flies after the fallback
 AFTER_FALLBACK = 4.0
-# s, from one identification to an unplanned one; and of a record that is tested for oscillation
+# s, from one identification to an unplanned one; also the length of a record tested for oscillation
 RETRY = 10.0
-# Gain of log-likelihood after a fallback, when the model may be wrong: dead surfaces had 46 to 656.
+# Gain of log-likelihood that is needed after a fallback. Dead surfaces had 46 to 656.
 SURE_GAIN = 40.0
 
 Design = Callable[[RiseDiConfig, Airframe, Goal], SelectedObserver]
@@ -97,26 +97,26 @@ PartName = tuple[str, ...]
 class Known(NamedTuple):
     """A part of the aircraft whose model flies."""
 
-    deviation: Mapping[str, float]  # relative, of its entries by name
+    deviation: Mapping[str, float]  # relative deviation of each entry, by name
     latest: Mapping[str, float]  # delay of each input plus two standard deviations, s
-    delays: tuple[float, ...]  # of each input, s
+    delays: tuple[float, ...]  # delay of each input, s
 
 
 class Verdict(NamedTuple):
-    """What shall fly after an identification, and what is said about its parts."""
+    """The model that shall fly after an identification, and sentences about its parts."""
 
-    model: Airframe  # the flown one itself if no part has another model
+    model: Airframe  # the flown model itself if no part has a new one
     known: dict[PartName, Known]
     sentences: list[str]
     refusals: list[Refusal]
-    tried: Airframe  # the model, and what later samples must show to be better
+    tried: Airframe  # `model`, with first models that later samples must still show to be better
 
 
 class Learner:
     """The record of y and u over a window, and the proposals made from it.
 
-    The parts of the aircraft are learned one by one. A part without a model flies either the
-    airframe file, by a design that allows for errors, or the law of the start.
+    The parts of the aircraft are learned one by one. A part without a model flies either by a
+    design for the airframe file that allows for errors, or by the law of the start.
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class Learner:
         self._controller = controller
         self._rough = airframe
         self._design = design
-        # It becomes None once the rough model did not fly, or the law fell back.
+        # It becomes None if the rough model does not fly, or if the law falls back.
         self._design_of_rough = design_of_rough
         self._has_proposed_rough = False
         self._believed = rough
@@ -159,15 +159,15 @@ class Learner:
         self._window_ns = nanoseconds(settings.window)
         self._latency_ns = nanoseconds(settings.latency)
         self._planned = deque(map(nanoseconds, settings.updates))
-        self._tolerance_ns = nanoseconds(settings.check / 2.0)  # of a plan, because y may be old
+        self._tolerance_ns = nanoseconds(settings.check / 2.0)  # of planned times, as y may be old
         self._first_ns: int | None = None
-        self._prior = airframe  # of the next identification
-        self._model = airframe  # what flies
-        self._tried = airframe  # what the next identification tests
+        self._prior = airframe  # prior of the next identification
+        self._model = airframe  # the model that flies
+        self._tried = airframe  # the model that the next identification tests
         self._tried_ns = -nanoseconds(RETRY)  # end of the record of the last identification
         self._known: dict[PartName, Known] = {}
-        # Parts that fly the law of the start for good, with their dead input; "" for outputs of
-        # `learn.without`.
+        # Parts that fly the law of the start for good, each with its dead input, or "" if its
+        # outputs are those of `learn.without`.
         self._dead: dict[PartName, str] = {}
         self._start = controller  # with the `learn.without` of what flies
         # Inputs without effect in the last test. A gust alone can hide an effect once.
@@ -183,33 +183,34 @@ class Learner:
 
     @property
     def model(self) -> Airframe | None:
-        """The rough airframe with the models of the parts that are known; None without one."""
+        """The rough airframe with the models of the known parts, or None if no part is known."""
         return self._model if self._known else None
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
         """Record a tick: y, and u after its limits, (m,), in the law's order.
 
-        `flown` is the digest of its parameters.
+        `flown` is the digest of the parameters that flew in this tick.
         """
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         self._record.take(Sample(stamp_ns, y, u, flown))
 
     def propose(self, flown: int, given_up: Sequence[str] = ()) -> LearnerResult:
-        """Propose parameters for what was identified, or give the sentence of a refusal.
+        """Propose parameters for the identified model, or return the sentence of a refusal.
 
-        The first proposal comes before any record: it is the rough airframe, by a design that
-        allows for errors. Parts that are refused later fly by it, too. If this proposal does not
-        fly, or the law falls back, they fly the law of the start.
+        The first proposal needs no record. It is a design for the rough airframe that allows for
+        errors. Parts that are refused later also fly by this design. If this proposal does not fly,
+        or if the law falls back, they fly the law of the start.
 
         The last RECORD seconds are tested for a loss of effect. If an input has no effect any more,
         its part flies the law of the start without it. After a loss, the older record is left out
         and the flown model is the prior. If nothing is due, there is no sentence.
 
         While the rough model flies, the first model of a part is only on trial. The next
-        identification proposes one if the samples since then show an advantage over the rough one.
+        identification proposes a model if the samples since then show an advantage over the rough
+        one.
 
-        If the last proposal does not fly after the latency, by the digest `flown`, an
-        identification is due: it was refused, or the controller fell back. Outputs that the
+        If the digest `flown` is not that of the last proposal after the latency, the proposal was
+        refused, or the controller fell back. An identification is then due. Outputs that the
         controller has `given_up` are not proposed again. If no part is left, nothing is identified,
         and the sentence says so once.
         """
@@ -227,7 +228,7 @@ class Learner:
         end_ns = self._record.end_ns
         self._note_given_up(flown, given_up)
         lost = flown != self._proposed
-        # A proposal does not act if the law fell back from the parameters that it was made beside.
+        # A proposal does not act if the law fell back from the parameters that flew before it.
         has_fallen = self._record.fell_back(self._proposed_ns, self._proposals)
         if lost and end_ns < self._proposed_ns + self._latency_ns and not has_fallen:
             return LearnerResult(None, None)  # the last proposal has yet to act
@@ -255,7 +256,7 @@ class Learner:
         verdict = self._verdict(self.identification, lost=lost)
         self._tried = verdict.tried
         self._tried_ns = end_ns
-        # a proposal that was lost has to leave out the dead inputs again
+        # after a lost proposal, the next one has to leave out the dead inputs again
         leaves_out_again = lost and any(self._dead.values())
         if verdict.model is self._model and not leaves_out_again:
             nothing = Refusal("each part flies the law of the start from before on")
@@ -267,7 +268,7 @@ class Learner:
         return LearnerResult(self._last, told)
 
     def _damaged(self, changes: Sequence[Change], end_ns: int) -> LearnerResult:
-        """Decide what becomes of changed parts: one with a dead input flies without it at once.
+        """Decide on changed parts. A part with a dead input flies without this input at once.
 
         A part without a dead input is identified from the record since the change, about the flown
         model.
@@ -292,7 +293,7 @@ class Learner:
         return LearnerResult(self._last, told)
 
     def _verdict(self, identified: Identification, *, lost: bool) -> Verdict:
-        """Which parts of an identification shall fly."""
+        """Decide which parts of an identification shall fly."""
         known = dict(self._known)
         model = self._model
         told = list[str]()
@@ -349,9 +350,9 @@ class Learner:
     def _adopt(
         self, model: Airframe, known: dict[PartName, Known], dead: dict[PartName, str]
     ) -> str | None:
-        """Design for a model, take it as proposed, and say what `learn.margin` costs.
+        """Design for a model, note it as proposed, and say what `learn.margin` costs.
 
-        Raises ParameterError without a design.
+        Raises ParameterError if there is no design.
         """
         proposed, price_text = self._designed(model, known, dead)
         new = [part for part, value in known.items() if value is not self._known.get(part)]
@@ -380,7 +381,7 @@ class Learner:
             self._design_of_rough = None
 
     def _rough_proposal(self) -> LearnerResult:
-        """Propose the rough airframe, by a design for one that errs. Raises ParameterError."""
+        """Propose a design for the rough airframe that allows for errors. Raises ParameterError."""
         name = self._rough.name
         try:
             proposed, _ = self._designed(self._rough, {}, self._dead)
@@ -393,8 +394,8 @@ class Learner:
     def _note_given_up(self, flown: int, outputs: Sequence[str]) -> None:
         """Note that the controller gave up outputs.
 
-        If the rest of what flies is the last proposal, that proposal flies. Otherwise it was
-        refused.
+        If the flown parameters are otherwise those of the last proposal, that proposal flies.
+        Otherwise it was refused.
         """
         if set(outputs) <= set(outputs_without(self._start)):
             return
@@ -486,7 +487,7 @@ class Learner:
         return about(steady, self._rough, *level_flight(self._model, ratio, self._thrust)), ratio
 
     def _at_speed(self, model: Airframe, ratio: float) -> Airframe:
-        """Return a model at a speed of `_steady`."""
+        """Return a model at the speed that `_steady` returns."""
         return at_speed(model, ratio, self._thrust) if self._has_speeds else model
 
     def _changes(self, end_ns: int) -> list[Change]:
@@ -494,7 +495,7 @@ class Learner:
 
         An input counts as dead only in the second test in a row, unless the law fell back. There is
         no change if the speed was not steady over the record, if an output stood still, or if one
-        oscillated over RETRY: a loop near instability moves y as no model with a stable loop does.
+        oscillated over RETRY, since no model with a stable loop explains such an oscillation.
         """
         suspected, self._suspected = self._suspected, {}
         begin_ns = end_ns - nanoseconds(RECORD)

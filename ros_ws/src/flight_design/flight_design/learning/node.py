@@ -31,7 +31,7 @@ from rise_di_controller.internals import GIVEN_UP
 from rise_di_controller.learning.proposals import Updates
 
 PERIOD_NS = NANOSECONDS // 10
-NICE = 10  # of a search in real time: it takes a core for seconds, and must not delay the loop
+NICE = 10  # nice value of a search in real time, which must not delay the loop for seconds
 
 
 class LearnerNode(FlightNode[LearnerConfig]):

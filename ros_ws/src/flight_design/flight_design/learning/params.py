@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the learner.
 
-The section `learn` of the controller in its scenario says what it identifies, and when.
+The section `learn` of the controller in the scenario says what the learner identifies, and when.
 """
 
 from flight_core.fields import Field

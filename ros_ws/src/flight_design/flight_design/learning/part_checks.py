@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The model of a part beside what flies: reasons against the model, and sentences about it."""
+"""Checks of a part's model against the model that flies, and sentences about the part."""
 
 from collections.abc import Iterable, Mapping
 
@@ -15,10 +15,11 @@ from flight_design.identification.model_quality import MAX_WHITENESS
 from flight_design.identification.model_refusals import MAX_DEVIATION, best_known
 from flight_design.learning.change_test import Change
 
-# standard deviations of a normal distribution, passed with 5 %: the level of either test of a model
-# against the file
+# level of both tests of a model against the file, in standard deviations: a normal value exceeds it
+# with a probability of 5 %
 LIKELIER = 1.645
-# s: a host, a bridge or a servo that is 30 ms later than the file says is found
+# s, standard deviation of the delay. A host, a bridge or a servo that is 30 ms later than the file
+# says is found.
 DELAY_DEVIATION = 0.015
 
 
@@ -48,7 +49,7 @@ def reason_against_innovations(part: Part) -> Refusal | None:
 
 
 def reason_against_delays(part: Part, delay: float) -> Refusal | None:
-    """Refuse a part whose inputs are as late as the search goes.
+    """Refuse a part if the delay of an input is at the bound of the search.
 
     The search starts from the known `delay` of the loop, s.
     """
@@ -69,7 +70,7 @@ def reason_against_delays(part: Part, delay: float) -> Refusal | None:
 def is_file_better(part: Part) -> bool:
     """Return whether the nominal model predicts later samples better than the one that flies.
 
-    If both models are as near to the aircraft, the probability of this answer is at most 5 %.
+    If both models are equally near to the aircraft, the result is True in at most 5 % of cases.
     """
     return part.advantage < -LIKELIER
 
@@ -77,9 +78,9 @@ def is_file_better(part: Part) -> bool:
 def reason_against_first_model(part: Part, name: str, *, flies: bool) -> Refusal | None:
     """Refuse a first model that has not proved itself beside the airframe of a name.
 
-    The model was chosen on the record up to then, so only later samples count. Against a file that
-    `flies`, it needs an advantage that two equally good models show with a probability of at most 5
-    %. A sketch does not fly, so the model only must not have such a disadvantage.
+    The model was chosen by the record, so only later samples count. Against a file that `flies`, it
+    needs an advantage that two equally good models show with a probability of at most 5 %. A sketch
+    does not fly. Against a sketch, the model is only refused if it has such a disadvantage.
     """
     limit = LIKELIER if flies else -LIKELIER
     if part.advantage == 0.0:
@@ -98,7 +99,7 @@ def reason_against_first_model(part: Part, name: str, *, flies: bool) -> Refusal
 def return_to_file(part: Part, name: str | None) -> str:
     """Say what flies after the airframe file predicted better than the model that flew.
 
-    That is the airframe of a name, or the law of the start if the name is None.
+    The airframe `name` flies, or the law of the start if `name` is None.
     """
     flies = "the law of the start" if name is None else f"the airframe {name} as it is"
     return f"{' and '.join(part.outputs)} by {flies}: {_file_advantage(part)}"
@@ -114,7 +115,7 @@ def entries_of_file(part: Part) -> tuple[Entry, ...]:
 
 
 def reason_against_part_alone(part: Part, known: Iterable[tuple[str, ...]]) -> Refusal | None:
-    """Refuse a part alone if the flown model couples it with another."""
+    """Refuse the model of a part alone if the flown model couples it with another part."""
     if not any(is_within(part.outputs, outputs) for outputs in known if outputs != part.outputs):
         return None
     return Refusal(
@@ -124,14 +125,15 @@ def reason_against_part_alone(part: Part, known: Iterable[tuple[str, ...]]) -> R
 
 
 def forgotten_coupling(part: Part) -> str:
-    """Why a model with coupling is forgotten."""
+    """Say why a model with coupling is forgotten."""
     return f"no coupling any more: {_file_advantage(part)}"
 
 
 def reason_against_effects(part: Part, flown: Airframe | None) -> Refusal | None:
-    """Refuse the effect that gusts make weaker than in the model that flies, by MAX_DEVIATION.
+    """Refuse an effect that gusts make weaker than in the flown model by more than MAX_DEVIATION.
 
-    Gusts hide what the inputs do: the effects come out too weak, and a design with them too strong.
+    Gusts hide what the inputs do. The identified effects are then too weak, and the gains of a
+    design with these effects are too high.
     """
     if flown is None or not part.gusts:
         return None
@@ -151,7 +153,7 @@ def reason_against_effects(part: Part, flown: Airframe | None) -> Refusal | None
 def effect_sentence(part: Part) -> str:
     """Say which effects of inputs on outputs the flight shows.
 
-    The effects are relative to the rough airframe, and have deviations.
+    The effects are relative to those of the rough airframe, and are given with their deviations.
     """
     effects = (entry for entry in part.entries if entry.matrix == "B" and entry.row in part.outputs)
     known = (entry for entry in effects if entry.nominal and entry.deviation < PRIOR / 2.0)

@@ -43,7 +43,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
 
     The rough model is the published airframe, not the aircraft in flight. For an aircraft of JSBSim
     it is the feedforward of the controller. In real time the loop has the delay in the section of
-    the controller; in one process and in lockstep u acts at once.
+    the controller. In one process and in lockstep u acts at once.
 
     Args:
         scenario: The flight.
@@ -100,7 +100,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
     of_rough: dict[RiseDiConfig, SelectedObserver] = {}
 
     def design_of_rough(start: RiseDiConfig) -> SelectedObserver:
-        """Design for the airframe as one that errs, once for the learners of many aircraft."""
+        """Design for an airframe with errors, once for the learners of many aircraft."""
         if start not in of_rough:
             margin = asked_margin(controller)
             of_rough[start] = selected_observer(start, scenario, airframe, margin, speeds=speeds)
@@ -118,12 +118,12 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
 
 
 def that_learns(scenario: Scenario) -> Scenario:
-    """Turn a scenario with the law alone into one that learns without a model of its aircraft.
+    """Turn a scenario with the law alone into a scenario that learns, without an airframe file.
 
         Omega = diag(D omega / input_scale),   V0 the trim speed
 
-    The law gives the signs and sizes; the rough model is the sketch of Omega and V0. Raises
-    ParameterError if the controller has an observer, or if a sketch lacks an output.
+    The law gives the signs and sizes of Omega. The rough model is the sketch of Omega and V0.
+    Raises ParameterError if the controller has an observer, or if a sketch lacks an output.
     """
     start = scenario.rise_di()
     expected = "none: a scenario of the law alone, whose signs and sizes are the rough model"
@@ -200,7 +200,7 @@ class LearnResult(NamedTuple):
 
 
 class _Ticks(NamedTuple):
-    """The ticks of a log, and what flew at each."""
+    """The ticks of a log, and the parameters that flew at each tick."""
 
     stamp_ns: NDArray[np.int64]
     instant_ns: NDArray[np.int64]
@@ -245,8 +245,8 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
     """Step the learner of a scenario with y and u of the engaged ticks of a log.
 
     If the law is deactivated, the record ends, as in flight. If the log has no settings of the
-    learner, or others than the scenario, each proposal is taken as flown. Raises ParameterError if
-    nothing can be learned from the log.
+    learner, or has other settings than the scenario, each proposal is taken as flown. Raises
+    ParameterError if nothing can be learned from the log.
     """
     # Simulated time begins at 0.
     make = learner(scenario, real_time=tape.start_ns > 0)
@@ -293,7 +293,7 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
 
 
 def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
-    """Return a scenario that has what flew last in one of its runs, in place of `learn`.
+    """Return a scenario with the parameters that flew last in one of its runs, without `learn`.
 
     Raises ParameterError if the run had another controller.
     """
