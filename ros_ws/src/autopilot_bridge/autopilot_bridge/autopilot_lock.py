@@ -13,7 +13,7 @@ CLOCK_TOLERANCE_NS = NANOSECONDS  # autopilots that were switched on within this
 
 
 class AutopilotLock:
-    """Locks to the first autopilot until it is silent, then to the next, as a topic to a publisher.
+    """Locks to the first autopilot until it is silent, and then to the next one.
 
     Two autopilots behind the same address differ by the time since boot in their messages. This
     time never goes back, and advances by at most the time that passes here, although a message may
@@ -25,8 +25,8 @@ class AutopilotLock:
         self._silence_ns = silence_ns
         self._addresses, self._starts = self._new_lock(), self._new_lock()
         self._newest_ns = 0  # the largest time since boot
-        # The earliest instant of the boot by the messages so far. It comes from the message with
-        # the least delay.
+        # The earliest instant of the boot that the messages so far have shown. It comes from the
+        # message with the least delay.
         self._boot_ns = 0
 
     def _new_lock(self) -> PublisherLock:
@@ -38,7 +38,7 @@ class AutopilotLock:
         return self._addresses.publisher
 
     def overran(self, duration_ns: int) -> None:
-        """Do not count a time as silence in which the receiver did not run."""
+        """Take out of the silence a time in which the receiver did not run, ns."""
         self._addresses.overran(duration_ns)
         self._starts.overran(duration_ns)
 
@@ -91,7 +91,7 @@ class AutopilotLock:
     def _start(self, since_boot_ns: int, now_ns: int) -> str:
         """Name the start of the autopilot to which a time since boot belongs.
 
-        It is the start to which the lock holds, or a new name from the instant of boot.
+        This is the name of the start that the lock holds, or a new name from the instant of boot.
         """
         boot_ns = now_ns - since_boot_ns
         advances = (

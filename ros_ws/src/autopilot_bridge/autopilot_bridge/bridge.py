@@ -27,20 +27,20 @@ UNBOUNDED = Refusal(
     "the loss of the transmitter cannot be seen over this link: set max_engaged in the "
     "map, or engage with --blind"
 )
-# If a u beyond this share of its limits does not change, it is at a limit of the law. The
-# amplitudes of experiments are smaller.
+# A u that does not change counts as being at a limit of the law if it is beyond this share of the
+# limits of the map. The amplitudes of experiments are smaller.
 LARGE = 0.5
 END_WARNING_NS = 10 * NANOSECONDS  # warning before `max_engaged` ends an engagement
 
 
 class Phase(IntEnum):
-    """The phase of the engagement, which says what the autopilot is sent."""
+    """The phase of the engagement, which determines what the bridge sends."""
 
-    DISENGAGED = 0  # nothing
-    ENGAGED = 1  # u
+    DISENGAGED = 0  # nothing is sent
+    ENGAGED = 1  # u is sent
     NEUTRAL = 2  # failsafe: u has timed out, and the neutral values are sent
-    RELEASE = 3  # release values, which return the channels to the autopilot
-    ENGAGING = 4  # heartbeats and requests, until the awaited conditions hold
+    RELEASE = 3  # release values are sent, which return the channels to the autopilot
+    ENGAGING = 4  # heartbeats and requests are sent until the awaited conditions hold
 
 
 def trim_key(name: str) -> str:
@@ -60,12 +60,12 @@ class Bridge:
         self.outputs = tuple(channel_map.outputs)
         self.inputs = tuple(channel_map.inputs)
         self.phase = Phase.DISENGAGED
-        # Why the bridge is not engaged, or what an engagement waits for or lacks.
+        # Why the bridge is not engaged, or what an engagement still waits for.
         self.reason: Refusal | None = Refusal("not engaged yet")
-        # What refuses and ends an engagement, such as another publisher. The node sets it.
+        # A reason that refuses and ends an engagement, such as another publisher. The node sets it.
         self.conflict: Refusal | None = None
-        # What refuses an engagement but does not end one yet, such as a rate of the link. The node
-        # sets it.
+        # A reason that refuses an engagement but does not end one yet, such as a slow rate of the
+        # link. The node sets it.
         self.problem: Refusal | None = None
         sources = {trim_key(name): row for name, row in channel_map.trims.items()}
         self._rows: dict[str, MeasuredRow] = {
@@ -86,7 +86,7 @@ class Bridge:
         self.conditions = Conditions(channel_map)
         self._parameters: dict[str, float] = {}
         self._phase_ns = 0  # when the phase began
-        # Whether a release leaves the mode as it is, since a pilot requested it or nothing flew.
+        # Whether a release keeps the mode, because a pilot chose the mode or because nothing flew.
         self._keeps_mode = True
         self._limit_ns: dict[str, int] = {}  # since when inputs are at a limit
         self._end_ns: int | None = None  # when `max_engaged` ends the engagement
@@ -101,9 +101,9 @@ class Bridge:
     def take_output(self, name: str, raw: float, stamp_ns: int, now_ns: int) -> None:
         """Take a value of a channel of y, of the pose or of a trim's source.
 
-        The channel becomes sign scale raw + offset. Raises ChannelError, reason "stamp" if the
-        stamp differs from now by more than the age limit, and reason "order" if it is not later
-        than the one before.
+        The channel becomes sign scale raw + offset. Raises ChannelError with the reason "stamp" if
+        the stamp differs from now by more than the age limit, and with the reason "order" if the
+        stamp is not later than the one before.
         """
         row = self._rows[name]
         if abs(now_ns - stamp_ns) > nanoseconds(row.max_age):
@@ -129,7 +129,7 @@ class Bridge:
     def _u_timeouts_ns(self) -> tuple[int, int]:
         """Return the timeouts of the publisher of u.
 
-        While the bridge is engaged, every second publisher conflicts, even after a timeout, because
+        While the bridge is engaged, any other publisher conflicts, even after a timeout, because
         its u would jump. The timeout ends the engagement.
         """
         takeover_ns = sys.maxsize if self.phase is Phase.ENGAGED else self._max_age_ns
@@ -138,7 +138,7 @@ class Bridge:
     def max_u_age_ns(self) -> int:
         """Return the age limit of a u by its stamp, which is the instant of a y.
 
-        Because of this limit, a log that is played cannot begin to fly the autopilot.
+        This limit prevents that a played log begins to fly the autopilot.
         """
         return self._max_age_ns + self._max_y_age_ns
 
@@ -270,8 +270,8 @@ class Bridge:
     def reason_against_engagement(self, now_ns: int) -> Refusal | None:
         """Say why `engage` would be refused now.
 
-        Awaited conditions do not count. A dry run states the reason that there would be with
-        `dry_run: false` too.
+        Awaited conditions do not count. A dry run also states the reason that there would be with
+        `dry_run: false`.
         """
         checks: tuple[Callable[[], Refusal | None], ...] = (
             lambda: self.conflict,
@@ -351,10 +351,10 @@ class Bridge:
         )
 
     def engage(self, now_ns: int, *, blind: bool = False) -> Refusal | None:
-        """Engage, or begin to: the phase tells. Or refuse to.
+        """Engage or begin to engage, or return the reason of a refusal. The phase tells which.
 
-        `blind`: without regard to the loss of the transmitter, and without end. A request while
-        engaged starts the time of `max_engaged` again.
+        If `blind`, the engagement ignores a loss of the transmitter, and has no time limit. A
+        request while engaged starts the time of `max_engaged` again.
         """
         if self.phase is Phase.ENGAGED:
             self.conditions.blind |= blind
@@ -377,7 +377,7 @@ class Bridge:
     def _continue_engagement(self, now_ns: int) -> None:
         """Engage once the awaited conditions hold.
 
-        Give up after their time, or if something else would refuse.
+        The bridge gives up when the time for them is over, or if there is another refusal.
         """
         self.reason = self.conditions.violation(now_ns, awaited=True)
         timed_out = now_ns - self._phase_ns > nanoseconds(self.channel_map.engage_timeout)
@@ -399,7 +399,7 @@ class Bridge:
     def disengage(self, reason: Refusal, now_ns: int, *, by_pilot: bool = False) -> None:
         """Disengage from any phase, which returns the channels to the autopilot.
 
-        If it is `by_pilot`, the pilot requested it and the mode stays as it is.
+        If `by_pilot`, the pilot requested this, and the mode stays as it is.
         """
         self._keeps_mode |= by_pilot
         if self.phase not in {Phase.DISENGAGED, Phase.RELEASE}:
@@ -445,7 +445,7 @@ class Bridge:
     def y(self, now_ns: int) -> StampedVector | None:
         """Return the sample of y at the stamp of the map's output `instant`.
 
-        Returns None if it was returned before, or if a channel is stale.
+        Returns None if this sample was returned before, or if a channel is stale.
         """
         newest = self._readings.get(self.channel_map.instant)
         if (

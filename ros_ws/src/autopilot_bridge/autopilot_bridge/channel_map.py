@@ -223,10 +223,10 @@ def message_type(name: str, load: Callable[[str], Any] = importlib.import_module
 
 
 def versioned_topic(topic: str, version: int) -> str:
-    """Return PX4's topic for a version of its definition, /fmu/.../NAME_vVERSION; others stay.
+    """Return PX4's topic for a version of its definition, /fmu/.../NAME_vVERSION.
 
-    A definition states its version as MESSAGE_VERSION. Version 0 has no suffix. Source: PX4 guide,
-    PX4 ROS 2 message translation node.
+    Any other topic stays as it is. A definition states its version as MESSAGE_VERSION. Version 0
+    has no suffix. Source: PX4 guide, PX4 ROS 2 message translation node.
     """
     if topic.startswith("/fmu/"):
         return VERSION.sub("", topic) + (f"_v{version}" if version else "")
@@ -250,9 +250,9 @@ def version_fault(topic: str, message_class: Any) -> Refusal | None:
 def version_faults(
     topics: Iterable[tuple[str, str]], load: Callable[[str], Any] = importlib.import_module
 ) -> list[Refusal]:
-    """Return `version_fault` of topics and types whose message packages are installed.
+    """Return the `version_fault` of each topic whose message package is installed.
 
-    Nothing is known about the rest.
+    Nothing is known about the other topics.
     """
     faults = []
     for topic, kind in dict.fromkeys(topics):
@@ -262,7 +262,7 @@ def version_faults(
 
 
 def no_publisher(environment: Mapping[str, str]) -> str:
-    """Why a topic of an autopilot has no publisher, as a sentence."""
+    """Return a sentence on why a topic of an autopilot has no publisher."""
     domain = environment.get("ROS_DOMAIN_ID") or "0"
     if domain != "0":
         return (

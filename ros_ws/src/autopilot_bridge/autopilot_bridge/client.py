@@ -19,7 +19,8 @@ from flight_ros.topics import ENGAGEMENT, NEWEST_SAMPLES, PUBLISH, U
 ENGAGE = "bridge/engage"
 ENGAGE_BLIND = "bridge/engage_blind"
 WITHDRAW_TIMEOUT = 1.0  # s
-# s, while the nodes of a flight start; the autopilot may send its first messages late.
+# s, longest wait for u while the nodes of a flight start. The autopilot may send its first messages
+# late.
 U_TIMEOUT = 30.0
 TRIM_SAMPLES = 20  # equal samples of u in a row, which show that u has reached trim
 
@@ -38,11 +39,11 @@ class EngagementClient(Client):
     def engage(self, progress: Callable[[str], None], *, blind: bool = False) -> Refusal | None:
         """Wait for u at trim and engage the bridge, which activates the controller.
 
-        Returns the reason of a refusal. An engaged bridge takes the request at once: the time of
-        `max_engaged` starts again. `blind`: without regard to the loss of the transmitter.
+        Returns the reason of a refusal. An engaged bridge takes the request at once, and starts the
+        time of `max_engaged` again. If `blind`, the engagement ignores a loss of the transmitter.
         `progress` is called with what the bridge waits for, and with what it lacks once it is
-        engaged. An engagement that is not waited for any more, as after Ctrl-C, is withdrawn: the
-        autopilot must not change its mode later.
+        engaged. If the caller stops waiting, for example after Ctrl-C, the request is withdrawn, so
+        that the autopilot does not change its mode later.
         """
         self._spin_until(
             lambda: bool(self._received_phases()),
@@ -79,7 +80,7 @@ class EngagementClient(Client):
         return _refusal_in(self._call(Trigger, ENGAGE_BLIND, request, "a flight with a bridge"))
 
     def disengage(self) -> Refusal | None:
-        """Disengage the bridge. Returns its reason to refuse."""
+        """Disengage the bridge, or return the reason for which it refuses."""
         return self._set_engaged(engaged=False)
 
     def _set_engaged(self, *, engaged: bool) -> Refusal | None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The conditions and pilot overrides of a channel map: what autopilot and pilot allow now."""
+"""The conditions and pilot overrides of a channel map, by which autopilot and pilot can refuse."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class Conditions:
         self._overrides[name] = Reading(now_ns, raw)
 
     def engage(self, now_ns: int) -> None:
-        """Keep the overrides as they are now. One that is `moved` acts by its change since then."""
+        """Keep the present values of the overrides. A `moved` override acts by its later change."""
         self._at_engagement = {
             name: reading.value
             for name, reading in self._overrides.items()
@@ -59,7 +59,7 @@ class Conditions:
     def violation(self, now_ns: int, *, awaited: bool) -> Refusal | None:
         """Say which conditions do not hold.
 
-        `awaited` selects those of an engagement; otherwise, it is the rest.
+        If `awaited`, they are the conditions that an engagement waits for, otherwise all others.
         """
         rows = (
             (name, row)
@@ -116,10 +116,10 @@ class Conditions:
         return Refusal(f"a pilot override has no effect: {'; '.join(silent)}") if silent else None
 
     def blindness(self, *, bounded: bool) -> Refusal | None:
-        """Say what an engagement lacks that does not see the loss of the transmitter.
+        """Say what an engagement lacks if it cannot see the loss of the transmitter.
 
-        The sentence also names what still releases. `bounded` says whether `max_engaged` ends the
-        engagement.
+        The sentence also names what can still release the aircraft. `bounded` says whether
+        `max_engaged` ends the engagement.
         """
         if self.watches_transmitter and not self.blind:
             return None
@@ -157,9 +157,9 @@ def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) 
 
 
 def joined_faults(faults: Mapping[str, Stale]) -> Refusal | None:
-    """Join what is wrong with some channels, by name, to a sentence.
+    """Join the faults of some channels, by name, to a sentence.
 
-    Channels with the same fault stand together.
+    Channels with the same fault are named together.
     """
     names: dict[Stale, list[str]] = {}
     for name, fault in faults.items():

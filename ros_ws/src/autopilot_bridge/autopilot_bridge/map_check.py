@@ -170,9 +170,9 @@ def _fault(
 
 
 def _has(definitions: Types, field: Any, components: str) -> bool:
-    """Return whether a field has components, as members or in an array.
+    """Return whether a field has some components, as members or in an array.
 
-    Without components, return whether it is a number.
+    If `components` is None, return whether the field is a number.
     """
     node, content = field
     if node is Nodetype.NAME:

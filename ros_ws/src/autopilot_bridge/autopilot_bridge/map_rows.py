@@ -63,10 +63,7 @@ Value = bool | Integer | Raw | str | tuple[Integer, ...] | tuple[Raw, ...]
 
 
 class Row(Config):
-    """What the rows of a map have in common: channel = sign scale raw + offset.
-
-    A row has a frame and a source.
-    """
+    """The base of the rows of a map, channel = sign scale raw + offset, with frame and source."""
 
     field: str = Field(
         description="the path of the field in the message, such as twist.angular.y or axes[1]"
@@ -142,7 +139,7 @@ class MeasuredRow(Row):
 class PoseRow(MeasuredRow):
     """A channel of the pose, as an absolute value.
 
-    `sign` and `offset` turn it from the frame that it has into FRD, north, east, up.
+    `sign` and `offset` convert the channel from the frame of the message to FRD, north, east, up.
     """
 
 
@@ -248,7 +245,7 @@ class WatchedRow(Config):
 class ConditionRow(WatchedRow):
     """A condition of the engagement: the field must have one of some values.
 
-    If it has another one, the bridge disengages.
+    If the field has another value, the bridge disengages.
     """
 
     one_of: Numbers = Field(

@@ -5,10 +5,10 @@
 A thread receives, sends a heartbeat each second, requests the rates of messages and reads
 parameters. It sends all of these as a companion computer of the autopilot. Only the messages of the
 map have the number of the ground station, because ArduPilot takes RC overrides from nobody else.
-Its failsafe FS_GCS_ENABL counts overrides as heartbeats of the station, but not those of a
-companion. Source: MAVLink guide (heartbeat and parameter protocols, SET_MESSAGE_INTERVAL),
-common.xml and ardupilotmega.xml as pymavlink has them; ArduPilot, GCS_Common.cpp,
-handle_rc_channels_override and handle_heartbeat; tried with ArduPlane in SITL.
+Its failsafe FS_GCS_ENABL counts these overrides as heartbeats of the station. It does not count the
+heartbeats of a companion. Sources: MAVLink guide (heartbeat and parameter protocols,
+SET_MESSAGE_INTERVAL); common.xml and ardupilotmega.xml of pymavlink; ArduPilot, GCS_Common.cpp,
+handle_rc_channels_override and handle_heartbeat. It was tried with ArduPlane in SITL.
 """
 
 import hashlib
@@ -34,36 +34,35 @@ from flight_core.vectors import ChannelError
 
 DIALECT = "ardupilotmega"
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
-# MAV_COMP_ID_ONBOARD_COMPUTER4: other companions mostly have 191. With the component of the ground
-# station,
-COMPANION = 194
-# Such as 0 or 190, ArduPilot would not forward the station's heartbeats any more
+# MAV_COMP_ID_ONBOARD_COMPUTER4: other companions mostly have 191. With a component of the ground
+# station, such as 0 or 190, ArduPilot would not forward the station's heartbeats any more
 # (MAVLink_routing.cpp, handle_heartbeat).
+COMPANION = 194
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD
 ACCEPTED = 0  # MAV_RESULT
 SIGNED = 1  # MAVLINK_IFLAG_SIGNED, of a header
 GCS = 6  # MAV_TYPE_GCS
 ONBOARD = 18  # MAV_TYPE_ONBOARD_CONTROLLER
 INVALID = 8  # MAV_AUTOPILOT_INVALID
-# ArduPilot takes RC overrides of these systems: since 4.7, to MAV_GCS_SYSID_HI where that is not 0,
-# and before
+# Parameters with the systems whose RC overrides ArduPilot takes. Since 4.7 they are MAV_GCS_SYSID,
+# or the range from it to MAV_GCS_SYSID_HI if that is not 0. Before 4.7 it is SYSID_MYGCS.
 STATION, LAST_STATION, OLD_STATION = "MAV_GCS_SYSID", "MAV_GCS_SYSID_HI", "SYSID_MYGCS"
 STATION_PARAMETERS = (STATION, LAST_STATION, OLD_STATION)
 STICKS = frozenset({"RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"})  # messages of a joystick
 BEAT = 1.0  # s
-ANSWER = 1.0  # s, for an answer to a request, which is then repeated
-# s without the autopilot, after which all rates are requested again, and another sender may take
-# its place.
+ANSWER = 1.0  # s, longest wait for an answer; then the request is repeated
+# s without a message of the autopilot, after which all rates are requested again, and another
+# sender can take its place.
 SILENCE = 3.0
-READ_AGAIN = 5.0  # s, then a parameter is read again, since a ground station may have set it
-QUEUE = 256  # messages between two ticks
+READ_AGAIN = 5.0  # s, after which a parameter is read again: a ground station may have set it
+QUEUE = 256  # most messages that are kept between two ticks
 TAKEN = Refusal(
     "requested again; a ground station on this link requests rates of its own (MAVProxy: set "
     "streamrate -1), or the link is too slow: give the bridge a port of its own"
 )
-RETRIES = 2  # of a connection over TCP, 1 s each
-POLL = 0.1  # s, the longest wait for a packet
-PACKET = 65535  # bytes, the largest of UDP
+RETRIES = 2  # retries of a connection over TCP, 1 s each
+POLL = 0.1  # s, longest wait for a packet
+PACKET = 65535  # bytes, size of the largest packet of UDP
 
 
 Address = tuple[Any, ...]
@@ -132,8 +131,8 @@ def _connection(config: LinkConfig) -> Any:
         raise ParameterError(
             f"link.url: found {config.url}, which cannot be opened ({error}), expected {expected}"
         ) from None
-    # That of pymavlink is of MAVLink 1 until a packet of MAVLink 2 comes, and forgets the
-    # passphrase then.
+    # The MAVLink object that pymavlink makes is of version 1 until a packet of MAVLink 2 comes, and
+    # then forgets the passphrase.
     connection.mav = dialect.MAVLink(connection, srcSystem=config.system, srcComponent=COMPANION)
     if config.passphrase_file is not None:
         passphrase = read_file(
@@ -144,13 +143,13 @@ def _connection(config: LinkConfig) -> Any:
 
 
 class Link:
-    """A connection, which receives from `start` on.
+    """A MAVLink connection, which receives from the call of `start` on.
 
     Only messages of the sender in `AutopilotLock` are taken, and over UDP no other address gets
-    messages. `parameters` are the names of parameters of the autopilot that are read; `further` are
-    others, which some releases lack. If there is a passphrase, each message is signed, and messages
-    without a valid signature are refused. Source: MAVLink guide, message signing; the key of a
-    passphrase is that of MAVProxy and Mission Planner.
+    messages. `parameters` are the names of the autopilot's parameters to read. `further` are more
+    of them, which some releases lack. If there is a passphrase, each message is signed, and
+    messages without a valid signature are refused. Source: MAVLink guide, message signing. The key
+    is derived from the passphrase in the same way as by MAVProxy and Mission Planner.
     """
 
     def __init__(
@@ -164,12 +163,12 @@ class Link:
         # a conflict that only another configuration can end
         self._clash: Refusal | None = None
         self._second: Refusal | None = None  # about a second sender
-        self._second_at = 0.0  # and when it sent last
+        self._second_at = 0.0  # when the second sender sent last
         self.stations: set[int] = set()  # systems of other ground stations
-        # why the last message was refused, for its signature
+        # why the signature of the last message was refused
         self._refused: Refusal | None = None
         self._queues: dict[str, deque[MavlinkMessage]] = {}
-        self.parameters: dict[str, float] = {}  # of the autopilot, as it told them last
+        self.parameters: dict[str, float] = {}  # the last received parameters of the autopilot
         self._to_read = tuple(parameters)
         self._further = tuple(further)
         self._systems: set[int] = set()  # systems of other autopilots than that of the map
@@ -182,7 +181,7 @@ class Link:
         self._began = time.monotonic()
         self._rates = MessageRates(config.rates, self._began)
         self._read = 0.0  # when the parameters were requested
-        # The ground station with a number of the RC overrides.
+        # When the ground station with a number of the RC overrides was last heard.
         self._station_heard: float | None = None
         self._sending = Lock()
         self._closed = Event()
@@ -190,9 +189,9 @@ class Link:
 
     @property
     def conflict(self) -> Refusal | None:
-        """Who else sends as the autopilot or as the bridge, or a setting that prevents engagement.
+        """Who else sends as the autopilot or as the bridge, or which setting prevents engagement.
 
-        Without that setting of the autopilot no engagement works.
+        The setting is one of the autopilot, without which no engagement works.
         """
         second = self._second if time.monotonic() - self._second_at <= SILENCE else None
         return joined((self._clash, second))
@@ -243,7 +242,7 @@ class Link:
         return joined((self.conflict, *slow, *denied, TAKEN if slow else None))
 
     def reason_against_engagement(self) -> Refusal | None:
-        """Say why an engagement would not have the rates of the map, or no effect."""
+        """Say why an engagement would lack the rates of the map, or would have no effect."""
         unknown = self._rates.unknown(time.monotonic())
         rates = Refusal(f"the rate of {', '.join(unknown)} is not known yet") if unknown else None
         return self.problem() or self._dropped_overrides() or rates
@@ -271,10 +270,7 @@ class Link:
         )
 
     def end_reason(self) -> Refusal | None:
-        """Say what ends an engagement.
-
-        Either a rate stays slow, or the ground station is silent.
-        """
+        """Say what ends an engagement: a rate that stays slow, or a silent ground station."""
         now = time.monotonic()
         limit = self._config.station_silence
         silence = None
@@ -309,13 +305,13 @@ class Link:
         return str(numbers[0]) if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]}"
 
     def _send(self, message: Any, system: int) -> None:
-        """Send as a system, with the component COMPANION."""
+        """Send a message with a system number and the component COMPANION."""
         with self._sending:
             try:
                 self._connection.mav.srcSystem = system
                 self._connection.mav.send(message)
             except OSError:
-                # The cable is out, which shows in the ages of what is received.
+                # The cable is out. The ages of the received messages will show this.
                 return
 
     def _receive(self) -> None:
@@ -342,7 +338,7 @@ class Link:
                 self._take(message, address, received_ns)
 
     def _packet(self) -> tuple[bytes, Address]:
-        """Receive the next bytes and their sender; there are none after a silence of POLL.
+        """Receive the next bytes and their sender, or no bytes after a silence of POLL.
 
         Over TCP and a serial line, the sender is the URL.
         """
@@ -360,8 +356,8 @@ class Link:
         """
         if not self._is_udp or _text(address) == self._lock.address:
             return self._parser.parse_buffer(data) or ()
-        # This needs a copy. A forged signature with a late time would make each later one of the
-        # autopilot count as replayed.
+        # This needs a copy. After a forged signature with a late time, each later signature of the
+        # autopilot would count as replayed.
         return self._new_parser(deepcopy(self._connection.mav.signing)).parse_buffer(data) or ()
 
     def _new_parser(self, signing: Any) -> Any:
@@ -371,9 +367,9 @@ class Link:
         return parser
 
     def _signature_fault(self, packet: bytes) -> Refusal:
-        """Why the signature of a packet was refused.
+        """Say why the signature of a packet was refused.
 
-        A signature has 6 bytes of a time, 10 us each, and 6 of a hash (MAVLink guide).
+        A signature has 6 bytes of a time in units of 10 us, and 6 bytes of a hash (MAVLink guide).
         """
         signing = self._connection.mav.signing
         if hashlib.sha256(signing.secret_key + packet[:-6]).digest()[:6] != packet[-6:]:
@@ -507,7 +503,7 @@ class Link:
         self._send(interval, self._config.system)
 
     def _request_parameters(self, now: float) -> None:
-        """Request each parameter, at first until it is known."""
+        """Request each parameter until it is known, and then again every READ_AGAIN."""
         has_all = all(name in self.parameters for name in self._to_read)
         if now - self._alive > SILENCE or now - self._read < (READ_AGAIN if has_all else ANSWER):
             return

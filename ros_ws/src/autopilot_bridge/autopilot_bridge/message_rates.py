@@ -27,14 +27,17 @@ GAPS = 3  # gaps between the newest messages, whose mean gives the present rate
 
 
 class MessageRates:
-    """Counts messages by name. `requested` has their rates, Hz."""
+    """Counts messages by name. `requested` has their requested rates, Hz."""
 
     def __init__(self, requested: Mapping[str, float], now: float) -> None:
         self._requested = dict(requested)
         self.begin(now)
 
     def begin(self, now: float) -> None:
-        """Begin again. The autopilot may have started again, and the rates are requested."""
+        """Begin to count again, because the autopilot may have started again.
+
+        The rates are then requested again.
+        """
         self._rates = {name: _Rate(rate, now) for name, rate in self._requested.items()}
         self._last_step = now
 
@@ -59,8 +62,8 @@ class MessageRates:
     def slow(self, now: float) -> dict[str, Refusal]:
         """Return what is wrong with slow messages, by name.
 
-        A message is slow if it is slow now, or if it was less than REMEMBERED ago after it had its
-        rate.
+        A message is slow if it is slow now. It also counts as slow if it was slow less than
+        REMEMBERED ago, after it had reached its rate.
         """
         reasons = {name: rate.slowness(name, now) for name, rate in self._rates.items()}
         return {name: reason for name, reason in reasons.items() if reason is not None}
@@ -90,12 +93,12 @@ class _Rate:
         self._window = max(COUNTED, MESSAGES / requested)  # s
         self._began = now
         self._instants: deque[float] = deque()  # of its messages within the window
-        self._lowest = requested  # Hz, lowest rate since it is slow
+        self._lowest = requested  # Hz, lowest rate since it became slow
         self._slow_since: float | None = None
         self._was_reached = False
-        # When it was slow last, if it had been reached before.
+        # When the rate was slow last, if it had been reached before.
         self._last_slow: float | None = None
-        self._repeated: float | None = None  # when it was requested again
+        self._repeated: float | None = None  # when the rate was requested again
 
     def take(self, now: float) -> None:
         self._instants.append(now)

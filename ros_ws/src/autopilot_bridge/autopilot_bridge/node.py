@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridge node, which replaces the aircraft node.
 
-By a channel map, it makes y from the messages of an autopilot, and the autopilot's setpoints from
+With a channel map, it makes y from the messages of an autopilot, and the autopilot's setpoints from
 u.
 """
 
@@ -126,7 +126,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._u_sender: str | None = None
         self._activation: Any = None  # the pending activation of the controller
         self._activation_ns = 0
-        self._awaits_controller = False  # engaged before the controller's service was found
+        self._awaits_controller = False  # whether it engaged before it found the controller
         if self._link is not None:
             self._link.start()
         waits = f"disengaged, waiting for {self.get_name()}/engage"
@@ -249,7 +249,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._warn_stale_inputs(now_ns)
 
     def _take_effects(self, sample: StampedVector, now_ns: int) -> None:
-        """Take the effects that the probe of the controller whose u flies has found."""
+        """Take the effects of the inputs, if they come from the controller whose u flies."""
         controller = self._bridge.u_lock.publisher
         if controller is None:
             # Nothing flies yet.
@@ -258,9 +258,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._bridge.take_effects(sample, now_ns)
 
     def _pause_ns(self) -> int:
-        """Return the time since the tick before began.
+        """Return the time since the previous tick began.
 
-        The time for which a host was suspended counts, although the clock of the ticks stood still.
+        A time in which the host was suspended counts too, although the clock of the ticks stops.
         """
         return self._boot_ns() - self._began_ns
 
@@ -399,7 +399,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._bridge.disengage(ACTIVATION_TIMED_OUT, now_ns)
 
     def _report(self, now_ns: int) -> None:
-        """Publish the phase and its reason; once a second also what would refuse an engagement."""
+        """Publish the phase and its reason, and each second what would refuse an engagement."""
         bridge = self._bridge
         self._report_ns = now_ns
         refusal = None
@@ -485,7 +485,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         raise FlightEnded(f"no y after {limit:g} s: {'; '.join(sentences)}")
 
     def _cause(self, subscription: PolledSubscription | MavlinkReader) -> str:
-        """Why no sample of a topic was accepted, as a sentence."""
+        """Return a sentence on why no sample of a topic was accepted."""
         if isinstance(subscription, MavlinkReader):
             if problem := subscription.link.problem(subscription.message_name):
                 return str(problem)
@@ -507,10 +507,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return str(next(iter((*faults, *refusal)), "no sample of its publisher arrives"))
 
     def graph_checks(self) -> list[Callable[[], None]]:
-        """Return the checks of the graph, with one for topics that the autopilot cannot take.
+        """Return the checks of the graph, also of the topics that the autopilot must receive.
 
-        It cannot if it subscribes with another type or an incompatible quality of service. A topic
-        with another publisher ends the engagement.
+        It cannot receive a topic if it subscribes with another type or an incompatible quality of
+        service. A second publisher of a topic ends the engagement.
         """
         outgoing = (
             partial(self.endpoints.check_subscribers, outgoing_message.publisher)

@@ -21,7 +21,7 @@ class ServiceCaller:
         self.topic_name = str(client.srv_name)
 
     def publish(self, request: Any) -> None:
-        """Request it, whatever the answer is. Raises ChannelError if there is no such service."""
+        """Send a request, without waiting for the answer. Raises ChannelError without a service."""
         if not self._client.service_is_ready():
             raise ChannelError("service", f"{self.topic_name}: no such service")
         self._client.call_async(request)
@@ -41,11 +41,14 @@ class OutgoingMessage:
         self._sent_ns = 0
 
     def due(self, now_ns: int, slack_ns: int) -> bool:
-        """Return whether its period has passed since it was last sent, within `slack_ns`."""
+        """Return whether the message's period has passed since it was last sent.
+
+        `slack_ns` is the tolerance.
+        """
         return now_ns - self._sent_ns >= self._period_ns - slack_ns
 
     def send(self, now_ns: int, raw: list[float]) -> None:
-        """Send it. `raw` holds the raw values of all inputs, of which the message takes its own."""
+        """Send the message. It takes its own inputs from the raw values `raw` of all inputs."""
         for number, row in self._inputs:
             set_field(self._message, row.field, raw[number])
         if self.row.stamped:
@@ -60,7 +63,7 @@ def prepare_message(
 ) -> tuple[Any, list[tuple[int, InputRow]]]:
     """Prepare a message of a map: fill its constant fields, and list its inputs with places in u.
 
-    Raises ParameterError if a field is missing, or cannot have its values.
+    Raises ParameterError if a field is missing, or cannot hold its constant value.
     """
     kind = field_type(row.type)
     message = kind.Request() if row.is_service else kind()

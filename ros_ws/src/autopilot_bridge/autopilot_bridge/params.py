@@ -37,7 +37,7 @@ PARAMETER = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
 
 
 class ChannelMap(Config):
-    """A channel map, which has the topic and the field of each channel of y and u."""
+    """A channel map, which gives the topic and the field of each channel of y and u."""
 
     name: str
     source: str = Field(
@@ -320,9 +320,9 @@ class ChannelMap(Config):
 
     @property
     def recorded_topics(self) -> list[str]:
-        """The topics that the log has.
+        """The topics that are recorded in the log.
 
-        They are those with a quality of service, and what comes over MAVLink.
+        They are the topics with a quality of service, and those of MAVLink messages.
         """
         rows = chain.from_iterable(
             rows_by_name.values() for rows_by_name in self._readers().values()
@@ -381,7 +381,7 @@ def maps() -> list[str]:
 
 
 def find_map(name: str) -> Path:
-    """Find the file of a channel map by its name in the library, or by its path in .yaml.
+    """Find the file of a channel map by its name in the library, or by a path that ends in .yaml.
 
     Raises ParameterError.
     """
