@@ -46,7 +46,7 @@ DEFINITION = "campaign.json"
 CHUNKS = "chunks"
 OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # word in an error of JAX
 LOGGER = logging.getLogger(__name__)
-_FITTING: dict[str, int] = {}  # aircraft at once by definition, if a chunk did not fit
+_FITTING: dict[str, int] = {}  # by definition: aircraft at once that fit, if a chunk did not fit
 MARGIN_AIRCRAFT = 200  # number of first aircraft of a case whose stability is counted
 
 
@@ -91,9 +91,9 @@ def define(
 ) -> Definition:
     """Define a campaign over a scenario.
 
-    If `wind` or `spread` is None, it is that of the scenario's `aircraft.uncertainty`. `units`
-    replaces units of the score by output, SI. If `chunk` is None, it is the size that is fast on
-    the device, or that of single flights. Raises ParameterError if a campaign cannot fly the
+    If `wind` or `spread` is None, it is taken from the scenario's `aircraft.uncertainty`. `units`
+    replaces units of the score by output, SI. If `chunk` is None, it is a size that is fast on the
+    device, or the size for single flights. Raises ParameterError if a campaign cannot fly the
     scenario.
     """
     if sweep is not None:
@@ -154,8 +154,8 @@ def _default_chunk(scenario: Scenario, aircraft: int) -> int:
 def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
     """Fly a chunk of a campaign, and return its rows as Parquet.
 
-    `text` is the definition as JSON; it and the job are the only inputs. `learner` makes the
-    learner of a scenario. Raises ParameterError if an aircraft does not fit into memory.
+    `text` is the definition as JSON. The rows depend on nothing but `text` and the job. `learner`
+    makes the learner of a scenario. Raises ParameterError if an aircraft does not fit into memory.
     """
     definition = Definition.model_validate_json(text)
     if single_flights.flies_alone(definition.scenario()):
@@ -323,7 +323,7 @@ class MonteCarlo:
             self.rows().sink_parquet(stream)
 
     def margins(self, case: int) -> LoopMargins | None:
-        """Return the margins of the nominal aircraft, and the worst found in the box of a case.
+        """Return the margins of the nominal aircraft, and the worst ones in the box of a case.
 
         Returns None if there is no linear loop.
         """
@@ -343,8 +343,8 @@ class MonteCarlo:
     def guarantee(self, case: int) -> Guarantee | None:
         """Return the guarantee that was computed for the loop of a case.
 
-        Returns None if there is none, or if lags or delays are drawn, which a guarantee takes as
-        exact.
+        Returns None if there is no guarantee, or if lags or delays are drawn. A guarantee takes
+        lags and delays as exact.
         """
         definition = self.definition
         if any(equipment.is_of_loop(entry) for entry in definition.entries):

@@ -25,7 +25,7 @@ from rise_di_controller.params import ControllerConfig
 
 
 def swept_parameters(controller: ControllerConfig) -> list[str]:
-    """Return the parameters that a sweep may multiply: numbers of the law itself, input_scale."""
+    """Return the parameters that a sweep may multiply: numbers of the law, and input_scale."""
     names = [
         name for name in type(controller).model_fields if name not in ControllerConfig.model_fields
     ]
@@ -53,7 +53,7 @@ class Sweep(Config):
         """Return the parameter times a factor; if a channel is named, only its value changes.
 
         A channel of u stands for the channel of y with which it is paired. Raises ParameterError if
-        the parameter or the channel is another one.
+        the parameter or the channel cannot be swept.
         """
         swept = swept_parameters(controller)
         require(
@@ -68,7 +68,7 @@ class Sweep(Config):
                 return tuple(factor * number for number in value)
             return factor * float(value)
         m = len(controller.outputs)
-        # k_d of (22) has none for the last channel.
+        # k_d of (22) has no value for the last channel.
         by_channel = isinstance(value, tuple) and len(value) in (m - 1, m)
         require(
             by_channel, "sweep", self.parameter, f"{self.name}: it does not have a value a channel"
@@ -90,7 +90,7 @@ class Sweep(Config):
 class Definition(Config):
     """All inputs of a campaign's figures.
 
-    Not among them are the version of the stack and the arithmetic of the CPU.
+    The version of the stack and the arithmetic of the CPU are not in the definition.
     """
 
     name: str  # name of the scenario

@@ -18,7 +18,7 @@ from flight_core.vectors import FloatArray
 
 
 class DrawnFleet(NamedTuple):
-    """Aircraft of a campaign on the host. Meanwhile the device may fly others."""
+    """Aircraft of a campaign on the host, drawn while the device may fly other aircraft."""
 
     scenario: Scenario
     A: FloatArray  # (N, n, n)

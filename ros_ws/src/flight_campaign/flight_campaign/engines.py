@@ -42,8 +42,8 @@ Devices = Sequence[Mapping[str, str]]
 def require_jax(*, shared: bool = False) -> None:
     """Raise ParameterError if JAX is not installed or finds no device.
 
-    It finds none, for example, with the JAX_PLATFORMS of another host. If `shared`, the process
-    leaves the memory of its device to other processes.
+    For example, JAX finds no device if JAX_PLATFORMS is that of another host. If `shared`, the
+    process leaves the memory of its device to other processes.
     """
     require_package("jax")
     if shared:
@@ -61,9 +61,10 @@ def require_jax(*, shared: bool = False) -> None:
 
 
 def threads(workers: int | None = None) -> Engine:
-    """Return an engine of threads of this process; None stands for as many as keep the device busy.
+    """Return an engine of threads of this process.
 
-    The loop is compiled once and releases the interpreter lock, so that threads run in parallel.
+    If `workers` is None, there are as many threads as keep the device busy. The loop is compiled
+    once and releases the interpreter lock, so that threads run in parallel.
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
@@ -219,7 +220,7 @@ def _local_cluster(workers: int, devices: Devices) -> Iterator[Any]:
         try:
             yield cluster
         finally:
-            # A worker that is just starting again cannot be joined yet. What becomes of it does not
-            # matter to the campaign.
+            # A worker that is just starting again cannot be joined yet. The campaign does not need
+            # it any more.
             with suppress(TimeoutError, AssertionError):
                 cluster.close()

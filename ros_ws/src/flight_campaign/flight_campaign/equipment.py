@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lags of the actuators, the noise of the sensors and the delay of u of a campaign's aircraft.
 
-They are drawn like the entries of A and B. An entry is lag[INPUT], a time constant in s,
-noise[OUTPUT], a standard deviation in SI, or delay, s. lag and noise without a channel mean all of
-them. The entry delay is the largest delay of u beyond that of the scenario, and is drawn in whole
+They are drawn like the entries of A and B. The entry lag[INPUT] is a time constant in s, and
+noise[OUTPUT] a standard deviation in SI. lag and noise without a channel mean all channels. The
+entry delay, in s, is the largest delay of u beyond the delay of the scenario. It is drawn in whole
 periods of the controller.
 """
 
@@ -92,9 +92,10 @@ def drawn(
 ) -> dict[str, FloatArray]:
     """Draw lags, noise and delays of aircraft of a seed, by entry, (count,) each.
 
-    The aircraft are first, first + 1, ... A lag and a noise are multiplied by 1 + d, as an entry of
-    A is. A delay is (1 + d) / 2 of the largest one, in whole periods. A value depends on nothing
-    but seed and number. The entries of `spread` are those of `expanded`.
+    The numbers of the aircraft are first, first + 1, ... A lag and a noise are multiplied by 1 + d,
+    in the same way as an entry of A. A delay is (1 + d) / 2 of the largest one, in whole periods. A
+    value depends on nothing but the seed and the number of the aircraft. The entries of `spread`
+    are those of `expanded`.
     """
     published_values = published(scenario)
     rate = scenario.controller.rate
@@ -116,7 +117,8 @@ def drawn(
 def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, float]:
     """Return the values to which a deviation is relative.
 
-    They are `published`, and half of the largest delay, which is drawn within +-100 %.
+    They are the `published` values. For the delay it is half of the largest delay, so that it is
+    drawn within +-100 %.
     """
     return published(scenario) | ({DELAY: entries[DELAY] / 2.0} if DELAY in entries else {})
 

@@ -16,8 +16,8 @@ from flight_campaign.rows import entry_names
 if TYPE_CHECKING:
     import polars as pl
 
-RANKED = 10_000  # first aircraft of a case that are ranked, for a standard error of 0.01
-LEAST_RANKED = 10  # fewer aircraft show nothing but chance
+RANKED = 10_000  # number of first aircraft of a case that are ranked: the standard error is 0.01
+LEAST_RANKED = 10  # least number of aircraft: fewer show nothing but chance
 CHANCE = 0.05  # share of campaigns in which an entry without effect exceeds the level of chance
 
 

@@ -38,9 +38,9 @@ CHUNK = 4
 
 
 class LearningOutcome(NamedTuple):
-    """What became of the identifications of a flight."""
+    """The outcome of the identifications of a flight."""
 
-    first_model: float  # s, when the first model flew; NaN without one
+    first_model: float  # s, instant from which the first model flew; NaN if none did
     models: int  # proposals that flew, not counting the rough model
     # identifications that the learner refused, and proposals that the controller refused
     refused: int
@@ -48,7 +48,7 @@ class LearningOutcome(NamedTuple):
 
 
 def learned(tape: Tape, events: Sequence[Event]) -> LearningOutcome:
-    """Return what became of the identifications of a flight, from its tape and its events."""
+    """Return the outcome of the identifications of a flight, from its tape and its events."""
     proposed = tape["learned"]["proposed"] if "learned" in tape else np.ones(0)
     models = [
         event.stamp_ns

@@ -48,7 +48,7 @@ class FigureStatistics(Config):
     count: int = 0
     mean: float = 0.0
     squares: float = 0.0  # sum of (value - mean)^2
-    largest: float = -1.0  # there is none yet
+    largest: float = -1.0  # -1 as long as there is no value
     # Counts by index in EDGES, without empty ones; -1 is below, len(EDGES) - 1 above.
     bins: dict[int, int] = Field(default={})
 
@@ -116,7 +116,7 @@ class Tally(Config):
 
     flights: int = 0
     diverged: int = 0
-    lost: int = 0  # did not diverge, but the score is above LOSS_OF_TRACK_SCORE
+    lost: int = 0  # flights that did not diverge, but have a score above LOSS_OF_TRACK_SCORE
     # "score", "rms.q", "max.q", "slew.elevator", ... of the flights that did not diverge
     figures: dict[str, FigureStatistics] = Field(default={})
     worst: tuple[Worst, ...] = ()  # the worst first
@@ -242,6 +242,6 @@ def score_units(
 def score(rms: FloatArray, unit: FloatArray) -> FloatArray:
     """Return the sum over the channels of rms / unit, (N,), from (m, N) and (m,).
 
-    A channel counts 1 if its error is 10 mrad/s or 0.1 m/s, for p 20 mrad/s.
+    A channel adds 1 if its error is 10 mrad/s or 0.1 m/s. The channel p adds 1 at 20 mrad/s.
     """
     return np.asarray(np.sum(rms / unit[:, None], axis=0))

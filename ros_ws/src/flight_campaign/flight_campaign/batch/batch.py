@@ -42,7 +42,7 @@ jax.config.update("jax_enable_x64", True)  # float64 as everywhere else in the s
 
 
 def vehicle(scenario: Scenario) -> Vehicle:
-    """Return what all aircraft of a scenario share. Raises ParameterError as `require_flyable`."""
+    """Return what all aircraft of a scenario share. Raises as `require_flyable` does."""
     require_flyable(scenario)
     plant = scenario.aircraft.plant()
     channels = scenario.aircraft.channels()
@@ -85,7 +85,7 @@ def shared(params: Any) -> Any:
 def with_equipment(
     vehicle: Vehicle, scenario: Scenario, values: Mapping[str, FloatArray]
 ) -> Vehicle:
-    """Put the lags and noise of N aircraft, named as in `equipment.drawn`, into the vehicle."""
+    """Put the lags and noise of N aircraft into the vehicle, by the names of `equipment.drawn`."""
     channels = scenario.aircraft.channels()
     aircraft = scenario.aircraft
     if any(name.startswith("lag[") for name in values):
@@ -148,14 +148,14 @@ def fly(
 ) -> FleetResult:
     """Fly N aircraft through the course under one law, from trim at rest.
 
-    Each tick has four parts: the sensors, a step of the law (or its engagement, or a missed sample,
-    as the phase of the course says), the actuators over the K steps to the next tick, and the
-    aircraft. The remainder s at the middle of a tick is extrapolated from this tick and the one
-    before.
+    Each tick has four parts. The first is the sensors, and the second a step of the law, or its
+    engagement or a missed sample, depending on the phase of the course. Then come the actuators
+    over the K steps to the next tick, and the aircraft. The remainder s at the middle of a tick is
+    extrapolated from this tick and the one before.
 
-    `params` of the law are (m, 1) or (m, N). If all aircraft fly the same, `shared` makes them from
-    those of one aircraft, (m,). `schedule` divides the ticks into compiled loops; None takes the
-    one that is fastest on the device. It does not change the figures.
+    `params` of the law are (m, 1) or (m, N). If all aircraft have the same ones, `shared` makes
+    them from those of one aircraft, (m,). `schedule` divides the ticks into compiled loops. None
+    takes the schedule that is fastest on the device. The schedule does not change the figures.
     """
     timing = _timing(fleet, course)
     constants = batch_loop.Constants(fleet._replace(blocks=()), vehicle, params)
@@ -205,7 +205,7 @@ class FleetStepper:
 
     @property
     def bounded(self) -> NDArray[np.bool_]:
-        """Which aircraft have not diverged, (N,)."""
+        """Mask of the aircraft that have not diverged, (N,)."""
         return np.asarray(self._state.bounded)
 
     def sense(self) -> tuple[FloatArray, FloatArray]:

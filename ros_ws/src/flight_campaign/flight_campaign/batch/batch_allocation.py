@@ -60,7 +60,7 @@ def allocate(v: Array, u_before: Array, dt: Array, params: Allocation) -> tuple[
 
 
 def _where_not(final: Array, value: Array, otherwise: Callable[[], Array]) -> Array:
-    """Keep the final values. The aircraft that have none, if any, get `otherwise`."""
+    """Keep the final values. Aircraft whose values are not final get those of `otherwise`."""
     return jax.lax.cond(jnp.all(final), lambda: value, lambda: jnp.where(final, value, otherwise()))
 
 
@@ -72,7 +72,7 @@ def _by_priority(start: Array, v: Array, limits: _Range, params: Allocation) -> 
 
 
 def _towards(u: Array, move: Array, limits: _Range, params: Allocation) -> Array:
-    """Return u after a move as far as the limits allow, from a u inside them."""
+    """Return u after a move as far as the limits allow. The move begins at a u inside them."""
     destination = _exchanged(u + move, limits, params)
     arrives = limits.has(destination)
 

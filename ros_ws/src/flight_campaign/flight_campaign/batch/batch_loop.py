@@ -42,12 +42,11 @@ from rise_di_controller.law.saturation import Limits, saturate
 class Vehicle:
     """What all aircraft of a fleet share."""
 
-    # These are constants of the compiled loop, so that a device takes rows without looking up where
-    # they are.
+    # These are constants of the compiled loop, so that a device does not look up places of rows.
     outputs: tuple[int, ...]  # (m,) indices of the outputs in the state, in the law's order
     inputs: tuple[int, ...]  # (p,) indices of the effectors in the airframe's order
     remainder_states: tuple[int, ...]  # (c,) indices of the states in the nonlinear remainder
-    vanes: tuple[int, ...]  # indices in the state of what the vanes read
+    vanes: tuple[int, ...]  # indices of the states that the vanes read
     # The aircraft reduced to the remainder: f_state of x[remainder_states] gives the rows
     # `remainder_rows`.
     remainder: Aircraft
@@ -69,7 +68,8 @@ class FleetResult(NamedTuple):
     rms: Array  # (m, N)
     max: Array  # (m, N)
     slew: Array  # (p, N) mean abs(u_dot) by effector, units of u / s
-    diverged: Array  # (N,) bool: the state exceeded DIVERGENCE_LIMIT, the other figures are invalid
+    # (N,) bool: whether the state exceeded DIVERGENCE_LIMIT; the other figures are then invalid
+    diverged: Array
 
 
 def rows_of(array: Array, places: Sequence[int] | NDArray[np.int64]) -> Array:
@@ -97,10 +97,10 @@ class Timing(NamedTuple):
 
 
 class LoopSample(NamedTuple):
-    """What a law takes at a tick, (m, N) or (m, 1)."""
+    """The sample that a law takes at a tick, (m, N) or (m, 1)."""
 
     y: Array
-    y_m: Array  # at the stamp of y
+    y_m: Array  # reference at the stamp of y
     y_m_dot: Array
 
 
@@ -109,10 +109,10 @@ class LoopState(NamedTuple):
 
     x: Array  # (n, N)
     position: Array  # (p, N) airframe's order
-    remainder: Array  # (q, N) that of the tick before
+    remainder: Array  # (q, N) remainder at the tick before
     law: Any
     u: Array  # (m, N) law's order
-    command: Array  # (p, N) of the effectors; it is u without an allocation
+    command: Array  # (p, N) command of the effectors; without an allocation it is u
     y_before: Array  # (y_late, m, N) newest first
     command_before: Array  # (u_late, p, N)
     squares: Array  # (m, N) sums of squared errors over the ticks
@@ -122,7 +122,7 @@ class LoopState(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """Inputs that stay from tick to tick, as arguments, so that the compiler folds no arrays."""
+    """Inputs that stay the same in all ticks. As arguments, they are not folded by the compiler."""
 
     fleet: FleetMatrices  # without its blocks
     vehicle: Vehicle
@@ -158,7 +158,7 @@ def fly_run(
     control_law: ControlLaw,
     timing: Timing,
 ) -> LoopState:
-    """Fly the ticks of a run, whose first has the number `first`; return the state after them."""
+    """Fly the ticks of a run from the number `first` on, and return the state after them."""
     size = len(run.pattern)
 
     def patterns(values: Array) -> Array:
@@ -213,7 +213,7 @@ def tick(
         if allocation is None:
             law, _, u = control_law.limited(now.law, measurements, segment.dt, params, limits)
             return law, u, u
-        # As in the guard, what the effectors give limits the law.
+        # As in the guard, the law is limited by the u that the effectors give.
         _, u_free = control_law.step(now.law, measurements, segment.dt, params)
         _, reachable = allocate(
             saturate(u_free, now.u, segment.dt, limits), now.command, segment.dt, allocation
@@ -236,7 +236,7 @@ def tick(
 def _measured(
     now: LoopState, segment: Segments, sample: LoopSample, fleet: FleetMatrices, vehicle: Vehicle
 ) -> Measurements:
-    """Collect what a law takes at a tick."""
+    """Collect the measurements that a law takes at a tick."""
     y, y_m, y_m_dot = sample
     by_output = dict(zip(vehicle.outputs, y, strict=True))
     x = jnp.stack([by_output.get(k, row) for k, row in enumerate(now.x)])
@@ -270,7 +270,7 @@ def _measured(
 
 
 def sense(now: LoopState, segment: Segments, vehicle: Vehicle) -> tuple[LoopState, LoopSample]:
-    """Sense a tick's sample for the law; the figures take the true error."""
+    """Sense a tick's sample for the law, and add the true error to the figures."""
     true = rows_of(now.x, vehicle.outputs)
     e = true - segment.y_m[:, None]
     y = true + segment.error[:, None]

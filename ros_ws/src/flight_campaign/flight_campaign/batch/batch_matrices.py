@@ -24,7 +24,7 @@ from flight_core.vectors import Array, FloatArray, array_namespace
 class StateBlock(NamedTuple):
     """Coupled states and the signals that act on them. It is hashable.
 
-    They are indices in x and in [x, p_1, ..., p_K, s].
+    The states are indices in x, and the signals are indices in [x, p_1, ..., p_K, s].
     """
 
     rows: tuple[int, ...]
@@ -32,9 +32,9 @@ class StateBlock(NamedTuple):
 
 
 class DriftMatrices(NamedTuple):
-    """A drift of N aircraft: by how much the matrices of their fleet change.
+    """A drift of N aircraft: the changes of the matrices of their fleet.
 
-    The change is complete after `duration`, and linear in time before that.
+    A change begins at `start`, is linear in time, and is complete after `duration`.
     """
 
     start: float  # s
@@ -87,10 +87,10 @@ def assemble(
     The steps, and the actuators' mean positions in them, are those of `plant.advance`. The
     remainder is held over a tick, and the forcing over a step.
 
-    `wind` and `late` have one value for all aircraft or N values; `late` is added to the delay of
+    `wind` and `late` have one value for all aircraft or N values. `late` is added to the delay of
     the course. `gust_directions`, (N, n, G), are the effects of wind on x_dot, as in
-    `uncertainty.gust_directions`; None takes those of the plant for all aircraft. A drift of the
-    plant multiplies the entries of all aircraft alike, and the matrices above are then
+    `uncertainty.gust_directions`. None takes those of the plant for all aircraft. A drift of the
+    plant multiplies the entries of all aircraft by the same factors. The matrices above are then
     interpolated.
     """
     aircraft = plant.aircraft

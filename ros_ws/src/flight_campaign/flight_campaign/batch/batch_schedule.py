@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How the loop over the ticks of a course is compiled: with branches, or in runs of known ticks.
+"""Schedules of the compiled loop over the ticks of a course: with branches, or in known runs.
 
 A GPU waits for the host at each branch. Since phase and forcing are known before the flight, each
 run of ticks gets a loop without a branch. A CPU is faster with one loop.
@@ -21,17 +21,20 @@ UNROLL = 4
 """Ticks in a step of the loop. On one H200, 250,000 flights of 60 s took 3.3 s with 1, and 1.8 s
 with 4 or 8. These compile for 3, 7 and 14 s."""
 
-LONGEST = 20  # ticks of the longest pattern, which is compiled tick by tick
+LONGEST = 20  # ticks of the longest pattern; a pattern is compiled tick by tick
 
 
 class TickKind(NamedTuple):
-    """What is known of a tick when the loop is compiled; if None, a branch asks at the tick."""
+    """The known properties of a tick when the loop is compiled.
+
+    If a property is None, a branch at the tick depends on it.
+    """
 
     phase: int | None
     forced: bool | None  # whether biases, gusts or turbulence act
 
 
-UNKNOWN = TickKind(None, None)  # a branch asks for both at the tick
+UNKNOWN = TickKind(None, None)  # branches at the tick depend on both
 
 
 class TickRun(NamedTuple):
@@ -50,7 +53,7 @@ Schedule = Callable[[Course], Iterator[TickRun]]
 
 
 def with_branches(course: Course) -> Iterator[TickRun]:
-    """Yield one single loop, whose branches ask at each tick."""
+    """Yield one single loop, with branches at each tick."""
     yield TickRun(len(course.segments.t), (UNKNOWN,), 1)
 
 

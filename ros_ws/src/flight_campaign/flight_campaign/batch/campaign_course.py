@@ -47,11 +47,12 @@ class Segments(NamedTuple):
     sampled_y_m_dot: FloatArray  # (T, m)
     u_ff: FloatArray  # (T, m) feedforward
     error: FloatArray  # (T, m) sensor error of the y of the tick
-    noise: FloatArray  # (T, m) noise in it
-    # (T, K r) mean over each step to the next tick: wind along `axes`, then basis' @ the rest
+    noise: FloatArray  # (T, m) noise in this error
+    # (T, K r) mean forcing over each step to the next tick: wind along `axes`, then basis' @ the
+    # other forcing
     forcing: FloatArray
-    forcing_now: FloatArray  # (T, r) at the tick
-    air: FloatArray  # (T, n) what the wind adds to alpha and beta, rad
+    forcing_now: FloatArray  # (T, r) forcing at the tick
+    air: FloatArray  # (T, n) contribution of the wind to alpha and beta, rad
     vane_m: FloatArray  # (T, k) readings of the vanes in the reference motion, rad
     vane_error: FloatArray  # (T, k) sensor error of the vanes, rad
 
@@ -65,13 +66,14 @@ class Course(NamedTuple):
     segments: Segments
     # (g,) indices of the axes of the airframe's gusts along which there is wind
     axes: NDArray[np.int64]
-    # (n, r - g) orthonormal directions in x_dot of f_time without wind: biases and sines
+    # (n, r - g) orthonormal directions in x_dot of the part of f_time without wind: biases and
+    # sines
     basis: FloatArray
     order: NDArray[np.int64]  # (m,) indices of the law's outputs in y
     late: int  # delay of y, ticks
     u_late: int  # delay of u, ticks
-    period: float  # s, from tick to tick
-    steps: int  # steps of the integration from tick to tick
+    period: float  # s, between two ticks
+    steps: int  # steps of the integration between two ticks
 
 
 FLOWN = frozenset(
@@ -190,9 +192,9 @@ def _references(scenario: Scenario, ticks: int, tick_ns: int) -> tuple[FloatArra
 def build_course(scenario: Scenario) -> Course:
     """Build the course of a scenario, with the feedforward of the controller.
 
-    Raises ParameterError if a campaign cannot fly the scenario: an aircraft of JSBSim, a delay of y
-    or u by a fraction of a tick, dropouts of a y whose rate is not that of the ticks, dropouts
-    longer than the age limit, or vanes with faults.
+    Raises ParameterError if a campaign cannot fly the scenario. The reasons are an aircraft of
+    JSBSim, a delay of y or u that is not a whole number of ticks, dropouts of a y whose rate is not
+    that of the ticks, dropouts longer than the age limit, and vanes with faults.
     """
     aircraft = scenario.aircraft
     controller = scenario.controller
@@ -399,9 +401,9 @@ def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _For
 
 
 def _air_angles(wind: FloatArray, airframe: Airframe) -> FloatArray:
-    """Return what the wind at the ticks, (T, G), adds to alpha and beta, rad.
+    """Return the contribution of the wind at the ticks, (T, G), to alpha and beta, rad.
 
-    It is in the order of the states, (T, n).
+    The result is in the order of the states, (T, n).
     """
     angles = np.zeros((len(wind), len(airframe.states)))
     for place, axis in enumerate(airframe.gusts):

@@ -11,10 +11,10 @@ import jax
 
 from flight_campaign.batch.batch_schedule import Schedule, with_branches, without_branches
 
-CPU_CHUNK = 1000  # aircraft at once; their matrices, 2 MB, stay in the caches of a core
-LARGEST_CHUNK = 250_000  # aircraft at once on a device; more were not faster on one H200
-BYTES = 16_384  # of memory per aircraft; osprey_servo needed 11,300 on one H200 (JAX 0.11.2)
-THREADS = 3  # for a device: while one chunk flies, one is drawn and one is written
+CPU_CHUNK = 1000  # aircraft at once on a CPU; their matrices, 2 MB, stay in the caches of a core
+LARGEST_CHUNK = 250_000  # most aircraft at once on a device; more were not faster on one H200
+BYTES = 16_384  # bytes per aircraft; osprey_servo needed 11,300 on one H200 (JAX 0.11.2)
+THREADS = 3  # threads for a device: while one chunk flies, one is drawn and one is written
 
 VISIBLE = {"cuda": "CUDA_VISIBLE_DEVICES", "rocm": "HIP_VISIBLE_DEVICES"}
 """Environment variables that name the devices of a process, by a word in the name of the platform.
@@ -24,7 +24,7 @@ _TURN = Lock()
 
 
 def _as_sentence(record: logging.LogRecord) -> bool:
-    """Report in a sentence that a plugin fails, such as that of a GPU on a host without one.
+    """Report in a sentence that a plugin fails, such as the GPU plugin on a host without a GPU.
 
     JAX would log a traceback, and fly on the other devices.
     """

@@ -39,9 +39,10 @@ TURBULENCE_SEED = 3  # seed of a comparison, which is not that of the tuning
 class Scores(NamedTuple):
     """Scores of the uncertain aircraft of a level in a wind."""
 
-    mean: float  # infinite if one diverged
+    mean: float  # infinite if an aircraft diverged
     worst: float
-    # Share that lost track, with a score above LOSS_OF_TRACK_SCORE; diverged ones are included.
+    # Share of the aircraft that diverged, or that lost track: their score is above
+    # LOSS_OF_TRACK_SCORE.
     lost: float
 
 
@@ -56,7 +57,7 @@ class LawResult(NamedTuple):
     """Results of a law; channels in the law's order, SI."""
 
     law: str
-    objective: str  # what it was tuned on
+    objective: str  # name of the objective of its tuning
     costs: list[float]  # one for each seed of its tuning; empty for gains of a scenario
     scores: dict[str, float]  # on the nominal aircraft, by wind
     levels: tuple[Level, ...]
@@ -103,7 +104,7 @@ def compare(
     )
 
     def results(name: str) -> list[LawResult]:
-        # One for all gain sets, so that it is compiled once.
+        # One control law serves all gain sets, so that it is compiled once.
         control_law = laws[name].control_law(benchmark.model)
         return [
             study.result(name, laws[name], control_law, objective, gains)

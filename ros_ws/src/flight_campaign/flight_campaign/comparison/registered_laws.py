@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Registered laws, next to those of the catalogue.
+"""Registered laws, which are compared with those of the catalogue.
 
-Such a law is the controller of a scenario, with its gains in the scenario.
+A registered law is the controller of a scenario. Its gains are those in the scenario.
 """
 
 from collections.abc import Iterable, Mapping
@@ -96,9 +96,10 @@ def find_laws(
 ) -> dict[str, ControllerConfig | None]:
     """Return the controller that flies for each name, or None for a law of the catalogue.
 
-    Besides those of the catalogue, a name may be the law of the scenario's own controller, or a key
-    of `others`, which are scenarios that stand for a law. Raises ParameterError if a name is
-    unknown, or if a controller has an allocation, another rate or another order of the channels.
+    A name can be a law of the catalogue, the law of the scenario's own controller, or a key of
+    `others`. Each scenario in `others` stands for the law of its controller. Raises ParameterError
+    if a name is unknown, or if a controller has an allocation, another rate or another order of the
+    channels.
     """
     effectors = "none: the laws that are compared command the effectors"
     require(scenario.controller.allocation is None, "controller.allocation", "a section", effectors)
@@ -143,7 +144,7 @@ def entries(controllers: Mapping[str, ControllerConfig | None]) -> dict[str, Law
 def with_courses(
     benchmark: Benchmark, controllers: Mapping[str, ControllerConfig | None]
 ) -> Benchmark:
-    """Add the courses of these controllers' feedforwards to the benchmark."""
+    """Add a course to the benchmark for the feedforward of each of these controllers."""
     courses = {wind: dict(by_law) for wind, by_law in benchmark.courses.items()}
     for name, controller in controllers.items():
         if controller is not None and controller.feedforward is not None:

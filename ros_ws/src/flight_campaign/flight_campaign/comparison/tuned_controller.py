@@ -46,8 +46,8 @@ def require_registered(name: str) -> None:
 def tuned_controller(name: str, result: TuningResult, benchmark: Benchmark) -> ControllerConfig:
     """Return the controller that flies like a law of the catalogue with tuned gains.
 
-    Its inputs are those of the benchmark, 1 / abs(Omega_ii). Topics have no delay, as in the
-    benchmark. Raises ParameterError if no scenario can fly the law.
+    Its inputs are scaled by 1 / abs(Omega_ii), and topics have no delay, both as in the benchmark.
+    Raises ParameterError if no scenario can fly the law.
     """
     require_registered(name)
     model = benchmark.model
@@ -86,8 +86,8 @@ def tuned_controller(name: str, result: TuningResult, benchmark: Benchmark) -> C
 def _rise_di(gains: dict[str, FloatArray], input_scale: FloatArray) -> dict[str, Any]:
     """Return the parameters of RISE-DI.
 
-    If (22) does not allow a K, it becomes a larger one with a smaller input scale, which is the
-    same loop.
+    If (22) does not allow a K, a larger K with a smaller input scale replaces it. The loop is the
+    same.
     """
     K = gains["K"]
     least = max(MIN_K, float(K[-1]))
@@ -119,7 +119,7 @@ def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
 def _observer(name: str, result: TuningResult, benchmark: Benchmark) -> ObserverConfig:
     """Return the observer of a law, with its bound on u_o.
 
-    The search set the margin, so that the observer must not meet one.
+    The search has already set the margin, so the observer does not have to meet one.
     """
     controller = benchmark.scenario.controller
     airframe = benchmark.scenario.aircraft.load()[0]

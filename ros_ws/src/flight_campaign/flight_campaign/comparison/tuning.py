@@ -42,7 +42,7 @@ GUST = "gust"
 TURBULENCE = "turbulence"
 """The winds of a benchmark: that of its scenario, and turbulence instead of it."""
 
-TUNING_TURBULENCE_SEED = 40  # seed of the turbulence in a cost; a comparison has another one
+TUNING_TURBULENCE_SEED = 40  # seed of the turbulence in a cost; a comparison has another seed
 
 
 class Objective(NamedTuple):
@@ -52,7 +52,8 @@ class Objective(NamedTuple):
     weights: dict[str, float]  # by wind
     delay: int  # delay of the late u, in multiples of `Benchmark.delay`
     all_late: bool  # whether u is late on all aircraft, and not only on the nominal one
-    requirement: Requirement | None = None  # on the nominal loop of a law that has margins
+    # requirement that the nominal loop must meet, if the law has margins
+    requirement: Requirement | None = None
 
 
 # Turbulence has half the weight, because scores in it are about twice those in gusts.
@@ -90,8 +91,8 @@ INITIAL_SIGMA = 0.4
 """A search has GENERATIONS, or GENERATIONS_PER_GAIN times its gains if that is more: from 15 gains
 on. INITIAL_SIGMA is the first standard deviation of log(gain)."""
 
-# Parts of the candidates of a generation, which fly side by side. A flight in a smaller part takes
-# more processor time.
+# Number of parts into which the candidates of a generation are divided. The parts fly side by side.
+# A flight in a smaller part takes more processor time.
 PARTS = 2
 
 # Cost of a flight that diverged and of a loop without any margin. It bounds every other cost.
@@ -212,9 +213,9 @@ def _courses(scenario: Scenario) -> dict[str, Course]:
 
 
 def result_score(result: FleetResult, unit: FloatArray) -> FloatArray:
-    """Sum the rms of the true error over its unit, over the channels, (N,).
+    """Return the sum over the channels of (rms of the true error / its unit), (N,).
 
-    It is infinite if a flight diverged.
+    It is infinite if the flight diverged.
     """
     total = statistics.score(np.asarray(result.rms), unit)
     return np.where(np.asarray(result.diverged) | ~np.isfinite(total), np.inf, total)
@@ -258,8 +259,8 @@ def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
         cost = sum over the winds of weight (mean over the aircraft with u in time
                                             + mean over those with u late)
 
-    No flight is in calm air only, because in the flights with gusts the manoeuvre comes first, in
-    calm air.
+    No flight is in calm air only, because the flights with gusts begin with the manoeuvre in calm
+    air.
     """
     airframe, _ = benchmark.scenario.aircraft.load()
     A, B = nominal_and_sampled(airframe, UNCERTAINTY, UNCERTAIN_AIRCRAFT, UNCERTAINTY_SEED)
@@ -316,10 +317,10 @@ def tune(
 ) -> TuningResult:
     """Find the gains of the smallest cost, by CMA-ES from the initial ones.
 
-    They are the best of several seeds, which run together. The cost of a candidate is the weighted
-    sum over the flights of `evaluations`. If a loop has only a fraction of the margins that the
-    objective requires, the fraction that is missing costs MAX_COST times its size. Each thread
-    flies a part of the candidates in one wind. `progress` receives the generation and the smallest
+    The result is the best of several seeds, which run together. The cost of a candidate is the
+    weighted sum over the flights of `evaluations`. If a loop has only a fraction of the margins
+    that the objective requires, the missing fraction times MAX_COST is added. Each thread flies a
+    part of the candidates in one wind. `progress` receives the generation and the smallest
     cost so far. Source: N. Hansen, A. Ostermeier, Evolutionary Computation 9(2), 2001; the package
     `cma`.
     """
@@ -398,8 +399,8 @@ def _best_result(
 def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
     """Return the margins of a law around the nominal aircraft, for N sets of gains.
 
-    The gains are (m, N) or (1, N); the margins are (N, m) and (N,), and lack those of all inputs at
-    once. u has no delay, as in a benchmark.
+    The gains are (m, N) or (1, N). The margins are (N, m) and (N,), without the margins of all
+    inputs together. u has no delay, as in a benchmark.
     """
     tuned_law = TunedLaw(law.control_law(model), law.params(gains, model))
     count = max((gain.shape[-1] for gain in gains.values()), default=1)
@@ -410,7 +411,7 @@ def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
 
 
 def _lacking(law: Law, objective: Objective, benchmark: Benchmark, gains: Gains) -> FloatArray:
-    """Return what the missing margins of N candidates cost, (N,)."""
+    """Return the costs of the missing margins of N candidates, (N,)."""
     if objective.requirement is None or not law.has_margins:
         return np.zeros(next(iter(gains.values())).shape[-1])
     margins = nominal_margins(law, gains, benchmark.model)
@@ -429,7 +430,7 @@ def _rounded(gains: Gains) -> dict[str, list[float]]:
 def _after(
     search: Any, point: FloatArray, values: FloatArray, best: tuple[float, FloatArray]
 ) -> tuple[float, FloatArray]:
-    """Tell the search the costs it asked for; return the least cost so far and its candidate."""
+    """Give the search its costs, and return the least cost so far with its candidate."""
     search.tell(list(point), list(values))
     least = int(np.argmin(values))
     return (float(values[least]), point[least]) if values[least] < best[0] else best
