@@ -20,8 +20,11 @@ from flight_core.parameters import require
 AXES: Mapping[str, int] = MappingProxyType({"p": 0, "q": 1, "r": 2})
 """Channels of y, and the axes of autopilots that they are: roll, pitch, yaw."""
 
-SAMPLES = 8  # kept; y_m is stepped past each y, so that a tick needs the newest y and two y_m
-SLOWEST, FASTEST = 0.6, 1.6  # times the trim speed, where the dynamic pressure is clipped
+# number of samples that are kept. y_m is stepped past each y, so a tick only needs the newest y and
+# two samples of y_m.
+SAMPLES = 8
+# speeds in units of the trim speed. The dynamic pressure is clipped to its values at these speeds.
+SLOWEST, FASTEST = 0.6, 1.6
 
 HOOKS = """ArduPlane/Plane.h, in class Plane, beside void stabilize();
     void rise_di();
@@ -47,7 +50,7 @@ float64 y_m_offset       # [s] of the newest y_m after y
 float32 rate             # [Hz] of the samples of the rates, measured; 0: not yet
 """
 
-# PX4 logs the topics of this file in place of its own, each with its least interval in ms.
+# PX4 logs these topics in place of its default ones, each with its least interval in ms.
 TOPICS = """rise_di_status
 vehicle_angular_velocity
 vehicle_torque_setpoint
@@ -144,12 +147,12 @@ HEADER = """/* Axes, signs and sizes of the autopilot for the channels of the sc
 
 
 class Shell(NamedTuple):
-    """How the code becomes a part of an autopilot; its files are in source/NAME."""
+    """The shell that puts the code into an autopilot. Its files are in source/NAME."""
 
-    place: str  # where the code goes in the folder
-    axes: str  # outputs that the controller may have
+    place: str  # place of the code in the folder
+    axes: str  # outputs that the controller can have
     reason: str
-    texts: Mapping[str, str]  # other files; `{channels}` and `{m}` are filled in
+    texts: Mapping[str, str]  # further files by name; `{channels}` and `{m}` are filled in
 
 
 SHELLS = {
@@ -176,9 +179,9 @@ def write_module(
     For PX4 the folder is EXTERNAL_MODULES_LOCATION. For ArduPlane it has files for the source tree,
     and hooks.txt with two lines to add to the tree. Raises ParameterError.
 
-    The outputs are body rates. If u of an input is at the upper end stop of its actuator, that is a
-    torque of 1, in ArduPlane a deflection of 45 degrees, with the sign of D. In PX4, the controller
-    that stands by is fw_rate_control, or mc_rate_control for a multicopter.
+    The outputs are body rates. A u at the upper end stop of its actuator is a torque of 1 with the
+    sign of D, and in ArduPlane a deflection of 45 degrees. In PX4, the controller that stands by is
+    fw_rate_control, or mc_rate_control for a multicopter.
     """
     shell = SHELLS[autopilot]
     controller = exportable(scenario.controller)
@@ -240,7 +243,7 @@ def _with_words(text: str, words: Mapping[str, str]) -> str:
 
 
 def _axes(scenario: Scenario, suffix: str) -> str:
-    """Write rise_di_axes.h: the axes, the torque per unit of u, and the speed at which it holds."""
+    """Write rise_di_axes.h: the axes, the torque per unit of u, and the speed for this torque."""
     controller = scenario.controller
     channels = scenario.aircraft.channels()
     upper = dict(zip(channels.inputs, scenario.aircraft.actuators.upper or (), strict=False))

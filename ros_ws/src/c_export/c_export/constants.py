@@ -85,7 +85,8 @@ REALS: Mapping[str, float] = MappingProxyType(
 class Constant(NamedTuple):
     """A member of struct rise_di_parameters.
 
-    Its value is whole numbers (int, tuple) or reals (array); a matrix comes row by row.
+    Its value is one or more whole numbers (int, tuple), or reals (array). A matrix is stored row by
+    row.
     """
 
     name: str
@@ -96,7 +97,7 @@ class Constant(NamedTuple):
 class Sizes:
     """The dimensions of the exported controller.
 
-    They are 0 without an allocation, a feedforward or an observer.
+    p is 0 without an allocation, n is 0 without a feedforward, and s is 0 without an observer.
     """
 
     m: int  # channels
@@ -133,10 +134,10 @@ IDLE_IN_C = frozenset(
 
 
 def exportable(controller: ControllerConfig) -> RiseDiConfig:
-    """Return the controller if it is RISE-DI.
+    """Return the controller if it can be exported.
 
-    Raises ParameterError if it has another law, or a key that the C code does not know, such as
-    models that are learned or off.
+    Raises ParameterError if it has another law than RISE-DI, or a key that the C code does not
+    know, such as models that are learned or switched off.
     """
     require(
         isinstance(controller, RiseDiConfig),
@@ -170,7 +171,7 @@ def sizes(controller: RiseDiConfig) -> Sizes:
 def constants(controller: RiseDiConfig) -> list[Constant]:
     """Return the members of struct rise_di_parameters in the order of rise_di.h.
 
-    If there is no limit, they are infinite.
+    A limit that the controller does not have is infinite.
     """
     guard = controller.guard()
     law = controller.law_params()
@@ -273,7 +274,7 @@ def header(
 ) -> str:
     """Write rise_di_parameters.h. If `reference` is None, it has no reference model.
 
-    The code keeps `samples` of y and of y_m.
+    The code keeps `samples` samples of y, and as many of y_m.
     """
     r = 0 if reference is None else len(reference.model().A_m)
     suffix = "F" if float32 else ""
@@ -392,8 +393,8 @@ def _initialiser(
 def _strings(names: tuple[str, ...]) -> str:
     """Write string literals of C.
 
-    Every byte of a character that is not a letter, a digit or one of "_. " becomes an octal escape.
-    The names of a parameter set have no such characters.
+    If a character is not a letter, a digit or one of "_. ", each of its bytes becomes an octal
+    escape. The names of a parameter set have no such characters.
     """
     return ", ".join(f'"{"".join(map(_octal, name))}"' for name in names)
 
@@ -406,5 +407,5 @@ def _octal(character: str) -> str:
 
 
 def _comment(names: tuple[str, ...]) -> str:
-    """Write names for a comment of C, with the escapes of `_strings`, so that none can end it."""
+    """Write names for a comment in C. Because of the escapes of `_strings`, no name can end it."""
     return ", ".join("".join(map(_octal, name)) for name in names)

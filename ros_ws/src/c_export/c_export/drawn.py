@@ -38,7 +38,7 @@ from rise_di_controller.law.control_law import Measurements, fields, restored
 from rise_di_controller.law.saturation import saturate
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# Start of the drawn stamps, where float64 does not resolve 1 ns.
+# Start of the drawn stamps. At this size float64 does not resolve 1 ns.
 EPOCH_NS = 1_795_000_000_000_000_000
 
 
@@ -47,8 +47,8 @@ def drawn_calls(
 ) -> Recording:
     """Draw calls of a controller with faults of every kind.
 
-    They have jitter, lost, late and early samples, repeated stamps, errors of any size, jumps, new
-    parameters and deactivation.
+    The faults are jitter, lost, late and early samples, repeated stamps, errors of any size, jumps,
+    new parameters and deactivation.
     """
     rng = np.random.default_rng(seed)
     controller = sets[0]
@@ -109,8 +109,8 @@ def drawn_calls(
 def _interval_ns(kind: float, size: float, period_ns: int) -> int:
     """Return the time to the next tick, ns.
 
-    It is a period with jitter, far from a period, or a long pause. `kind` and `size` are drawn from
-    0 to 1.
+    This time is a period with jitter, a time far from a period, or a long pause. `kind` and `size`
+    are drawn from 0 to 1.
     """
     if kind < 0.9:
         return round(period_ns * (1.0 + 0.2 * (size - 0.5)))
@@ -121,9 +121,10 @@ def _interval_ns(kind: float, size: float, period_ns: int) -> int:
 
 
 def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
-    """Yield what is added to samples of y, (m,).
+    """Yield the jumps that are added to samples of y, (m,).
 
-    One sample in 50, and some samples after it, get up to 10^5 units, so that they are lost.
+    A jump begins at one sample in 50 and lasts for some samples. It is up to 10^5 units, so that
+    these samples are lost.
     """
     m = len(unit)
     offset = np.zeros_like(unit)
@@ -163,9 +164,9 @@ def drawn_standstill(
 def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int) -> Recording:
     """Draw single steps of an engaged controller from any state, and compute them at once.
 
-    The parameters are those with the `index` in `sets`. Errors are 0.001 to 300 widths of the
-    softened sign. dt is 0.2 to 10 periods, so that up to 9 samples are missing, as long as no gap
-    makes the law engage again.
+    The parameters are those at `index` in `sets`. Errors are 0.001 to 300 widths of the softened
+    sign. dt is 0.2 to 10 periods, so that up to 9 samples are missing. It is at most so long that
+    the law does not engage again.
     """
     rng = np.random.default_rng(seed)
     guard = sets[index].guard()
@@ -208,7 +209,8 @@ def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int)
 def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Recording:
     """Draw live commands for the reference model.
 
-    They are of any size, beyond the bounds, late, repeated, and lost for longer than `max_age`.
+    Commands have any size, also beyond the bounds. They can be late, repeated, or lost for longer
+    than `max_age`.
     """
     rng = np.random.default_rng(seed)
     model = Reference(

@@ -53,7 +53,7 @@ NOTHING = np.zeros(0)
 
 
 class Recording(NamedTuple):
-    """Events, and the state of the controller or reference model after each of the T ticks.
+    """Events, and the state after each of the T ticks of a controller or a reference model.
 
     The states are those of the Python code.
     """
@@ -62,8 +62,8 @@ class Recording(NamedTuple):
     names: tuple[str, ...]  # names of the integers and the reals
     events: NDArray[np.void]  # of `event_type`
     integers: NDArray[np.int64]  # (T, i)
-    reals: FloatArray  # (T, w), with u or y_m first
-    loaded: FloatArray = NOTHING  # reals of the states before the ticks, which LOAD takes
+    reals: FloatArray  # (T, w); the first reals are u or y_m
+    loaded: FloatArray = NOTHING  # reals of the states before the ticks, which the event LOAD loads
 
     @property
     def ticks(self) -> int:
@@ -109,9 +109,9 @@ def numbered(groups: Mapping[str, int]) -> Iterator[str]:
 class Recorder(Controller):
     """A controller that records its calls and its states.
 
-    `sets` are the parameters that `retune` may take, and the first of them are those at the start.
+    `sets` are the parameter sets that `retune_to` can take. The recorder starts with the first one.
     `before_tick` is called with the recorder and the instant before each tick, and returns whether
-    the controller is active. `samples` of y and of y_m are kept.
+    the controller is active. `samples` samples of y, and as many of y_m, are kept.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class Recorder(Controller):
         return refusal
 
     def retune_to(self, index: int) -> None:
-        """Take the parameters of an index of `sets`."""
+        """Take the parameters at an index of `sets`."""
         self._add(RETUNE, flag=index)
         self.retune(self.sets[index])
 
@@ -207,9 +207,10 @@ class Recorder(Controller):
     def guard_tick(
         self, now_ns: int, sample: tuple[int, FloatArray, FloatArray, int] | None, *, active: bool
     ) -> None:
-        """Record a tick: stamp, y, y_m at the stamp, and the distance of the newest y_m in ns.
+        """Record a tick with a sample: its stamp, y, y_m at the stamp, and an offset.
 
-        `sample` is None if there are no samples.
+        The offset is the stamp of the newest y_m minus the stamp of the sample, ns. `sample` is
+        None if there are no samples.
         """
         y = None
         y_m = []
@@ -293,7 +294,8 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
     ]
     # Change the extensions.
     if controller.schedule is not None:
-        changes.append({"schedule.time": 5.0 / controller.rate})  # shorter than the longest dt
+        # make the time constant shorter than the longest dt
+        changes.append({"schedule.time": 5.0 / controller.rate})
     if controller.observer is not None:
         changes.append({"observer.F": tuple(0.9 * value for value in controller.observer.F)})
         changes.append({"observer.fade": 0.0})
@@ -314,8 +316,8 @@ def flight_recordings(
 ) -> Iterator[Recording]:
     """Fly in one process: as the scenario says, with a tenth of y lost, and with faults.
 
-    The faults are new parameters, y or y_m lost within hold, within ramp and beyond, deactivation,
-    engagement and tight limits.
+    The faults are new parameters, deactivation, engagement and tight limits, and losses of y or y_m
+    that end within the hold, within the ramp, and after the ramp.
     """
     sensors = scenario.aircraft.sensors.model_dump() | {"dropout": 0.1}
     yield _flight("the flight", scenario, Recorder(sets, samples=samples))
@@ -366,10 +368,10 @@ def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder
 
 
 def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]:
-    """Read a log: the parameters with their changes in flight, the ticks, and how many agree.
+    """Read from a log the parameter sets, the ticks, and the number of ticks that agree.
 
-    A tick agrees if its u is that of the log. Raises ParameterError if the changes of the log do
-    not lead to the parameters in force.
+    The sets are the parameters and their changes in flight. A tick agrees if its u is that of the
+    log. Raises ParameterError if the changes in the log do not lead to the parameters that flew.
     """
     sets = [exportable(recorded_parameters(run.scenario_file()))]
     changes = [*recorded_changes(run, sets[0])]
@@ -397,7 +399,7 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
                 recorder.restart()
             sample = (int(log.stamp_ns[k]), groups["y"][k], groups["y_m"][k], offset_ns)
         elif log.stamp_ns[k] == recorder.state.stamp_ns:
-            # If the stamp stays the same, y came from before it and engaged nothing.
+            # If the stamp stays the same, y came from before it, and the law did not engage.
             sample = (int(log.stamp_ns[k]) - 1, groups["y"][k], groups["y_m"][k], 0)
         recorder.guard_tick(int(now_ns[k]), sample, active=log["mode"][k] != Mode.INACTIVE)
         equal += recorder.state.command.tobytes() == groups[command][k].tobytes()

@@ -24,11 +24,11 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 _POINTER = ctypes.c_void_p
-MOST = float(np.finfo(np.float64).max)  # stands for infinity, as in the C code
+MOST = float(np.finfo(np.float64).max)  # this number stands for infinity, as in the C code
 
 
 class CController:
-    """A controller in C that has the calls of `rise_di_controller.controller.Controller`.
+    """A controller in C with the methods of `rise_di_controller.controller.Controller`.
 
     u has p values.
     """
@@ -61,7 +61,7 @@ class CController:
         )
 
     def tick(self, now_ns: int, *, active: bool = True) -> tuple[FloatArray, int]:
-        """Compute a tick; return u, and the mode, which is -1 if no u must be sent."""
+        """Compute a tick, and return u and the mode. The mode is -1 if u must not be sent."""
         arguments = (ctypes.c_int64(now_ns), ctypes.c_int64(active), _POINTER(self._u.ctypes.data))
         mode = int(self._library.library_tick(self._memory, *arguments))
         return self._u.copy(), mode
@@ -70,7 +70,7 @@ class CController:
         """Return the u of each tick of a log, see `events.run_recording`, (T, p)."""
         events = recording.events
         ticks = events[events["kind"] == GUARD_TICK]
-        before = np.zeros(len(events), dtype=np.int64)  # which event comes before each tick
+        before = np.zeros(len(events), dtype=np.int64)  # code of the event before each tick
         before[1:] = 4 * (events["kind"] == START)[:-1] + 8 * (events["kind"] == RESTART)[:-1]
         flags = ticks["flag"] + before[events["kind"] == GUARD_TICK]
         integers = [
@@ -248,8 +248,8 @@ DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 def model_description(controller: RiseDiConfig, scenario: str, units: Units) -> str:
     """Write modelDescription.xml of the unit.
 
-    Its inputs are y, y_m, active, y_new and y_m_new, its outputs u and mode, and its parameters
-    TUNABLE. A step is a tick.
+    Its inputs are y, y_m, active, y_new and y_m_new. Its outputs are u and mode, and its parameters
+    are those in TUNABLE. A step is a tick.
     """
     variables = _channels(controller, units)
     begin = 2 * len(controller.outputs) + 1
@@ -275,7 +275,7 @@ def build_fmu(
 ) -> Path:
     """Compile exported code to a co-simulation unit of FMI 2.0 for this machine (linux64).
 
-    The unit also has the sources, for other machines. Raises ParameterError.
+    The unit also contains the sources, for other machines. Raises ParameterError.
     """
     with tempfile.TemporaryDirectory(prefix="rise_di_fmu_") as name:
         library = _shared(code, compiler, "fmu.c", Path(name) / "rise_di.so")

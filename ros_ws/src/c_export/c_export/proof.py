@@ -33,11 +33,11 @@ PARAMETERS = "rise_di_parameters.h"
 # Files that are written with the code.
 REPORT = "proof.txt"
 FMU = "rise_di.fmu"
-CERTIFICATE = "certificate.json"  # that of the guarantee of the loop
+CERTIFICATE = "certificate.json"  # certificate of the guarantee of the loop
 COMPILERS = ("gcc", "clang")
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 COUNTING_FLAGS = ("-x", "c++", "-std=c++20", "-O2", "-include", "counting.h")
-LEAST_SAMPLES = 4  # to keep, because the slope of y_m spans two periods
+LEAST_SAMPLES = 4  # least number of samples to keep, because the slope of y_m spans two periods
 
 FLOAT32_BOUND = 2.0**-10
 """Largest difference of u in float32 along a flight, as a fraction of the range of u in the flight.
@@ -55,20 +55,21 @@ class Difference:
 
 
 class Comparison(NamedTuple):
-    """A recording of T ticks that C has computed, compared with Python."""
+    """Comparison of the states that C computes for a recording of T ticks with those of Python."""
 
     name: str
     ticks: int
     values: int  # how many were compared
     differing: int  # how many differ
     first: Difference | None
-    deviation: float  # largest difference of u over the range of u, of all inputs
-    modes_equal: bool  # whether modes and times are equal
+    deviation: float  # largest difference of u of all inputs, as a share of the range of u
+    modes_equal: bool  # whether all modes and times are equal
 
     def holds(self, *, float32: bool) -> bool:
-        """Return whether every bit is equal, or in float32 whether u is within its bound.
+        """Return whether C agrees with Python.
 
-        In float32, every mode must be equal, and u must be within FLOAT32_BOUND.
+        In float64, every bit must be equal. In float32, every mode must be equal, and u must be
+        within FLOAT32_BOUND.
         """
         return (
             self.modes_equal and self.deviation <= FLOAT32_BOUND if float32 else self.differing == 0
@@ -86,8 +87,8 @@ def write_code(
 ) -> list[Path]:
     """Write the C code of a controller and of a reference model to a folder.
 
-    The report and the unit of earlier code are removed. The controller keeps `samples` of y and of
-    y_m. Raises ParameterError.
+    The report and the FMI unit of earlier code are removed. The controller keeps `samples` samples
+    of y, and as many of y_m. Raises ParameterError.
     """
     require(samples >= LEAST_SAMPLES, "samples", samples, f"{LEAST_SAMPLES} or more")
     with writing("c", folder, "a folder that can"):
@@ -104,7 +105,7 @@ def write_code(
 def compilers(names: Sequence[str] = ()) -> list[list[str]]:
     """Return the commands of the C compilers: `names`, or those of COMPILERS on the PATH.
 
-    Raises ParameterError if there is none.
+    Raises ParameterError if there is no compiler.
     """
     commands = [words(command) for command in names] or [
         [name] for name in COMPILERS if shutil.which(name)
@@ -123,7 +124,7 @@ def words(
 ) -> list[str]:
     """Split a command into words, as a shell does.
 
-    Raises ParameterError if it names no program.
+    Raises ParameterError if the command names no program.
     """
     try:
         parts = shlex.split(command)
@@ -169,7 +170,7 @@ class Program:
         build([*compiler, *flags, "-o", "proof", "proof.c"], folder)
 
     def take(self, sets: Sequence[RiseDiConfig]) -> None:
-        """Replace the parameter sets. The first one still is that of the exported header."""
+        """Replace the parameter sets. The first one stays that of the exported header."""
         self._sets = sets
         content = b"".join(packed(controller, float32=self._float32) for controller in sets)
         (self._folder / "sets").write_bytes(content)
@@ -240,10 +241,10 @@ class Program:
 
 
 class Proof(NamedTuple):
-    """What was compiled, compared and measured."""
+    """The results of a proof: what was compiled, compared and measured."""
 
-    compilers: tuple[str, ...]  # their versions
-    comparisons: tuple[Comparison, ...]  # of each recording with every compiler in turn
+    compilers: tuple[str, ...]  # versions of the compilers
+    comparisons: tuple[Comparison, ...]  # comparisons of all recordings, compiler by compiler
     figures: Mapping[str, int]  # numbers of bytes and of operations, by name
     float32: bool
 
@@ -264,10 +265,9 @@ def prove(
 ) -> Proof:
     """Compile the code in a folder with each compiler, and compare it with the recordings.
 
-    Every state of the C code is compared with the recorded state of the Python code. `runner`
-    starts the programs of a compiler for another machine, as qemu does. If g++ is installed, a
-    further program counts the operations on reals, and so gives the largest number of them in one
-    call.
+    Every state of the C code is compared with the recorded state of the Python code. `runner`, such
+    as qemu, starts the programs of a compiler for another machine. If g++ is installed, a further
+    program counts the operations on reals, and so gives the largest number of them in one call.
     """
     comparisons: list[Comparison] = []
     with tempfile.TemporaryDirectory(prefix="rise_di_export_") as name:
@@ -358,8 +358,8 @@ def version(compiler: Sequence[str]) -> str:
 def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, int]:
     """Return the bytes of machine code and constants, and of the stack: the sum of all frames.
 
-    What is unknown is left out. No function calls itself, so that no chain of calls needs more
-    stack than the sum.
+    A figure that is unknown is left out. No function calls itself, so that no chain of calls needs
+    more stack than this sum.
     """
     for name in (*CODE, PARAMETERS):
         shutil.copyfile(code / name, folder / name)
@@ -376,7 +376,7 @@ def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, in
         process = subprocess.run(  # noqa: S603 - of binutils
             [size, "rise_di.o"], cwd=folder, capture_output=True, text=True, check=False
         )
-        if not process.returncode:  # it fails for a file for another machine
+        if not process.returncode:  # `size` fails for a file for another machine
             text, data, bss = (int(word) for word in process.stdout.splitlines()[1].split()[:3])
             sizes |= {"code_bytes": text, "data_bytes": data + bss}
     return sizes
