@@ -178,8 +178,7 @@ def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
 class Selection:
     """The two gain sets for an airframe.
 
-    A set is assessed when it is first used, because the margins of all samples take most of the
-    time.
+    A set is assessed when it is first used: the margins of all samples take most of the time.
     """
 
     study: Study
@@ -202,16 +201,14 @@ class Selection:
 def gain_sets(study: Study, setting: LoopSetting) -> Selection:
     """Derive two gain sets for an airframe: by Theorem 1 and by the engineering procedure.
 
-    The set by Theorem 1 has the literal sign.
-
-    Both sets have the same channels (the fastest first, so that the last has the smallest K),
-    inputs scaled by 1 / abs(Omega_ii), and D from the minors. The theorem's set is `theorem_gains`
-    with Lambda = 1 / s, for which the smallest k_g suffices. The other one is `engineering_gains`
-    with the slew of the nominal airframe. Behind servos, `within_requirement` searches for the
-    integral gains and the bandwidths with the least error. Their margins must meet the setting's
-    requirement on the nominal airframe and on every sample. `omega` is the largest abs(Omega_ii) of
-    the samples. Raises ParameterError as `signs_of_pairing` does, and for parameters that the
-    controller does not accept.
+    The set by Theorem 1 has the literal sign. Both sets have the same channels (the fastest first,
+    so that the last has the smallest K), inputs scaled by 1 / abs(Omega_ii), and D from the minors.
+    The theorem's set is `theorem_gains` with Lambda = 1 / s, for which the smallest k_g suffices.
+    The other one is `engineering_gains` with the slew of the nominal airframe. Behind servos,
+    `within_requirement` searches for the integral gains and the bandwidths with the least error.
+    Their margins must meet the setting's requirement on the nominal airframe and on every sample.
+    `omega` is the largest abs(Omega_ii) of the samples. Raises ParameterError as `signs_of_pairing`
+    does, and for parameters that the controller does not accept.
     """
     pairs = _paired(study, setting)
     engineering = gain_candidates(study, setting)
