@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a flight, which are pure functions of its tape.
+"""Metrics of a flight, each of which is a pure function of the tape of the flight.
 
-They are the error, the noise floor, the ultimate bound, settling, saturation and ticks.
+They are the error, the noise floor, the ultimate bound, settling, control effort, saturation and
+switches of the sign.
 """
 
 import math
@@ -24,47 +25,48 @@ from rise_di_controller.internals import Saturation
 Windows = Mapping[str, tuple[float, float]]
 
 SETTLING_DWELL = 1.0
-"""s. A transient counts this long beyond its end. An error has settled once it has been in the band
-this long."""
+"""A transient counts for this time beyond its end, s. An error has settled when it has stayed in
+the band for this time."""
 
 SETTLING_BAND = 0.01  # half-width of the settling band as a fraction of the largest abs(y_m)
 
 MIN_BAND_NOISE_FLOORS = 4.0
-"""Least half-width of the settling band of a measured error, in noise floors. 500 samples of normal
-noise stay within 4 with a probability of 97 %."""
+"""Least half-width of the settling band of a measured error, as a multiple of the noise floor. With
+a probability of 97 %, 500 samples of normal noise stay within 4 noise floors."""
 
-# Largest deviation of an entry, relative to its value, that a flight shows. It is half of the
-# deviation before the flight.
+# A flight shows an entry if the entry's standard deviation, relative to its value, is below this
+# number. The number is half of the deviation before the flight.
 MAX_DEVIATION = 0.15
 
 LONGEST_INTERVAL = 1.0
-"""s. A sample stands for at most this time. A longer interval is a gap of the log, over which no
-figure is taken."""
+"""A sample stands for at most this time, s. A longer interval is a gap of the log, and the rest of
+it does not count."""
 
 # names that `best_error` returns
 TRUE_ERROR = "true error"
 MEASURED_ERROR = "measured error"
 
-TURN_BANK = math.radians(5.0)  # rad; a turn commands more bank
-CAPTURE_ANGLE = math.radians(1.0)  # rad; a capture commands a steeper flight path
-CAPTURE_TIME = 0.5  # s; in a capture, the path is farther away than the aircraft flies in this time
+TURN_BANK = math.radians(5.0)  # guidance turns if it commands more bank than this, rad
+# Guidance captures if it commands a flight path that is steeper than this, rad, ...
+CAPTURE_ANGLE = math.radians(1.0)
+CAPTURE_TIME = 0.5  # ... or if the path is farther away than the aircraft flies in this time, s
 
 CALM = "calm"
 UNKNOWN_AIR = "other"
 AIRS = (CALM, "wind", "shear", "turbulence", "microburst", UNKNOWN_AIR)
-"""What was in the air apart from gusts. It names the part of a flight without gust, command and
-engagement. UNKNOWN_AIR means that no simulated aircraft flew."""
+"""The disturbances of the air except gusts. The part of a flight without gust, command and
+engagement has the name of its air. UNKNOWN_AIR means that no simulated aircraft flew."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Transient:
     """An engagement, a command, a gust, a turn or a capture.
 
-    The span is from the first to the last instant, in s of flight time.
+    `start` and `stop` are its first and its last instant, in s of flight time.
     """
 
     kind: str  # "engagement", "command", "gust", "turn" or "capture"
-    name: str  # name of the commanded channel, or of the gust
+    name: str  # name of the commanded channel or of the gust, or ""
     start: float
     stop: float
 
@@ -86,7 +88,10 @@ class ErrorMetrics:
 
 @dataclass(frozen=True, kw_only=True)
 class InputMetrics(ErrorMetrics):
-    """An input over some samples: deviation from trim in the input's unit, rate in units per s."""
+    """Deviation of an input from trim over some samples, in the unit of the input.
+
+    `rate` is the mean rate in this unit per s.
+    """
 
     rate: float
 
@@ -94,8 +99,8 @@ class InputMetrics(ErrorMetrics):
 def best_pose(tape: Tape) -> Signal | None:
     """Return the true pose if the simulation has logged it, else the measured one, if any.
 
-    The channels are `flight_core.channels.POSE`. A sensor that is off, or a pose that somebody else
-    publishes, moves the measured pose but not the aircraft.
+    The channels are `flight_core.channels.POSE`. The true pose is better, because errors of the
+    sensors, or a pose from another publisher, change the measured pose but not the aircraft.
     """
     if "truth" in tape and len(tape["truth"].stamp_ns):
         pose = tape["truth"].group("pose")
@@ -119,7 +124,7 @@ def tracking_error(tape: Tape) -> Signal:
 
 
 def _controlled(tape: Tape) -> tuple[str, ...]:
-    """Return the channels of y that y_m has too; y may have more.
+    """Return the channels that y and y_m share. Each of them can have more.
 
     Raises ParameterError if they share none.
     """
@@ -136,8 +141,9 @@ def _controlled(tape: Tape) -> tuple[str, ...]:
 def true_error(tape: Tape) -> Signal | None:
     """Return the true error C x - y_m at every sample of `truth`, (N, m), within the time of y_m.
 
-    The channels are as in `tracking_error`. Errors of the sensors do not count, but lost samples
-    do. Returns None unless `truth` has "x.output" for every channel, as in a simulation.
+    The channels are those of `tracking_error`. The noise and bias of the sensors do not enter this
+    error, except through their effect on the flight. Returns None unless `truth` has "x.output" for
+    every channel, as in a simulation.
     """
     if "truth" not in tape:
         return None
@@ -150,10 +156,11 @@ def true_error(tape: Tape) -> Signal | None:
 
 
 def best_error(tape: Tape) -> tuple[str, Signal]:
-    """Return the best error on a tape, with its name: the true error, or else the measured one.
+    """Return the name and the signal of the best error on a tape.
 
-    The name is "true error" or "measured error", and e = y - y_m, (N, m), is in SI. Raises
-    ParameterError if the tape has no y and y_m.
+    It is the true error if the tape has it, else the measured one. The name is "true error" or
+    "measured error", and e = y - y_m, (N, m), is in SI. Raises ParameterError if the tape has no y
+    and y_m.
     """
     error = true_error(as_tape(tape))
     return (MEASURED_ERROR, tracking_error(tape)) if error is None else (TRUE_ERROR, error)
@@ -168,8 +175,8 @@ def _minus_reference(y: Signal, y_m: Signal) -> Signal:
     values = y.values[first:end]
     if np.array_equal(stamps, y_m.stamp_ns):
         return Signal(stamps, y.names, values - _columns(y_m, y.names))
-    # float64 represents stamps exactly if they are relative to the first one, but not ns since the
-    # epoch.
+    # float64 represents a stamp exactly if it is relative to the first one, but not if it counts ns
+    # since the epoch.
     instants = (stamps - y_m.stamp_ns[0]).astype(float)
     knots = (y_m.stamp_ns - y_m.stamp_ns[0]).astype(float)
     reference = np.stack([np.interp(instants, knots, y_m[name]) for name in y.names]).T
@@ -183,11 +190,11 @@ def _columns(signal: Signal, names: Sequence[str]) -> FloatArray:
 def noise_floor(tape: Tape) -> dict[str, float]:
     """Return the noise floor of y by channel, SI.
 
-    A measured error below it cannot be told from noise. A true error can be smaller. The floor is
-    the rms of "noise.channel" of `truth`, if the tape has it. Otherwise it is an estimate of white
-    noise from the second differences d_k = y_(k+1) - 2 y_k + y_(k-1): rms = median(abs(d)) /
-    (0.6745 sqrt(6)). d has 6 times the variance of the noise, and half of a normal distribution
-    lies within 0.6745 rms. The floor is at least the rounding of the largest y.
+    A measured error below the floor cannot be told from noise, while a true error can be smaller.
+    The floor is the rms of "noise.channel" of `truth` if the tape has it. Otherwise it is estimated
+    for white noise from the second differences d_k = y_(k+1) - 2 y_k + y_(k-1), as rms =
+    median(abs(d)) / (0.6745 sqrt(6)). d has 6 times the variance of the noise, and half of a normal
+    distribution lies within 0.6745 rms. The floor is at least the rounding of the largest y.
     """
     noise = tape["truth"].group("noise") if "truth" in tape else None
     floor = {}
@@ -217,9 +224,9 @@ def engagements(tape: Tape) -> list[Transient]:
 
 
 def live_commands(tape: Tape) -> list[Transient]:
-    """Return the changes of a live command, from `u_m`.
+    """Return the changes of a live command, from `u_m`, as transients.
 
-    Changes of a channel that are less than SETTLING_DWELL apart are one transient.
+    If two changes of a channel are at most SETTLING_DWELL apart, they belong to one transient.
     """
     if "u_m" not in tape:
         return []
@@ -243,8 +250,8 @@ def live_commands(tape: Tape) -> list[Transient]:
 def guided_transients(tape: Tape) -> list[Transient]:
     """Return the turns and captures of a guided flight, from `guidance`, as the glossary says.
 
-    `u_m` never rests in such a flight. Transients of the same kind that are less than
-    SETTLING_DWELL apart count as one.
+    In such a flight `u_m` changes all the time, so that it shows no transients. Transients of the
+    same kind that are less than SETTLING_DWELL apart count as one.
     """
     if "guidance" not in tape:
         return []
@@ -270,10 +277,10 @@ def guided_transients(tape: Tape) -> list[Transient]:
 def mask_spans(
     t: FloatArray, mask: NDArray[np.bool_], min_length: float = 0.0
 ) -> list[tuple[float, float]]:
-    """Return the start and the stop of each run of True in a mask of shape (N,), s.
+    """Return the start and the stop, s, of each run of True in a mask of shape (N,).
 
-    A run stops at the next False sample. Spans that are less than `min_length` apart are merged,
-    and spans that are shorter are lengthened to `min_length`.
+    A run stops at the next False sample. If two spans are less than `min_length` apart, they are
+    merged. If a span is shorter than `min_length`, it is lengthened to this length.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
     spans: list[tuple[float, float]] = []
@@ -289,7 +296,10 @@ def mask_spans(
 def in_spans(
     t: FloatArray, spans: Iterable[tuple[float, float]], settle: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Return which of the ascending instants t are in a span or up to `settle` s after it, (N,)."""
+    """Return a mask, (N,), of the instants that are in a span or up to `settle` s after it.
+
+    The instants t, (N,), must ascend.
+    """
     inside = np.zeros(len(t), dtype=bool)
     for start, stop in spans:
         inside[np.searchsorted(t, start) : np.searchsorted(t, stop + settle, side="right")] = True
@@ -305,8 +315,8 @@ def part_masks(
     """Return masks of the instants t, (N,), by part of the flight.
 
     The parts are "whole", `air`, "command" and "gust". In a guided flight, "capture" and "turn"
-    replace "command". An instant counts to the last part in this order that matches. `air` has no
-    transient of any kind.
+    replace "command". Every instant is in "whole". If transients overlap, an instant also belongs
+    to the last of their parts in this order. If there is no transient, it belongs to `air`.
     """
     kinds = {transient.kind for transient in transients}
     commands = ["capture", "turn"] if kinds & {"capture", "turn"} else ["command"]
@@ -326,9 +336,9 @@ def part_masks(
 
 
 def sample_times(stamp_ns: NDArray[np.int64]) -> FloatArray:
-    """Return the time that each sample stands for, s, (N,).
+    """Return the time that each sample stands for, (N,), s.
 
-    It is half of the intervals to both neighbours, where an interval counts at most
+    It is half the sum of the intervals to both neighbours, where an interval counts as at most
     LONGEST_INTERVAL. The first and the last sample stand for a whole interval, so that equal
     intervals give equal times.
     """
@@ -342,17 +352,17 @@ def sample_times(stamp_ns: NDArray[np.int64]) -> FloatArray:
 
 
 def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMetrics:
-    """Compute the root mean square and the max abs(e) of samples, (N,); NaN if N = 0.
+    """Compute the root mean square and the largest abs(e) of N samples.
 
-    rms = sqrt(sum t e^2 / sum t) with the `times` t of the samples, (N,); with equal times it is
+    rms = sqrt(sum t e^2 / sum t) with the `times` t of the samples. If all times are equal, it is
     sqrt(mean e^2).
 
     Args:
         errors: Samples e of a channel, shape (N,), in any unit.
-        times: Time that each sample stands for, shape (N,), s; None stands for equal times.
+        times: Time that each sample stands for, shape (N,), s. If None, all times are equal.
 
     Returns:
-        `rms` and `max`, in the unit of the errors.
+        `rms` and `max`, in the unit of the errors. Both are NaN if N = 0.
 
     Raises:
         ParameterError: `errors` are no numbers of shape (N,).
@@ -371,9 +381,9 @@ def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMe
 
 
 def known_entries(learned: Signal) -> list[str]:
-    """Return the entries of A and B, in samples of `learned`, that the flight shows.
+    """Return the names of the entries of A and B that the flight shows, from samples of `learned`.
 
-    Their least deviation is below MAX_DEVIATION of the value.
+    The flight shows an entry if its deviation is below MAX_DEVIATION times its value in a sample.
     """
     values = learned.group("value")
     deviations = learned.group("deviation")
@@ -392,8 +402,8 @@ def errors_by_part(
 ) -> dict[str, dict[str, ErrorMetrics]]:
     """Return the metrics of `best_error` by channel and part of the flight.
 
-    The max of "calm" is the ultimate bound: the largest abs(e) at least `settle` s after the end of
-    every transient, in calm air.
+    The maximum of "calm" is the ultimate bound, which is the largest abs(e) in calm air later than
+    `settle` s after the end of every transient.
     """
     _, error = best_error(tape)
     masks = part_masks((error.stamp_ns - tape.start_ns) / 1e9, transients, settle, air)
@@ -409,8 +419,8 @@ def errors_by_part(
 def settling_bands(tape: Tape) -> dict[str, float]:
     """Return the half-width of the settling band by channel, SI: SETTLING_BAND max abs(y_m).
 
-    If y_m is zero, max abs(e) replaces max abs(y_m). The band of a measured error is at least
-    MIN_BAND_NOISE_FLOORS noise floors wide, because noise alone would leave a narrower one.
+    If y_m is zero, max abs(e) replaces max abs(y_m). The half-width for a measured error is at
+    least MIN_BAND_NOISE_FLOORS noise floors, because noise alone would leave a narrower band.
     """
     kind, error = best_error(tape)
     floors = noise_floor(tape) if kind == MEASURED_ERROR else {}
@@ -430,11 +440,11 @@ def settling_bands(tape: Tape) -> dict[str, float]:
 def settling_time(
     t: FloatArray, e: FloatArray, band: float, leaves: float, dwell: float = SETTLING_DWELL
 ) -> float | None:
-    """Return the time from t[0] until abs(e) <= band holds for `dwell` s or to the last sample, s.
+    """Return the time, s, after which abs(e) stays in the band for `dwell` s or until the end.
 
-    The shapes are (N,). The time is 0 if abs(e) stays in the band for the first `leaves` s, because
-    an excursion after that has another cause. It is None if abs(e) does not return to the band, or
-    if there is no sample.
+    The time counts from t[0], and t and e have the shape (N,). It is 0 if abs(e) stays in the band
+    for the first `leaves` s, because a later excursion has another cause. It is None if abs(e) does
+    not return to the band, or if there is no sample.
     """
     if len(t) == 0:
         return None
@@ -453,15 +463,15 @@ class Settling(NamedTuple):
 
     transient: Transient
     until: dict[str, float]  # start of the next transient of the channel, or end of the flight, s
-    time: dict[str, float | None]  # settling time, s; None: not settled by then
+    time: dict[str, float | None]  # settling time, s, or None if not settled before `until`
 
 
 def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling]:
-    """Return the settling times of `best_error` into `settling_bands`, by excited channel.
+    """Return the settling times of `best_error` into `settling_bands` after each transient.
 
-    A time begins with the start of a transient, and counts up to the next transient of the channel.
-    Transients after the end of the flight are left out. So are turns and captures, whose commands
-    move to their end.
+    A settling time begins with the start of a transient, and only samples before the next transient
+    of the channel count. Transients after the end of the flight are left out. So are turns and
+    captures, because their commands change until they end.
     """
     _, error = best_error(tape)
     t = (error.stamp_ns - tape.start_ns) / 1e9
@@ -496,10 +506,11 @@ def inputs_by_part(
     topic: str = "u",
     air: str = CALM,
 ) -> dict[str, dict[str, InputMetrics]]:
-    """Return the control effort by input and part: rms and max abs(u) about trim, mean abs(u_dot).
+    """Return the control effort by input and part of the flight.
 
-    If the `topic` is y, the metrics are those of y. mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum
-    (t_k - t_(k-1)) over the steps that end in the part; it is NaN if there is no step.
+    The metrics are rms and max abs(u) about trim, and mean abs(u_dot). If the `topic` is y, they
+    are those of y. mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1)) over the steps
+    that end in the part. It is NaN if there is no such step.
     """
     if topic not in tape:
         return {}
@@ -538,8 +549,9 @@ def saturation_shares(tape: Tape) -> dict[str, dict[str, float]]:
 def sign_switches(tape: Tape) -> dict[str, float]:
     """Return the rate at which the sign term switches, by output, 1/s.
 
-    It counts the changes of sign between successive nonzero increments of Pi, over the time of the
-    ticks. If the tape has no `internals`, it counts the changes of sign of the measured error.
+    The rate is the number of changes of sign between successive nonzero increments of Pi, divided
+    by the time of the ticks. If the tape has no `internals`, the changes of sign of the measured
+    error are counted instead.
     """
     if "internals" in tape:
         signal = tape["internals"].group("Pi")

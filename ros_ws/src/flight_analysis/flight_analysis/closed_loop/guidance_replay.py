@@ -25,7 +25,7 @@ from flight_guidance.steering.path import Route
 
 
 class GuidanceReplay(NamedTuple):
-    """The steps of `guidance` as recorded and as computed; u_m is among their channels."""
+    """Comparison of the recorded steps of `guidance` and of u_m with the computed ones."""
 
     steps: int
     checked: int
@@ -63,9 +63,10 @@ def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
 def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceReplay:
     """Compute every step of the topic `guidance` again, and the u_m published at its instant.
 
-    After a failed step the state stays as it was and the last u_m goes on, which is checked. Steps
-    on a route that is not in the log are not checked, nor are steps of a log with other channels.
-    Raises ParameterError if the log lacks the scenario's section of guidance.
+    If a step failed, the state must stay as it was and the last u_m must go on. This is checked,
+    too. A step is not checked if its route is not in the log. If the log has other channels than
+    this version records, no step is checked. Raises ParameterError if the log lacks the scenario's
+    section of guidance.
     """
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")
@@ -143,9 +144,9 @@ class _Comparison:
         *,
         goes_on: bool,
     ) -> FloatArray:
-        """Compute the channels of a step after a state, then u_m.
+        """Compute the channels of the step that follows the state `previous`, then u_m.
 
-        If it `goes_on`, the step failed and the last u_m went on.
+        `goes_on` says that the step failed, so that guidance went on with the last u_m.
         """
         route = int(channels["route"])
         if goes_on and previous is not None:

@@ -29,19 +29,19 @@ class LearnerResult(NamedTuple):
 
 
 class Learner(Protocol):
-    """What learns from a flight. Its channels are in the law's order."""
+    """A learner of a flight. Its channels are in the order of the control law."""
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
-        """Take y and u, (m,), and the digest of the parameters of a tick of the engaged law.
+        """Take y, u and the digest of the parameters of one tick of the engaged law.
 
-        u is after its limits.
+        y and u have the shape (m,), and u is the input after the limits were applied.
         """
 
     def propose(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
         """Propose parameters from the record so far.
 
-        `flown` is the digest of the parameters at its end. `given_up` are the outputs that have no
-        model until the engagement ends.
+        `flown` is the digest of the parameters at the end of the record. `given_up` are the outputs
+        that have no model until the engagement ends.
         """
 
 
@@ -51,8 +51,8 @@ Learn = Callable[[RiseDiConfig], Learner]
 class Entry(NamedTuple):
     """An entry of A or B, and how far the flight shows it to be off.
 
-    It has the nominal value in SI, the relative error, and the standard deviation of the error
-    after the flight. If the nominal value is 0, both are relative to another `unit`.
+    The nominal value is in SI. `error` and `deviation`, the standard deviation of the error after
+    the flight, are fractions of `unit`. This is the nominal value, unless the nominal value is 0.
     """
 
     matrix: str
@@ -61,7 +61,7 @@ class Entry(NamedTuple):
     nominal: float
     error: float
     deviation: float
-    unit: float  # of error and deviation, SI: the nominal value unless it is 0
+    unit: float  # value in SI of which `error` and `deviation` are fractions
 
     @property
     def name(self) -> str:
@@ -77,8 +77,8 @@ class Entry(NamedTuple):
 class Learned(NamedTuple):
     """The channels of the topic `learned`.
 
-    They are `proposed`, and the values and deviations of the entries of A and B in the rows of the
-    outputs.
+    The first channel is `proposed`. The values of the entries of A and B in the rows of the outputs
+    follow, then their standard deviations.
     """
 
     names: tuple[str, ...]
@@ -88,7 +88,10 @@ class Learned(NamedTuple):
 def learned_sample(
     entries: Iterable[Entry], outputs: tuple[str, ...], *, proposed: bool
 ) -> Learned:
-    """Return what an identification found, and whether it became a proposal."""
+    """Return the sample of `learned` for what an identification found.
+
+    `proposed` says whether the identification became a proposal.
+    """
     output_entries = [entry for entry in entries if entry.row in outputs]
     channels = {f"value.{entry.name}": entry.value for entry in output_entries}
     channels |= {
@@ -98,7 +101,7 @@ def learned_sample(
 
 
 class Identifications:
-    """The identifications of a learner, if it has any; each comes once."""
+    """Hands out each identification of a learner once, if the learner makes any."""
 
     def __init__(self, learner: Learner, outputs: tuple[str, ...]) -> None:
         self._learner = learner
@@ -113,7 +116,7 @@ class Identifications:
             return None
         self._last = identification
         entries = {entry.name: entry for entry in identification.entries if entry.nominal}
-        # A topic keeps its channels, those of the rough airframe.
+        # A topic must keep its channels, so the entries of the first identification stay.
         self._names = self._names or tuple(entries)
         return learned_sample(
             (entries[name] for name in self._names),
@@ -125,7 +128,8 @@ class Identifications:
 def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown: int) -> Proposal:
     """Return a proposal as the controller receives it.
 
-    It carries the end of the window, and the digest of the parameters that were in force then.
+    It is stamped with `end_ns`, the end of the window of data. `flown` is the digest of the
+    parameters that were in force at that instant.
     """
     change = {} if proposal.controller is None else design_changes(start, proposal.controller)
     return Proposal(
@@ -172,7 +176,7 @@ class ProposalStation:
 class LearnerStation:
     """Records the ticks of the controller for a learner.
 
-    When an identification is due, it asks for a proposal.
+    When an identification is due, the station asks the learner for a proposal.
     """
 
     def __init__(
@@ -192,7 +196,7 @@ class LearnerStation:
         if output is None or not controller.has_internals:
             return
         if controller.mode is Mode.ENGAGED:
-            # This is the u of the law. With an allocation, `output` has that of the effectors.
+            # This is the u of the law. If there is an allocation, `output.u` has the effectors.
             u = controller.state.u
             self._learner.take(output.stamp_ns, output.inputs.y, u, controller.digest)
         if not self._learning.ticked(controller, t_ns):

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Replay of a recorded flight: every tick of the controller is computed again.
 
-The inputs come from the log, and every tick is compared bit by bit.
+The inputs of a tick come from the log, and its results are compared with the log bit by bit.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

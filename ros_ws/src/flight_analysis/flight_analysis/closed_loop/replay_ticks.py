@@ -31,15 +31,15 @@ Change = Mapping[str, Any]
 
 
 def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> ControllerConfig:
-    """Return parameters with changes by dotted name, validated; None removes a parameter.
+    """Return the parameters with changes by dotted name, validated.
 
-    Raises ParameterError.
+    The value None removes a parameter. Raises ParameterError if a changed value is invalid.
     """
     return AnyLaw.validate_mapping(parameters.changed(changes), "controller")
 
 
 class ParametersInForce:
-    """The parameters in force at a tick, and the changes that follow."""
+    """The parameters in force at a tick, and the changes that are still to come."""
 
     def __init__(self, parameters: ControllerConfig, changes: Sequence[Change]) -> None:
         self._changed: dict[str, list[int]] = {}  # ticks by names of the parameters
@@ -59,7 +59,7 @@ class ParametersInForce:
         self.limits = parameters.guard()
 
     def notes(self) -> tuple[str, ...]:
-        """Return a note for each kind of change, by the names of the parameters."""
+        """Return one note for each set of parameters that changed together in flight."""
         return tuple(
             f"parameters changed before tick {numbers[0]}"
             + (f" and {len(numbers) - 1:,} later ones" if len(numbers) > 1 else "")
@@ -70,9 +70,9 @@ class ParametersInForce:
     def change(
         self, digest: int, number: int, state: ControllerState | None
     ) -> ControllerState | None:
-        """Apply the changes up to the parameters with a digest, if there are any.
+        """Apply the changes that lead to the parameters with a digest, and return the state then.
 
-        Return the state after them.
+        If no sequence of changes leads to this digest, nothing changes.
         """
         if digest == self.digest or digest in self._unmatched:
             return state
@@ -194,7 +194,7 @@ class Ticks:
     def tick(
         self, k: int, state: ControllerState, limits: GuardParams, law: TunedLaw
     ) -> tuple[ControllerState, FloatArray]:
-        """Compute a tick; return the state after it and its row of `internals`.
+        """Compute a tick, and return the state after the tick and its row of `values`.
 
         If the tick has no output, the row is NaN.
         """
@@ -202,7 +202,7 @@ class Ticks:
         y = None
         y_m = []
         if not self.flies[k] and stamp_ns == state.stamp_ns:
-            # If the stamp stays the same, y came from before it and engaged nothing.
+            # If the stamp stays the same, the last y is older than the stamp and engaged nothing.
             y = StampedVector(stamp_ns - 1, self._y[k])
             y_m = [StampedVector(stamp_ns - 1, self._groups["y_m"][k])]
         elif self.flies[k]:
@@ -211,7 +211,8 @@ class Ticks:
             if (offset_ns := int(self._offset_ns[k])) > 0:
                 y_m.append(y_m[0]._replace(stamp_ns=stamp_ns + offset_ns))
         if self._engages[k] and state.mode is Mode.ENGAGED:
-            # As in `Controller.restart`, the law has engaged again by itself, and the rest goes on.
+            # As in `Controller.restart`, only the law has engaged again. The state of the guard
+            # goes on.
             state = state._replace(mode=Mode.WAITING)
         # After a gap, the log has the output of the feedforward but not its state, so that only
         # the law is computed.
@@ -239,7 +240,7 @@ class Ticks:
 def _checked_internals(tape: Tape, names: Sequence[str]) -> Signal:
     """Return the channels `names` of `internals`, in this order.
 
-    Raises ParameterError if the channels or values are others.
+    Raises ParameterError if `internals` has other channels, or values that no controller publishes.
     """
     require(
         "internals" in tape,
@@ -270,9 +271,10 @@ def _checked_internals(tape: Tape, names: Sequence[str]) -> Signal:
 def _tick_order(
     now_ns: NDArray[np.int64], number: FloatArray
 ) -> tuple[NDArray[np.int64], list[int]]:
-    """Order the ticks by their instants; return also where in this order a controller starts.
+    """Order the ticks by their instants, and return the order and where each controller starts.
 
-    The ticks of one controller are in the order of their numbers, whichever was stored first.
+    The starts are places in this order. The ticks of one controller are in the order of their
+    numbers, whichever of them was stored first.
     """
     order = np.argsort(now_ns, kind="stable")
     starts = controller_starts(number[order])
@@ -284,7 +286,7 @@ def _tick_order(
 def _as_published(
     tape: Tape, topic: str, names: Sequence[str], stamp_ns: NDArray[np.int64], otherwise: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return the samples of a topic at these stamps, (N, m), and which stamps have one.
+    """Return the samples of a topic at N stamps, (N, m), and a mask of the stamps that have one.
 
     A stamp without a sample has the values of `otherwise`.
     """
@@ -297,7 +299,7 @@ def _as_published(
     for row, stamp in enumerate(tape[topic].stamp_ns.tolist()):
         rows.setdefault(stamp, []).append(row)
     for k, stamp in enumerate(stamp_ns.tolist()):
-        # There are two if a failsafe u has the stamp of a y that arrived later.
+        # A stamp has two samples if a failsafe u has the stamp of a y that arrived later.
         candidates = rows.get(stamp, [])
         matched[k] = bool(candidates)
         if candidates and not any(

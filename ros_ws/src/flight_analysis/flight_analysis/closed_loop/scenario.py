@@ -66,7 +66,7 @@ class Scenario:
     reference_model: ReferenceModelConfig
     controller: ControllerConfig
     recorder: RecorderConfig
-    guidance: GuidanceConfig | None = None  # if None, the reference model has the commands
+    guidance: GuidanceConfig | None = None  # if None, the commands are those of reference_model
 
     @classmethod
     def from_parts(cls, name: str, **sections: Mapping[str, Any] | Config) -> "Scenario":
@@ -106,8 +106,8 @@ class Scenario:
 
         A section is a mapping of new parameters, or a whole parameter set, such as the `controller`
         of a second scenario. Lists may be arrays. If the `law` changes, the gains of the former law
-        are dropped. The copy is validated. If the scenario has no section of guidance, a new one
-        begins with the numbers by rule.
+        are dropped. The copy is validated. If the scenario has no section of guidance, your changes
+        are added to the parameters that `guidance_by_rule` computes.
 
         Args:
             sections: New parameters, or a whole parameter set, by section.
@@ -148,12 +148,12 @@ class Scenario:
             name: Name of a parameter, such as k_g.
 
         Returns:
-            Names of sections; none if the parameter is unknown.
+            Names of sections. The list is empty if no section has such a parameter.
         """
         return [key for key in SCHEMAS if name in getattr(getattr(self, key), "model_fields", ())]
 
     def _values(self, name: str, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the parameters of a section to which changes are added."""
+        """Return the parameters of a section before its changes are added."""
         section: Config | None = getattr(self, name)
         if section is None:
             return guidance_by_rule(self.aircraft, self.reference_model, self.controller)
@@ -179,7 +179,7 @@ class Scenario:
         return isinstance(self.controller, RiseDiConfig) and self.controller.learn is not None
 
     def air(self) -> str:
-        """Name the most violent disturbance of the air, gusts apart: one of metrics.AIRS."""
+        """Name the most violent disturbance of the air except gusts: one of metrics.AIRS."""
         aircraft = self.aircraft
         if aircraft.microburst is not None:
             return "microburst"
@@ -190,14 +190,16 @@ class Scenario:
         return "wind" if any(aircraft.wind) else "calm"
 
     def gust_windows(self) -> dict[str, tuple[float, float]]:
-        """Return the start and the stop of each gust, s: entry and entry + 2 H / V0.
+        """Return the start and the stop of each gust, s.
 
-        A gust that is repeated has a number from the second time on.
+        A gust of length H starts when the aircraft enters it, and stops 2 H / V0 later. If a gust
+        is repeated, its name has a number from the second time on.
         """
         speed = self.aircraft.channels().speed
         windows = {}
         for name, gust in self.aircraft.gusts.items():
-            again = (self.flight.duration - gust.start) / gust.every  # 0 for a single gust
+            # `every` is infinite for a single gust, so `again` is 0
+            again = (self.flight.duration - gust.start) / gust.every
             entries = gust.start + gust.every * np.arange(1.0, max(math.ceil(again), 1))
             for number, entry in enumerate([gust.start, *entries.tolist()], 1):
                 label = name if number == 1 else f"{name} {number}"
@@ -221,14 +223,17 @@ SCHEMAS: dict[str, type[Config]] = {
     "guidance": GuidanceConfig,
 }
 OPTIONAL = ("recorder", "guidance")
-"""Sections that a file may leave out: then the recorder has its defaults, and nothing is guided."""
+"""Sections that a file may leave out.
+
+If `recorder` is missing, the recorder has its defaults. If `guidance` is missing, nothing guides.
+"""
 
 
 def load_scenario(path: FilePath, *, with_route: bool = True) -> Scenario:
     """Read and validate a scenario file. Raises ParameterError with a sentence.
 
-    Without `with_route`, the route and the program of guidance are left out before the check, for a
-    flight of another route.
+    If `with_route` is False, the route and the program of guidance are left out before the check,
+    because the flight will take another route.
     """
     path = as_path(path, "scenario", A_SCENARIO)
     content = read_file(path, str(path), A_SCENARIO)
@@ -266,7 +271,8 @@ def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]
 def parse_scenario_sections(content: bytes, path: Path, namespace: str | None = None) -> Sections:
     """Parse the sections of a scenario file, without validating them. Raises ParameterError.
 
-    `namespace` is that of the nodes, as in `parse_sections`, and paths are found by `find_files`.
+    `namespace` is the namespace of the nodes, as in `parse_sections`. `find_files` finds the files
+    that the sections name.
     """
     sections = parse_sections(content, path, SCHEMAS, OPTIONAL, namespace)
     find_files(sections, path)
@@ -276,8 +282,9 @@ def parse_scenario_sections(content: bytes, path: Path, namespace: str | None = 
 def find_files(sections: Sections, path: Path) -> None:
     """Find the files that the sections of a parameter file name.
 
-    A path of an airframe or of a recorded command that names no file from the working folder is
-    tried from the folder of the parameter file, and then by its file name in that folder.
+    A section can name an airframe file and recorded commands. If such a path leads to no file from
+    the working folder, it is tried relative to the folder of the parameter file. Then its bare file
+    name is tried in that folder.
     """
     recorded = sections.get("reference_model", {}).get("recorded")
     signals = recorded.values() if isinstance(recorded, Mapping) else ()
@@ -295,9 +302,10 @@ def guidance_by_rule(
 ) -> dict[str, Any]:
     """Compute the parameters of guidance that follow from the other sections.
 
-    The authorities of throttle and aileron are abs(Omega_ii) u for RISE-DI, with Omega_ii = omega /
-    input_scale and the limits of u from trim. A controller without these numbers has none. Raises
-    ParameterError if the model or the aircraft does not suit guidance.
+    For RISE-DI, the authorities of throttle and aileron are abs(Omega_ii) u, with Omega_ii = omega
+    / input_scale and u at its limits, as deviations from trim. If a controller lacks these numbers,
+    the result has no authorities. Raises ParameterError if the model or the aircraft does not suit
+    guidance.
     """
     key = "reference_model.second_order"
     channels = aircraft.channels()
@@ -343,7 +351,7 @@ def scenario_yaml(
     """Write a scenario file as text with every parameter, defaults included.
 
     `overrides` replace parameters by section. A parameter is left out if its value is None or
-    empty, because that is the default.
+    empty, because such a value is its default.
 
     Args:
         scenario: The scenario to write.
@@ -377,9 +385,9 @@ def scenario_yaml(
 
 
 def _yaml_values(values: Any) -> Any:
-    """Return values with lists in place of tuples.
+    """Return the values with lists in place of tuples.
 
-    None, and empty texts, lists and mappings, are left out.
+    An item of a mapping is left out if its value is None, or an empty text, list or mapping.
     """
     if isinstance(values, Mapping):
         converted = {key: _yaml_values(value) for key, value in values.items()}
@@ -434,7 +442,7 @@ def check_together(scenario: Scenario) -> None:
 def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
     """Warn of each limit of the controller that is beyond an end stop of the actuators.
 
-    At such a limit the anti-windup starts too late.
+    If a limit is beyond the stop, the anti-windup starts too late.
     """
     controller = scenario.controller
     actuators = scenario.aircraft.actuators
@@ -468,8 +476,9 @@ def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
 def require_guidable(scenario: Scenario) -> None:
     """Raise ParameterError if guidance cannot fly a scenario.
 
-    It cannot if a bank does not turn the simulated airframe, or if the flight begins outside a
-    fence. Behind a bridge, the airframe of the scenario does not fly.
+    Guidance cannot fly if a bank does not turn the simulated airframe, or if the flight begins
+    outside a fence. Do not call this for a flight behind a bridge, because another airframe than
+    that of the scenario flies there.
     """
     aircraft = scenario.aircraft
     guidance = scenario.guidance
@@ -542,8 +551,8 @@ def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
 def opposite_signs(scenario: Scenario) -> tuple[str, ...]:
     """Warn, in a sentence, if D contradicts the signs of C B of the airframe file.
 
-    The law then drives y away from y_m. With an allocation, or without an airframe file, nothing is
-    compared.
+    With wrong signs the law drives y away from y_m. If there is an allocation, or no airframe file,
+    nothing is compared.
     """
     controller = scenario.controller
     aircraft = scenario.aircraft

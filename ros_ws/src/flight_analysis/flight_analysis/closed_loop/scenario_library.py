@@ -48,15 +48,15 @@ def scenarios() -> list[str]:
 def find_scenario(
     name: FilePath | Scenario, duration: float | None = None, *, with_route: bool = True
 ) -> Scenario:
-    """Find a scenario by its name in LIBRARY or its .yaml file; set a `duration`, s, if given.
+    """Find a scenario by its name in LIBRARY, or read it from its .yaml file.
 
     Args:
         name: Name in the library, path of a scenario file (.yaml), or a Scenario.
-        duration: Duration of the flight, s; None: as in the file.
+        duration: Duration of the flight, s. If None, the duration in the file stays.
         with_route: Whether guidance keeps the route and the program of the file.
 
     Returns:
-        The scenario, read and validated. A Scenario stays as given, or gets the duration.
+        The scenario, read and validated. If `name` is a Scenario, only its duration can change.
 
     Raises:
         ParameterError: No scenario has the name, or the file is invalid.
@@ -80,8 +80,9 @@ def with_route(
 ) -> Scenario:
     """Return the scenario with a route that guidance flies from the start.
 
-    It replaces the scenario's route and program of targets. `fence` has more sections of guidance,
-    such as those of `read_fence_file`. Raises ParameterError if the route cannot be flown.
+    The route replaces the scenario's route and program of targets. `fence` has further sections of
+    guidance, such as the result of `read_fence_file`. Raises ParameterError if the route cannot be
+    flown.
     """
     leg_speeds = speeds(waypoints, scenario.aircraft.channels().speed)
     route: dict[str, list[Any]] = {
@@ -104,10 +105,10 @@ def with_route(
 def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
     """Return the scenario with a file from which the nodes in a namespace read the same.
 
-    That is the scenario's own file, unless it has recorded commands or sections for another
-    namespace, such as /uav7/controller. Otherwise it is a new file in the folder `run`, which holds
-    the values of the recorded commands, so that the log needs no other file to be flown again, and
-    has sections for any namespace. Raises ParameterError if the file cannot be written.
+    The scenario keeps its own file, unless this has recorded commands or sections for another
+    namespace, such as /uav7/controller. In these cases a new file is written into the folder `run`.
+    It has sections for any namespace and holds the values of the recorded commands, so that the log
+    can be flown again without another file. Raises ParameterError if the file cannot be written.
     """
     if not scenario.reference_model.recorded and _reaches_nodes(scenario.path, namespace):
         return scenario
@@ -115,10 +116,10 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
 
 
 def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
-    """Add to the scenario what else a parameter file says to the nodes in a namespace.
+    """Return the scenario with the values that a parameter file gives the nodes in a namespace.
 
-    Its values replace those of the same names. Raises ParameterError with the name of the file,
-    because the scenario alone is valid.
+    They replace the scenario's values of the same names. An error must be in the parameter file,
+    because the scenario alone is valid. ParameterError therefore names the parameter file.
     """
     content = read_file(path, str(path), "a ROS parameter file")
     further = parse_sections(content, path, SCHEMAS, tuple(SCHEMAS), namespace, with_general=True)
@@ -147,8 +148,8 @@ def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
 def _reaches_nodes(path: Path, namespace: str) -> bool:
     """Return whether the nodes in a namespace get every section of a scenario file, and no other.
 
-    Overrides of a node are written into a section for all nodes, which rcl puts before that of the
-    node.
+    If the file has a section for all nodes, the result is False. rcl would put the overrides of a
+    node into this section, and a section of the node itself would replace them.
     """
     content = read_file(path, str(path), A_SCENARIO)
     if has_general(content, path):

@@ -33,7 +33,7 @@ from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 Record = Callable[[Mapping[str, Signal]], None]
-"""Takes the samples of a part of a flight, by topic."""
+"""Takes the samples of a span of a flight, by topic."""
 
 
 class _Recorder:
@@ -105,11 +105,11 @@ def fly(
 ) -> Outcome:
     """Fly a scenario and return the outcome.
 
-    `record` takes the samples once per simulated second and at the end. `progress` is called with
-    the flight time after `record`. `guide` makes the guidance of a scenario that has one; the
-    default gets the true pose. `control` makes the controller. `learn` makes the learner of a
-    scenario that learns, and `announce` takes the events of the learning. Raises ParameterError if
-    the scenario learns and `learn` is None.
+    `record` takes the samples once per simulated second and at the end. After each of these calls
+    `progress` is called with the flight time. `guide` makes the guidance if the scenario has any.
+    `control` makes the controller. `learn` makes the learner of a scenario that learns, and
+    `announce` takes the events of the learning. Raises ParameterError if the scenario learns and
+    `learn` is None.
 
     The order at an instant is: y of the aircraft, y_m of the reference model, u_m of guidance,
     proposals of the learner, u of the controller. A flight ends early if it diverges or is

@@ -63,7 +63,7 @@ class FlightLoop:
 
 
 class Topics:
-    """The samples of the topics. Subscribers get them and, if `recorded`, they are kept."""
+    """The samples of the topics, which are handed to subscribers and kept if `recorded`."""
 
     def __init__(self, *, recorded: bool = True) -> None:
         self._recorded = recorded
@@ -83,7 +83,7 @@ class Topics:
     def subscribe(self, topic: str, take: Take, channels: Sequence[str] | None = None) -> None:
         """Hand each sample of a topic to `take`.
 
-        `channels` of the topic come in this order; None stands for all channels.
+        A sample has only these `channels`, in this order. If None, it has all channels.
         """
         self._subscriptions[topic].append((channels, take))
 
@@ -119,7 +119,7 @@ class Topics:
 
 
 def _or_refuse(take: Take) -> Take:
-    """Refuse a sample with a ChannelError, as a node does."""
+    """Return a `take` that ignores a sample if it raises ChannelError, as a node does."""
 
     def take_or_refuse(sample: StampedVector, t_ns: int) -> None:
         with suppress(ChannelError):
@@ -131,8 +131,8 @@ def _or_refuse(take: Take) -> Take:
 class AircraftStation:
     """The simulated aircraft: it publishes y, pose and truth, and holds the last u.
 
-    A lost sample of y is not published, and a delayed sample keeps its stamp. `every_ns` is a
-    period above that of the sensors.
+    A lost sample of y is not published, and a delayed sample keeps its stamp. `every_ns` replaces
+    the period of the sensors by a longer one.
     """
 
     def __init__(
@@ -218,7 +218,10 @@ class GuidanceStation:
 
 
 class ControllerStation:
-    """The controller: it publishes u and the log of its ticks. `output` is the last tick's."""
+    """The controller: it publishes u and the log of its ticks.
+
+    `output` is the output of the last tick, or None if that tick had none.
+    """
 
     def __init__(self, controller: Controller, topics: Topics) -> None:
         parameters = controller.parameters

@@ -11,7 +11,7 @@
 | `uncertain_loop` | the box of uncertain aircraft as a loop with a block of deviations |
 | `worst_case` | searches the worst aircraft of a box |
 | `structured_value` | bounds the structured singular value |
-| `branch_and_bound` | proves a bound over parts of the box |
+| `branch_and_bound` | proves stability over the box, which it splits where necessary |
 | `guarantee` | the largest box for which stability and a disk are proved |
-| `certificate` | a guarantee as a file: checked without this stack, shown by later flights |
+| `certificate` | a guarantee as a file, which can be checked without this stack |
 """

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Proves stability for every aircraft of a box whose bound as a whole is too large.
+"""Proof of stability for every aircraft of a box, if one bound for the whole box is too large.
 
-The box is halved along one parameter, and each half again, over the frequencies that are left.
+The box is halved along one parameter, and each half again, over the frequencies at which nothing is
+proved yet.
 Source: M. P. Newlin, P. M. Young, International Journal of Robust and Nonlinear Control 7, 1997.
 """
 
@@ -24,20 +25,24 @@ from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
 from flight_core.vectors import FloatArray
 
 LEVELLED = 8  # frequencies at which the ratios of D for the channels of a late u are sought
-DIGITS = 5  # significant digits of D and G in a step
+DIGITS = 5  # significant digits of D and G in a step of a proof
 
 
 class Region(NamedTuple):
-    """The aircraft with abs(d - centre) <= half, (r,), at the frequencies from low to high."""
+    """The aircraft with abs(d - centre) <= half, at the frequencies from low to high.
+
+    d, `centre` and `half` have the shape (r,).
+    """
 
     centre: FloatArray
     half: FloatArray
     low: float  # rad/s
     high: float
-    scaling: Scaling | None = None  # D and G of a larger box or of a neighbouring frequency
+    # D and G of a larger box or of a neighbouring frequency, at which the search begins
+    scaling: Scaling | None = None
 
     def halves(self, i: int) -> list["Region"]:
-        """Return both halves along a parameter."""
+        """Return the two halves of the region along parameter i."""
         half = self.half.copy()
         half[i] /= 2.0
         step = np.zeros(len(half))
@@ -46,24 +51,24 @@ class Region(NamedTuple):
         return [narrowed._replace(centre=self.centre + side * step) for side in (-1.0, 1.0)]
 
     def outside(self, begin: float, end: float) -> list["Region"]:
-        """Return what is left of the frequencies below and above an interval, rad/s."""
+        """Return the regions with the frequencies below and above an interval, rad/s."""
         below = self._replace(high=begin)
         above = self._replace(low=end)
         return [side for side in (below, above) if side.high > side.low]
 
 
 def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[str, Any]] | None:
-    """Find the steps that prove the loop stable; None if `most` steps are too few.
+    """Find the steps that prove the loop stable, or return None if `most` steps are too few.
 
-    The proof holds for all abs(d_i) <= size, for any delays of the part from tick to tick, and for
-    complex disks of size `disk` in the channels of disks. It starts from d = 0, where the loop is
-    stable, and shows that no aircraft of the box has a mode on abs(z) = RADIUS. The eigenvalues
-    move continuously over the box, so none of them can leave the circle.
+    The proof holds for all abs(d_i) <= size, for delays that change from tick to tick within their
+    range, and for complex disks of size `disk` in the channels of disks. It starts from d = 0,
+    where the loop is stable, and shows that no aircraft of the box has a mode on abs(z) = RADIUS.
+    The eigenvalues move continuously over the box, so none of them can leave the circle.
 
-    Each step takes the last box of a list, which at first holds the whole box from 0 to pi / T.
-    Either the step halves this box along an entry, {"halve": i}, and appends both halves; or it
-    proves the box from "low" to "high", rad/s, by "t" and "g", and appends what is left below and
-    above.
+    Each step takes the last region of a list, which at first holds the whole box from 0 to pi / T.
+    A step {"halve": i} halves this region along entry i and appends both halves to the list. Every
+    other step proves the region from "low" to "high", rad/s, by "t" and "g", and appends the
+    regions that are left below and above.
     """
     highest = np.pi / part.period
     narrowest = NARROWEST * highest
@@ -101,9 +106,10 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
 
 
 def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
-    """Round D and G to `t` and `g` of a step; any D and G prove a bound, so this is safe.
+    """Round D and G, and return them as `t` and `g` of a step.
 
-    Only those of the means are written if the others follow from them, as in `tightened_at`.
+    Rounding is safe, because any D and G prove a bound. The step has only the D and G of the means
+    over a period if the others follow from these, as in `tightened_at`.
     """
     count = len(scaling.t) if scaling.g[entries:].any() else entries
     t, g = ([float(f"{x:.{DIGITS}g}") for x in values[:count]] for values in (scaling.t, scaling.g))
@@ -111,7 +117,7 @@ def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
 
 
 def _frequency(region: Region, highest: float) -> float:
-    """Choose the frequency of a region to bound: first the ends 0 and pi / T, where M is real."""
+    """Choose the frequency at which a region is bounded, first 0 and pi / T, where M is real."""
     if region.low == 0.0:
         return 0.0
     return highest if region.high == highest else float(np.sqrt(region.low * region.high))
@@ -120,7 +126,8 @@ def _frequency(region: Region, highest: float) -> float:
 def _levelled(part: Channels, scale: FloatArray) -> Channels:
     """Scale the channels of a late u so that one factor of D serves them at the worst frequency.
 
-    What changes from tick to tick must have the same D at all frequencies, up to a common factor.
+    A delay can change from tick to tick. Its channels must therefore have the same D at all
+    frequencies, up to a common factor.
     """
     if not part.late:
         return part

@@ -4,7 +4,7 @@
 
 examples/check_certificate.py reads a certificate, which contains the sampled loop in numbers, the
 box of its entries, and the steps of the proof. The checker computes the motion over a period again,
-and bounds what the Legendre coefficients leave out.
+and bounds the error of the Legendre coefficients that are left out.
 
 A report shows the guarantee that was computed for its loop, but computes none itself. Guarantees
 are kept in the folder rise-di/guarantees in $XDG_CACHE_HOME, or in ~/.cache, by the digest of the
@@ -35,13 +35,13 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
 
     Args:
         linear: The loop, with the box of the guarantee, of any size.
-        promise: Its guarantee, with u in time.
+        promise: The guarantee of this loop, computed for u in time.
         sources: What the loop belongs to, by name: SHA-256 of the airframe and of the scenario, and
             the text of the exported constants.
 
     Raises:
-        ParameterError: Nothing is proved, a lag is in the box, or u may be late: what the
-            coefficients of a late u leave out has no bound.
+        ParameterError: Nothing is proved, a lag is in the box, or u can be late. For a late u, the
+            checker has no bound for the coefficients that are left out.
     """
     require(promise.stable > 0.0, "certificate", "no stable box", "a loop with a guarantee")
     require(promise.late == 0.0, "certificate", f"u up to {promise.late:g} s late", "u in time")
@@ -67,7 +67,7 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
 
 
 def keep(promise: Guarantee) -> None:
-    """Keep a guarantee with u in time, unless its folder cannot be written."""
+    """Keep a guarantee for u in time. If its folder cannot be written, do nothing."""
     if promise.late:
         return
     path = _path(promise.loop)
@@ -79,19 +79,19 @@ def keep(promise: Guarantee) -> None:
 
 
 def kept_guarantee(linear: LinearLoop) -> Guarantee | None:
-    """Return the guarantee that was computed for a loop and that holds for its aircraft.
+    """Return the guarantee that was computed for a loop, if it holds for the aircraft that flies.
 
-    Returns None if there is none, if its file is damaged, or if `unstated` has a reason.
+    Returns None if no guarantee is kept, if its file is damaged, or if `unstated` has a reason.
     """
     promise = _kept(linear)
     return None if promise is None or unstated(linear, promise) else promise
 
 
 def unstated(linear: LinearLoop, promise: Guarantee) -> tuple[str, ...]:
-    """Return why a guarantee cannot be stated for the aircraft that flies; empty if it can.
+    """Return the reasons why a guarantee cannot be stated for the aircraft that flies.
 
-    A guarantee holds for a linear loop and for the aircraft within its box, so it says nothing
-    about what the loop leaves out.
+    There are none if it can be stated. A guarantee holds for a linear loop and for the aircraft
+    within its box, so it says nothing about what the loop leaves out.
     """
     reasons = [each.sentence for each in linear.differences if each.standing is not Standing.TAKEN]
     return (*reasons, *_beyond_box(linear, promise))

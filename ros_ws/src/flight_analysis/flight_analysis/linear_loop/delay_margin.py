@@ -10,10 +10,11 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, LoopTiming, is_stable
 
 MAX_DELAY_MARGIN = 0.5
-"""s, upper end of the search for a delay margin. A loop that tolerates more is slower than any loop
+"""Upper end of the search for a delay margin, s. A loop that tolerates more is slower than any loop
 of this stack."""
 
-NEAR = 4  # times the resolution: first step of a search that begins at the margin of a similar loop
+# first step of a search that begins at the margin of a similar loop, in multiples of the resolution
+NEAR = 4
 
 
 def delay_margin(
@@ -24,13 +25,13 @@ def delay_margin(
     longest: float = MAX_DELAY_MARGIN,
     near: float | None = None,
 ) -> float:
-    """Find the delay margin: pure delay beyond loop.delay, s, at the limit of stability.
+    """Find the delay margin: the delay beyond loop.delay, s, at the limit of stability.
 
-    Input i is late by `share`_i, (m,), of the delay, so you can delay all inputs alike or only some
-    of them. The margin is 0 if the loop is unstable without extra delay, and infinite if the loop
-    tolerates `longest`, s. The search takes steps of half a period, then bisects down to 0.1 ms. If
-    you give the margin of a similar loop as `near`, s, the search begins there and takes a third of
-    the time.
+    Input i is delayed by `share`_i times the delay, so you can delay all inputs alike or only some
+    of them. `share` has the shape (m,). The margin is 0 if the loop is unstable without extra
+    delay, and infinite if the loop tolerates `longest`, s. The search takes steps of half a period,
+    then bisects down to 0.1 ms. If you give the margin of a similar loop as `near`, s, the search
+    begins at this margin and takes a third of the time.
     """
     delayed = np.broadcast_to(share, loop.lag.shape)
     stride = 1  # in parts of 0.1 ms or less

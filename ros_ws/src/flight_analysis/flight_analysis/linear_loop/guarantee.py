@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What holds for every aircraft of a box.
+"""Guarantees that hold for every aircraft of a box.
 
 A guarantee states the deviation up to which the loop is stable, and the disk margins that remain.
-Deviations are constant in time and the loop is linear, without saturation or rate limits.
+It assumes that the deviations are constant in time, and that the loop is linear, without saturation
+or rate limits.
 """
 
 from collections.abc import Sequence
@@ -26,20 +27,22 @@ from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import LoopTiming, closed_loop, is_stable
 
-LARGEST = 0.99  # relative deviation up to which an unstable aircraft is sought
+LARGEST = 0.99  # relative deviation up to which the search for an unstable aircraft goes
 WIDEST_DISK = 2.0  # a disk of 2 means a phase margin of 90 deg and any gain
-EXACT = 1.002  # factor on the deviations of an unstable aircraft until the exact loop confirms it
-CONFIRMED = 10  # number of such factors that are tried
+# factor by which the deviations of an unstable aircraft grow until the exact loop confirms it
+EXACT = 1.002
+CONFIRMED = 10  # number of such steps that are tried
 
-# gaps between what is proved and what was found; the first is tried first, then finer ones
+# gaps between the size that is proved and the least size that was found too large, as fractions of
+# the proved size: if the first can be proved, the finer ones are tried as well
 GAPS = (0.08, 0.16, 0.32, 0.64, 1.28, 2.56)
 FINER_GAPS = (0.04, 0.02, 0.01, 0.005)
-BOXES = 1500  # for the first gap
-FEWER_BOXES = 300  # for the other gaps, and for disks
-# How much larger deviations are proved than are stated, as a fraction: this covers the coefficients
-# that are left out, and what a check by intervals loses.
+BOXES = 1500  # largest number of steps of a proof for the first gap
+FEWER_BOXES = 300  # the same for the other gaps, and for disks
+# The proved deviations are larger than the stated ones by this fraction. It covers the coefficients
+# that are left out, and the width that a check by interval arithmetic loses.
 SLACK = 2e-3
-NAMED = 12  # digits of a digest, which name a certificate
+NAMED = 12  # number of digits of the digest that name a certificate
 
 
 class Unstable(NamedTuple):
@@ -51,20 +54,21 @@ class Unstable(NamedTuple):
 
 
 class Guarantee(NamedTuple):
-    """What holds for every aircraft of a box, where sizes are fractions of each entry."""
+    """A guarantee for every aircraft of a box. Deviations are fractions of the nominal entry."""
 
     uncertainty: float  # largest relative deviation in the box
     stable: float  # every aircraft within this deviation is stable, at most 1
-    unstable: Unstable | None  # the first one found; None if there is none up to LARGEST
-    # balanced disk margin at an input that every aircraft of the box has, other loops closed
+    unstable: Unstable | None  # the least one found; None if none was found up to LARGEST
+    # balanced disk margin that every aircraft of the box has at an input, with other loops closed
     disk: dict[str, float]
-    disk_all: float  # with independent disks in all inputs at once
+    disk_all: float  # disk margin with independent disks in all inputs at once
     loop: str  # digest of the loop
-    # s: u is late by an unknown time from 0 to this, which changes from tick to tick
+    # u is late by an unknown time from 0 to this number, s, and this time changes from tick to tick
     late: float = 0.0
     has_exact_lags: bool = True  # whether no lag of an actuator is in the box
     exact: tuple[str, ...] = ()  # nonzero entries of A and B that are not part of the box
-    proof: Sequence[dict[str, Any]] = ()  # with "entries" and "steps" of each part, see `proof_of`
+    # "entries" and "steps" of each strongly connected part of the loop, as in `proof_of`
+    proof: Sequence[dict[str, Any]] = ()
 
     @property
     def holds(self) -> bool:
@@ -73,7 +77,7 @@ class Guarantee(NamedTuple):
 
     @property
     def certificate(self) -> str:
-        """Name of its certificate; "" for a late u, a lag in the box, or nothing proved."""
+        """Name of the certificate, or "" if u is late, a lag is uncertain or nothing is proved."""
         return self.loop[:NAMED] if self.stable and not self.late and self.has_exact_lags else ""
 
     def as_json(self) -> dict[str, Any]:
@@ -86,10 +90,10 @@ class Guarantee(NamedTuple):
 
 
 def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
-    """Compute the guarantee for the box of a loop, with u late in each input.
+    """Compute the guarantee for the box of a loop.
 
-    u is late by an unknown time from 0 to `late`, s, which changes from tick to tick. Raises
-    ParameterError if the loop has no box.
+    Each input is late by an unknown time from 0 to `late`, s, which changes from tick to tick.
+    Raises ParameterError if the loop has no box.
     """
     box = linear.box
     require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
@@ -112,7 +116,7 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     uncertain = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
     first = _first_unstable(linear, late)
     size = (1.0 if first is None else first.deviation) / largest
-    # nothing larger is proved for lags
+    # beyond MOST_OF_LAG nothing can be proved for a lag
     most = MOST_OF_LAG / float(box.part[is_lag].max()) if is_lag.any() else np.inf
     exact = first is None or most < size
     proved, proof = _proved(parts_of(uncertain), min(size, most), disks=False, exact=exact)
@@ -144,13 +148,13 @@ def _exact_entries(linear: LinearLoop, box: Box) -> tuple[str, ...]:
 
 
 def _loops(linear: LinearLoop, late: float) -> list[LoopTiming]:
-    """Return the loop with u in time, and with u late by the whole time."""
+    """Return the timing of the loop with u in time, and with u late by the whole of `late`, s."""
     loop = linear.loop
     return [loop._replace(delay=loop.delay + extra) for extra in sorted({0.0, late})]
 
 
 def _first_unstable(linear: LinearLoop, late: float) -> Unstable | None:
-    """Search for an unstable aircraft, and return the first one found."""
+    """Search for unstable aircraft, and return the one with the least deviation, if any."""
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
     largest = LARGEST / float(box.part.max())
@@ -163,17 +167,21 @@ def _first_unstable(linear: LinearLoop, late: float) -> Unstable | None:
 
 
 def _disk(loop: Channels, inputs: tuple[int, ...], least: float) -> float:
-    """Return the disk margin that every aircraft of the box has, given the least one found."""
+    """Return the disk margin that is proved for every aircraft of the box.
+
+    `least` is the least disk margin that a search has found.
+    """
     return _proved(parts_of(loop, inputs), min(least, WIDEST_DISK), disks=True)[0]
 
 
 def _proved(
     parts: list[Channels], least: float, *, disks: bool, exact: bool = False
 ) -> tuple[float, list[dict[str, Any]]]:
-    """Prove the largest size possible below `least`, which was found to be too large.
+    """Prove the largest size possible below `least`, and return this size and the proof.
 
-    The size is that of the deviations, or that of the disks over the whole box; 0 if none is
-    proved. With `exact`, `least` itself may be proved. The proof comes second.
+    The size is that of the deviations, or with `disks` that of the disks over the whole box. It is
+    0 if none is proved. A search has found that `least` is too large, unless `exact`, in which case
+    `least` itself is tried first.
     """
     for proved in (*(0.0,) * exact, *GAPS):
         most = FEWER_BOXES if disks or proved > GAPS[0] else BOXES
@@ -195,7 +203,10 @@ def _proved(
 def _proof(
     parts: list[Channels], size: float, most: int, *, disks: bool
 ) -> list[dict[str, Any]] | None:
-    """Prove each part for a size larger by SLACK; None if `most` boxes are not enough."""
+    """Prove each part for a size, or return None if `most` steps are not enough.
+
+    The proved deviations exceed the size by the fraction SLACK.
+    """
     proof = []
     for part in parts:
         deviation, disk = (1.0, size) if disks else ((1.0 + SLACK) * size, 0.0)
@@ -208,7 +219,10 @@ def _proof(
 
 
 def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:
-    """Return the aircraft of deviations d, made a little larger if the exact loop requires it."""
+    """Return the aircraft with deviations d if the exact loop confirms that it is unstable.
+
+    If necessary, d grows a little until the exact loop confirms it.
+    """
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
     still = np.zeros(len(linear.inputs))

@@ -34,43 +34,43 @@ IntArray = NDArray[np.intp]
 
 DECADES = 5
 PER_DECADE = 40
-"""Grid of frequencies below pi / T. The frequencies of the modes are added to it, and eight points
-around every peak."""
+"""The grid of frequencies has this many points per decade, over DECADES below pi / T. The
+frequencies of the modes are added to it, and eight points around every peak."""
 
 SLOW = np.pi / 2.0
-"""rad, natural frequency times T up to which a mode counts as slow: four ticks a cycle. A faster
-mode shows in gain margin and S."""
+"""A mode counts as slow if its natural frequency times T is below this, rad, so that a cycle has
+more than four ticks. A faster mode shows in gain margin and S."""
 
-# rad, natural frequency times T below which an eigenvalue belongs to an integral or a kept constant
+# An eigenvalue belongs to an integral or a constant state if its frequency times T is less, rad.
 NO_MODE = 1e-6
-# magnitude of an eigenvalue of a motion ended within a period: a delayed input, or rounding
+# An eigenvalue below this magnitude is a delayed input or rounding: its motion ends in a period.
 VANISHED = 1e-9
-# largest condition of the vectors of the modes, Frobenius: S is exact to 1e-9 below
+# Up to this condition of the eigenvectors, in the Frobenius norm, S is exact to 1e-9.
 MOST_CONDITION = 1e6
 BATCH = 16  # aircraft computed together: larger arrays leave the cache
-# entries of a complex matrix below which OpenBLAS starts no threads: threads would only wait
+# OpenBLAS starts no threads for a complex matrix with at most this many entries. Threads would only
+# wait.
 SERIAL_SIZE = 4000
-# rad, phase of -L at the lowest frequency below which L is taken as real there
+# L counts as real at the lowest frequency if the phase of -L there is less than this, rad.
 PHASE_AT_ZERO = 0.01
-# rounds of `scaled_norm`, and of the search for the peak
-BALANCED_ROUNDS = 6
-DESCENT_STEPS = 40
-MAX_REFINED = 40
+BALANCED_ROUNDS = 6  # rounds of Osborne's iteration
+DESCENT_STEPS = 40  # steps of the descent in `scaled_norm`
+MAX_REFINED = 40  # rounds of the search for the largest norm over the frequencies
 
 
 class Margins(NamedTuple):
-    """Margins at m inputs, shapes (..., m), and of the loop as a whole, (...).
+    """Margins at m inputs, shape (..., m), and margins of the loop as a whole, shape (...).
 
-    An unstable loop has no margins: they are 0 or 1, and S is infinite.
+    For an unstable loop the gain margins are 1, the other margins 0, and the sensitivity infinite.
     """
 
     stable: NDArray[np.bool_]  # (...) whether no eigenvalue lies outside the unit circle
     phase: FloatArray  # (..., m) rad, infinite where abs(L_i) is never 1
-    crossover: FloatArray  # (..., m) rad/s, frequency of this phase margin, 0 without a crossover
+    crossover: FloatArray  # (..., m) rad/s, frequency of the phase margin, 0 without a crossover
     gain_decrease: (
-        FloatArray  # (..., m) factor below 1 at which the loop turns unstable, 0 without a limit
+        FloatArray  # (..., m) factor below 1 at which the loop becomes unstable, 0 without a limit
     )
-    gain_increase: FloatArray  # (..., m) factor above 1, infinite without a limit
+    gain_increase: FloatArray  # (..., m) the same factor above 1, infinite without a limit
     sensitivity: FloatArray  # (..., m) largest abs(S_ii)
     disk: FloatArray  # (..., m) balanced disk margin of an input, 0 to 2
     sensitivity_all: (
@@ -86,11 +86,15 @@ class Margins(NamedTuple):
             return np.minimum(self.gain_increase, 1.0 / self.gain_decrease)
 
     def at(self, place: int | slice) -> "Margins":
-        """Return the figures of one of N aircraft, or of some of them."""
+        """Return the margins of one of N aircraft, or of some of them."""
         return Margins(**{name: value[place] for name, value in self._asdict().items()})
 
     def worst(self) -> "Margins":
-        """Return the worst of N aircraft figure by figure, from shapes (N, m) and (N,)."""
+        """Return the worst value of each margin among N aircraft.
+
+        The margins have the shapes (N, m) and (N,) before, and (m,) and () after. `crossover` is
+        that of the aircraft with the smallest phase margin.
+        """
         least = {name: np.asarray(value.min(axis=0)) for name, value in self._asdict().items()}
         most = {
             name: np.asarray(getattr(self, name).max(axis=0))
@@ -123,9 +127,9 @@ class SlowModes(NamedTuple):
 
 
 def slow_modes(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> SlowModes:
-    """Compute the slow modes of an aircraft: frequency abs(p) and damping -Re p / abs(p).
+    """Compute the slow modes of an aircraft under a law.
 
-    p = log(eigenvalue) / T.
+    With p = log(eigenvalue) / T, the frequency is abs(p) and the damping ratio -Re p / abs(p).
     """
     eigenvalues = np.linalg.eigvals(closed_loop(plant, law, loop, np.zeros(len(loop.lag))))
     return _slow_modes(eigenvalues.astype(np.complex128), loop.period)
@@ -141,7 +145,7 @@ def _slow_modes(eigenvalues: ComplexArray, period: float) -> SlowModes:
 def loop_transfer(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming, w: FloatArray
 ) -> ComplexArray:
-    """Compute L_i of an aircraft at the frequencies w, (F,) rad/s up to pi / T, shape (F, m)."""
+    """Compute L_i of an aircraft at F frequencies w, rad/s, up to pi / T. The shape is (F, m)."""
     form = schur_form(LinearPlant(plant.A[None], plant.B[None], plant.C), law, loop)
     S = _sensitivity(form, np.exp(1j * w * loop.period)[None])[0]
     return np.asarray(1.0 / np.einsum("...ii->...i", S) - 1.0)
@@ -152,16 +156,17 @@ def input_margins(
 ) -> Margins:
     """Compute the margins of an aircraft, or of N aircraft.
 
-    N aircraft have A (N, n, n) and B (N, n, m) of the plant, and either a common law or one law
-    each. Crossings found on the grid of frequencies are refined to rounding, peaks to 1e-3 of their
-    height. The phase margin is the smallest abs(angle(-L_i)) at abs(L_i) = 1. The gain margins are
-    the values of 1 / abs(L_i) at real L_i < 0 that are next to 1 on either side. The disk margin of
-    an input is 1 / max_w abs(S_ii - 1/2); with independent disks in all inputs at once it is
+    For N aircraft, the plant has A (N, n, n) and B (N, n, m), and the law is either common or one
+    for each aircraft. Crossings that are found on the grid of frequencies are refined to rounding,
+    and peaks to 1e-3 of their height. The phase margin is the smallest abs(angle(-L_i)) at
+    abs(L_i) = 1. The gain margins are the values of 1 / abs(L_i) at real L_i < 0 that are next to 1
+    on either side. The disk margin of an input is 1 / max_w abs(S_ii - 1/2). With independent disks
+    in all inputs at once, it is
 
         1 / max_w min_D norm(D (S - I/2) D^-1, 2),  D diagonal
 
-    which is exact for m <= 3 and at most the disk margin for more inputs. Without `together`, the
-    figures of all inputs at once are NaN, which saves a third of the time.
+    This value is exact for m <= 3. For more inputs the true disk margin can be larger. If
+    `together` is False, `sensitivity_all` and `disk_all` are NaN, which saves a third of the time.
     """
     shape = _batch_shape(plant, law)
     parts = [
@@ -177,10 +182,10 @@ def input_margins(
 
 
 def phase_margins(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> FloatArray:
-    """Compute only the `phase` of `input_margins`, (..., m), to 1e-8.
+    """Compute only the phase margins of `input_margins`, (..., m), rad, to 1e-8.
 
-    There is no search for gain margins and peaks. If the modes of a loop are independent, it is
-    evaluated as a sum over them.
+    This is faster, because there is no search for gain margins and peaks. If the modes of a loop
+    are independent, S is evaluated as a sum over the modes.
     """
     parts = []
     for aircraft, its_law in _batches(plant, law):
@@ -213,7 +218,7 @@ class SchurForm(NamedTuple):
     v = d + L (z - T)^-1 R d.
     """
 
-    T: ComplexArray  # (N, k, k) upper triangular, or (N, k) a diagonal
+    T: ComplexArray  # upper triangular (N, k, k), or the diagonal alone (N, k)
     R: ComplexArray  # (N, k, m)
     L: ComplexArray  # (N, m, k)
 
@@ -224,7 +229,7 @@ class SchurForm(NamedTuple):
 
 
 def _batches(plant: LinearPlant, law: LinearLaw) -> Iterator[tuple[LinearPlant, LinearLaw]]:
-    """Split an aircraft, or N of them, each with its law, into batches."""
+    """Split one or N aircraft into batches, and yield each batch with the laws of its aircraft."""
     shape = _batch_shape(plant, law)
     count = int(np.prod(shape))
 
@@ -243,7 +248,7 @@ def _batches(plant: LinearPlant, law: LinearLaw) -> Iterator[tuple[LinearPlant, 
 
 
 def schur_form(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> SchurForm:
-    """Bring the closed loops of N aircraft, A (N, n, n), B (N, n, m), into Schur form."""
+    """Bring the closed loops of N aircraft, with A (N, n, n) and B (N, n, m), into Schur form."""
     from scipy.linalg import schur  # noqa: PLC0415 - a controller without an observer starts without it
 
     A, B, K = _from_inputs_to_inputs(plant, law, loop)
@@ -264,7 +269,7 @@ def _modal_form(
     size = np.linalg.norm(modes, axis=(1, 2))
     try:
         inverse: ComplexArray = np.linalg.inv(modes).astype(np.complex128)
-    except np.linalg.LinAlgError:  # vectors that are equal to the bit
+    except np.linalg.LinAlgError:  # two eigenvectors are equal to the last bit
         inverse = np.full_like(modes, np.inf)
     with np.errstate(over="ignore"):
         independent = size * np.linalg.norm(inverse, axis=(1, 2)) <= MOST_CONDITION
@@ -275,7 +280,7 @@ def _modal_form(
 def _from_inputs_to_inputs(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the closed loops of N aircraft from a disturbance d of the inputs to u.
+    """Return A, B and K of the closed loops of N aircraft, from a disturbance d of the inputs to u.
 
     z+ = A z + B d, u = K z
     """
@@ -350,7 +355,7 @@ def _stable(form: SchurForm) -> NDArray[np.bool_]:
 
 
 def on_grid(form: SchurForm, period: float) -> tuple[FloatArray, ComplexArray]:
-    """Return the grids of the aircraft, (N, F), rad/s, and the balanced S on them, (N, F, m, m)."""
+    """Return the frequencies of each aircraft, (N, F), rad/s, and the balanced S, (N, F, m, m)."""
     w = _frequencies(form.eigenvalues, period)
     return w, _balanced(_sensitivity(form, np.exp(1j * w * period)))
 
@@ -362,9 +367,9 @@ def _loop_of_sensitivity(S: ComplexArray) -> ComplexArray:
 
 
 def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:
-    """Return the grids of the aircraft, (N, F), rad/s, ascending.
+    """Return the ascending frequencies at which each aircraft is evaluated, (N, F), rad/s.
 
-    Each is a common grid plus the frequencies of the modes.
+    They are a common grid and the frequencies of the modes of the aircraft.
     """
     highest = np.pi / period
     turns = np.log(np.where(np.abs(eigenvalues) > VANISHED, eigenvalues, VANISHED)) / period
@@ -375,9 +380,10 @@ def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:
 
 
 def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
-    """Place four points on either side of each peak, (N, G).
+    """Return four frequencies on either side of each peak, (N, G), rad/s.
 
-    The peaks are those of S_ii, of S_ii - 1/2 and of norms over the inputs, with S balanced.
+    The peaks are those of abs(S_ii), of abs(S_ii - 1/2) and of the norms of S and S - I/2, where S
+    is balanced.
     """
     diagonal = np.einsum("NFii->NFi", S)
     half = S - np.eye(S.shape[-1]) / 2.0
@@ -401,7 +407,10 @@ def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
 
 
 def _crossings(values: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Find aircraft, place and input of the changes of sign along the second axis of (N, F, m)."""
+    """Find the changes of sign along the second axis of `values`, (N, F, m).
+
+    Returns the index of the aircraft, of the frequency before the change, and of the input.
+    """
     return np.nonzero(np.signbit(values[:, :-1]) != np.signbit(values[:, 1:]))  # type: ignore[return-value]
 
 
@@ -418,7 +427,7 @@ def _refined(
     The method is regula falsi with the Illinois modification.
     """
     aircraft, place, channel = places
-    # only the row and column of the input that crosses
+    # Keep only the row and the column of the input whose L_i crosses.
     forms = SchurForm(
         form.T[aircraft], form.R[aircraft, :, channel, None], form.L[aircraft, None, channel]
     )
@@ -438,7 +447,7 @@ def _refined(
         L = 1.0 / S[:, 0, 0] - 1.0
         value = residual(L)
         side = np.where(np.signbit(value) == np.signbit(at_high), 1.0, -1.0)
-        # the value at an end that is kept twice is halved
+        # If an end is kept twice in a row, its value is halved.
         share = np.where(side == before, 0.5, 1.0)
         low = np.where(side > 0.0, low, middle)
         high = np.where(side > 0.0, middle, high)
@@ -456,7 +465,7 @@ def _log_gain(L: ComplexArray) -> FloatArray:
 def _phase_margins(
     form: SchurForm, w: FloatArray, L: ComplexArray, period: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Find the smallest abs(angle(-L_i)) at abs(L_i) = 1, and its frequency, (N, m)."""
+    """Find the smallest abs(angle(-L_i)) at abs(L_i) = 1, and its frequency, each (N, m)."""
     gains = _log_gain(L)
     places = _crossings(gains)
     frequency, crossing = _refined(form, w, places, gains, period, _log_gain)
@@ -472,12 +481,12 @@ def _phase_margins(
 def _gain_margins(
     form: SchurForm, w: FloatArray, L: ComplexArray, period: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Find the factors next to 1, below and above, with which L_i = -1, (N, m).
+    """Find the gain factors next to 1, below and above, that make L_i = -1, each (N, m).
 
-    L_i is also real at w = 0 and at pi / T.
+    L_i is also real at w = 0 and at pi / T, so these ends are crossings, too.
     """
     imaginary = np.imag(L) / (1.0 + np.abs(L))
-    imaginary[:, -1] = 0.0  # real there, apart from rounding
+    imaginary[:, -1] = 0.0  # L is real at pi / T, except for rounding
     places = _crossings(imaginary)
     inside = places[1] < L.shape[1] - 2  # the last point is treated separately
     places = (places[0][inside], places[1][inside], places[2][inside])
@@ -498,7 +507,7 @@ def _gain_margins(
 
 
 def _narrow(decrease: FloatArray, increase: FloatArray, place: tuple[int, int], L: float) -> None:
-    """Narrow the limits of the gain by 1 / abs(L) of a real L < 0."""
+    """Narrow the limits of the gain to the factor 1 / abs(L) where L is real, if L < 0."""
     if L < 0.0:
         factor = -1.0 / L
         if factor > 1.0:
@@ -511,7 +520,7 @@ def _narrow(decrease: FloatArray, increase: FloatArray, place: tuple[int, int], 
 
 
 def _balanced(matrices: ComplexArray) -> ComplexArray:
-    """Balance matrices: D M D^-1, (..., m, m), with similar norms of row i and column i.
+    """Return D M D^-1, (..., m, m), with D such that row i and column i have similar norms.
 
     The method is Osborne's iteration.
     """
@@ -537,7 +546,7 @@ def norm_bound(matrices: ComplexArray) -> FloatArray:
 
 
 def scaled_norm(matrices: ComplexArray) -> FloatArray:
-    """Compute min_D norm(D M D^-1, 2) over diagonal D > 0, M (P, m, m), shape (P,).
+    """Compute min_D norm(D M D^-1, 2) over diagonal D > 0, for P matrices M (m, m). Shape (P,).
 
     The result bounds the structured singular value. Osborne's iteration comes first, then a descent
     along d log norm / d log D_i = abs(u_i)^2 - abs(v_i)^2 with the singular vectors u and v. Any D
@@ -555,13 +564,14 @@ def scaled_norm(matrices: ComplexArray) -> FloatArray:
 
 
 def _largest_norm(balanced: ComplexArray) -> FloatArray:
-    """Return the largest `scaled_norm` over the second axis of (N, F, m, m).
+    """Return the largest `scaled_norm` over the second axis of (N, F, m, m), shape (N,).
 
-    Only the peak of an upper bound is refined, until it converges.
+    Every matrix has an upper bound. Only the largest bound of each aircraft is refined to the
+    scaled norm, and this is repeated until the largest one is refined already.
     """
     bounds = norm_bound(balanced)
     rows = np.arange(len(balanced))
-    # a diagonal entry, which D does not change
+    # D does not change a diagonal entry, so the largest one is a lower bound.
     least = np.abs(np.einsum("NFii->NFi", balanced)).max(axis=(1, 2))
     near = bounds > least[:, None]
     bounds[near] = np.linalg.norm(balanced[near], ord=2, axis=(1, 2))

@@ -44,12 +44,13 @@ from rise_di_controller.law.linear_loop import (
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-LAG_ENTRY = "1/lag"  # begins the name of an entry of an actuator
-LEAST_LAG = 2.0  # periods
+LAG_ENTRY = "1/lag"  # beginning of the name of an uncertain entry that is the lag of an actuator
+LEAST_LAG = 2.0  # least lag of an actuator that can be uncertain, periods
 MOST_OF_LAG = 0.8
 """The largest deviation d of 1 / lag for which a proof holds. With a lag of LEAST_LAG, the two
-Legendre coefficients of a period leave out less than a thousandth of it, which is half of what is
-proved beyond what is stated; for larger deviations they leave out more."""
+Legendre coefficients of a period leave out less than a thousandth of the deviation. This is half of
+the fraction by which the proved deviations exceed the stated ones. For a larger d they leave out
+more."""
 
 BARE = (
     "; each output integrates its inputs, without drag and phugoid: the margins cover Omega alone"
@@ -57,23 +58,28 @@ BARE = (
 
 
 ROUNDING = 1e-9  # relative deviation of an entry that counts as none
-DIGITS = 10  # of numbers in a digest: two ways to the same loop differ by rounding
+# significant digits of the numbers in a digest: two ways to the same loop differ only by rounding
+DIGITS = 10
 
 
 class LinearLoop(NamedTuple):
-    """The loop of a controller around a model of its aircraft; channels in the law's order."""
+    """The loop of a controller around a model of its aircraft.
 
-    model: str  # what the plant is the model of
-    states: tuple[str, ...]  # of the aircraft, followed by those actuators whose lag deviates
-    outputs: tuple[str, ...]  # that the law reads, vanes last
+    Its channels are in the order of the control law.
+    """
+
+    model: str  # a few words on what the plant models
+    states: tuple[str, ...]  # states of the aircraft, then the actuators whose lag deviates
+    outputs: tuple[str, ...]  # outputs that the law reads, with the vanes last
     inputs: tuple[str, ...]
-    plant: LinearPlant  # of N aircraft, the nominal one first: A (N, n, n), B (N, n, m)
+    plant: LinearPlant  # N aircraft, with the nominal one first: A (N, n, n), B (N, n, m)
     law: LinearLaw
     loop: LoopTiming
-    box: Box | None = None  # of the uncertain aircraft; None if there are none
+    box: Box | None = None  # box of the uncertain aircraft, or None if there are none
     # how the aircraft that flies differs from what the controller was told
     differences: tuple[Difference, ...] = ()
-    # largest deviation of its A and B from the airframe file, in the measure of the box
+    # Largest deviation of A and B of the aircraft that flies from the airframe file. It can be set
+    # against a guarantee, because each entry counts in proportion to its deviation in the box.
     off: float = 0.0
 
     @property
@@ -85,7 +91,7 @@ class LinearLoop(NamedTuple):
     def digest(self) -> str:
         """SHA-256 of the names and of the numbers, to DIGITS digits, of the loop and of its box.
 
-        Of the box only the shape counts, because a guarantee finds the size.
+        The box is divided by its size, because a guarantee finds the size.
         """
         loop = self.loop
         arrays = [*self.nominal, *self.law, loop.lag, loop.delay, loop.period]
@@ -101,19 +107,19 @@ class LinearLoop(NamedTuple):
 
 
 class LoopMargins(NamedTuple):
-    """Margins of a loop, channels in the law's order."""
+    """Margins of a loop, with the channels in the order of the control law."""
 
     inputs: tuple[str, ...]
     nominal: Margins
-    modes: SlowModes  # of the nominal aircraft
-    delay: float  # s, delay margin of the nominal aircraft, u late in all inputs
-    channel_delay: tuple[float, ...]  # s, with u late in one input only
+    modes: SlowModes  # slow modes of the nominal aircraft
+    delay: float  # delay margin of the nominal aircraft if u is late in all inputs, s
+    channel_delay: tuple[float, ...]  # delay margin if u is late in this input only, s
     # least margins of the uncertain aircraft, figure by figure; None if there are none
     worst: Margins | None = None
-    worst_delay: float | None = None  # s
-    aircraft: int = 0  # number of uncertain aircraft
-    stable: int = 0  # number of them that are stable
-    by_search: bool = False  # whether `worst` is that of a search over the box, not of samples
+    worst_delay: float | None = None  # least delay margin of the uncertain aircraft, s
+    aircraft: int = 0  # number of uncertain aircraft that were drawn
+    stable: int = 0  # number of stable ones among them
+    by_search: bool = False  # whether `worst` comes from a search over the box, not from samples
 
 
 def margins(
@@ -128,22 +134,22 @@ def margins(
     A search finds the least margins. Every entry of A and B of an uncertain aircraft is off by up
     to `uncertainty`, or as `spread` says, except in the rows of angles. Drawn samples only serve to
     count the stable aircraft, because the least margins lie at corners, where no sample falls. Lags
-    and delay are those of the aircraft, even if the controller was told others; they are exact
+    and delay are those of the aircraft, even if the controller was told others. A lag is exact
     unless `spread` has an entry 1/lag[INPUT]. The uncertainty of the scenario itself is left out.
 
     Args:
         scenario: The flight: aircraft and controller.
-        aircraft: Number of uncertain aircraft that are drawn; 0 for the nominal aircraft alone.
+        aircraft: Number of uncertain aircraft that are drawn. 0 is the nominal aircraft alone.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
         seed: Seed of the uncertain aircraft.
         spread: Distribution of the deviations, and deviations by entry.
 
     Returns:
-        Margins of the nominal aircraft and the worst found; delay margins in s.
+        Margins of the nominal aircraft, and the least margins that were found. Delays are in s.
 
     Raises:
-        ParameterError: The law has the literal sign, the aircraft is of JSBSim and the controller
-            has no model, or an entry is unknown.
+        ParameterError: The law has the literal sign, the controller of an aircraft of JSBSim has no
+            model, or an entry is unknown.
 
     Examples:
         >>> rise_di.margins(rise_di.find_scenario("osprey_servo")).delay > 0.03
@@ -190,7 +196,7 @@ def loop_margins(linear: LinearLoop) -> LoopMargins:
 
 
 def _assessed_by_search(linear: LinearLoop, box: Box) -> LoopMargins:
-    """Search the box for the worst margins; the samples only count for stability."""
+    """Search the box for the worst margins, and use the samples only to count the stable ones."""
     nominal = loop_margins(linear._replace(plant=_some(linear.plant, slice(1)), box=None))
     samples = closed_loop(
         _some(linear.plant, slice(1, None)), linear.law, linear.loop, np.zeros(len(linear.inputs))
@@ -208,10 +214,10 @@ def _assessed_by_search(linear: LinearLoop, box: Box) -> LoopMargins:
 
 
 def _least_delay(linear: LinearLoop, nominal: float) -> float:
-    """Find the smallest delay margin of the aircraft of a loop, at most the nominal one, s.
+    """Find the smallest delay margin of the aircraft of a loop, s.
 
-    All aircraft are tried together with a delay that rises in steps of half a period, or of 1/12 of
-    the nominal margin if that is longer.
+    The result is at most `nominal`, the nominal margin. All aircraft are tried together with a
+    delay that rises in steps of half a period, or of 1/12 of the nominal margin if this is longer.
     """
     longest = min(nominal, MAX_DELAY_MARGIN)
     uncertain = linear.plant
@@ -246,8 +252,8 @@ def scenario_loop(
 ) -> LinearLoop:
     """Build the loop of a controller around the nominal and uncertain aircraft of a scenario.
 
-    Lags and delay are those that fly: of the aircraft in the scenario, or as a flight shows them.
-    Raises as `margins` does.
+    Lags and delay are those of the aircraft that flies, as the scenario or the `flight` tells them.
+    Raises ParameterError as `margins` does.
     """
     airframe = scenario_model(scenario, controller)
     comparison = compare(scenario, controller, flight)
@@ -263,15 +269,15 @@ def scenario_loop(
 
 
 def as_compared(linear: LinearLoop, scenario: Scenario, comparison: Comparison) -> LinearLoop:
-    """Return the loop with how the aircraft differs from what the controller was told."""
+    """Return the loop with the differences of a comparison and the deviation of the aircraft."""
     return _with_deviation(linear._replace(differences=comparison.differences), scenario)
 
 
 def _with_deviation(linear: LinearLoop, scenario: Scenario) -> LinearLoop:
     """Return the loop with the deviation of the aircraft that the scenario draws.
 
-    The deviation is 0 for the airframe as in its file, and infinite if an entry deviates that is
-    exact in the box.
+    The deviation is 0 if the airframe is as in its file. It is infinite if the scenario moves an
+    entry that is exact in the box.
     """
     if linear.box is None or scenario.aircraft.is_jsbsim:
         return linear
@@ -298,12 +304,12 @@ def linear_loop(
 ) -> LinearLoop:
     """Build the loop of a controller around N aircraft, A (N, n, n) and B (N, n, m).
 
-    The airframe gives the states and channels. If `timing` is None, it is what the controller was
-    told. Raises ParameterError for the literal sign.
+    The airframe gives the states and channels. If `timing` is None, the loop has the timing that
+    the controller was told. Raises ParameterError for the literal sign.
     """
     rows, columns = law_order(airframe, controller)
     loop = loop_of(controller) if timing is None else timing
-    # y_dot = Omega u has no angles, so use the observer of y alone
+    # The model y_dot = Omega u has no angles, so the observer without vanes is used.
     if not set(controller.vanes) <= set(airframe.states):
         controller = controller.without_vanes()
     states = np.array(list(airframe.states))
@@ -330,10 +336,10 @@ def with_box(
     seed: int,
     spread: Spread,
 ) -> LinearLoop:
-    """Return the loop of the nominal aircraft and those of a seed, with the box around them.
+    """Return the loop with the box around its aircraft, which are the nominal and the drawn ones.
 
-    The box is None if nothing deviates. A lag that deviates becomes an entry of the plant, and 0 in
-    the loop:
+    The box is None if nothing deviates. If a lag deviates, its actuator becomes a state of the
+    plant, and the lag becomes 0 in the timing of the loop:
 
         x_dot = A x + B u_a,  u_a_dot = (1 + d) / lag (u - u_a),  states x and u_a
 
@@ -349,10 +355,11 @@ def with_box(
 def of_matrices_and_lags(
     spread: Spread, timing: LoopTiming, inputs: Sequence[str]
 ) -> tuple[Spread, dict[int, float]]:
-    """Separate the entries of A and B from the relative deviations of 1 / lag by input of the law.
+    """Separate the entries of A and B in `spread` from the entries of lags.
 
-    An entry of a lag is 1/lag[INPUT]. Raises ParameterError for an unknown entry, a lag below
-    LEAST_LAG periods, and a deviation outside [0, 1).
+    The entry of a lag is named 1/lag[INPUT]. It becomes a relative deviation of 1 / lag, by the
+    index of the input of the law. Raises ParameterError for an unknown entry, a lag below LEAST_LAG
+    periods, and a deviation outside [0, 1).
     """
     least = LEAST_LAG * timing.period
     known = {
@@ -387,7 +394,7 @@ def with_lags_pulled_out(
     part = np.array([*parts.values()])
     uniform = random_streams.uniform(0, count - 1, m, random_streams.EQUIPMENT, seed)[:, places]
     d = np.vstack([np.zeros(size), deviations(uniform, spread.distribution)])
-    # u_a of the inputs S' u, then the other inputs
+    # S selects the inputs whose actuators become states u_a, and `others` the other inputs.
     S = np.eye(m)[:, places]
     others = np.eye(m) - S @ S.T
     rates = (rate * (1.0 + part * d))[:, :, None] * np.eye(size)
@@ -451,9 +458,9 @@ def _some(plant: LinearPlant, names: slice) -> LinearPlant:
 
 
 def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airframe:
-    """Return the airframe as the law of a controller sees it: with the inputs v, u = T v.
+    """Return the airframe with the inputs v of the control law in place of u = T v.
 
-    Without an allocation the airframe stays as it is.
+    If there is no allocation, the airframe stays as it is.
     """
     if not _has_effectors(airframe, controller):
         return airframe
@@ -463,7 +470,7 @@ def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airf
 def distribution(airframe: Airframe, controller: ControllerConfig) -> FloatArray:
     """Return T (p, m) with its rows in the order of the inputs of an airframe.
 
-    It is I if no allocation distributes these inputs.
+    T is the identity if no allocation drives these inputs.
     """
     allocation = controller.allocation
     if allocation is None or not _has_effectors(airframe, controller):
@@ -485,9 +492,10 @@ def delay_margins(
 ) -> dict[str, Any]:
     """Compute the delay margins of the nominal linear loop, s.
 
-    u is late either in every channel or in a single one, named by its output. The least margin that
-    is allowed is included. The result is empty if there is no linear loop (an aircraft of JSBSim,
-    the literal sign). A margin is 0 if the loop is unstable with its own lag.
+    "delay_margin" is for u late in every channel. "channels" has the margin for u late in a single
+    channel, by the name of its output. "least" is the least margin that is allowed. The result is
+    empty if there is no linear loop, as for an aircraft of JSBSim or the literal sign. A margin is
+    0 if the loop is unstable without further delay.
     """
     if scenario.aircraft.is_jsbsim or is_literal(controller):
         return {}
@@ -509,7 +517,7 @@ def is_literal(controller: ControllerConfig) -> bool:
 
 
 def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[int], list[int]]:
-    """Return the indices of the law's outputs and inputs in the order of an airframe.
+    """Return the index of each output, and of each input, of a law in the lists of an airframe.
 
     Raises ParameterError if the airframe lacks any of them.
     """
@@ -524,13 +532,13 @@ def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[in
 def scenario_model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
     """Return the airframe of a scenario, or y_dot = Omega u for an aircraft of JSBSim.
 
-    The latter has the inputs of the law, and the controller gives Omega: from the feedforward, or
-    from abs(Omega_ii) = omega / input_scale of RISE-DI, which is an upper bound.
+    This model has the inputs of the law. Its Omega comes from the controller: it is that of the
+    feedforward, or abs(Omega_ii) = omega / input_scale of RISE-DI, which is an upper bound.
     """
     aircraft = scenario.aircraft
     if not aircraft.is_jsbsim:
         return load_airframe(aircraft.airframe)
-    # The controller knows A and B of its feedforward, or a bound of Omega.
+    # The controller has A and B of its feedforward, or a bound of Omega.
     if controller.feedforward is not None and set(controller.feedforward.states) == set(
         controller.outputs
     ):

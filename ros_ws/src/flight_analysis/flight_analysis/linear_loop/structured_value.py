@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Upper bound of the structured singular value of a loop, over intervals of frequency.
 
-mu(M) is 1 / the size of the least Delta = diag(delta_i) for which det(I - M Delta) = 0, with
-delta_i real or complex. For any D = diag(exp(t)) and G = diag(g), with g_i = 0 at complex channels,
+mu(M) is the reciprocal of the size of the least Delta = diag(delta_i) for which det(I - M Delta) =
+0, with delta_i real or complex. For any D = diag(exp(t)) and G = diag(g), with g_i = 0 at complex
+channels,
 
     mu(M)^2 <= lambda_max(N* N + j (G N - N* G)),    N = D M D^-1
 
@@ -21,30 +22,32 @@ from rise_di_controller.law.linear_loop import SPECTRAL_RADIUS_TOLERANCE
 
 RADIUS = 1.0 + SPECTRAL_RADIUS_TOLERANCE  # abs(z) at the limit of stability
 
-# rounds of the search for D and G
-BALANCE_ROUNDS = 6
-LARGEST_G = 1e3
-LEVELS = 40
-CENTRING = 6
+BALANCE_ROUNDS = 6  # rounds of Osborne's iteration
+LARGEST_G = 1e3  # limit of abs(g_i)
+LEVELS = 40  # largest number of levels in the search for D and G
+CENTRING = 6  # largest number of Newton steps at each level
 LENGTHS = tuple(0.6**k for k in range(20))  # lengths of Newton's step that are tried
 CENTRED = 0.5  # decrement of Newton's method at which a point counts as the centre
-FALL = 0.3  # fraction of the way from the level to the bound that is left after a fall
-STALLED = 1e-3  # how far the level may stay above the bound at the end, as a fraction of the bound
+FALL = 0.3  # fraction of the distance from the bound to the level that remains after a round
+STALLED = 1e-3  # the search ends if the level exceeds the bound by less than this fraction of it
 
-NARROWEST = 1e-8  # of pi / T: less than what LARGEST_G leaves around a frequency at which M is real
-MEANS_UP_TO = 0.3  # rad a period: below this the second coefficients count for less than 0.1 %
+# Width of the narrowest interval, as a fraction of pi / T. It is less than the interval that
+# LARGEST_G allows around a frequency at which M is real.
+NARROWEST = 1e-8
+# frequency times T, rad, below which the second coefficients change the bound by less than 0.1 %
+MEANS_UP_TO = 0.3
 TINY = 1e-30
-# abs(log abs(z)) below which an eigenvalue of the pencil counts as on the circle: a spurious one
-# only costs a shorter interval
+# An eigenvalue of the pencil counts as on the circle if abs(log abs(z)) is less than this. If the
+# crossing is spurious, it only makes the interval shorter.
 ON_CIRCLE = 1e-7
-# number of points of an interval, and of each of its decades, at which the bound is checked again:
-# rounding hides a crossing beside an integrator, where the pencil has multiple eigenvalues
+# The bound is checked again at this many points of an interval, and of each of its decades, because
+# rounding hides a crossing beside an integrator, where the pencil has multiple eigenvalues.
 CHECKED = 8
 DECADES = 6
 
 
 class Scaling(NamedTuple):
-    """log D and G, (p,) each."""
+    """The scalings of the bound: t = log D and g, the diagonal of G, each of shape (p,)."""
 
     t: FloatArray
     g: FloatArray
@@ -80,13 +83,14 @@ def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
 def tightened(
     M: ComplexArray, real: int, target: float, alike: int = 0, near: Scaling | None = None
 ) -> tuple[float, Scaling]:
-    """Tighten the bound of M, (p, p), by a search for D and G; the first `real` channels are real.
+    """Search for the D and G with the least bound of M, (p, p), and return the bound and both.
 
-    The next `alike` channels share one factor of D. The search begins at the balanced D, or at the
-    D and G of a matrix `near` M if their bound is smaller.
+    The first `real` channels are real, and the next `alike` channels share one factor of D. The
+    search begins at the balanced D, or at `near` if its bound is smaller. `near` has the D and G of
+    a similar matrix.
 
-    Once the bound is below `target`, D and G lie in the middle of the set that reaches the target.
-    The method of centres on the linear matrix inequality
+    If the bound gets below `target`, the search ends with D and G in the middle of the set that
+    reaches the target. The method of centres on the linear matrix inequality
 
         F = level D - N* D N - j (G N - N* G) > 0,  trace D = p,  D > 0,  abs(g_i) < LARGEST_G
 
@@ -124,10 +128,10 @@ def tightened(
 def tightened_at(
     part: Channels, w: float, scaled: ComplexArray, near: Scaling | None
 ) -> tuple[float, Scaling]:
-    """Bound a scaled M(w) of a part, as `tightened` does for the target 1.
+    """Bound a scaled M(w) of a part of the loop, as `tightened` does for the target 1.
 
-    If D and G of the means over a period are enough, they are taken. The D of the second
-    coefficients then balances rows and columns.
+    At first D and G are found for the means over a period alone, and the D of the second
+    coefficients balances rows and columns. If this bound is below 1, or w is low, it is returned.
     """
     k = len(part.entries)
     rows = np.r_[0:k, part.uncertain : len(scaled)]
@@ -148,11 +152,11 @@ def tightened_at(
 
 
 class Centre(NamedTuple):
-    """D and G of the inequality, while its centre is sought."""
+    """D and G of the linear matrix inequality, at a step of the search for its centre."""
 
-    d: FloatArray  # (p,)
-    g: FloatArray  # (real,)
-    free: FloatArray  # (p, f), d = free x: channels that share a factor share a column
+    d: FloatArray  # (p,) diagonal of D
+    g: FloatArray  # (real,) entries of G at the real channels
+    free: FloatArray  # (p, f) map from f free factors to d: channels with one factor share a column
 
     def inequality(self, N: ComplexArray, level: float) -> ComplexArray:
         """Compute F, (p, p)."""
@@ -166,7 +170,10 @@ class Centre(NamedTuple):
         return -float(np.linalg.eigvalsh(self.inequality(N, 0.0) / root[:, None] / root)[0])
 
     def stepped(self, N: ComplexArray, level: float) -> tuple["Centre", float]:
-        """Take a Newton step of D and G, and return its decrement too, which is 0 at the centre."""
+        """Take a Newton step of D and G, and return the result and the decrement of the step.
+
+        The decrement is 0 at the centre.
+        """
         real = len(self.g)
         P = np.linalg.inv(self.inequality(N, level))
         R = N @ P
@@ -201,7 +208,7 @@ class Centre(NamedTuple):
         return Centre(self.d + self.free @ step[:f], self.g + step[f:], self.free)
 
     def inside(self, N: ComplexArray, level: float) -> bool:
-        """Return whether the inequality and the limits hold, and everything is finite."""
+        """Return whether the inequality and the limits of D and G hold, and all is finite."""
         if not (self.d.min() > 0.0 and np.abs(self.g).max(initial=0.0) < LARGEST_G):
             return False
         F = self.inequality(N, level)
@@ -213,11 +220,11 @@ class Centre(NamedTuple):
 
 
 def crossings(part: Channels, scaling: Scaling, scale: FloatArray) -> FloatArray:
-    """Find where diag(scale) M(z) crosses the bound 1 of a D and a G: frequencies, rad/s.
+    """Find the frequencies, rad/s, at which the bound of diag(scale) M(z) for a D and a G can be 1.
 
-    lambda_max(N* N + j (G N - N* G)) = 1 on abs(z) = RADIUS exactly where a pencil with twice the
-    states has an eigenvalue there. Source: S. Boyd, V. Balakrishnan, P. Kabamba, Mathematics of
-    Control, Signals, and Systems 2, 1989, for the largest singular value.
+    At a z on abs(z) = RADIUS, N* N + j (G N - N* G) has the eigenvalue 1 exactly if z is an
+    eigenvalue of a pencil with twice as many states. Source: S. Boyd, V. Balakrishnan, P. Kabamba,
+    Mathematics of Control, Signals, and Systems 2, 1989, for the largest singular value.
     """
     from scipy.linalg import eigvals  # noqa: PLC0415 - a flight starts without it
 
@@ -244,9 +251,9 @@ def crossings(part: Channels, scaling: Scaling, scale: FloatArray) -> FloatArray
 def interval_at(
     part: Channels, w: float, scaling: Scaling, scale: FloatArray
 ) -> tuple[float, float] | None:
-    """Find the frequencies around w for which D and G of w keep diag(scale) M below 1, rad/s.
+    """Find the interval around w, rad/s, in which D and G keep the bound of diag(scale) M below 1.
 
-    Returns None if there are none.
+    `scaling` has D and G, which were found at w. Returns None if there is no such interval.
     """
     highest = np.pi / part.period
     ends = crossings(part, scaling, scale)

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the controller was told of its aircraft, compared with the aircraft that flies.
 
-A linear loop takes lags and delay from the section `controller`. The section `aircraft` has those
-that fly, and a log those that were measured. `compare` says where they differ, and gives the timing
-of the loop that flies, to which margins and guarantees refer. If something acts that no linear loop
-contains, such as a fault, the guarantee is not stated.
+The section `controller` of a scenario has the lags and the delay that the controller was told. The
+section `aircraft` has the true ones, and a log the measured ones. `compare` says where they differ,
+and gives the timing of the loop that flies. Margins and guarantees refer to this timing. If
+something acts that no linear loop contains, such as a fault, no guarantee is stated.
 """
 
 from dataclasses import replace
@@ -28,9 +28,11 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import LoopTiming
 from rise_di_controller.params import ControllerConfig
 
-SMALLEST = 1e-6  # s: a microsecond changes no printed margin
-SAME_PERIOD = 0.01  # relative: clocks of hosts differ by only 1e-4, a missed tick by much more
-# periods of the aircraft: y waits up to one for a tick, and u up to one for the aircraft
+SMALLEST = 1e-6  # difference of two times that counts as none, s: it changes no printed margin
+# Relative difference of two periods that counts as none. The clocks of two hosts differ by only
+# 1e-4, and a missed tick changes a period by much more.
+SAME_PERIOD = 0.01
+# longest wait in periods of the aircraft: y waits up to one for a tick, and u up to one to act
 WAITS = 2.0
 
 IN_LOOP = frozenset(
@@ -46,7 +48,7 @@ IN_LOOP = frozenset(
 
 OUTSIDE_LOOP = frozenset(
     {
-        # What acts from outside moves no mode of a linear loop.
+        # Disturbances from outside do not change the modes of a linear loop.
         *(f"gusts.*.{key}" for key in ("start", "speed", "length", "every")),
         *(f"turbulence.{key}" for key in ("altitude", "wind", "sigma", "rotary", "seed")),
         *(f"bias.*.{key}" for key in ("start", "value", "rise")),
@@ -56,7 +58,7 @@ OUTSIDE_LOOP = frozenset(
         *(f"microburst.{key}" for key in ("ground", "north", "east", "radius", "speed", "height")),
         "wind",
         *(f"sensors.{key}" for key in ("bias", "drift", "noise", "seed")),
-        # The inner loop does not read the place.
+        # The inner loop does not read the position.
         *(f"start.{key}" for key in ("north", "east", "heading")),
         *(f"pose.{key}" for key in ("rate", "delay", "bias", "drift", "noise", "seed")),
         # Products of small rates and angles are of the second order about trim.
@@ -71,12 +73,12 @@ OUTSIDE_LOOP = frozenset(
 
 
 class Standing(Enum):
-    """What a difference means for margins and guarantee."""
+    """The consequence of a difference for margins and guarantee."""
 
     TAKEN = auto()  # the loop uses the value of the aircraft
-    # no linear loop contains it: margins leave it out, and no guarantee is stated
+    # no linear loop contains the fact: margins leave it out, and no guarantee is stated
     LEFT_OUT = auto()
-    NO_LOOP = auto()  # nobody knows what flew: neither margins nor guarantee are stated
+    NO_LOOP = auto()  # the loop that flew is unknown: neither margins nor guarantee are stated
 
 
 MEANING = {
@@ -89,7 +91,7 @@ MEANING = {
 class Difference(NamedTuple):
     """A fact about the aircraft that differs from what the controller was told."""
 
-    fact: str  # key, value of the aircraft, value of the controller
+    fact: str  # the key, with its value in the aircraft and its value in the controller
     standing: Standing
 
     @property
@@ -99,7 +101,7 @@ class Difference(NamedTuple):
 
 
 class FlightFacts(NamedTuple):
-    """What is known of a flight beside its scenario; None if a log does not tell."""
+    """Facts about a flight that its scenario does not tell. None if the log does not, either."""
 
     is_simulated: bool = True  # whether the aircraft of the scenario flew
     tick: float | None = None  # s, median period of the ticks
@@ -107,7 +109,7 @@ class FlightFacts(NamedTuple):
     age: float | None = None  # s, mean age of u at the aircraft
     # the aircraft after each change in flight
     later: tuple[AircraftConfig, ...] = ()
-    has_parameters: bool = True  # whether the parameters of the file are those that flew
+    has_parameters: bool = True  # whether the controller flew with the parameters of the file
 
 
 PLANNED = FlightFacts()
@@ -115,14 +117,14 @@ PLANNED = FlightFacts()
 
 
 class Comparison(NamedTuple):
-    """The loop that flies, and how it differs from the one that the controller was told."""
+    """The timing of the loop that flies, and how the aircraft differs from what was told."""
 
     timing: LoopTiming
     differences: tuple[Difference, ...]
 
 
 def loop_of(controller: ControllerConfig) -> LoopTiming:
-    """Return the timing of the loop that the controller was told."""
+    """Return the timing of the loop as the controller was told it."""
     lag = np.array(controller.lag, dtype=np.float64)
     return LoopTiming(lag, controller.delay, 1.0 / controller.rate)
 
@@ -153,8 +155,9 @@ def lag_through(effect: FloatArray, T: FloatArray, lag: FloatArray) -> FloatArra
 
         lag_i = sum_j effect_ij T_ji lag_j / sum_j effect_ij T_ji,  exact to first order in the lags
 
-    `effect` (m, p) is that of the p effectors on the outputs, T has shape (p, m), and lag (p,) is
-    in s. If the effectors have no effect, the longest lag counts.
+    `effect` (m, p) is the effect of the p effectors on the outputs, T has the shape (p, m), and
+    `lag` (p,) has the lags of the effectors, s. If the effectors have no effect on an output, the
+    longest lag counts.
     """
     share = effect * T.T
     total = share.sum(axis=1)
@@ -163,7 +166,7 @@ def lag_through(effect: FloatArray, T: FloatArray, lag: FloatArray) -> FloatArra
 
 
 def flown_lag(aircraft: AircraftConfig, controller: ControllerConfig) -> FloatArray:
-    """Return the lags of the aircraft's actuators in the inputs of the law, (m,), s."""
+    """Return the lag of the aircraft's actuators for each input of the law, (m,), s."""
     names = tuple(aircraft.channels().inputs)
     lags = dict(zip(names, aircraft.actuators.lag or (0.0,) * len(names), strict=True))
     lag = np.array([lags[name] for name in controller.effectors])
@@ -179,10 +182,10 @@ def flown_lag(aircraft: AircraftConfig, controller: ControllerConfig) -> FloatAr
 def _compare_lags(
     scenario: Scenario, controller: ControllerConfig
 ) -> tuple[FloatArray, list[Difference]]:
-    """Compare the lags, and return those that fly with the differences.
+    """Compare the lags, and return the lags of the aircraft that flies and the differences.
 
     A model of JSBSim has actuators of its own, whose lag is not among the keys of the aircraft. The
-    controller may therefore be told of more lag than the keys have, but not of less.
+    controller can therefore be told a longer lag than the keys have, but not a shorter one.
     """
     lag = np.array(controller.lag, dtype=np.float64)
     flown = flown_lag(scenario.aircraft, controller)
@@ -203,13 +206,13 @@ def _compare_lags(
 def _compare_delays(
     scenario: Scenario, controller: ControllerConfig, flight: FlightFacts
 ) -> tuple[float, list[Difference]]:
-    """Compare the delays beyond sampling, and return the one that flies with the differences.
+    """Compare the delays beyond sampling, and return the delay that flies and the differences.
 
-    y and u each wait for the next instant of the other side, in simulation up to a period of the
-    aircraft. A controller may be told any delay in that range; if it is told another one, the
-    longest is assumed. If you fly an aircraft of your own, its transport delay is unknown. The law
-    steps with each y, so if y comes less often than the ticks, it is late by one and a half of its
-    own periods instead of one and a half ticks.
+    In simulation, y waits for the next tick and u for the next step of the aircraft, each up to a
+    period of the aircraft. The controller can be told any delay in this range. If it is told
+    another one, the longest delay of the range is assumed. If you fly an aircraft of your own, its
+    transport delay is unknown. The law steps with each y. If y comes less often than the ticks, it
+    is late by one and a half of its own periods instead of one and a half ticks.
     """
     aircraft = scenario.aircraft
     told_delay = controller.delay
@@ -229,7 +232,7 @@ def _compare_delays(
         span = f"{least:.6g} s to {most:.6g} s" if np.isfinite(most) else f"{least:.6g} s or more"
         fact = f"{', '.join(parts)}: {span} in flight, controller.delay {told_delay:.6g} s"
         differences.append(Difference(fact, Standing.TAKEN))
-    # u is held for a tick, so a mean within one does not show another delay
+    # u is held for a tick, so a mean age that is off by less than a tick shows no other delay
     if flight.age is not None and flight.age - delay >= 1.0 / controller.rate:
         delay = flight.age
         fact = f"age of u: {flight.age:.3g} s in the log, controller.delay {told_delay:.6g} s"
@@ -238,7 +241,7 @@ def _compare_delays(
 
 
 def _is_within(value: float, least: float, most: float) -> bool:
-    """Return whether a value is in a range, up to the digits of a file and SMALLEST."""
+    """Return whether a value is in a range, with a tolerance for the few digits of a file."""
     slack = max(SMALLEST, STOP_TOLERANCE * abs(value))
     return bool(least - slack <= value <= most + slack)
 
@@ -275,16 +278,16 @@ def _beyond_loop(scenario: Scenario, controller: ControllerConfig) -> list[Diffe
     flies = replace(scenario, controller=controller)
     beyond = (*limits_beyond_stops(flies), *_slew_beyond_rates(flies))
     differences += [Difference(sentence, Standing.LEFT_OUT) for sentence in beyond]
-    # The loop takes B from the airframe and D from the law.
+    # The loop already takes B from the airframe and D from the law, so these are TAKEN.
     signs = (*opposite_signs(flies), *_other_effect(flies))
     differences += [Difference(sentence, Standing.TAKEN) for sentence in signs]
     return differences
 
 
 def _other_effect(scenario: Scenario) -> list[str]:
-    """Return a sentence for each output whose row of allocation.effect is not that of C B.
+    """Return a sentence for each output for which allocation.effect and C B have different rows.
 
-    Rows are compared up to a factor, because input_scale has it.
+    Rows are compared up to a positive factor, because input_scale contains this factor.
     """
     controller = scenario.controller
     allocation = controller.allocation
@@ -308,7 +311,7 @@ def _other_effect(scenario: Scenario) -> list[str]:
 
 
 def _effect(aircraft: AircraftConfig, controller: ControllerConfig) -> FloatArray:
-    """Return C B of the airframe file by output of the law and effector, (m, p)."""
+    """Return C B of the airframe file, (m, p), for the outputs of the law and the effectors."""
     airframe = load_airframe(aircraft.airframe)
     rows = [airframe.outputs.index(name) for name in controller.outputs]
     columns = [list(airframe.inputs).index(name) for name in controller.effectors]

@@ -1,24 +1,24 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled loop of every aircraft of a box, with the uncertain entries of A and B pulled out.
+"""The sampled loop of all aircraft of a box, with the uncertain entries of A and B pulled out.
 
     A + E diag(d) F,  B + E diag(d) G,  abs(d_i) <= 1
     zeta+ = A zeta + W w + U v,  z = Z zeta + D w + V v,  u = K zeta,  w = d z
 
-z holds the first TERMS Legendre coefficients of F x + G u over a period, and w those of the
-deviation. The motion is exact in d except for the coefficients that are left out, an error of the
-order of (period rate)^4. Source of the lifted loop: T. Chen, B. Francis, "Optimal Sampled-Data
-Control Systems", chapter 10.
+z holds the first TERMS Legendre coefficients of F x + G u over a period, and w the coefficients of
+the deviation d (F x + G u). The motion is exact in d except for the coefficients that are left out.
+Their error is of the order of (T p)^4, for a period T and an eigenvalue p. Source of the lifted
+loop: T. Chen, B. Francis, "Optimal Sampled-Data Control Systems", chapter 10.
 
-u may be late by an unknown time from 0 to `late`, s, which differs from tick to tick and from input
-to input; the newest u that has arrived acts. The input of a period then changes by
+u can be late by an unknown time from 0 to `late`, s, which differs from tick to tick and from input
+to input. At each instant the newest u that has arrived acts. The input of a period then changes by
 
     w_0 + w_1 ROOT (2 s - 1),  w_0 = -sum_j a_j v_j,  w_1 = sum_j ROOT b_j v_j
 
 with v_j = u_k-j - u_k-j-1. For a shift by j + f periods, 0 <= f < 1, a_i = 1 for i < j, a_j = f,
-b_j = f (1 - f), and all further coefficients are 0. Each coefficient is a real d around the middle
-of its range, and may change from tick to tick: these channels have one D for all frequencies, and G
-= 0.
+b_j = f (1 - f), and all further coefficients are 0. Each coefficient is the middle of its range
+plus a real d, which can change from tick to tick. These channels therefore have one D for all
+frequencies, and G = 0.
 """
 
 from typing import NamedTuple
@@ -40,16 +40,18 @@ ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.intp]
 
 TERMS = 2  # Legendre coefficients of a signal within a period
-# fraction of the sizes of row and column below which an entry of M counts as 0
+# An entry of M counts as 0 below this fraction of the geometric mean of its row's and its column's
+# largest entries.
 NO_COUPLING = 1e-13
-PATTERN_PARTS = (1e-3, 1e-2, 0.06, 0.25)  # of pi / T: where the pattern of M is sampled
+# frequencies at which the pattern of M is sampled, as fractions of pi / T
+PATTERN_PARTS = (1e-3, 1e-2, 0.06, 0.25)
 
 
 class Box(NamedTuple):
     """The k uncertain entries of a plant, d_i in [-1, 1].
 
     d_i changes A by E_i d_i F_i, and B by E_i d_i G_i. An entry is named A[STATE,STATE] or
-    B[STATE,EFFECTOR]; T leads from the inputs of the law to the p effectors.
+    B[STATE,EFFECTOR]. T maps the m inputs of the law to the p effectors.
     """
 
     names: tuple[str, ...]
@@ -62,7 +64,7 @@ class Box(NamedTuple):
 
 
 def plants_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:
-    """Return the plants with deviations d, (..., k)."""
+    """Return the plants at the deviations d, which has the shape (..., k)."""
     effect = box.E * d[..., None, :]
     return LinearPlant(plant.A + effect @ box.F, plant.B + effect @ box.G, plant.C)
 
@@ -70,17 +72,19 @@ def plants_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:
 class Channels(NamedTuple):
     """A loop, or a part of one, as zeta+ = A zeta + W w, z = Z zeta + D w.
 
-    The real channels of the entries come first, TERMS for each, then those of a delay, then disks
-    in inputs. A disk adds v to u and reads u + v / 2, which is S - I / 2 from v.
+    The real channels of the entries come first, TERMS for each. The channels of a delay follow, and
+    then disks in inputs. A disk adds v to u and reads u + v / 2, so that the transfer function from
+    v to its reading is S - I / 2.
     """
 
     A: FloatArray
     W: FloatArray
     Z: FloatArray
     D: FloatArray
-    entries: tuple[int, ...]  # places of the entries in the box
-    period: float
-    # channels of a delay: first those of w_0, for each j with m inputs, then those of w_1
+    entries: tuple[int, ...]  # indices of the entries in the box
+    period: float  # s
+    # Number of the channels of a delay. Those of w_0 come first, then those of w_1. Both are
+    # ordered by j, with the m inputs for each j.
     late: int = 0
 
     @property
@@ -90,7 +94,7 @@ class Channels(NamedTuple):
 
     @property
     def parameters(self) -> IntArray:
-        """Number of the entry to which each of these channels belongs."""
+        """Index in `entries` for each of the `uncertain` channels."""
         return np.tile(np.arange(len(self.entries)), TERMS)
 
     @property
@@ -104,13 +108,19 @@ class Channels(NamedTuple):
         return self._replace(W=self.W[:, channels], Z=self.Z[channels], D=D)
 
     def response(self, w: FloatArray | float, radius: float) -> ComplexArray:
-        """Compute M(z) at abs(z) = radius and the frequencies w, (F,) or (), rad/s: (F, p, p)."""
+        """Compute M(z), (F, p, p) or (p, p), at abs(z) = radius and frequencies w, (F,) or ().
+
+        w is in rad/s.
+        """
         z = radius * np.exp(1j * np.asarray(w) * self.period)
         motion = z[..., None, None] * np.eye(len(self.A)) - self.A
         return np.asarray(self.Z @ np.linalg.solve(motion, self.W.astype(complex)) + self.D)
 
     def at(self, d: FloatArray) -> "Channels":
-        """Move the channels to the aircraft with deviations d, (..., k) of this part."""
+        """Return the channels centred on the aircraft with deviations d.
+
+        d has the shape (..., k), for the k entries of this part of the loop.
+        """
         c = np.zeros((*d.shape[:-1], len(self.D)))
         c[..., : self.uncertain] = np.tile(d, TERMS)
         return self.centred(c)
@@ -134,15 +144,15 @@ class Channels(NamedTuple):
 def uncertain_loop(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box, late: float = 0.0
 ) -> Channels:
-    """Build the loop of a plant, A (n, n), with box entries and input disks pulled out.
+    """Build the loop of a plant with the entries of the box and disks in all inputs pulled out.
 
-    u is late by an unknown time from 0 to `late`, s.
+    The plant has A (n, n). u is late by an unknown time from 0 to `late`, s.
     """
     n, m = plant.B.shape
     k = len(box.names)
     size = n + TERMS * k
-    # Append two integrals of each z = F x + G u to the states of the aircraft: they give the means
-    # over a period.
+    # Append to the states of the aircraft the integral of each z = F x + G u, and the integral of
+    # this integral. They give the Legendre coefficients over a period.
     A = np.zeros((size, size))
     A[:n, :n] = plant.A
     A[n : n + k, :n] = box.F / loop.period
@@ -153,7 +163,7 @@ def uncertain_loop(
     pulled = LinearPlant(A, B, C)
     by_tick = sampled_plant(pulled, loop, still)
 
-    # The motion over a period caused by w, constant or rising; no actuator delays it.
+    # w causes a motion over a period. It is constant or rising, and no actuator delays it.
     moved = LinearPlant(A, np.vstack([box.E, np.zeros((TERMS * k, k))]), C)
     direct = LoopTiming(np.zeros(k), 0.0, loop.period)
     by_w = [sampled_plant(moved, direct, np.zeros(k), rising=rising) for rising in (False, True)]
@@ -179,7 +189,7 @@ def uncertain_loop(
         entries=tuple(range(k)),
         period=loop.period,
     )
-    # A delay adds channels.
+    # If u can be late, further channels are added.
     if late == 0.0:
         return exact
     ramps = sampled_plant(pulled, loop, still, rising=True)
@@ -187,9 +197,10 @@ def uncertain_loop(
 
 
 def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
-    """Return the Legendre coefficients of k channels.
+    """Return the rows of a matrix that give the Legendre coefficients of k channels.
 
-    They follow from the integrals of z, which come after n states, and the integrals of these.
+    They follow from the integrals of z, whose rows come after those of n states, and from the
+    integrals of these integrals.
     """
     once = matrix[n : n + k]
     twice = matrix[n + k : n + 2 * k]
@@ -197,7 +208,7 @@ def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
 
 
 def _blocks(D: FloatArray, V: FloatArray) -> FloatArray:
-    """Build D of channels that disks in all inputs follow, with V from disks to channels."""
+    """Return D with disks in all inputs appended, where V leads from the disks to the channels."""
     m = V.shape[1]
     return np.block([[D, V], [np.zeros((m, len(D))), np.eye(m) / 2.0]])
 
@@ -205,9 +216,9 @@ def _blocks(D: FloatArray, V: FloatArray) -> FloatArray:
 def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int) -> Channels:
     """Add the channels of a delay to a loop with n states of the aircraft and k entries.
 
-    The delay of the loop becomes the middle of the ranges. The channels follow from the motion
-    caused by w_1. The states of w_1 of earlier ticks, c of them, and u of earlier ticks are
-    appended to those of the loop.
+    The nominal delay of the loop becomes the middle of the range of each coefficient. `ramps` is
+    the motion that w_1 causes. To the states of the loop are appended the c states that the w_1 of
+    earlier ticks need, and then u of earlier ticks.
     """
     E, U, K = exact.W[:, : exact.uncertain], exact.W[:, exact.disks], exact.Z[exact.disks]
     m, q = K.shape
@@ -236,7 +247,8 @@ def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int
     W = np.hstack([-held] * ticks + [ramp] * ticks)
     to_z = exact.D[: exact.uncertain]
     D = np.hstack([-to_z[:, exact.disks]] * ticks + [_coefficients(ramps.B, n, k)] * ticks)
-    # The loop with the additional states, with its delay in the middle of the ranges.
+    # Build the loop with the additional states and with the coefficients in the middle of their
+    # ranges.
     A = np.zeros((q + c + width, q + c + width))
     A[:q, :q] = exact.A
     A[: n + m, q : q + c] = effect[rows[: n + m]]
@@ -259,10 +271,10 @@ def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int
 def sensitivity_slopes(
     loop: Channels, d: FloatArray, w: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Compute S, (F, m, m), of the aircraft with deviations d, (k,), and its slopes, (F, k, m, m).
+    """Compute S, (F, m, m), and its slopes along d, (F, k, m, m), at the frequencies w, (F,).
 
-    They are evaluated at the frequencies w, rad/s. The loop must have disks in all inputs, and u in
-    time.
+    S is that of the aircraft with the deviations d, (k,), and w is in rad/s. The loop must have
+    disks in all inputs, and u must be in time.
     """
     around = loop.at(d)
     p, k = loop.uncertain, len(d)
@@ -278,10 +290,11 @@ def sensitivity_slopes(
 
 
 def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
-    """Split the loop into its strongly connected parts, and reduce them.
+    """Split the loop into its strongly connected parts, and reduce each part.
 
-    With disks in some inputs, only parts with such inputs count. The structured singular value of a
-    block triangular matrix is the largest of those of its blocks.
+    If `inputs` are given, the loop has disks in these, and only parts with a disk are returned. To
+    bound the parts is enough, because the structured singular value of a block triangular matrix is
+    the largest one of its blocks.
     """
     from scipy.sparse import csr_array  # noqa: PLC0415 - a flight starts without it
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
@@ -291,7 +304,7 @@ def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
     k = len(every.entries)
     m = len(loop.D) - p
     c = len(inputs)
-    # The pattern of the couplings at some frequencies; each entry or delay is a node.
+    # Find which nodes are coupled at some frequencies. A node is an entry, a late input or a disk.
     late = np.tile(k + np.arange(m), every.late // m)
     at = np.pi / loop.period * np.array(PATTERN_PARTS)
     sizes = np.abs(every.response(at, 1.0 + 1e-6)).max(axis=0)
@@ -300,7 +313,7 @@ def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
     pattern = np.zeros((k + m + c, k + m + c), dtype=bool)
     np.logical_or.at(pattern, (node[:, None], node[None]), wide)
     count, label = connected_components(csr_array(pattern), directed=True, connection="strong")
-    # A part without a loop of its own has no bound to give.
+    # A node that is coupled to no other and not to itself forms no loop, so it is left out.
     parts = []
     for number in range(count):
         nodes = np.flatnonzero(label == number)
@@ -314,9 +327,9 @@ def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
 
 
 def _reduced(every: Channels, channels: IntArray) -> Channels:
-    """Keep some channels, without the states that none of their w moves or none of their z shows.
+    """Keep some channels, and the states that are both moved by their w and seen in their z.
 
-    Such states are constants that are kept, integrals, and the rest of the loop.
+    The other states are left out. They are constants, integrals, and states of other parts.
     """
     part = every.some(channels)
     coupled = np.abs(part.A) > NO_COUPLING

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Searches a box for the worst aircraft: the first unstable one, and the least margins.
+"""Search of a box for the worst aircraft: the least unstable deviation, and the least margins.
 
-The search walks over the corners of the box. Each entry moves to the side to which the figure
-falls, by its gradient through the loop with the entries pulled out.
+The search walks over the corners of the box. Each entry moves to the side at which a figure, such
+as a margin, is smaller. The gradient of the figure shows this side. It comes from the loop with the
+entries pulled out.
 """
 
 from typing import Any, NamedTuple
@@ -38,24 +39,25 @@ from rise_di_controller.law.linear_loop import (
     LoopTiming,
 )
 
-SEED = 1  # of the random corners at which a search starts
-STARTS = 24
-ROUNDS = 12
-POLISHED = 4  # corners from which each flip of an entry is tried
-CLIMBERS = 24  # more corners at which climbs start
-LONGEST_CLIMB = 40  # flips
-FALL = 0.005  # fraction by which the next size to try lies below the least one found
-RESOLUTION = 1e-4  # of the size of an unstable deviation
-NEAR = 2.5  # a mode counts as near a frequency within this factor of it
-SLOWEST = 0.05  # rad/s, below which a mode counts as one at 0 rad/s
+SEED = 1  # seed of the random corners at which a search starts
+STARTS = 24  # number of these corners
+ROUNDS = 12  # largest number of moves to other corners
+POLISHED = 4  # number of corners from which each flip of an entry is tried
+CLIMBERS = 24  # number of further corners at which climbs start
+LONGEST_CLIMB = 40  # largest number of flips in a climb
+FALL = 0.005  # the next size to try is smaller than the least one found by this fraction
+RESOLUTION = 1e-4  # resolution of the size of an unstable deviation
+NEAR = 2.5  # a mode counts as near a frequency if the two differ by at most this factor
+SLOWEST = 0.05  # a mode below this frequency counts as one at 0 rad/s, rad/s
 REAL = 1e-9  # fraction of an eigenvalue up to which its imaginary part counts as rounding
 
 
 def first_unstable(part: Channels, entries: int, largest: float) -> list[FloatArray]:
-    """Find deviations, (entries,), of unstable aircraft of a part, up to a largest size.
+    """Find unstable aircraft of a part of the loop, with deviations up to a largest size.
 
-    Each one found is smaller than the one before: first by a divergence at 0 rad/s, then by modes
-    at the frequencies up to pi / T.
+    The search looks for a divergence at 0 rad/s, and then for modes near one frequency after the
+    other, up to pi / T. Deviations have the shape (entries,), and each one is smaller than the one
+    before.
     """
     highest = np.pi / part.period
     count = int(np.ceil(np.log(highest / SLOWEST) / (2.0 * np.log(NEAR))))
@@ -75,9 +77,10 @@ def first_unstable(part: Channels, entries: int, largest: float) -> list[FloatAr
 def _divergence(part: Channels) -> tuple[float, FloatArray]:
     """Find the least size at which an eigenvalue leaves the circle at z = 1, and its corner.
 
-    The size is infinite if there is none. det(I - size M diag(s)) = 0 at the largest real
-    eigenvalue 1 / size of M diag(s). From STARTS corners, each s moves to the side to which this
-    eigenvalue rises. Coefficients beyond the means of a period are left out.
+    The size is infinite if no eigenvalue leaves. At a corner s, the size is the reciprocal of the
+    largest real eigenvalue of M diag(s), because det(I - size M diag(s)) = 0 there. From STARTS
+    corners, each s_i moves to the side at which this eigenvalue is larger. Coefficients beyond the
+    means over a period are left out.
     """
     k = len(part.entries)
     M = part.response(0.0, 1.0 + SPECTRAL_RADIUS_TOLERANCE)[:k, :k].real
@@ -95,7 +98,7 @@ def _divergence(part: Channels) -> tuple[float, FloatArray]:
         best = np.where(rises, upward[rows, most], best)
         if not rises.any():
             break
-        # of its logarithm, up to the factor s
+        # These are the slopes of the logarithm of the eigenvalue, up to the factor s.
         slopes = np.linalg.pinv(X)[rows, most] * X[rows, :, most]
         corners = np.where((slopes.real < 0.0) & rises[:, None], -corners, corners)
     first = int(np.argmax(best))
@@ -103,12 +106,12 @@ def _divergence(part: Channels) -> tuple[float, FloatArray]:
 
 
 def _oscillation(part: Channels, frequency: float, largest: float) -> tuple[float, FloatArray]:
-    """Find the least size of an unstable deviation near a frequency, rad/s, and its corner.
+    """Find the least size at which a mode near a frequency, rad/s, is unstable, and its corner.
 
     The size is infinite if none is found. From each of STARTS corners, the search grows the size
-    until a mode near the frequency leaves abs(z) < 1, then moves to the corner to which abs(z)
-    grows, until the size no longer falls. Then it climbs from more corners at a smaller size, as
-    long as one of them ends at an unstable aircraft.
+    until a mode near the frequency leaves abs(z) < 1. Then it moves to the corner at which abs(z)
+    is larger, and repeats this until it knows every such corner. At last it climbs from further
+    corners at a smaller size, as long as one of the climbs ends at an unstable aircraft.
     """
     rng = np.random.default_rng(SEED)
     k = len(part.entries)
@@ -139,9 +142,10 @@ def _nearer(
     starts: FloatArray,
     found: tuple[float, FloatArray],
 ) -> tuple[float, FloatArray]:
-    """Lower the size by climbs from some corners a little below it, and return it with its corner.
+    """Find a smaller size by climbs a little below `level`, and return the size and its corner.
 
     As long as a climb ends at an unstable aircraft, the size of that aircraft is the next level.
+    If no climb does, the function returns `found`.
     """
     while True:
         corner, radius = _climbed(part, starts, frequency, (1.0 - FALL) * level)
@@ -157,9 +161,9 @@ def _climbed(
 ) -> tuple[FloatArray, float]:
     """Climb from corners at a given size to the largest mode near a frequency.
 
-    Returns its corner and abs(z). A climb flips one entry at a time as long as abs(z) grows: at
-    first the one with the steepest slope, then, from the POLISHED best corners, the one that raises
-    abs(z) most.
+    Returns the corner and abs(z) of this mode. A climb flips one entry at a time as long as abs(z)
+    grows. At first it flips the entry with the steepest slope. From the POLISHED best corners, it
+    then flips the entry that raises abs(z) most.
     """
     corners = starts.copy()
     radii = _radii(part, size * corners, frequency)
@@ -189,7 +193,7 @@ def _climbed(
 
 
 def _radii(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
-    """Return the largest abs(z) of a mode near a frequency, (...), at deviations d, (..., k)."""
+    """Return the largest abs(z) of a mode near a frequency, shape (...), for d of (..., k)."""
     return np.asarray(_near(np.linalg.eigvals(part.at(d).A), frequency, part.period).max(axis=-1))
 
 
@@ -201,7 +205,10 @@ def _near(z: NDArray[Any], frequency: float, period: float) -> FloatArray:
 
 
 def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float) -> float:
-    """Find the size along a corner at which a mode near a frequency leaves, or infinity."""
+    """Find the size along a corner at which a mode near a frequency becomes unstable.
+
+    The size is infinite if none becomes unstable up to the size `largest`.
+    """
 
     def unstable(size: FloatArray) -> NDArray[np.bool_]:
         z = np.linalg.eigvals(part.at(size[:, None] * corner).A)
@@ -220,7 +227,10 @@ def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float)
 
 
 def _growth(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
-    """Compute the slopes d abs(z) / d d_i of the largest mode near a frequency, (N, k), at d."""
+    """Compute the slopes d abs(z) / d d_i of the largest mode near a frequency, (N, k).
+
+    They are evaluated at the deviations d, (N, k).
+    """
     around = part.at(d)
     z, X = np.linalg.eig(around.A)
     Y = np.linalg.inv(X)
@@ -234,25 +244,27 @@ def _growth(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
 
 # The least margins of a box
 
-BEGUN = 16  # random corners at the start, beside those from the slopes at the nominal aircraft
-FOLLOWED = 2  # corners with the least value of a figure, from which the walk continues
-WALKED = 6  # rounds of the walk over the corners
+# number of random corners at the start, in addition to those to which the nominal slopes point
+BEGUN = 16
+FOLLOWED = 2  # for each figure, the walk continues from so many corners with its least values
+WALKED = 6  # largest number of rounds of the walk over the corners
 
 
 class WorstCase(NamedTuple):
-    """The least margins found in a box, each figure by itself."""
+    """The least margins that were found in a box. Each is the least one of its kind."""
 
     worst: Margins
     corners: FloatArray  # (N, k) deviations of all aircraft that were tried
-    margins: Margins  # of these
-    least_phase: FloatArray  # (k,) deviations with the smallest phase margin
+    margins: Margins  # margins of these N aircraft
+    least_phase: FloatArray  # (k,) deviations of the aircraft with the smallest phase margin
 
 
 def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box) -> WorstCase:
     """Search the corners of a box around a plant, A (n, n), for the least margins.
 
-    Each figure moves from the corner at which it is least to the corner to which its slope points,
-    until no figure moves any more. The values are those of `input_margins`.
+    The search follows each figure, such as the phase margin of an input, from the corners where it
+    is least to the corner to which its slope points, until no new corner is found. The values are
+    those of `input_margins`.
     """
     rng = np.random.default_rng(SEED)
     k = len(box.names)
@@ -284,12 +296,12 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box)
 
 
 def _corners(slopes: FloatArray) -> FloatArray:
-    """Return the corners towards which figures with these slopes fall."""
+    """Return the corner towards which each figure becomes smaller, given its slopes."""
     return np.asarray(np.where(slopes > 0.0, -1.0, 1.0))
 
 
 def _figures(margins: Margins) -> FloatArray:
-    """Stack the figures of N aircraft, (N, 4 m + 3), as `_slopes` does: smaller is worse."""
+    """Stack the figures of N aircraft, (N, 4 m + 3), ordered as in `_slopes`. Smaller is worse."""
     all_inputs = (1.0 / margins.sensitivity_all, margins.disk_all, margins.damping)
     return np.concatenate(
         [
@@ -312,11 +324,11 @@ def _slopes(
     uncertain: Channels,
     d: FloatArray,
 ) -> FloatArray:
-    """Compute the slopes of `_figures` along deviations at d, (4 m + 3, k), up to a factor.
+    """Compute the slopes of `_figures` along the deviations, (4 m + 3, k), at d, up to a factor.
 
-    With a = d log L / d d_i and b = d log L / d w, the phase changes by Im a - Im b Re a / Re b at
-    abs(L) = 1, and the log of the gain by Re a - Re b Im a / Im b at real L. A peak of abs(S - c)
-    changes by its slope at constant frequency.
+    With a = d log L / d d_i and b = d log L / d w, the slope of the phase at abs(L) = 1 is Im a -
+    Im b Re a / Re b, and the slope of the log of the gain at real L is Re a - Re b Im a / Im b. The
+    slope of a peak of abs(S - c) is its slope at constant frequency.
     """
     at = plants_at(plant, box, d[None])
     form = schur_form(at, law, loop)
@@ -365,9 +377,10 @@ def _slopes(
 def _crossed(
     w: FloatArray, L: ComplexArray, values: FloatArray, distance: FloatArray
 ) -> tuple[FloatArray, ComplexArray]:
-    """Find the nearest zero of `values`, (F, m), for each input: frequency and d log L / d w, (m,).
+    """Find the zero of `values`, (F, m), with the least `distance`, (F - 1, m), for each input.
 
-    If there is no zero, the lowest frequency is returned.
+    Returns the frequencies of the zeros, rad/s, and d log L / d w there, each (m,). If there is no
+    zero, the lowest frequency is returned.
     """
     columns = np.arange(values.shape[1])
     crosses = np.signbit(values[:-1]) != np.signbit(values[1:])
@@ -382,9 +395,9 @@ def _crossed(
 
 
 def _damping_slope(uncertain: Channels, d: FloatArray) -> FloatArray:
-    """Compute the slope of the least damping of a slow mode along the deviations at d, (k,).
+    """Compute the slope of the least damping ratio of a slow mode along the deviations, (k,), at d.
 
-    It is known only up to a factor. zeta = -cos(angle(log z)).
+    The damping ratio is zeta = -cos(angle(log z)). The slope is known only up to a factor.
     """
     around = uncertain.at(d)
     z, X = np.linalg.eig(around.A)
