@@ -3,9 +3,9 @@
 """Arithmetic of law, observer and feedforward with a stated order of operations.
 
 Every operation is rounded once to float64. u therefore does not depend on the BLAS or the libm of a
-host, and C code without libraries gives the same bits. With NumPy this is exact to the bit. XLA,
-the compiler of JAX, may contract a product and a sum into a fused multiply-add with a single
-rounding, so JAX only comes close.
+host, and C code without libraries gives the same bits. NumPy keeps this order to the bit. XLA, the
+compiler of JAX, can contract a product and a sum into a fused multiply-add with a single rounding,
+so JAX only comes close.
 """
 
 import math
@@ -15,12 +15,12 @@ import numpy as np
 from flight_core.vectors import Array, FloatArray, Scalar, array_namespace
 
 ARITHMETIC = "1"
-"""Number of this arithmetic in the provenance of a log."""
+"""Version number of this arithmetic in the provenance of a log."""
 
 MAX_ANGLE = 1e6
 """Largest angle of `sine`, rad. A larger angle counts as MAX_ANGLE."""
 
-# 30 bits of pi: a product with an integer below 2^23 is exact
+# the first 30 bits of pi, so that the product with an integer below 2^23 is exact
 PI_HIGH = math.floor(math.pi * 2.0**28) / 2.0**28
 PI_LOW = 1.984187159361081e-09  # pi - PI_HIGH
 INVERSE_PI = 1.0 / math.pi
@@ -34,8 +34,8 @@ ROUNDING = 1.5 * 2.0**52
 def product(matrix: Array, vector: Array) -> Array:
     """Sum matrix[:, j] vector[j] over the columns j = 0, 1, ..., in this order.
 
-    Shapes: matrix (k, s) and vector (s,) or (s, N), or N matrices (k, s, N) and vectors (s, N), s >
-    0. The result is (k,) or (k, N).
+    The shapes are (k, s) for a matrix and (s,) or (s, N) for one or N vectors. N matrices have the
+    shape (k, s, N). s must be positive. The result has the shape (k,) or (k, N).
     """
     if matrix.ndim == 2 and isinstance(vector, np.ndarray) and vector.ndim == 1:
         return np.add.accumulate(matrix * vector, axis=1)[:, -1]
@@ -50,9 +50,9 @@ def product(matrix: Array, vector: Array) -> Array:
 def sine(x: Scalar) -> Scalar:
     """Compute the sine of an angle in rad, with an error below 5e-16 up to MAX_ANGLE.
 
-    r = x - k pi, then the Taylor series up to r^19. k is the integer nearest to x / pi, pi is
-    PI_HIGH + PI_LOW to 82 bits, and sin(x) is sin(r) for even k, -sin(r) for odd k. The remainder
-    of the series is at most (pi / 2)^21 / 21! = 2.6e-16.
+    The angle is reduced to r = x - k pi, where k is the integer nearest to x / pi, and PI_HIGH +
+    PI_LOW is pi to 82 bits. sin(x) is sin(r) for even k, and -sin(r) for odd k. sin(r) is the
+    Taylor series up to r^19, whose remainder is at most (pi / 2)^21 / 21! = 2.6e-16.
     """
     xp = array_namespace(x)
     x = xp.minimum(xp.maximum(x, -MAX_ANGLE), MAX_ANGLE)
@@ -67,14 +67,17 @@ def sine(x: Scalar) -> Scalar:
 
 
 def _rounded(x: Scalar) -> Scalar:
-    """Round to the nearest integer, half to even; XLA would simplify the sum to x."""
+    """Round to the nearest integer, and a half to the even one.
+
+    Only a float takes the sum with ROUNDING, because XLA would simplify the sum to x.
+    """
     return (x + ROUNDING) - ROUNDING if isinstance(x, float) else array_namespace(x).round(x)
 
 
 def inverse(matrix: FloatArray) -> FloatArray:
     """Invert a regular matrix (m, m) by Gauss-Jordan elimination.
 
-    The pivot is the largest entry of each column.
+    The pivot of a column is its entry with the largest magnitude.
     """
     m = len(matrix)
     rows = np.hstack([matrix, np.eye(m)])

@@ -1,45 +1,51 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Channels shared by several nodes, by name: docs/topics.md."""
+"""Names of the channels that several nodes share, as docs/topics.md lists them."""
 
 from collections.abc import Sequence
 
 from flight_core.outcome import Refusal
 
 RATES_AND_SPEED = ("q", "V", "p", "r")
-"""Channels of y, y_m and u_m in a guided flight: rad/s in body axes, and m/s from trim."""
+"""Channels of y, y_m and u_m in a guided flight. The rates q, p and r are in rad/s in body axes. V
+is the deviation of the airspeed from trim, m/s."""
 
 WITHOUT_RUDDER = RATES_AND_SPEED[:3]
-"""The same for an aircraft without rudder, such as a flying wing, whose r follows the bank."""
+"""The same channels for an aircraft without rudder, such as a flying wing. Its r follows from the
+bank."""
 
 VERTICAL = {"vertical_speed": 1.0, "w": -1.0}
-"""Channels that a multicopter has in place of V, with the climb, m/s, that 1 m/s of each means."""
+"""Channels of which a multicopter has one in place of V. The value is the rate of climb, m/s, if
+the channel is 1 m/s."""
 
 
 def vertical(names: Sequence[str]) -> str:
-    """Return the channel of VERTICAL among names; "" if there is none, as for an airplane."""
+    """Return the channel of VERTICAL among names, or "" if there is none, as for an airplane."""
     return next((name for name in names if name in VERTICAL), "")
 
 
 ATTITUDE = ("phi", "theta")
-"""Channels of u_m beside the commands: bank, and pitch above the pitch of level flight, rad. They
-only mark where u_m ends."""
+"""Channels of u_m after the commands: the bank, and the pitch minus the pitch of level flight, rad.
+The reference model only uses them when u_m ends."""
 
 SIDES = ("down", "up")
-"""Beginnings of the channels of `authority`: down.V and up.V say how fast an input can at least
-change V either way, units/s."""
+"""Beginnings of the channels of `authority`. For example, down.V and up.V are the rates, units/s,
+at which the input can at least decrease and increase V."""
 
 UNKNOWN = 1e9
 """Value of `authority` for an output without a model learned in flight, and of `effects` for an
 input that is not probed."""
 
 LEAST_EFFECT = 0.4
-"""Fraction of its effect below which an input counts as stuck: a healthy surface still has 0.44 at
-two thirds of the trim speed."""
+"""An input counts as stuck if it has less than this fraction of its effect at trim. A healthy
+surface still has 0.44 at two thirds of the trim speed."""
 
 
 def reason_against_inputs(names: Sequence[str], effects: Sequence[float]) -> Refusal | None:
-    """Refuse the inputs below LEAST_EFFECT in a sample of `effects`."""
+    """Return a reason against the inputs that are below LEAST_EFFECT in a sample of `effects`.
+
+    Returns None if there is no such input.
+    """
     stuck = [
         f"{name} does not answer the probe: it has at most {100.0 * effect:.0f} % of its effect"
         for name, effect in zip(names, effects, strict=True)
@@ -49,5 +55,6 @@ def reason_against_inputs(names: Sequence[str], effects: Sequence[float]) -> Ref
 
 
 POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb", "beta")
-"""Channels of `pose`: attitude, rad (body FRD in NED, psi from true north in (-pi, pi]); position,
-m; velocity over ground, m/s; sideslip, rad, which counts as 0 if it is not measured."""
+"""Channels of `pose`. They are the attitude, rad, of the body axes FRD in NED, with psi from true
+north in (-pi, pi], the position, m, the velocity over ground, m/s, and the sideslip, rad. The
+sideslip counts as 0 if it is not measured."""

@@ -12,19 +12,19 @@ from pathlib import Path
 
 CLONE_NEWUSER = 0x10000000
 CLONE_NEWNET = 0x40000000
-# system calls, the same numbers on every architecture
+# numbers of system calls, which are the same on every architecture
 CREATE_RULESET = 444
 ADD_RULE = 445
 RESTRICT_SELF = 446
 PATH_BENEATH = 1
 VERSION_FLAG = 1
-NO_NEW_PRIVS = 38  # of prctl(2)
+NO_NEW_PRIVS = 38  # PR_SET_NO_NEW_PRIVS of prctl(2)
 WRITE_FILE = 1 << 1
 TRUNCATE = 1 << 14
-# write a file; remove and make files, folders, links, sockets
+# rights to write a file, and to remove and make files, folders, links and sockets
 CHANGES = WRITE_FILE | sum(1 << bit for bit in range(4, 13))
-REFER_VERSION = 2  # of landlock
-TRUNCATE_VERSION = 3  # with LANDLOCK_ACCESS_FS_REFER and _TRUNCATE
+REFER_VERSION = 2  # first version of landlock with LANDLOCK_ACCESS_FS_REFER
+TRUNCATE_VERSION = 3  # first version of landlock with LANDLOCK_ACCESS_FS_TRUNCATE
 REFER = 1 << 13
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
@@ -51,7 +51,10 @@ def confine(folder: Path) -> list[str]:
 
 
 def _write_beneath(folder: Path) -> bool:
-    """Restrict changes of files to `folder` and /dev/null; return whether the kernel does so."""
+    """Restrict changes of files to `folder` and /dev/null.
+
+    Returns whether the kernel does so.
+    """
     version = _LIBC.syscall(CREATE_RULESET, None, 0, VERSION_FLAG)
     if version < 1:
         return False

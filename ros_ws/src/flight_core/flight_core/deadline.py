@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A deadline for a process, which holds even while a call into a library keeps the interpreter.
+"""A deadline for a process, which holds even while a call into a library blocks the interpreter.
 
-During such a call neither a Python thread nor a signal handler of Python runs, and the default
-action of a signal loses the exit status. A timer of the kernel therefore starts a thread of the C
-library (POSIX timer_create, SIGEV_THREAD), which calls _exit(status).
+During such a call neither a Python thread nor a signal handler of Python runs. The default action
+of a signal would end the process, but without the exit status. A timer of the kernel therefore
+starts a thread of the C library (POSIX timer_create, SIGEV_THREAD), which calls _exit(status).
 """
 
 import ctypes
@@ -19,11 +19,11 @@ from flight_core.rates import NANOSECONDS
 
 SIGEV_THREAD = 2  # linux/bits/sigevent-consts.h
 SIGEVENT_SIZE = 64  # bytes, of struct sigevent
-TOLD_AT = 0.9  # fraction of the deadline at which the stacks go to stderr
+TOLD_AT = 0.9  # fraction of the deadline after which the stacks of the threads go to stderr
 
 
 class _SignalEvent(ctypes.Structure):
-    """struct sigevent with the members of SIGEV_THREAD."""
+    """The C structure sigevent, with the members that SIGEV_THREAD uses."""
 
     _fields_ = (
         ("value", ctypes.c_ssize_t),
@@ -36,7 +36,7 @@ class _SignalEvent(ctypes.Structure):
 
 
 class _TimerTimes(ctypes.Structure):
-    """struct itimerspec: period and first expiry, s and ns."""
+    """The C structure itimerspec: the period and the first expiry of a timer, s and ns."""
 
     _fields_ = tuple(
         (name, ctypes.c_long) for name in ("period_s", "period_ns", "first_s", "first_ns")
@@ -46,13 +46,13 @@ class _TimerTimes(ctypes.Structure):
 class Deadline:
     """Ends the process with an exit status after `duration` s, unless it is cancelled.
 
-    As a context manager it is cancelled at the end of the block. Python does not clean up when it
-    ends the process, so anything that must reach a file has to be closed before.
+    As a context manager it is cancelled at the end of the block. When the deadline ends the
+    process, Python does not clean up. Close before what must reach a file.
     """
 
     def __init__(self, duration: float, status: int) -> None:
         for stream in filter(None, (sys.stdout, sys.stderr)):
-            with suppress(OSError):  # the reader may have ended
+            with suppress(OSError):  # the reader of a pipe can have ended
                 stream.flush()
         library = ctypes.CDLL(None, use_errno=True)
         if not hasattr(library, "timer_create"):  # before glibc 2.34
@@ -79,7 +79,7 @@ class Deadline:
         self.cancel()
 
     def cancel(self) -> None:
-        """Let the process continue."""
+        """Cancel the deadline, so that the process continues."""
         faulthandler.cancel_dump_traceback_later()
         _require(self._delete(self._timer))
 

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What ROS 2 needs of the environment, checked in less than a millisecond before rclpy is loaded.
+"""Check of what ROS 2 needs of the environment, before rclpy is loaded.
 
-Without the check rclpy ends with a traceback, with a bus error, or after a timeout.
+The check takes less than a millisecond. Without it, rclpy would end with a traceback, with a bus
+error or after a timeout.
 """
 
 import os
@@ -17,20 +18,21 @@ from pathlib import Path
 from typing import NoReturn
 
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
-MAX_PARTICIPANTS = 100  # of a domain, by `flight_ros/loopback.xml`
+MAX_PARTICIPANTS = 100  # largest number of participants in a domain, by `flight_ros/loopback.xml`
 SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - its free space is read, no file is made
 LEAST_SHARED_MEMORY = 1 << 16  # bytes; rclpy and a flight use 12 kB
-LEAST_FILES = 128  # open at once in a process
+LEAST_FILES = 128  # least number of files that a process must be able to hold open
 LAST_START = 2**31 - 86_400
-"""s. A stamp of ROS 2 has seconds of 32 bits with a sign: the last is on 2038-01-19
-(builtin_interfaces/Time). Nodes start until a day before."""
+"""Last time at which a node can start, s since the epoch. It is a day before the last stamp of ROS
+2, on 2038-01-19: a stamp counts seconds in 32 bits with a sign (builtin_interfaces/Time)."""
 MAX_DOMAIN = 232  # a higher domain has port numbers above 65535 (DDSI-RTPS 2.3, section 9.6.1.1)
 
 
 def require_ros_environment() -> None:
     """Raise ParameterError, with the remedy, if no node can start here.
 
-    Checks clock, logs, shared memory, loopback, domain and middleware.
+    The check covers the clock, the domain, the middleware, shared memory, open files, logs and
+    loopback.
     """
     _require_clock()
     _require_domain()
@@ -62,7 +64,10 @@ def _require_domain() -> None:
 
 
 def _require_middleware() -> None:
-    """Refuse a middleware that is not installed; an installation without an index passes."""
+    """Refuse a middleware that is not installed.
+
+    If an installation has no index of its middlewares, any name passes.
+    """
     name = os.environ.get("RMW_IMPLEMENTATION", "")
     prefixes = [
         *filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)),
@@ -81,8 +86,8 @@ def _require_middleware() -> None:
 def _require_shared_memory() -> None:
     """Refuse a full file system of shared memory.
 
-    rclpy writes a page of it when it is loaded, which ends in a bus error if the file system is
-    full.
+    rclpy writes a page of shared memory when it is loaded. If the file system is full, this write
+    ends in a bus error.
     """
     try:
         state = os.statvfs(SHARED_MEMORY)
@@ -98,7 +103,10 @@ def _require_shared_memory() -> None:
 
 
 def _require_files() -> None:
-    """Refuse a limit of open files below LEAST_FILES: a node has some 50 files and sockets open."""
+    """Refuse a limit of open files below LEAST_FILES.
+
+    A node has some 50 files and sockets open.
+    """
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     if most < LEAST_FILES:
         _refuse(
@@ -107,7 +115,7 @@ def _require_files() -> None:
 
 
 def _require_log_settings() -> None:
-    """Refuse a setting of rcutils/logging.h with which each line of a log becomes an error."""
+    """Refuse a setting of rcutils/logging.h that turns each line of a log into an error."""
     for variable in (
         "RCUTILS_LOGGING_USE_STDOUT",
         "RCUTILS_LOGGING_BUFFERED_STREAM",
@@ -120,7 +128,7 @@ def _require_log_settings() -> None:
 def log_folder() -> Path | None:
     """Return the folder for the logs of nodes, as rcl_logging_interface chooses it.
 
-    Returns None if none of its variables is set.
+    Returns None if none of the environment variables for it is set.
     """
     for variable, inside in (("ROS_LOG_DIR", ""), ("ROS_HOME", "log"), ("HOME", ".ros/log")):
         if value := os.environ.get(variable):
@@ -142,7 +150,7 @@ def _require_log_folder() -> None:
         os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     except (OSError, ValueError) as error:
         if folder.is_dir() and isinstance(error, FileExistsError):
-            return  # left by a killed process with the same number
+            return  # a killed process with the same number has left this file
         reason = error.strerror if isinstance(error, OSError) else str(error)
         _refuse(
             f"{folder}: cannot be written ({reason}), expected a folder for the logs of nodes "
@@ -154,7 +162,10 @@ def _require_log_folder() -> None:
 
 
 def _require_loopback() -> None:
-    """Refuse a host without loopback: nodes talk over 127.0.0.1 unless the user has a profile."""
+    """Refuse a host without loopback.
+
+    Nodes talk over 127.0.0.1, unless the user has a profile of Fast DDS.
+    """
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))

@@ -6,8 +6,8 @@
 def failsafe_scale(silence_ns: int, hold_ns: int, ramp_ns: int) -> float:
     """Compute the factor s of the failsafe input u = s u_last, where u is the deviation from trim.
 
-    `silence_ns` is the time since the last input. s is 1 until hold ends, then falls linearly to 0
-    over ramp. If ramp is 0, it falls in a step.
+    `silence_ns` is the time since the last sample. s is 1 for `hold_ns`, then falls linearly to 0
+    within `ramp_ns`. If `ramp_ns` is 0, s falls to 0 in a step.
     """
     if silence_ns <= hold_ns:
         return 1.0

@@ -1,15 +1,18 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Failed steps of a node: the count, and when to log a sentence."""
+"""Failed steps of a node: their count, and the decision when to log a sentence."""
 
 import math
 
 DWELL = 10.0
-"""s without a failed step before another sentence is due."""
+"""Time without a failed step after which the next one is logged again, s."""
 
 
 class Failures:
-    """A count of failed steps, with a sentence at the first and at the first after DWELL."""
+    """A count of failed steps.
+
+    A sentence is due at the first failed step, and at the next one after DWELL without any.
+    """
 
     def __init__(self) -> None:
         self.count = 0

@@ -3,9 +3,9 @@
 """Values of a parameter set: an annotation says what is permitted, and refusals are sentences.
 
 Types are strict. An int is accepted as a float, a sequence as a tuple, an array or a scalar of
-NumPy as lists and numbers, and a path as a str; nothing else is converted. The annotations are
-float, int, bool, str, object, Literal, tuple, dict, unions of these, and parameter sets, with
-`Field(...)` in Annotated for the rules.
+NumPy as lists and numbers, and a path as a str. Nothing else is converted. The annotations are
+float, int, bool, str, object, Literal, tuple, dict, unions of these, and parameter sets. Rules such
+as a limit come from `Field(...)` in Annotated.
 """
 
 import math
@@ -41,20 +41,20 @@ class Problems:
     """Sentences about values that are not permitted."""
 
     def __init__(self) -> None:
-        self.unknown: list[str] = []  # keys
-        # by set: the missing keys with what is expected of each
+        self.unknown: list[str] = []  # a sentence for each unknown key
+        # for each parameter set, the missing keys and the meaning of each
         self.missing: dict[str, dict[str, str]] = {}
         self.others: list[str] = []
 
     def sentences(self) -> list[str]:
-        """List the sentences, unknown keys first.
+        """List the sentences, with those about unknown keys first.
 
-        A mistyped key then comes before the key that is missing because of it.
+        A mistyped key therefore comes before the key that is missing because of the mistake.
         """
         return self.unknown + self.missing_sentences() + self.others
 
     def missing_sentences(self) -> list[str]:
-        """Write a sentence for each set that lacks keys, which names all of them."""
+        """Write one sentence for each set that lacks keys. It names all the missing keys."""
         sentences = []
         for where, keys in self.missing.items():
             (name, meaning), *more = keys.items()
@@ -81,17 +81,21 @@ class Problems:
 
 
 class Kind(NamedTuple):
-    """Values permitted by an annotation."""
+    """The values that an annotation permits, and how they are read."""
 
-    expected: str  # for the sentence about a value of a different type
+    expected: str  # words for the sentence about a value of a different type
     takes: Callable[[Any], bool]  # whether a value has the type
-    # (value of the type, key, problems) -> the value in the set
+    # (value of the type, key, problems) -> the value for the parameter set
     content: Callable[[Any, str, Problems], Any]
-    # whether all values of a list are permitted as they are: most of a scenario are matrices
+    # Whether all values of a list are permitted as they are. This shortcut saves time, because most
+    # values of a scenario are entries of matrices.
     takes_all: Callable[[Sequence[Any]], bool] = lambda _: False
 
     def read(self, value: object, key: str, problems: Problems) -> Any:
-        """Return the value for the set; if it is not permitted, add a sentence to `problems`."""
+        """Return a value as the parameter set holds it.
+
+        If the value is not permitted, add a sentence to `problems` and return None.
+        """
         if hasattr(value, "dtype") and hasattr(value, "tolist"):  # an array or a scalar of NumPy
             value = value.tolist()
         if self.takes(value):
@@ -111,11 +115,11 @@ LIMITS: Mapping[str, tuple[Callable[[Any, Any], bool], str]] = MappingProxyType(
         "ge": (operator.ge, "greater than or equal to"),
     }
 )
-"""Comparison and words of each limit of a number."""
+"""The comparison and the words for each kind of limit of a number."""
 
 
 def _number(kind: type[float], *, allow_inf_nan: bool = False, **limits: float) -> Kind:
-    """Permit an int, or a float, which may be infinite or NaN only with `allow_inf_nan`."""
+    """Permit an int or a float. A float can be infinite or NaN only with `allow_inf_nan`."""
     if unknown := limits.keys() - LIMITS.keys():
         raise TypeError(f"a number has no rule {', '.join(sorted(unknown))}")
     checks = [(*LIMITS[rule], limits[rule]) for rule in LIMITS if rule in limits]
@@ -123,7 +127,7 @@ def _number(kind: type[float], *, allow_inf_nan: bool = False, **limits: float) 
     def content(value: Any, key: str, problems: Problems) -> Any:
         try:
             number = kind(value)
-        except OverflowError:  # of an int beyond the range of a float
+        except OverflowError:  # an int beyond the range of a float
             return problems.refuse(key, value, "a finite number")
         if kind is float and not allow_inf_nan and not math.isfinite(number):
             return problems.refuse(key, value, "a finite number")
@@ -168,7 +172,7 @@ def _string(*, min_length: int = 0, pattern: str = "") -> Kind:
 
 
 def _choice(choices: Sequence[object], expected: str = "") -> Kind:
-    """Permit a value among choices, of the same type: 1 is neither True nor 1.0."""
+    """Permit a value that equals one of the choices and has its type. 1 is not True or 1.0."""
     words = expected or _either([repr(choice) for choice in choices])
     return Kind(
         words,
@@ -189,7 +193,10 @@ def _check_count(count: int, key: str, problems: Problems, least: float, most: f
 
 
 def _values(parts: Sequence[Any], *, min_length: float = 0, max_length: float = math.inf) -> Kind:
-    """Permit a tuple, either of any length with values of one kind, or with a value per kind."""
+    """Permit a tuple of values.
+
+    It has either any number of values of one kind, or one value for each of several kinds.
+    """
     is_repeated = parts[-1] is Ellipsis
     kinds = [kind_of(part) for part in parts if part is not Ellipsis]
     least, most = (min_length, max_length) if is_repeated else (len(kinds), len(kinds))
@@ -247,7 +254,7 @@ def _group(schema: Any) -> Kind:
 
 
 def _union(kinds: Sequence[Kind]) -> Kind:
-    """Permit a value of any of the kinds, and take it as the first that fits."""
+    """Permit a value of any of the kinds, and read it as the first kind that fits."""
 
     def content(value: Any, key: str, problems: Problems) -> Any:
         trial = Problems()
@@ -288,7 +295,7 @@ SIMPLE: Mapping[Any, Callable[..., Kind]] = MappingProxyType(
 
 
 def kind_of(annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})) -> Kind:
-    """Return which values an annotation permits under rules, such as gt.
+    """Return the kind of values that an annotation permits under rules, such as gt.
 
     Raises TypeError for an unknown annotation or rule.
     """
@@ -307,11 +314,11 @@ def kind_of(annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})) ->
 
 
 REQUIRED: Any = object()
-"""Default of a field without a default."""
+"""Mark of a field that has no default."""
 
 
 class FieldInfo:
-    """Declaration of a field; in Annotated, only its rules."""
+    """The declaration of a field. In Annotated, only its rules count."""
 
     annotation: Any = None
 
@@ -322,7 +329,7 @@ class FieldInfo:
 
     @cached_property
     def kind(self) -> Kind:
-        """What the field permits."""
+        """The kind of values that the field permits."""
         return kind_of(self.annotation, self.rules)
 
 
@@ -330,7 +337,8 @@ def Field(default: Any = REQUIRED, *, description: str = "", **rules: Any) -> An
     """Declare the default, the meaning and the rules of a field.
 
     Args:
-        default: Value of a field that a file leaves out; absent: the field is required.
+        default: Value of the field if a file leaves it out. Without a default, the field is
+            required.
         description: Meaning and unit, a sentence.
         rules: gt, ge, lt, le and allow_inf_nan of a number, min_length and pattern of a string,
             min_length and max_length of a tuple and of a dict.

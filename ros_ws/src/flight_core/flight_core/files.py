@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Input and output files: existence checks, YAML, atomic replacement.
 
-A file that cannot be read or written is a ParameterError with a sentence.
+If a file cannot be read or written, the functions raise ParameterError with a sentence.
 """
 
 import errno
@@ -24,8 +24,8 @@ from flight_core.arguments import FilePath, as_path
 from flight_core.parameters import ParameterError, one_of, require
 from flight_core.text import printable
 
-# Exceptions of PyYAML: YAMLError for invalid syntax, the others for an invalid scalar ("0b_",
-# "2001-99-99", "!!bool 2") or for nesting that is too deep.
+# Exceptions of PyYAML. It raises YAMLError for invalid syntax, and the others for an invalid scalar
+# ("0b_", "2001-99-99", "!!bool 2") or for nesting that is too deep.
 NOT_YAML = (
     yaml.YAMLError,
     ArithmeticError,
@@ -40,21 +40,21 @@ INT_TAG = "tag:yaml.org,2002:int"
 FLOAT_TAG = "tag:yaml.org,2002:float"
 
 MAX_FILE_BYTES = 1 << 19
-"""Bytes. A scenario has 4 kB, and metadata.yaml of 500 topics less than this limit. PyYAML needs up
-to 0.2 kB and 5 us for each byte."""
+"""Largest size of a file, bytes. A scenario has 4 kB, and even the metadata.yaml of 500 topics is
+smaller than this limit. PyYAML needs up to 0.2 kB of memory and 5 us for each byte."""
 
 MAX_YAML_NODES = 100_000
-"""Number of values in a file once its aliases are expanded. A few lines of nested aliases can
-expand to billions of values."""
+"""Largest number of values in a file, counted after its aliases are expanded. A few lines of nested
+aliases can expand to billions of values."""
 
 
 INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)|0o[0-7]+|0x[0-9a-fA-F]+")
 FLOAT = re.compile(
     r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
 )
-"""Numbers of the core schema of YAML 1.2.2, section 10.3.2, without leading zeros: YAML 1.1 reads
-060 as 48, YAML 1.2 as 60. That section does not have 1:00, which YAML 1.1 reads as 60, or 1_000.
-All of these are strings here, so that no number is guessed."""
+"""Numbers of the core schema of YAML 1.2.2, section 10.3.2, except those with leading zeros: YAML
+1.1 reads 060 as 48, YAML 1.2 as 60. The core schema has neither 1:00, which YAML 1.1 reads as 60,
+nor 1_000. All of these are strings here, so that no number is guessed."""
 
 
 LEADING_ZERO = re.compile(r"[-+]?0[0-9]+")
@@ -63,9 +63,10 @@ LEADING_ZERO = re.compile(r"[-+]?0[0-9]+")
 class _Loader(Composer, yaml.CSafeLoader):
     """Reads numbers as YAML 1.2 does, and rejects duplicate keys.
 
-    PyYAML would keep the last of duplicate keys. Aliases that expand to more than MAX_YAML_NODES
-    values are rejected too. libyaml parses, nine times as fast as Python. Python composes the
-    nodes, because libyaml's binding exhausts the stack if they are nested deeply.
+    PyYAML would keep the last of several equal keys. Aliases that expand to more than
+    MAX_YAML_NODES values are rejected, too. libyaml parses the text, nine times as fast as Python.
+    The nodes are composed in Python, because libyaml's binding exhausts the stack if they are
+    nested deeply.
     """
 
     def __init__(self, stream: str) -> None:
@@ -117,22 +118,22 @@ for _class in (_Loader, _Dumper):
             _tag, re.compile(rf"(?:{_pattern.pattern})\Z"), list("-+.0123456789")
         )
 _Loader.add_constructor(INT_TAG, _integer)
-# launch_ros writes lists of parameters like this; rcl reads them as lists
+# launch_ros writes a list of parameters as a tuple of Python, which rcl reads as a list
 _Loader.add_constructor("tag:yaml.org,2002:python/tuple", _sequence)
 
 
 def dump_yaml(value: object, *, flow: bool | None = None) -> str:
     """Write a value as YAML text that `parse_yaml` can read.
 
-    Lists of scalars stand in one line; if `flow` is False, everything stands in blocks.
+    A list of scalars is written in one line. If `flow` is False, everything is written in blocks.
     """
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=flow, width=128)
 
 
 def _expanded_size(node: yaml.Node, sizes: dict[int, float]) -> float:
-    """Count the nodes after expansion of aliases; the count is infinite for a recursive node.
+    """Count the nodes below a node, and the node itself, after its aliases are expanded.
 
-    `sizes` caches the counts by identity.
+    The count is infinite for a recursive node. `sizes` caches the counts by identity.
     """
     if isinstance(node, yaml.ScalarNode):
         return 1
@@ -156,13 +157,13 @@ def comment(lines: Iterable[str]) -> str:
 def is_file(path: Path) -> bool:
     """Return whether the path is a file.
 
-    It is not if the path is invalid, such as one that is too long.
+    Returns False for an invalid path, too, such as one that is too long.
     """
     return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises OSError and ValueError
 
 
 def is_folder(path: Path) -> bool:
-    """Return whether the path is a folder; False also for an invalid path."""
+    """Return whether the path is a folder. Returns False for an invalid path, too."""
     return os.path.isdir(path)  # noqa: PTH112 - as above
 
 
@@ -172,7 +173,8 @@ def names_in(library: Path) -> list[str]:
 
 
 CHECKOUT = Path(__file__).resolve().parents[4]
-"""Root of the sources, with `examples`; in an installation from a wheel, some other folder."""
+"""Root of the sources, which contains `examples`. In an installation from a wheel, this is some
+other folder."""
 
 EXAMPLES = "examples/"  # a path that begins like this may also start at the root of the sources
 
@@ -180,8 +182,9 @@ EXAMPLES = "examples/"  # a path that begins like this may also start at the roo
 def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
     """Find the file with a name in a library, or at the path of a .yaml file.
 
-    A path that begins with `examples/` is found from any working folder. `key` and `kind` go into
-    the sentence: "scenario", "a scenario file". Raises ParameterError with the known names.
+    A path that begins with `examples/` is found from any working folder. Raises ParameterError with
+    the known names. `key` and `kind`, such as "scenario" and "a scenario file", go into its
+    sentence.
     """
     known = names_in(library)
     path_text = f"the path of {kind} (.yaml)"
@@ -206,9 +209,9 @@ def display_path(path: Path) -> str:
 
 
 def open_nonblocking(path: str | Path) -> BinaryIO:
-    """Open a file for reading; a pipe without a writer reads as empty instead of blocking.
+    """Open a file for reading without waiting for a writer.
 
-    Raises OSError or ValueError.
+    A pipe without a writer reads as empty. Raises OSError or ValueError.
     """
     return open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
 
@@ -217,7 +220,7 @@ def open_nonblocking(path: str | Path) -> BinaryIO:
 def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
     """Turn an OSError inside the block into a ParameterError.
 
-    Its sentence has `key`, which may be empty, the `path` that cannot be written, and `expected`.
+    The sentence has `key`, which can be empty, the `path` that cannot be written, and `expected`.
     """
     try:
         yield
@@ -277,7 +280,7 @@ def require_no_octal(content: bytes | str, key: str) -> None:
     rcl reads 0100 as 64, because it calls strtoll with base 0.
     """
     numbers = []
-    with suppress(*NOT_YAML):  # rcl reports it itself
+    with suppress(*NOT_YAML):  # rcl itself reports invalid YAML
         scalars = (
             token
             for token in yaml.scan(content, yaml.CSafeLoader)
@@ -293,12 +296,13 @@ def require_no_octal(content: bytes | str, key: str) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Write a file atomically: the stream becomes the file at `path` once the block ends.
+    """Write a file atomically: what you write to the stream is at `path` when the block ends.
 
-    If the block fails, the stream is removed. After a crash, a kill or a full disk the file has
-    either the new or the old content. The stream is a fresh file in the same folder, so nothing is
-    written through a link at `path`: the file replaces the link. Raises OSError, also if `path`
-    exists and is no regular file but, for example, a folder or a device.
+    The stream is a fresh file in the same folder, and replaces the file at `path` at the end. If
+    the block fails, the fresh file is removed. After a crash, a kill or a full disk, `path` has
+    either the new or the old content. If `path` is a link, the file replaces the link, and the
+    target of the link stays as it is. Raises OSError if the file cannot be written, or if `path`
+    exists and is no regular file, but a folder or a device.
     """
     with suppress(FileNotFoundError):  # also raised for a link to nothing
         mode = path.stat().st_mode
@@ -325,7 +329,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 def _umask() -> int:
     """Return the permissions that this process withholds from new files.
 
-    umask(2) returns the mask only while it sets a new one.
+    umask(2) returns the mask only when it sets a new one, so the mask is set and restored.
     """
     mask = os.umask(0o077)
     os.umask(mask)
@@ -333,7 +337,7 @@ def _umask() -> int:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file atomically, text as UTF-8, as `replacing` does. Raises OSError."""
+    """Write a file atomically, as `replacing` does, with text as UTF-8. Raises OSError."""
     with replacing(path) as stream:
         stream.write(content.encode() if isinstance(content, str) else content)
 

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How to install a missing Python package.
 
-In a checkout make does it, elsewhere pip with an extra of whatever `rise-di` came from.
+In a checkout, make installs it. Elsewhere, pip does so with an extra of `rise-di`, from where
+`rise-di` was installed.
 """
 
 import json
@@ -13,8 +14,7 @@ from pathlib import Path
 from flight_core.parameters import ParameterError
 
 CHECKOUT = Path(__file__).resolve().parents[4]
-"""The root of the repository, if this file is ros_ws/src/flight_core/flight_core/installation.py
-there."""
+"""The root of the repository, if this file lies in a repository."""
 
 TARGETS = {
     "ros": "make setup",
@@ -44,7 +44,7 @@ MESSAGE_SUFFIXES = ("_msgs", "_interfaces", "_srvs")
 def require_package(package: str, remark: str = "") -> None:
     """Raise ParameterError if a Python package is not installed.
 
-    The sentence ends with the remark.
+    The sentence of the error ends with the remark.
     """
     if find_spec(package) is None:
         raise ParameterError(missing(package) + remark)
@@ -77,9 +77,9 @@ def missing(package: str) -> str:
 def _pip_command(extra: str) -> str:
     """Return the command that installs an extra of the stack from where the stack came.
 
-    That is a checkout, a wheel, a repository or an index. An unreleased checkout must not send its
-    user to an index, where somebody else may have published a package of this name. Source: PEP
-    610, direct_url.json, which an installation from an index does not have.
+    The stack came from a checkout, a wheel, a repository or an index. An unreleased checkout must
+    not send its user to an index, where somebody else can have published a package of this name.
+    Source: PEP 610. An installation from an index has no direct_url.json.
     """
     try:
         origin = distribution("rise-di").read_text("direct_url.json")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fixed-step integrators; a variable step could miss a gust."""
+"""Integrators with a fixed step, because a variable step could miss a gust."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,7 +18,8 @@ def rk4(
 ) -> Array:
     """Take a step of the classical fourth-order Runge-Kutta method, with u held over the step.
 
-    x(t + dt) = x + dt/6 (k1 + 2 k2 + 2 k3 + k4), local error O(dt^5). Works on any array type.
+    x(t + dt) = x + dt/6 (k1 + 2 k2 + 2 k3 + k4), with a local error O(dt^5). x and u can be arrays
+    of any type.
     Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, table 1.2.
     """
     k1 = x_dot(t, x, u, params)

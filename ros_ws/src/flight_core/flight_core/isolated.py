@@ -26,23 +26,23 @@ from flight_core.notes import note
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 
-RESULT = "result"  # the file of the result in the working folder
-# raised here if the subprocess raises them
+RESULT = "result"  # name of the file with the result, in the working folder
+# If the subprocess raises one of these errors, the caller gets it, too.
 ERRORS = MappingProxyType({"ended": FlightEnded, "refused": ParameterError})
-# How many times the processor time we wait: other work may keep the subprocess from the processor
-# for so long.
+# Wall time that we wait at most, as a multiple of the limit of processor time. Other work can keep
+# the subprocess from the processor for so long.
 WAIT = 20.0
-FILE_LIMIT = 1 << 30  # bytes of a file that the subprocess writes
+FILE_LIMIT = 1 << 30  # largest size of a file that the subprocess writes, bytes
 
 NUMPY = frozenset({"_frombuffer", "_reconstruct", "dtype", "ndarray", "scalar"})
-"""Names that a pickled array contains. Unlike other names in a pickle, none of them runs code of
-the sender's choice."""
+"""Names of functions and classes that a pickled array contains. Other names in a pickle could run
+code of the sender's choice, but these cannot."""
 
 
 class IsolatedCallError(RuntimeError):
     """The subprocess crashed or timed out.
 
-    The message is the rest of a sentence: "was killed by SIGSEGV".
+    The message is the second half of a sentence, such as "was killed by SIGSEGV".
     """
 
 
@@ -57,15 +57,15 @@ def call(
     """Call function(*arguments) in a fresh process, confined to an empty working folder.
 
     The subprocess finds the function by module and name. Arguments must fit into JSON. The return
-    value consists of plain values, arrays, and named tuples of the module `records`, by default
-    that of the function. If the function raises FlightEnded or ParameterError, so does this call.
+    value consists of plain values, arrays, and named tuples of the module `records`, by default the
+    module of the function. If the function raises FlightEnded or ParameterError, so does this call.
 
-    The subprocess has `memory` bytes of data, FILE_LIMIT, and `timeout` seconds of processor time,
-    or WAIT times as many of wall time: an endless computation is found on a busy machine too, and a
-    finite one gets enough time. If the kernel permits, it has no network and writes only in its
-    folder; if not, a warning says so once, provided the data are `foreign`. Raises
-    IsolatedCallError if the process crashes (a segmentation fault, an exception) or returns nothing
-    in that time.
+    The subprocess has `memory` bytes of data, files of at most FILE_LIMIT, and `timeout` seconds of
+    processor time. It also ends after WAIT times as many seconds of wall time, so that a process
+    that waits forever ends, and a computation has enough time on a busy machine. If the kernel
+    permits, it has no network and writes only in its folder. If not, and the data are `foreign`, a
+    warning says so once. Raises IsolatedCallError if the process crashes, as by a segmentation
+    fault or an exception, or returns nothing in its time.
     """
     call_text = json.dumps([timeout, memory, function.__module__, function.__qualname__, arguments])
     with tempfile.TemporaryDirectory() as folder:
@@ -78,7 +78,7 @@ def call(
                 stdin=subprocess.DEVNULL,
                 timeout=WAIT * timeout,
                 cwd=folder,
-                # each thread takes memory
+                # each thread of OpenBLAS would take memory
                 env=os.environ | {"TMPDIR": folder, "OPENBLAS_NUM_THREADS": "1"},
                 check=False,
             )
@@ -146,7 +146,7 @@ def main() -> None:
         (resource.RLIMIT_CORE, 0),
     )
     for limit, most in limits:
-        # the user sets the hard limit, which no process may raise
+        # The user sets the hard limit, and no process can raise it.
         hard = resource.getrlimit(limit)[1]
         soft = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(limit, (soft, hard))

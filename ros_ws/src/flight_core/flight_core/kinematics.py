@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Euler's kinematics of bank and pitch, and their inverse in a coordinated turn.
 
-Angles in rad, rates in rad/s, body axes FRD. Arguments are Python floats, or arrays with a value
-per aircraft of a fleet. Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters
-2, 3 and 9.
+Angles are in rad, rates in rad/s, and body axes are FRD. Arguments are Python floats, or arrays
+with a value for each aircraft of a fleet. Source: R. W. Beard, T. W. McLain, Small Unmanned
+Aircraft (2012), chapters 2, 3 and 9.
 """
 
 import math
@@ -50,7 +50,7 @@ def turn_rate(phi: Scalar, theta: Scalar, theta_dot: Scalar, speed: Scalar) -> S
 def body_rates(
     phi: Scalar, theta: Scalar, phi_dot: Scalar, theta_dot: Scalar, r: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """Compute p and q for given rates of the attitude and r, the inverse of `euler_rates`.
+    """Compute p and q from r and the rates of the attitude, as the inverse of `euler_rates`.
 
     q = (theta_dot + r sin(phi)) / cos(phi),  p = phi_dot - tan(theta) (q sin(phi) + r cos(phi))
     """
@@ -61,10 +61,11 @@ def body_rates(
 
 
 def thrust_axis(phi: float, theta: float, psi: float) -> tuple[float, float, float]:
-    """Return the direction of a thrust against the body z axis: north, east and up, length 1.
+    """Return the unit vector of a thrust along the negative body z axis: north, east and up.
 
-    The third column of the rotation from the body to north, east and down, with the other sign
-    ahead of the horizontal part. Source: Stevens, Lewis, eq. (1.3-20).
+    The third column of the rotation from the body axes to north, east and down is the body z axis.
+    The result is the opposite vector, with up in place of down. Source: Stevens, Lewis, eq.
+    (1.3-20).
     """
     back = math.cos(phi) * math.sin(theta)
     right = math.sin(phi)
@@ -74,11 +75,11 @@ def thrust_axis(phi: float, theta: float, psi: float) -> tuple[float, float, flo
 
 
 def tilt(angle: Scalar) -> Scalar:
-    """Limit an angle to +-MAX_TILT."""
+    """Limit an angle to the range from -MAX_TILT to MAX_TILT."""
     return clip(angle, MAX_TILT)
 
 
 def clip(value: Scalar, limit: Scalar) -> Scalar:
-    """Limit a value to +-limit."""
+    """Limit a value to the range from -limit to limit."""
     xp = array_namespace(value)
     return xp.minimum(xp.maximum(value, -limit), limit)

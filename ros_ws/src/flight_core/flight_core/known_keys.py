@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The keys of a parameter set that a computation knows.
 
-A computation of a flight beside that of the nodes states the set of keys that it knows.
-`require_known` refuses every other key that has a value of its own, by name. A key that is added
-later is unknown until you place it.
+Some computations compute a flight without the nodes. Each states the set of keys that it knows.
+`require_known` refuses every other key whose value is not the default. A key that is added later is
+unknown until you put it into the set.
 
-A key is a dotted name, as `actuators.lag`. The sections of a mapping by name share one: the `start`
-of every gust is `gusts.*.start`.
+A key is a dotted name, such as `actuators.lag`. If sections are given by name in a mapping, they
+share their keys. For example, the `start` of every gust is `gusts.*.start`.
 """
 
 from collections.abc import Iterator, Mapping, Set
@@ -16,21 +16,21 @@ from typing import Any, NamedTuple, get_args
 from flight_core.fields import REQUIRED, short_repr
 from flight_core.parameters import Config, ParameterError
 
-ANY = "*"  # stands for any name of a mapping
-A_SECTION = "a section"  # the value of a section that is left out by default
+ANY = "*"  # stands for any name in a mapping of sections
+A_SECTION = "a section"  # value of the key of a section that is left out by default
 
 
 class SetKey(NamedTuple):
-    """A key that has a value of its own."""
+    """A key whose value is not the default."""
 
-    key: str  # as in the set of known keys
-    name: str  # as in the file: gusts.vertical.start
+    key: str  # the key as in the set of known keys, such as gusts.*.start
+    name: str  # the key as in the file, such as gusts.vertical.start
     value: Any
     default: Any = None
 
 
 def keys_of(schema: type[Config]) -> frozenset[str]:
-    """Return every key of a parameter set, those of its sections included."""
+    """Return every key of a parameter set, including those of its sections."""
     return frozenset(_keys(schema, ""))
 
 
@@ -59,8 +59,9 @@ def _section(annotation: Any) -> tuple[type[Config] | None, bool]:
 def set_keys(parameters: Config) -> Iterator[SetKey]:
     """Yield the keys whose value is not their default.
 
-    A list of zeros where the default is the empty list is that default, too: both mean none. A
-    section that is left out by default is a key of its own if all its values are their defaults.
+    If the default is the empty list, a list of zeros counts as the default, too, because both mean
+    none. If a section is left out by default, but is given with nothing but defaults, the section
+    itself is a key.
     """
     return _set_keys(parameters, "", "")
 
@@ -89,7 +90,7 @@ def _is_default(value: Any, default: Any) -> bool:
 def unknown_keys(parameters: Config, known: Set[str]) -> list[SetKey]:
     """Return the keys outside `known` whose value is not their default.
 
-    A section that is left out by default, and of which nothing is known, counts as one key.
+    If a section is left out by default, and none of its keys is known, the section is one key.
     """
     sections: dict[str, SetKey] = {}
     for each in set_keys(parameters):
@@ -100,7 +101,10 @@ def unknown_keys(parameters: Config, known: Set[str]) -> list[SetKey]:
 
 
 def _outermost(parameters: Config, found: SetKey, known: Set[str]) -> SetKey:
-    """Return the widest optional section around a key of which nothing is known, or the key."""
+    """Return the outermost optional section around a key of which no key is known.
+
+    Returns the key itself if there is no such section.
+    """
     keys, names = found.key.split("."), found.name.split(".")
     schema: type[Config] | None = type(parameters)
     for depth in range(1, len(keys)):
@@ -122,7 +126,7 @@ def _knows_in(section: str, known: Set[str]) -> bool:
 
 
 def require_known(parameters: Config, known: Set[str], section: str, why: str) -> None:
-    """Raise ParameterError for a key outside `known` that has a value of its own.
+    """Raise ParameterError for a key outside `known` whose value is not the default.
 
     Args:
         parameters: The parameter set.
@@ -131,7 +135,7 @@ def require_known(parameters: Config, known: Set[str], section: str, why: str) -
         why: Who does not know the key, for the sentence.
 
     Raises:
-        ParameterError: A key has a value, and nothing is known of that key.
+        ParameterError: A key outside `known` has a value that is not the default.
     """
     for unknown in unknown_keys(parameters, known):
         found = unknown.value if unknown.value is A_SECTION else short_repr(unknown.value)

@@ -8,16 +8,17 @@ Without it, one packet to its middleware could take the memory of the host.
 import resource
 
 DATA_LIMIT = 2 << 30
-"""Bytes. A node of a flight maps 0.2 GB of data (VmData of proc_pid_status(5)), half of which are
-thread stacks."""
+"""Default limit, bytes. A node of a flight maps 0.2 GB of data (VmData of proc_pid_status(5)). Half
+of this are thread stacks."""
 
 
 def limit_memory(limit: int = DATA_LIMIT) -> None:
     """Limit the data of this process and its later children to `limit` bytes.
 
-    If the user has set a lower limit (ulimit -d), it stays. An allocation beyond the limit fails:
-    Python raises MemoryError, and the middleware, which does not expect that, ends the process.
-    Source: getrlimit(2), RLIMIT_DATA: heap and private writable mappings, thread stacks included.
+    If the user has set a lower limit (ulimit -d), it stays. If an allocation exceeds the limit,
+    Python raises MemoryError, while the middleware does not expect the failure and ends the
+    process. The limit covers the heap and private writable mappings, including thread stacks.
+    Source: getrlimit(2), RLIMIT_DATA.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     lowest = min([limit, *(bound for bound in (soft, hard) if bound != resource.RLIM_INFINITY)])

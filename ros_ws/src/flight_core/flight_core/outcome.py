@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The outcome of a flight as a record: end, reason and shortfalls; and a reason as a value.
+"""The outcome of a flight as a record of its end, its reason and its shortfalls.
 
 The sentence and the exit status follow from the record, so that nothing has to be read back from a
 sentence.
@@ -14,19 +14,20 @@ from typing import Any
 
 from flight_core.text import bounded
 
-STATUS_BAD_INPUT = 2  # also of a node
-STATUS_ENDED_EARLY = 3  # also of a node
+STATUS_BAD_INPUT = 2  # exit status of a command and of a node
+STATUS_ENDED_EARLY = 3  # exit status of a command and of a node
 STATUS_SHORTFALL = 4  # the flight reached its end, but falls short of something
-STATUS_LANDED = 5  # only of the node of an aircraft, which ends with the landing
-STATUS_LOST_CONTACT = 6  # only of a node: it ended because another node did
-STATUS_HOST = 7  # only the host was too busy for a flight in real time
+STATUS_LANDED = 5  # exit status only of the node of an aircraft, which ends with the landing
+STATUS_LOST_CONTACT = 6  # exit status only of a node, which ended because another node had ended
+STATUS_HOST = 7  # nothing is wrong except that the host was too busy for a flight in real time
 STATUS_INTERRUPTED = 130
 
 SEVEREST = (0, STATUS_HOST, STATUS_SHORTFALL, STATUS_ENDED_EARLY, STATUS_INTERRUPTED)
-"""Exit statuses of flights, by severity; several flights together have the last one of theirs."""
+"""Exit statuses of flights, with the severest last. A command that flies several flights ends with
+the severest of their statuses."""
 
 
-HEADLINE = 120  # characters at most: a line of a terminal
+HEADLINE = 120  # largest number of characters of a headline, which is one line of a terminal
 
 
 def _shortened(text: str) -> str:
@@ -37,23 +38,23 @@ def _shortened(text: str) -> str:
 class End(StrEnum):
     """How a flight ended."""
 
-    COMPLETED = "completed"  # at its duration
-    LANDED = "landed"  # softly, on its wheels
+    COMPLETED = "completed"  # the flight reached its duration
+    LANDED = "landed"  # the aircraft landed softly, on its wheels
     ENDED_EARLY = "ended early"
     NEVER_FLEW = "never flew"
     INTERRUPTED = "interrupted"  # by the user
-    HOST = "host"  # the host starved a flight in real time: it is no finding about the law
+    HOST = "host"  # the host starved a flight in real time, which says nothing about the law
     IMPORTED = "imported"  # a log that another program wrote
     UNKNOWN = "unknown"
 
 
 class Aim(StrEnum):
-    """What a flight can fall short of, the gravest first, because it explains those that follow."""
+    """What a flight can fall short of. The gravest is first, because it explains later ones."""
 
     ENGAGEMENT = "engagement"  # the law flies while it should
     REFERENCE = "reference"  # y_m is the one of the scenario
     GROUND = "ground"  # the aircraft stays above the ground
-    SEPARATION = "separation"  # from the other aircraft of a fleet
+    SEPARATION = "separation"  # the aircraft keeps clear of the other aircraft of a fleet
     STALL = "stall"  # the airspeed stays above the stall speed
     FENCE = "fence"  # the aircraft stays inside
     ALTITUDE = "altitude"  # the aircraft stays between the least and the largest altitude
@@ -69,8 +70,8 @@ class Aim(StrEnum):
 class Shortfall:
     """A shortfall of a flight as a sentence and in figures, SI.
 
-    `brief` replaces the sentence in a headline if it is too long for one. `times` says by what
-    factor the figure exceeds what is allowed, so that the worst shortfall of an aim can be found.
+    `brief` replaces the sentence in a headline if the sentence is too long. `times` is the factor
+    by which the figure exceeds what is allowed, so that the worst shortfall of an aim can be found.
     """
 
     aim: Aim
@@ -82,7 +83,7 @@ class Shortfall:
 
 @dataclass(frozen=True)
 class Refusal:
-    """A reason against something: a sample, a model, an engagement, or going on.
+    """A reason against something, such as a sample, a model or an engagement.
 
     `str` gives the sentence for the user. A function that finds no reason returns None.
     """
@@ -95,14 +96,14 @@ class Refusal:
 
 
 def joined(refusals: Iterable[Refusal | None]) -> Refusal | None:
-    """Join the reasons that there are into one; return None if there is none."""
+    """Join all reasons that are not None into one. Returns None if there is none."""
     found = [str(refusal) for refusal in refusals if refusal is not None]
     return Refusal("; ".join(found)) if found else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Allowance:
-    """An error that is not the law's fault: noise or wind causes it in the linear loop too."""
+    """A tracking error that is allowed, because noise or wind causes it in the linear loop, too."""
 
     sentence: str
     figures: Mapping[str, Any] = field(default_factory=dict)
@@ -124,21 +125,22 @@ class Outcome:
     end: End
     reason: str = ""  # a sentence, if the end alone does not say why
     shortfalls: tuple[Shortfall, ...] = ()
-    # not a part of how the flight ended
+    # errors that are allowed, which do not belong to how the flight ended
     allowances: tuple[Allowance, ...] = field(default=(), compare=False)
-    # the worst part of each output beside what was allowed, as figures in SI
+    # for each output, the error in the worst part of the flight and the error allowed there, SI
     errors: tuple[Mapping[str, Any], ...] = field(default=(), compare=False)
 
     @property
     def has_reached_end(self) -> bool:
-        """Whether the flight reached the duration, or landed."""
+        """Whether the flight reached its duration or landed."""
         return self.end in {End.COMPLETED, End.LANDED}
 
     @property
     def status(self) -> int:
         """Exit status: 0 for a flight that reached its end without a shortfall.
 
-        A starved flight is judged outside of its starved spans, so its shortfalls count.
+        If the host starved a flight, it is judged outside of the starved spans, so its shortfalls
+        count.
         """
         if self.end is End.INTERRUPTED:
             return STATUS_INTERRUPTED
@@ -206,7 +208,10 @@ class Outcome:
         }
 
     def record(self) -> dict[str, str]:
-        """Return the end and the reason, for the log; the shortfalls follow from the log itself."""
+        """Return the end and the reason for the log.
+
+        The shortfalls are left out, because they follow from the log itself.
+        """
         return {"end": self.end.value, "reason": self.reason}
 
     def text(self) -> str:
@@ -237,7 +242,7 @@ def ended_early(reason: str) -> Outcome:
 def log_ends_at(end: float, duration: float) -> Outcome:
     """Return the outcome of a flight of `duration` s whose log ends early.
 
-    The log holds y, y_m and u up to the flight time `end`, s, or not at all if `end` is -inf.
+    The log holds y, y_m and u up to the flight time `end`, s. If `end` is -inf, it holds none.
     """
     part = f"up to t = {end:.3f} of" if end >= 0.0 else "of"
     verb = "holds" if end >= 0.0 else "does not hold"
@@ -245,7 +250,10 @@ def log_ends_at(end: float, duration: float) -> Outcome:
 
 
 def read_outcome(record: object) -> Outcome:
-    """Read the outcome from a `record`, of a log or of `summary.json`; UNKNOWN if it is none."""
+    """Read the outcome from a `record` of a log or of `summary.json`.
+
+    Returns UNKNOWN if `record` is no such record.
+    """
     if not isinstance(record, Mapping):
         return UNKNOWN
     try:
@@ -269,7 +277,7 @@ def _of_fleet(record: Mapping[str, Any]) -> tuple[Shortfall, ...]:
 
 
 def parsed_outcome(text: str) -> Outcome:
-    """Read the outcome from a record in JSON; UNKNOWN if the text is none."""
+    """Read the outcome from a record in JSON. Returns UNKNOWN if the text is no record."""
     try:
         return read_outcome(json.loads(text))
     except ValueError:
@@ -277,7 +285,7 @@ def parsed_outcome(text: str) -> Outcome:
 
 
 class FlightEnded(RuntimeError):  # noqa: N818 - the end of a flight is not a program error
-    """Raised if a flight ends before its duration, early or by a landing.
+    """Raised if a flight ends before its duration, by a landing or for another reason.
 
     The message is a sentence for the user, printable and bounded.
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The parameter file of a node, to be filled in: every key with its default and its meaning."""
+"""The template of a node's parameter file: every key with its default and its meaning."""
 
 import textwrap
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ LEAD = """# Parameters of {name}. Give each needed key a value.
 def parameter_template(name: str, schema: type[Config]) -> str:
     """Write the parameter file of a node with a schema, as text.
 
-    A key without a default is a comment, and a needed one says so.
+    A key without a default stands in a comment. If the key is needed, the comment says so.
     """
     return LEAD.format(name=name) + "".join(f"{line}\n" for line in _lines(schema))
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Validated parameter sets: a declaration per set, a sentence per error.
+"""Validated parameter sets, each with one declaration, and with one sentence for each error.
 
 A set is a frozen class of annotated fields. `validate_mapping` builds it from the nested mapping of
 a scenario file or of a ROS node. The first value that is not permitted becomes a `ParameterError`
@@ -90,16 +90,16 @@ class Config:
 
     @classmethod
     def validate_mapping(cls, values: Mapping[str, Any], where: str, *, check: bool = True) -> Self:
-        """Build the set from a nested mapping; `where` names it in errors, as "controller".
+        """Build the set from a nested mapping.
 
-        Without `check`, the caller must check relations between the values of the set. Raises
-        ParameterError with a sentence for the first key that is not permitted, and for every
-        missing key.
+        `where`, such as "controller", names the set in errors. If `check` is False, the caller must
+        check the relations between the values of the set. Raises ParameterError with a sentence for
+        the first key that is not permitted, and for every missing key.
         """
         problems = Problems()
         try:
             parameters = cls.read(values, where, problems, check=check)
-        except ArithmeticError as error:  # of a check with several keys
+        except ArithmeticError as error:  # a check that combines several keys overflows
             numbers = f"numbers too large or too small ({error.args[-1]})"
             raise ParameterError(f"{where}: found {numbers}, expected those of a flight") from None
         if parameters is None:
@@ -139,20 +139,21 @@ class Config:
         try:
             if check:
                 parameters._check()
-        except ValueError as error:  # from `require`, with the rest of the key and the sentence
+        except ValueError as error:  # `require` gives the rest of the key, and the sentence
             problems.others.append(f"{key}.{error}")
             return None
         return parameters
 
     @classmethod
     def keys_beside(cls, values: Mapping[str, Any]) -> Set[str]:
-        """Return the keys that the set may have beside these values."""
+        """Return the keys that the set can have if it has these values."""
         return cls.model_fields.keys()
 
     def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values with changes by dotted name, not validated.
+        """Return the values with changes by dotted name, without validation.
 
-        A change to None removes a parameter. Raises ParameterError.
+        The value None removes a parameter. Raises ParameterError if a name is both a value and a
+        group.
         """
         flat = dict(flatten(self.model_dump()))
         for name in changes:
@@ -167,7 +168,7 @@ class Config:
         """Check relations between the values. Raises ParameterError."""
 
     def model_copy(self, *, update: Mapping[str, Any]) -> Self:
-        """Copy the set with new values, without a check."""
+        """Copy the set with new values, without a check of the values."""
         copy = type(self).__new__(type(self))
         values = {name: getattr(self, name) for name in self.model_fields}
         vars(copy).update(values | dict(update), _given=vars(self)["_given"] | update.keys())
@@ -246,19 +247,19 @@ class NodeConfig(Config):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Return what may change in flight: dotted names, or names of whole groups."""
+        """Return the parameters that can change in flight: dotted names, or names of groups."""
         return frozenset()
 
     @classmethod
     def learned(cls) -> frozenset[str]:
-        """Return more parameters that change in flight, but only by the node itself."""
+        """Return the parameters that only the node itself can change in flight."""
         return frozenset()
 
 
 SMALLEST = 1e-9
 LARGEST = 1e9
-"""Bounds of a quantity in SI units. A value beyond them is a mistake in units, and overflows in
-products and quotients of the law."""
+"""Bounds of the magnitude of a quantity in SI units. A value beyond them is a mistake in units, and
+makes products and quotients of the law overflow."""
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0, ge=SMALLEST, le=LARGEST)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
@@ -268,8 +269,8 @@ Positives = Annotated[tuple[Positive, ...], Field(min_length=1)]
 NonNegatives = Annotated[tuple[NonNegative, ...], Field(min_length=1)]
 """Type of a parameter: a list of at least one number, each 0 or more."""
 Name = Annotated[str, Field(pattern=r"[A-Za-z][A-Za-z0-9_.]*")]
-"""Type of the name of a channel, a state or an input. It goes into C code, pages and files of other
-programs as it stands."""
+"""Type of the name of a channel, a state or an input. A name goes unchanged into C code, pages and
+files of other programs."""
 Names = Annotated[tuple[Name, ...], Field(min_length=1)]
 Signs = Annotated[tuple[Literal[1, -1], ...], Field(min_length=1)]
 
@@ -331,9 +332,9 @@ def require_channels(key: str, names: Sequence[str], expected: Sequence[str], ow
 
 
 def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the pairs (dotted name, value) of a nested mapping, as ROS 2 names parameters.
+    """Yield the pairs (dotted name, value) of a nested mapping.
 
-    None values are left out.
+    Dotted names are the names of parameters in ROS 2. Values that are None are left out.
     """
     for key, value in mapping.items():
         if isinstance(value, Mapping):

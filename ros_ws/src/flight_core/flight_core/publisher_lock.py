@@ -11,8 +11,8 @@ from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError
 
 SHARED_NS = NANOSECONDS
-"""A name counts as shared for this long after the last evidence. This exceeds the age limits of y
-and u, so that the failsafe begins."""
+"""A name counts as shared for this time after the last evidence. The time exceeds the age limits of
+y and u, so that the failsafe begins."""
 FOREVER_NS = 2**63  # longer than any flight
 SENDER = "sender"  # the reason of a ChannelError for a sample of a conflicting publisher
 
@@ -26,24 +26,25 @@ def require_sender(sender: str, expected: str) -> None:
 class PublisherLock:
     """Locks to the first publisher of a topic, until its samples time out.
 
-    Then it locks to the next publisher. A restarted node, which has the same name, may take over
-    earlier than a different node. If the receiving node overruns, the publisher is not blamed for
-    the silence, but the first sample after the overrun may come from a different publisher.
+    Then it locks to the next publisher. A restarted node, which has the same name, can take over
+    earlier than a different node. If the receiving node overruns, the time of the overrun does not
+    count as silence of the publisher.
 
     The middleware numbers the messages of a publisher. If the numbers go back, two publishers use
-    the same name. Neither is admitted then, because either may be forged.
+    the same name. Neither is admitted then, because either can be forged.
 
-    `timeouts_ns` returns two ages of the last sample above which a publisher has timed out: for the
-    same node in a new process, and for a different node.
+    `timeouts_ns` returns two limits of the age of the last sample. Above the first one, the same
+    node in a new process can take over, and above the second one a different node.
     """
 
     def __init__(self, timeouts_ns: Callable[[], tuple[int, int]]) -> None:
         self._timeouts_ns = timeouts_ns
         self.publisher: str | None = None
         self._received_ns = 0
-        self._overrun_ns = 0  # overruns of this node since the last sample
-        self._sequence = 0  # of the last message of the locked publisher; 0 is unknown
-        self._went_back_ns: int | None = None  # when the sequence last went back
+        self._overrun_ns = 0  # sum of the overruns of this node since the last sample
+        # number of the last message of the locked publisher, or 0 if it is unknown
+        self._sequence = 0
+        self._went_back_ns: int | None = None  # instant at which the numbers last went back
 
     def age_ns(self, now_ns: int) -> int:
         """Return the time since the last sample of the locked publisher."""
@@ -54,20 +55,20 @@ class PublisherLock:
         return self.publisher is None or self.age_ns(now_ns) > max_age_ns
 
     def holds(self, sender: str, now_ns: int) -> bool:
-        """Return whether this is the locked publisher and it has not timed out.
+        """Return whether the sender is the locked publisher and has not timed out.
 
-        That is so if its last sample is within the age limit of a restart.
+        It has timed out if its last sample is older than the age limit of a restart.
         """
         return sender == self.publisher and not self.timed_out(now_ns, self._timeouts_ns()[0])
 
     def overran(self, duration_ns: int) -> None:
-        """Do not blame the publisher for a silence while the node itself did not run."""
+        """Add a time in which the node itself did not run, so that it does not count as silence."""
         self._overrun_ns += duration_ns
 
     def check(self, sender: str, now_ns: int) -> None:
         """Raise ChannelError, reason "sender", for a sample of a second publisher.
 
-        The second one may take over once the locked publisher has timed out.
+        The second publisher can take over after the locked publisher has timed out.
         """
         if sender == self.publisher:
             return
@@ -98,10 +99,10 @@ class PublisherLock:
     def require_alone(self, sender: str, sequence: int, now_ns: int) -> None:
         """Raise ChannelError, reason "sender", if two publishers send under the locked name.
 
-        They count as two for SHARED_NS after the sequence went back. `sequence` is the number that
-        the middleware gave the message; 0 means unknown. After a timeout, a lower number comes from
-        a restarted publisher. Call this only for samples with a valid stamp and content, so that a
-        replay of old messages stops nothing.
+        The name counts as shared for SHARED_NS after the numbers went back. `sequence` is the
+        number that the middleware gave the message, or 0 if it is unknown. After a timeout, a lower
+        number comes from a restarted publisher. Call this only for samples with a valid stamp and
+        content, so that a replay of old messages stops nothing.
         """
         if sender != self.publisher:
             return
@@ -121,10 +122,10 @@ class PublisherLock:
 class LockstepLock(PublisherLock):
     """Locks a topic of a lockstep flight to the publisher of its first message, for good.
 
-    In lockstep each message is an instant, so a message of anybody else must not count. No message
-    is lost, so the numbers of one publisher rise by one each time. Any other number belongs to a
-    second publisher under the same name, and only that message is refused. If the messages of a
-    topic name no sender, the sender is "".
+    In lockstep each message is an instant of the flight, so a message of anybody else must not
+    count. No message is lost, so the numbers of one publisher rise by one each time. Any other
+    number belongs to a second publisher under the same name, and only the message with this number
+    is refused. If the messages of a topic name no sender, the sender is "".
     """
 
     def __init__(self) -> None:
@@ -134,7 +135,7 @@ class LockstepLock(PublisherLock):
         """Raise ChannelError, reason "sender", unless the message is the next one by its number."""
         expected = self._sequence + 1
         if self.publisher is None:
-            self._sequence = 0  # the number of a message that was refused may be here
+            self._sequence = 0  # it can still be the number of a message that was refused
         elif self._sequence and sequence not in {0, expected}:
             raise ChannelError(
                 SENDER,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rates and periods. A period is a whole number of nanoseconds: k periods add up exactly."""
+"""Rates and periods. A period is a whole number of ns, so that k periods add up exactly."""
 
 from flight_core.parameters import ParameterError, require
 
@@ -8,7 +8,7 @@ NANOSECONDS = 1_000_000_000
 
 
 def seconds(time_ns: int) -> float:
-    """Convert nanoseconds to float seconds, rounded once: t = time_ns / 1e9."""
+    """Convert nanoseconds to seconds as a float, with a single rounding: t = time_ns / 1e9."""
     return time_ns / NANOSECONDS
 
 
@@ -29,11 +29,11 @@ def period_ns(rate: float, key: str) -> int:
 
 
 def divide(whole_ns: int, part_ns: int, key: str, whole_name: str) -> int:
-    """Return the number of parts in the whole.
+    """Return how often a part fits into the whole.
 
-    Raises ParameterError naming `key` unless it is an integer.
+    Raises ParameterError naming `key` unless the number is an integer.
     """
-    # ask first, because the sentence takes longer than the division
+    # Test first, because to write the sentence takes longer than the division.
     if part_ns <= 0 or whole_ns % part_ns:
         expected = f"a whole fraction of {whole_name} ({seconds(whole_ns):g} s)"
         raise ParameterError(f"{key}: found {seconds(part_ns):g} s, expected {expected}")

@@ -7,8 +7,8 @@
     rate: 100.0    # Hz
 
 rcl joins the sections that match the full name of a node, in the order of the file, so that a later
-value replaces an earlier one. `**` in a name stands for any number of names, `*` for one. From a
-section for all nodes, a node takes the parameters that it knows.
+value replaces an earlier one. In the name of a section, `**` stands for any number of names, and
+`*` for one. From a section for all nodes, a node takes only the parameters that it knows.
 """
 
 import difflib
@@ -30,7 +30,8 @@ ROS_PARAMETERS = (SIM_TIME, "start_type_description_service", "qos_overrides")
 """Parameters that ROS gives every node."""
 
 WILDCARDS: Mapping[str, str] = {"**": "(/[^/]+)*", "*": "/[^/]+"}
-MISTYPED = 0.8  # similarity at which a foreign section is a misspelt missing one: recoder, recorder
+# similarity at which an unknown section counts as a missing one that is misspelt, such as recoder
+MISTYPED = 0.8
 
 
 def parse_sections(
@@ -44,12 +45,12 @@ def parse_sections(
 ) -> Sections:
     """Return the sections of a scenario file by node name, as {"controller": {"rate": 100.0, ...}}.
 
-    Sections of nodes that are not among `schemas` are left alone. A section in `optional` may be
-    absent or an empty mapping; every parameter then has its default. Parameters of ROS itself are
-    left out, but if a node follows /clock, `use_sim_time` of the section `flight` becomes true.
-    `namespace` is that of the nodes, "" for the root; if it is None, any one that the file names
-    will do. With `with_general`, for a file that comes beside a scenario, parameters for all nodes
-    make up a section that the file does not have.
+    Sections of nodes that are not among `schemas` are left out. A section in `optional` can be
+    absent or an empty mapping. Every parameter of it then has its default. Parameters of ROS itself
+    are left out, but if a node follows /clock, `use_sim_time` of the section `flight` becomes true.
+    `namespace` is the namespace of the nodes, "" for the root. If it is None, the nodes can be in
+    any namespace. Set `with_general` for a parameter file in addition to a scenario. If the file
+    has no section for a node, the parameters for all nodes then make up this section.
 
     Raises ParameterError with the path if the content is no scenario file or too long, has a
     duplicate key, lacks a section, or names nodes of two namespaces while `namespace` is None.
@@ -99,7 +100,7 @@ def parse_sections(
 
 
 def names_node(content: bytes, path: Path, name: str, key: str, namespace: str) -> bool:
-    """Return whether a section for this node, not one for all nodes, has the parameter `key`.
+    """Return whether a section of this node has the parameter `key`; one for all does not count.
 
     Raises ParameterError if the content is no ROS parameter file.
     """
@@ -144,7 +145,7 @@ def _all_sections(content: bytes, path: Path) -> dict[str, dict[Any, Any]]:
 def _node_sections(
     top: object, section: object, path: Path, namespace: str = ""
 ) -> Iterator[tuple[str, Mapping[Any, Any]]]:
-    """Yield the full names of nodes and their parameters; namespaces may be nested."""
+    """Yield the full names of nodes and their parameters. Namespaces can be nested."""
     pattern = f"{namespace}/{str(top).strip('/')}"
     parts: Mapping[Any, Any] = section if isinstance(section, dict) else {}
     values = parts.get(PARAMETERS)
@@ -195,7 +196,7 @@ def _require_one_namespace(own: list[str], name: str, path: Path) -> None:
 def _require_not_mistyped(
     found: Mapping[str, object], name: str, schemas: Mapping[str, object], path: Path
 ) -> None:
-    """Refuse a section whose name resembles the one that is lacking."""
+    """Refuse an unknown section whose name resembles the name of the missing section."""
     foreign = [pattern.rpartition("/")[2] for pattern in found]
     foreign = [other for other in foreign if other not in schemas]
     near = difflib.get_close_matches(name, foreign, n=1, cutoff=MISTYPED)
@@ -217,7 +218,7 @@ def _nested(values: Mapping[Any, Any]) -> dict[Any, Any]:
 
 
 def join_parameters(values: dict[Any, Any], further: Mapping[Any, Any]) -> None:
-    """Merge more parameters into `values`; they replace those of the same name."""
+    """Merge further parameters into `values`, where they replace those of the same name."""
     for key, value in further.items():
         before = values.get(key)
         if isinstance(before, dict) and isinstance(value, Mapping):

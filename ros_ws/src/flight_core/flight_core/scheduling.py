@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Requests of a node to Linux's scheduler, so that fewer ticks are late.
 
-No privilege is needed. If Linux refuses, ticks are as late as without the request.
+A request needs no privilege. If Linux refuses it, ticks are as late as without it.
 """
 
 import ctypes
@@ -12,7 +12,7 @@ import struct
 from contextlib import suppress
 from pathlib import Path
 
-TIMER_SLACK = Path("/proc/self/timerslack_ns")  # of the main thread; Linux
+TIMER_SLACK = Path("/proc/self/timerslack_ns")  # timer slack of the main thread, on Linux
 THREADS = Path("/proc/self/task")
 REAL_TIME = (os.SCHED_FIFO, os.SCHED_RR)
 SLICE_NS = 100_000  # the shortest slice of Linux, which has 0.7 ms (1 + log2(cores)) by default
@@ -57,8 +57,8 @@ def _schedule_threads(policy: int, priority: int) -> None:
 def disable_timer_slack() -> None:
     """Set the timer slack of the main thread to the minimum.
 
-    By default Linux delays a wake-up by up to 50 us to save power. Threads of real-time priority
-    have no timer slack. Source: prctl(2), PR_SET_TIMERSLACK.
+    The timer slack is the time by which Linux can delay a wake-up to save power, 50 us by default.
+    Threads of real-time priority have none. Source: prctl(2), PR_SET_TIMERSLACK.
     """
     with suppress(OSError):  # /proc is missing or read-only: ticks keep the slack
         TIMER_SLACK.write_text("1", encoding="utf-8")
@@ -67,8 +67,9 @@ def disable_timer_slack() -> None:
 def request_short_slices() -> None:
     """Ask for time slices of SLICE_NS for every thread of this process.
 
-    A waking thread goes before a running thread with a longer slice. Its share of a core stays the
-    same. Linux before 6.12 ignores the request. If the user has chosen a policy (chrt), it is kept.
+    When a thread with a shorter slice wakes, it runs before a running thread with a longer one. Its
+    share of a core stays the same. Linux before 6.12 ignores the request. If the user has chosen a
+    policy (chrt), the policy is kept.
     Source: sched_setattr(2); the kernel's documentation, scheduler/sched-eevdf (latency-sensitive
     tasks).
     """

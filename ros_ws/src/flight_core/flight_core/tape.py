@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tape: the in-memory log of a flight.
 
-It comes from a flight in a single process or over topics, or from a bag.
+A tape comes from a flight in a single process, from a flight over topics, or from a bag.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,9 +26,9 @@ class Signal:
     Attributes:
         stamp_ns: Instants of the samples, shape (N,), int64, ns, ascending.
         names: The k channels.
-        values: Samples, shape (N, k), of a log with a channel contiguous in memory.
-        sender: Number of the publisher of each sample, shape (N,), in the order of their first
-            samples; None: one publisher.
+        values: Samples, shape (N, k). In a log, each channel is contiguous in memory.
+        sender: Number of the publisher of each sample, shape (N,). Publishers are numbered in the
+            order of their first samples. None if there is one publisher.
 
     Examples:
         >>> q = rise_di.Signal(np.array([0, 2_000_000]), ("q",), np.array([[0.0], [0.1]]))
@@ -63,7 +63,7 @@ class Signal:
         return Signal(self.stamp_ns[:count], self.names, self.values[:count], sender)
 
     def where(self, keep: NDArray[np.bool_]) -> "Signal":
-        """Return the samples of a mask, shape (N,).
+        """Return the samples where a mask is True.
 
         Args:
             keep: Mask, shape (N,), bool.
@@ -75,7 +75,7 @@ class Signal:
         return Signal(self.stamp_ns[keep], self.names, self.values[keep], sender)
 
     def after(self, earlier: "Signal | None") -> "Signal":
-        """Prepend the samples of an earlier part, if there is one, with the same channels.
+        """Return the signal with the samples of an earlier signal, if any, put before its own.
 
         Args:
             earlier: A signal with the same channels, or None.
@@ -89,7 +89,7 @@ class Signal:
         return Signal(stamp_ns, self.names, np.concatenate([earlier.values, self.values]))
 
     def within(self, windows: Sequence[tuple[int, int]]) -> "Signal":
-        """Return the samples inside windows (first, last instant), ns.
+        """Return the samples that lie in any of some windows of time.
 
         Args:
             windows: First and last instant of each window, ns.
@@ -116,7 +116,8 @@ class Signal:
         """
         columns = [i for i, name in enumerate(self.names) if name.startswith(prefix + ".")]
         names = tuple(self.names[i].removeprefix(prefix + ".") for i in columns)
-        adjacent = bool(columns) and columns[-1] - columns[0] < len(columns)  # then without a copy
+        # if the channels are adjacent, a slice selects them without a copy
+        adjacent = bool(columns) and columns[-1] - columns[0] < len(columns)
         return Signal(
             self.stamp_ns,
             names,
@@ -126,40 +127,42 @@ class Signal:
 
 
 class Recording(NamedTuple):
-    """Stamps of the messages of a topic in the order of the recording.
+    """What the stamps of a topic's messages show, in the order of the recording.
 
-    If the clock of the stamps steps, the signal lacks the samples from there on, as well as those
+    If the clock of the stamps steps, the signal ends before the step. It also lacks the samples
     without a usable stamp.
     """
 
-    found: int  # messages
-    unset: int = 0  # zero stamps, and stamps far from their neighbours
-    repeated: int = 0  # stamps equal to the stamp of the message before
-    step_ns: int = 0  # the first step of the clock: negative for a step back; 0 without a step
+    found: int  # number of messages
+    unset: int = 0  # number of stamps that are zero or far from their neighbours
+    repeated: int = 0  # number of stamps that equal the stamp of the message before
+    step_ns: int = 0  # the first step of the clock, negative for a step back, or 0 if there is none
     step_at_ns: int = 0  # the last stamp before the step
-    left_out: int = 0  # messages after the step
-    # messages missing in the numbers of the publisher; None without numbers
+    left_out: int = 0  # number of messages after the step
+    # number of messages that the publisher's numbering shows as lost, or None without numbers
     lost: int | None = None
-    # last stamps before pauses of the reception too, which are no steps of the clock
+    # The last stamp before each pause in which nothing was received either. It is no step of the
+    # clock.
     pauses_ns: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Process:
-    """A process of a flight. Stamps in ns; None: unknown, or without samples."""
+    """A process of a flight. A stamp is in ns, or None if it is unknown or has no sample."""
 
-    ready_ns: int | None  # when its event loop began
-    first_ns: int | None  # stamps of its first and last sample
-    last_ns: int | None
-    samples: int | None = None  # on the topics of the aircraft
+    ready_ns: int | None  # instant at which its event loop began
+    first_ns: int | None  # stamp of its first sample
+    last_ns: int | None  # stamp of its last sample
+    samples: int | None = None  # number of its samples on the topics of the aircraft
 
 
 @dataclass(frozen=True, kw_only=True)
 class LostPart:
-    """A part of a flight that its log lost: a file, the end of one, or a leap of the clock."""
+    """A span of a flight that its log lost: a file, the end of a file, or a leap of the clock."""
 
     sentence: str
-    is_end: bool = False  # of a truncated file; a planned end shows this too
+    # whether the end of a file is lost, which also shows after a planned end
+    is_end: bool = False
 
 
 @dataclass(frozen=True)
@@ -206,7 +209,7 @@ class Tape:
         return isinstance(topic, str) and topic in self.signals
 
     def time(self, topic: str) -> FloatArray:
-        """Return the flight times of the samples of a topic in s, (N,): t = (stamp - start) / 1e9.
+        """Return the flight times of the samples of a topic: t = (stamp - start) / 1e9.
 
         Args:
             topic: Name of the topic.

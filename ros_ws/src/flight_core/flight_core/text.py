@@ -9,10 +9,7 @@ MAX_LENGTH = 1000  # characters of a sentence, however long the bad input is
 
 
 def printable(text: str) -> str:
-    """Write a text with unprintable characters as escapes.
-
-    Those are line ends and terminal control codes, for example.
-    """
+    """Write unprintable characters, such as line ends and terminal control codes, as escapes."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -27,5 +24,5 @@ def bounded(text: str) -> str:
 
 
 def sentences(*parts: object) -> str:
-    """Join the parts that are neither None nor empty into one text; a reason is its sentence."""
+    """Join the texts and reasons that are neither None nor empty into one text."""
     return "; ".join(str(part) for part in parts if part)

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The topics of a flight.
 
-Each row has name, message, publishers, subscribers, and what the log and the pages say of the
-topic. Transport, recorder and launch read this table. `python -m tools.topics` writes the table of
-docs/topics.md and the access control policy from it.
+Each row has the name, the message, the publishers, the subscribers and the meaning of a topic.
+Transport, recorder and launch read this table. From it, `python -m tools.topics` writes the table
+of docs/topics.md and the access control policy.
 """
 
 from importlib import import_module
@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 EXTERNAL = "external"  # publishers and subscribers that do not belong to the stack
 NODES = ("aircraft", "reference_model", "guidance", "controller", "learner", "recorder", "bridge")
 LOG = "log"  # as a subscriber: the recorder
-HISTORY = "2 s"  # what a publisher keeps for a late subscriber: the samples of two seconds,
-LAST = "last"  # the last message,
-NOTHING = "-"  # or nothing, without retransmissions
+HISTORY = "2 s"  # a publisher keeps the samples of two seconds for a late subscriber
+LAST = "last"  # a publisher keeps the last message for a late subscriber
+NOTHING = "-"  # a publisher keeps nothing, and nothing is sent again
 
 VECTOR = "sensor_msgs/msg/JointState"
 DIAGNOSTIC = "diagnostic_msgs/msg/DiagnosticArray"
@@ -28,11 +28,12 @@ class Topic(NamedTuple):
     """A topic by its relative name."""
 
     name: str
-    message: str | type  # as "sensor_msgs/msg/JointState", or the class
-    # names of the nodes, as "aircraft, bridge -> controller, log"; "nodes" are NODES
+    message: str | type  # name, such as "sensor_msgs/msg/JointState", or class of the message
+    # publishers -> subscribers, such as "aircraft, bridge -> controller, log", where "nodes" stands
+    # for all NODES
     ends: str = "->"
-    meaning: str = ""  # channels, units and use: Markdown
-    keeps: str = HISTORY
+    meaning: str = ""  # channels, units and use, in Markdown
+    keeps: str = HISTORY  # what a publisher keeps for a late subscriber
     only_with: str = ""  # the topic is recorded only with this node or section
 
     @property
@@ -42,12 +43,12 @@ class Topic(NamedTuple):
 
     @property
     def subscribers(self) -> list[str]:
-        """Names of the nodes that subscribe to the topic, and LOG."""
+        """Names of the nodes that subscribe to the topic, and LOG if it is recorded."""
         return _names(self.ends.partition("->")[2])
 
     @property
     def foreign(self) -> bool:
-        """Whether foreign programs publish the topic, at any quality of service."""
+        """Whether foreign programs publish the topic, possibly at another quality of service."""
         return EXTERNAL in self.publishers
 
     @property
@@ -213,7 +214,7 @@ FLIGHT = tuple(topic for topic in TOPICS if LOG in topic.subscribers and not top
 
 
 def recorded_with(node: str) -> list[str]:
-    """List the topics that are recorded only with a node or section."""
+    """List the topics that are recorded only if a flight has a certain node or section."""
     return [topic.name for topic in TOPICS if topic.only_with == node]
 
 

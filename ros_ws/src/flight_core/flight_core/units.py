@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Units of airframe files.
 
-Values are converted to SI once, when they are loaded; the code uses SI and radians.
+Values are converted once, when they are loaded. The code then uses only SI and radians.
 """
 
 import re
@@ -22,7 +22,7 @@ POUND_FORCE = POUND * 9.80665  # N
 
 @dataclass(frozen=True, kw_only=True)
 class Quantity:
-    """A unit: the SI value of 1, and the exponents of angle, length, time and mass."""
+    """A unit: its value in SI, and its exponents of angle, length, time and mass."""
 
     si: float
     angle: int = 0
@@ -106,7 +106,7 @@ def quantity(unit: str, key: str = "unit") -> Quantity:
 
 
 def si_per_unit(unit: str) -> float:
-    """Return the SI value of 1 of a unit, by which you multiply a value in that unit.
+    """Return the factor that converts a value in a unit to SI.
 
     Raises ParameterError if the unit is not known.
     """
@@ -114,7 +114,7 @@ def si_per_unit(unit: str) -> float:
 
 
 def in_si(value: str | float, key: str, like: str) -> float:
-    """Convert a number in SI, or a text of a number with a unit ("176 ft/s"), to SI.
+    """Return a number in SI, given such a number or a text with a unit, such as "176 ft/s".
 
     `like` is an SI unit of the same dimension. Raises ParameterError if the text has no finite
     number, an unknown unit, or a unit of another dimension.

@@ -21,12 +21,12 @@ from flight_core.text import bounded
 FloatArray = NDArray[np.float64]
 Array = Any
 """An array of NumPy or of JAX."""
-Scalar = Any  # a Python float, or an array with a value per aircraft of a fleet
+Scalar = Any  # a Python float, or an array with a value for each aircraft of a fleet
 FUTURE = "future"  # the reason of a ChannelError for a stamp ahead of the clock
 
 
 class _NumPy1:
-    """NumPy 1 with `concat`, which this stack uses and NumPy 1 lacks."""
+    """NumPy 1 with `concat` added, which this stack uses and NumPy 1 lacks."""
 
     concat = staticmethod(np.concatenate)
 
@@ -59,15 +59,15 @@ class _Floats:
 
 
 def array_namespace(array: Scalar) -> Any:
-    """Return the array namespace of an array by the array API standard; `_Floats` for a float.
+    """Return the array namespace of an array by the array API standard, or `_Floats` for a float.
 
-    Arrays of NumPy 1 lack `__array_namespace__`.
+    It also works for arrays of NumPy 1, which lack `__array_namespace__`.
 
     Args:
         array: An array of NumPy or of JAX, or a float.
 
     Returns:
-        The namespace: the functions for arrays of the type.
+        The namespace with the functions for arrays of this type.
 
     Raises:
         ParameterError: `array` is a list.
@@ -141,7 +141,7 @@ def require_newer(stamp_ns: int, last_ns: int, what: str = "sample") -> None:
 def require_not_future(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
     """Raise ChannelError, reason "future", for a stamp too far ahead of the clock.
 
-    The limit is the age limit.
+    A stamp is too far ahead if it leads by more than the age limit.
     """
     if stamp_ns > now_ns + max_age_ns:
         raise ChannelError(FUTURE, f"stamp {seconds(stamp_ns - now_ns):g} s ahead of the clock")
@@ -173,7 +173,7 @@ def select(
         vector = np.array(values, dtype=np.float64)
     else:
         vector = np.asarray(values, dtype=np.float64)[_places(tuple(channels), tuple(names))]
-    # for a few channels this takes a third of the time of np.isfinite
+    # For a few channels, this loop takes a third of the time of np.isfinite.
     if not all(map(math.isfinite, vector.tolist())):
         raise ChannelError("finite", f"{', '.join(channels)} = {vector.tolist()} is not finite")
     return vector
@@ -192,7 +192,7 @@ def selection_matrix(channels: Sequence[str], names: Sequence[str]) -> FloatArra
 
 @lru_cache(maxsize=256)
 def _places(channels: tuple[str, ...], names: tuple[str, ...]) -> NDArray[np.intp]:
-    """Find the places of the channels among the names. Raises ChannelError as `select` does."""
+    """Find the indices of the channels among the names. Raises ChannelError as `select` does."""
     for name in channels:
         if names.count(name) != 1:
             raise ChannelError(
