@@ -9,7 +9,7 @@
 | `disk` | reserves disk space for the end of a file |
 | `message_definitions` | finds the definition of a message type |
 | `provenance` | collects versions, revision, host and command |
-| `file_kinds` | names the kind of a file by the first bytes |
+| `file_kinds` | names the kind of a file by its first bytes |
 | `open_log` | opens the files of a log for every reader: MCAP, packed files, compressed messages |
 | `scan` | reads the records of an intact, truncated or damaged MCAP file |
 | `follow` | reads a growing log |

@@ -24,9 +24,10 @@ CHANNELS = ("mean", "max")
 
 
 def age_of_u(messages: Iterable[bytes], namespace: str) -> Signal | None:
-    """Return mean and largest age of u between two reports of an aircraft, s; None if none.
+    """Return the mean and the largest age of u, s, in each report of an aircraft.
 
-    `namespace` is that of the aircraft.
+    Each covers the time since the report before. `namespace` is the namespace of the aircraft.
+    Returns None if the aircraft has no report.
     """
     rows: dict[int, tuple[float, float]] = {}
     for data in messages:

@@ -26,18 +26,21 @@ from flight_log.rosbag2_metadata import METADATA, FileContents, TopicCount, bag_
 from flight_log.scan import RECORD
 
 SCENARIO_MEDIA_TYPE = "application/yaml"  # media type of the attached scenario
-FILE_MEDIA_TYPE = "text/yaml"  # and of other attached files
-BEFORE_REMAP = "rise_di_topic"  # of a channel: the full name of its topic before a remap of ROS 2
+FILE_MEDIA_TYPE = "text/yaml"  # media type of other attached files
+# Key in the metadata of a channel: the full name of its topic before a remap of ROS 2.
+BEFORE_REMAP = "rise_di_topic"
 OUTCOME = "rise_di_outcome"  # name of the metadata record with the outcome of the flight
 SILENCES = "rise_di_silent"  # name of the metadata record with the silences of topics, s
-OUTCOME_FILE = "outcome"  # in the folder of a run, from the flight to the recorder
+OUTCOME_FILE = "outcome"  # file in the folder of a run by which the recorder learns the outcome
 # Name of the metadata record of a log that the stack did not fly: "log", "kind", "map", COMPARED.
 IMPORTED = "rise_di_imported"
-# What the vehicle's parameters do not tell, as a sentence; empty if all agree with the map.
+# Key in IMPORTED: a sentence on what the vehicle's parameters do not tell. It is empty if all of
+# them agree with the map.
 COMPARED = "parameters"
 # Name of the metadata record with the SI units of channels, for a log without a scenario.
 CHANNEL_UNITS = "rise_di_units"
-# Name of the metadata record of a flight by /clock: topic, speed over real time.
+# Name of the metadata record of a flight by /clock. It has the topic, and the speed of the flight
+# as a multiple of real time.
 SIMULATED_TIME = "rise_di_simulated_time"
 # Name of the metadata record that counts the messages the recorder lost, by topic.
 LOST_MESSAGES = "rise_di_lost"
@@ -54,17 +57,17 @@ INDEX_BYTES_BY_TOPIC = 10
 CHUNK_BUILDER = "_Writer__chunk_builder"
 CHUNK_INDEXES = "_Writer__chunk_indices"
 MESSAGE = int(Opcode.MESSAGE)
-# RECORD, then channel, sequence, log time and publish time (MCAP specification)
+# RECORD, followed by channel, sequence, log time and publish time (MCAP specification)
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
-INDEX_HEAD = struct.Struct("<BQHI")  # RECORD, then channel and size
+INDEX_HEAD = struct.Struct("<BQHI")  # RECORD, followed by channel and size
 
 
 class LogAttachments(NamedTuple):
-    """Files and metadata that a log stores beside the messages."""
+    """Files and metadata that a log stores in addition to the messages."""
 
     scenario: Path | None = None
     files: tuple[Path, ...] = ()
-    # A YAML file: named sets of strings, each becomes a metadata record.
+    # A YAML file of named sets of strings, each of which becomes a metadata record.
     metadata: Path | None = None
 
 
@@ -80,7 +83,7 @@ class BagChannel:
 
 
 class _MessageIndex(MessageIndex):
-    """The places of a channel's messages in a chunk, packed at once."""
+    """The offsets of a channel's messages in a chunk, which are packed in one step."""
 
     def write(self, stream: RecordBuilder) -> None:
         size = 16 * len(self.records)
@@ -93,7 +96,7 @@ class _MessageIndex(MessageIndex):
 class _ChunkBuilder(ChunkBuilder):
     """Writes the bytes of mcap's builder in half the time.
 
-    mcap's own builder writes a message field by field, and its length afterwards.
+    mcap's own builder writes a message field by field, and then goes back to write its length.
     """
 
     def add_message(self, message: Message) -> None:
@@ -145,14 +148,17 @@ class _ChunkIndexes:
 
 
 def full_names(remaps: Mapping[str, str]) -> dict[str, str]:
-    """Map topics of a log to full names in the stack; `remaps` gives topics of the log by name."""
+    """Return the full name in the stack by topic of a log.
+
+    `remaps` has the topic of the log by name in the stack.
+    """
     return {topic: f"/{name.lstrip('/')}" for name, topic in remaps.items()}
 
 
 def stack_topic(channel: Channel, remaps: Mapping[str, str] = {}) -> str:
     """Return the full name in the stack of a topic of a log.
 
-    The names in `remaps`, by topics of the log, take precedence over those in the log itself.
+    `remaps` has names by topic of the log. They replace the names that the log itself has.
     """
     return remaps.get(channel.topic) or channel.metadata.get(BEFORE_REMAP) or channel.topic
 
@@ -160,10 +166,10 @@ def stack_topic(channel: Channel, remaps: Mapping[str, str] = {}) -> str:
 class BagWriter:
     """Writes a bag into a folder.
 
-    `flush` closes the chunk in progress; closed chunks stay readable if the process is killed. Disk
-    space for the end of the file is reserved. Once a write has used the reserve, `full` is true and
-    the bag must be closed. Raises OSError if a write fails for any other reason, or if the reserve
-    is not enough.
+    `flush` closes the chunk in progress. If the process is killed, closed chunks stay readable.
+    Disk space for the end of the file is reserved. After a write has used the reserve, `full` is
+    true and the bag must be closed. Raises OSError if a write fails for any other reason, or if the
+    reserve is not enough.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -215,7 +221,8 @@ class BagWriter:
     def add_topic(self, topic: str, type_name: str, qos: str, before_remap: str = "") -> BagChannel:
         """Add a topic by its full name.
 
-        `qos` is rosbag2's YAML list of offered profiles, and `before_remap` the name in the stack.
+        `qos` is rosbag2's YAML list of the offered profiles of quality of service. `before_remap`
+        is the full name of the topic in the stack.
         Raises ParameterError if the definition of the type is not known.
         """
         type_definition = definition(type_name)
@@ -281,7 +288,7 @@ def _is_mapping_of_strings(content: object) -> bool:
 
 
 def read_metadata_records(path: Path) -> dict[str, dict[str, str]]:
-    """Read named sets of strings from a YAML file; raise ParameterError for anything else."""
+    """Read named sets of strings from a YAML file. Raises ParameterError for anything else."""
     expected = "a mapping of mappings of strings"
     content = read_yaml(path, str(path), expected)
     valid = isinstance(content, dict) and all(map(_is_mapping_of_strings, content.values()))

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The clock of the stamps of a topic, followed in the order of the recording.
+"""Check of a topic's stamps in the order of the recording.
 
-It finds steps of the clock, damaged stamps and equal stamps.
+It finds steps of the clock that made the stamps, damaged stamps and equal stamps.
 """
 
 from collections.abc import Iterator, Mapping
@@ -15,33 +15,36 @@ from numpy.typing import NDArray
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import LostPart, Recording, Signal
 
-STEP_NS = NANOSECONDS // 10  # ns, step back of a clock; late samples are less late than this
-LEAP_NS = NANOSECONDS // 4  # ns, step forth of a clock, compared with the time of the recording
-# ns, back. Fewer messages than CONFIRMED that are so much older have a damaged stamp.
+STEP_NS = NANOSECONDS // 10  # least step back of a clock, ns; no sample is as late as this
+# least step forth of a clock, compared with the time of the recording, ns
+LEAP_NS = NANOSECONDS // 4
+# If fewer than CONFIRMED messages are older than the one before by more than this time, ns, their
+# stamps are damaged.
 STRAY_NS = NANOSECONDS
-LATE_NS = 4 * NANOSECONDS  # a recorder that starts on a busy host stores its first sample so late
-# Successive messages after a step. Fewer come from another publisher, or have a damaged stamp.
+LATE_NS = 4 * NANOSECONDS  # largest delay of the first sample of a recorder on a busy host, ns
+# Number of successive messages that confirm a step. Fewer come from another publisher, or have a
+# damaged stamp.
 CONFIRMED = 10
-CONFIRMED_AT_END = 3
+CONFIRMED_AT_END = 3  # the same number at the end of a topic
 SINCE_EPOCH_NS = 10**15  # larger stamps count from 1970, not from the start of the flight
 
 
 class StampClock:
-    """Follows the stamps of a topic, up to a step of their clock.
+    """Finds the usable samples of a topic, which end at a step of the clock of their stamps.
 
-    A step of the clock ends the usable part of the topic. A sample with a damaged stamp is left
-    out. The samples after a step forth stay, because `without_leaps`, which knows all topics,
-    decides on them.
+    A sample with a damaged stamp is left out. The samples after a step forth stay here, because
+    only `without_leaps`, which knows all topics, can decide about them.
     """
 
     def __init__(self) -> None:
         self._count = self._unset = self._repeated = self._left_out = 0
         self._step_ns = self._step_at_ns = 0
-        self._last_ns: int | None = None  # of the usable part
-        self._last_offset_ns = 0
+        self._last_ns: int | None = None  # last usable stamp
+        self._last_offset_ns = 0  # this stamp minus the time of its recording
         self._offset_ns = -(2**62)  # the largest lead of a stamp over the time of the recording
         self._is_history = False  # whether the last samples were recorded in a burst
-        self._pauses_ns: set[int] = set()  # last stamps before pauses of the reception, too
+        # the last stamp before each pause in which nothing was received either
+        self._pauses_ns: set[int] = set()
 
     def usable(
         self,
@@ -52,13 +55,13 @@ class StampClock:
         more: bool,
         end: bool = False,
     ) -> tuple[NDArray[np.bool_], int]:
-        """Return the mask of the usable messages among the next K messages, shape (K,), and K.
+        """Return a mask of the usable messages among the first K messages, shape (K,), and K.
 
-        If `more` messages come at once, K is less than the number of messages unless the last ones
-        confirm or exclude a step. `end` says that these are the last messages of the topic. `steps`
-        are those of the publisher's number before each message, (K,). If a number falls together
-        with both times, this part of the log is out of order. A jump forth beside lost messages is
-        a gap.
+        K is less than the number of messages if `more` messages follow at once and the last ones
+        neither confirm nor exclude a step. `end` says that these are the last messages of the
+        topic. `steps` has the increase of the publisher's number before each message. If the number
+        falls together with both times, this span of the log is out of order. If messages are lost
+        at a jump forth, the jump is a gap.
         """
         latest = np.maximum.accumulate(np.append(self._last_ns or 0, stamp_ns))[:-1]
         if self._step_ns:
@@ -74,10 +77,10 @@ class StampClock:
         numbers = np.ones(len(stamps), dtype=np.int64) if steps is None else steps[places]
         back = (jumps < -STEP_NS) & ((numbers >= 0) | (np.abs(leads) > STEP_NS))
         forth = (jumps > STEP_NS) & ((leads > STEP_NS) | ~has_time) & (numbers <= 1)
-        # If the reception pauses too, the publisher or the host has paused, not the clock.
+        # If nothing is received meanwhile, the publisher or the host has paused, not the clock.
         with_reception = (jumps > LEAP_NS) & (leads <= LEAP_NS) & has_time
         self._pauses_ns.update((stamps - jumps)[with_reception].tolist())
-        # Places where the messages of a clock begin.
+        # These are the indices at which the messages of a new clock can begin.
         starts = np.flatnonzero(back | forth)
         edges = [0, *starts[starts > 0].tolist(), len(stamps)]
         for first, after in pairwise(edges if len(stamps) else []):
@@ -85,7 +88,7 @@ class StampClock:
             jump_ns, is_ahead = self._jump_to(
                 int(stamps[first]), int(offsets[first]), has_time=bool(has_time[first])
             )
-            # Nothing is to be confirmed if the clock goes on.
+            # If the clock goes on, nothing needs to be confirmed.
             goes_on = self._last_ns is not None and jump_ns >= 0 and not is_ahead
             is_short = after - first < (CONFIRMED_AT_END if is_last and end else CONFIRMED)
             if is_short and not (goes_on and first not in starts):
@@ -97,7 +100,7 @@ class StampClock:
             is_back = jump_ns < -STEP_NS and bool(back[first])
             if is_back and has_time[first]:
                 is_late = self._catches_up(stamps[first:], offsets[first:])
-                if is_late is None and more:  # the next messages tell
+                if is_late is None and more:  # the next messages will tell
                     return self._taken(stamp_ns, keep[: places[first]], int(places[first]))
                 is_back = not is_late
             if is_back or is_ahead:
@@ -113,7 +116,7 @@ class StampClock:
         return self._taken(stamp_ns, keep, len(stamp_ns))
 
     def _follow(self, stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> None:
-        """Take successive messages of the clock."""
+        """Note the stamps of successive messages of the clock."""
         self._last_ns = int(stamp_ns[-1])
         self._last_offset_ns = int(offset_ns[-1])
         self._offset_ns = max(self._offset_ns, int(offset_ns.max()))
@@ -121,11 +124,11 @@ class StampClock:
             self._is_history = _in_burst(stamp_ns, offset_ns)
 
     def _catches_up(self, stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool | None:
-        """Tell whether samples behind a step back are only late; a clock that was set stays behind.
+        """Return whether the samples after a step back are merely late.
 
-        A late sample is at most STRAY_NS older than the one before, and within STRAY_NS of the
-        reception the samples are as late as before. Returns None if there are too few messages to
-        tell.
+        A late sample is at most STRAY_NS older than the one before, and after at most STRAY_NS of
+        reception the samples are no later than before. If the clock was set, they stay behind.
+        Returns None if there are too few messages to tell.
         """
         if self._last_ns is None or stamp_ns[0] < self._last_ns - STRAY_NS:
             return False
@@ -136,11 +139,12 @@ class StampClock:
         return None if within.all() else False
 
     def _jump_to(self, stamp_ns: int, offset_ns: int, *, has_time: bool) -> tuple[int, bool]:
-        """Return the time from the usable part to a stamp, ns, and whether it leads its clock.
+        """Return the time from the last usable stamp to a stamp, ns, and whether the stamp leads.
 
-        The time is 0 if there is no usable part.
+        A stamp leads if it is too far ahead of the time of the recording. The time is 0 if there is
+        no usable stamp.
         """
-        # There is no usable stamp, or a stamp that was not set.
+        # There is no usable stamp yet, or only one that was not set.
         if not self._last_ns:
             return 0, False
         jump_ns = stamp_ns - self._last_ns
@@ -148,9 +152,9 @@ class StampClock:
         return jump_ns, is_ahead and has_time and not self._is_history
 
     def _after_step(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Mask the samples that stay after the step.
+        """Return a mask of the samples that stay after the step.
 
-        Behind a step forth they are those later than the step; behind a step back there are none.
+        After a step forth, the samples later than the step stay. After a step back, none stay.
         """
         return (stamp_ns > self._step_at_ns) & (self._step_ns > 0)
 
@@ -169,7 +173,7 @@ class StampClock:
         return keep, count
 
     def recording(self, unset: int = 0) -> Recording:
-        """Return the result; `unset` counts more messages without a usable stamp."""
+        """Return what was found, with `unset` further messages without a usable stamp."""
         return Recording(
             found=self._count,
             unset=self._unset + unset,
@@ -182,7 +186,7 @@ class StampClock:
 
 
 def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Mask the samples that may come before the last one by the same clock, (N - 1,) of N."""
+    """Return a mask of the first N - 1 of N samples that can have the clock of the last one."""
     away_ns = stamp_ns[-1] - stamp_ns[:-1]
     lead_ns = offset_ns[-1] - offset_ns[:-1]
     is_near = (away_ns <= STRAY_NS) | (lead_ns <= LATE_NS)
@@ -203,7 +207,7 @@ def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool
 
 
 def recording_note(name: str, recording: Recording, start_ns: int) -> str | None:
-    """Write the sentence about the stamps of a topic, if they have steps or damage."""
+    """Write a sentence about the stamps of a topic, or return None if all are usable."""
     parts = []
     if recording.unset:
         parts.append(
@@ -224,22 +228,22 @@ class Leap(NamedTuple):
     """A leap of the clock of all topics at one instant."""
 
     at_ns: int  # the last stamp before the leap
-    by_ns: int
+    by_ns: int  # the size of the leap
 
     def undone(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """Convert stamps to the clock before the leap."""
         return stamp_ns - np.where(stamp_ns > self.at_ns + STEP_NS, self.by_ns, 0)
 
 
-LOOP = ("y", "y_m", "u", "internals", "truth")  # topics that all have a leap of the clock
+LOOP = ("y", "y_m", "u", "internals", "truth")  # topics that must all show a leap of the clock
 
 
 def without_leaps(
     signals: Mapping[str, Signal], recording: Mapping[str, Recording]
 ) -> tuple[dict[str, Signal], dict[str, Recording], list[Leap]]:
-    """Convert the signals to the clock before each leap, and return the leaps too.
+    """Convert the signals to the clock before each leap, and return them and the leaps.
 
-    A step forth of a single topic is no leap: the samples after it are left out.
+    If a single topic steps forth, this is no leap, and the samples after the step are left out.
     """
     mended = dict(signals)
     clocks = dict(recording)
@@ -272,11 +276,11 @@ def without_leaps(
 def _candidates(
     signals: Mapping[str, Signal], recording: Mapping[str, Recording]
 ) -> Iterator[Leap]:
-    """Yield leaps of the stamps against a second measure of time.
+    """Yield the leaps of the stamps against a second measure of time.
 
-    The measure is the flight time in `truth`. If there is none, it is a constant period, wherever
-    the numbers of the messages have no gap and the reception did not pause as long: a host that was
-    busy or suspended leaves out time, but its clock goes on.
+    The measure is the flight time in `truth`. If there is none, it is a constant period of the
+    messages, provided no message is lost. A gap during which nothing was received either is no
+    leap: the host was busy or suspended, but its clock went on.
     """
     name = next((name for name in ("truth", "y_m", "y") if name in signals), "")
     if not name:
@@ -284,7 +288,7 @@ def _candidates(
     stamp_ns = signals[name].stamp_ns
     elapsed_ns = np.diff(stamp_ns)
     if "t" in signals[name].names:
-        # A damaged flight time may overflow.
+        # A damaged flight time can overflow.
         with np.errstate(over="ignore", invalid="ignore"):
             flown_ns = np.diff(np.round(signals[name]["t"] * NANOSECONDS))
     elif len(elapsed_ns) and all(
@@ -309,7 +313,7 @@ def _has_gap(signal: Signal, leap: Leap) -> bool:
 
 
 def lost_in_leap(leap: Leap, start_ns: int) -> LostPart:
-    """Say which part of the flight a leap of the clock hides."""
+    """Return the span of the flight that a leap of the clock hides."""
     times = f"{seconds(leap.by_ns):.3f} s at t = {seconds(leap.at_ns - start_ns):.3f} s"
     return LostPart(sentence=f"the clock of all stamps leaps forth by {times}")
 

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples of a topic as columns: a short topic in memory, a long one in a temporary file.
 
-Metrics and figures use whole channels, one after another. An hour of `truth` takes 400 MB, each of
-its channels only 14 MB.
+Metrics and figures use whole channels, one after another. An hour of `truth` takes 400 MB, but each
+of its channels only 14 MB.
 """
 
 from collections.abc import Iterator
@@ -19,26 +19,28 @@ from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 
 IN_MEMORY = 32_000_000
-"""Bytes of a topic that stay in memory; 28 channels of `truth` at 500 Hz need more after 5 min."""
+"""Largest size of a topic that stays in memory, bytes. 28 channels of `truth` at 500 Hz need more
+after 5 min."""
 
 
 class Columns:
     """Samples in order of arrival: stamps, and rows of equal length.
 
-    The rows are read as columns, contiguous in memory. `expected` samples are expected, but more
-    are taken. Raises ParameterError if no temporary file can hold a long topic.
+    The rows are read as columns, which are contiguous in memory. There is space for `expected`
+    samples at first, and for more when they come. Raises ParameterError if no temporary file can
+    hold a long topic.
     """
 
     def __init__(self, width: int, expected: int) -> None:
         self.count = 0
         self._width = width
-        self._senders: dict[str, int] = {}  # numbers of the publishers
-        self._sender: list[NDArray[np.int16]] = []  # of each sample
+        self._senders: dict[str, int] = {}  # number of each publisher by its name
+        self._sender: list[NDArray[np.int16]] = []  # number of the publisher of each sample
         self._stamp_ns, self._store = self._new(expected)
 
     @property
     def senders(self) -> list[str]:
-        """Publishers by their numbers."""
+        """Names of the publishers, in the order of their numbers."""
         return [*self._senders]
 
     def _new(self, capacity: int) -> tuple[NDArray[np.int64], "_MemoryColumns | _FileColumns"]:
@@ -87,7 +89,7 @@ class _MemoryColumns:
 class _FileColumns:
     """Columns in a temporary file without a name.
 
-    They are written past memory, and mapped only while an array of them is used.
+    They go to the file at once, and are mapped into memory only while an array of them is used.
     """
 
     def __init__(self, width: int, capacity: int) -> None:
@@ -126,10 +128,10 @@ def _on_disk() -> Iterator[None]:
 
 
 class _StoredSignal(Signal):
-    """A signal with values in a file, whose neighbouring columns from `first` on are its channels.
+    """A signal whose values are in a file.
 
-    `values` maps the file each time, so the memory is free once you drop the array. In a loop, keep
-    the array.
+    Its channels are the columns of the file from `first` on. `values` maps the file each time, so
+    that the memory is free when you drop the array. In a loop, keep the array.
     """
 
     def __init__(

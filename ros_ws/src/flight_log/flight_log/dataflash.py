@@ -16,13 +16,14 @@ from flight_log.vehicle_tables import Loss
 
 HEAD = b"\xa3\x95"
 FORMAT = 0x80  # identity of a packet that declares a format
-TAIL = 528  # bytes: with fewer at its end a log is whole (pymavlink, DFReader.py)
+# A log counts as whole if fewer bytes than this at its end hold no packet (pymavlink, DFReader.py).
+TAIL = 528
 
 
 class Packets(DFReader.DFReader_binary):
     """The packets of a log that are followed by another packet or by the end.
 
-    pymavlink's own index ends at the first unknown packet, such as lost bytes leave.
+    pymavlink's own index ends at the first unknown packet, which lost bytes leave behind.
     """
 
     def init_arrays(self, progress_callback: Callable[[int], None] | None = None) -> None:
@@ -30,7 +31,7 @@ class Packets(DFReader.DFReader_binary):
         self.name_to_id: dict[str, int] = {}
         self.id_to_name: dict[int, str] = {}
         self.offsets: list[list[int]] = [[] for _ in range(256)]
-        # first byte, end, and the packet before
+        # first byte and end of each span without a packet, and the place of the packet before it
         self.lost: list[tuple[int, int, int]] = []
         here = before = 0
         while here < self.data_len:
@@ -51,7 +52,7 @@ class Packets(DFReader.DFReader_binary):
     init_arrays_fast = init_arrays
 
     def _length(self, here: int) -> int:
-        """Return the length of the packet at a place in bytes; 0 if there is no whole packet."""
+        """Return the length of the packet at a place, bytes, or 0 if no whole packet is there."""
         form = self.formats.get(int.from_bytes(self.data_map[here + 2 : here + 3], "little"))
         if self.data_map[here : here + 2] != HEAD or form is None:
             return 0
@@ -82,12 +83,12 @@ class Packets(DFReader.DFReader_binary):
         return True
 
     def _stamp_ns(self, place: int) -> int:
-        """Return the stamp of the packet at a place; 0 if it has none."""
+        """Return the stamp of the packet at a place, ns, or 0 if it has none."""
         self.offset = place
         return round(1e3 * stamp_us(self._parse_next(), 0.0))
 
     def loss(self) -> Loss | None:
-        """Return the bytes without a packet; None for a whole log."""
+        """Return the loss of bytes that hold no packet, or None for a whole log."""
         lost = self.lost
         if lost and lost[-1][1] == self.data_len and lost[-1][1] - lost[-1][0] < TAIL:
             lost = lost[:-1]
@@ -103,7 +104,7 @@ class Packets(DFReader.DFReader_binary):
 
 
 class Lines(DFReader.DFReader_text):
-    """The lines of a log as text that fit their format."""
+    """The lines of a text log that fit their format."""
 
     offset: int
 
@@ -111,7 +112,7 @@ class Lines(DFReader.DFReader_text):
         """Index the lines, and count those without a message."""
         self.offsets: dict[str, list[int]] = {}
         self._places: list[int] = []
-        self.lost_us: list[float] = []  # the stamp before each line without a message
+        self.lost_us: list[float] = []  # the last stamp before each line without a message, us
         newest_us = 0.0
         here: int = self.offset
         self._count = 0
@@ -140,14 +141,14 @@ class Lines(DFReader.DFReader_text):
         return super()._parse_next()
 
     def _message(self, here: int, line: bytes) -> Any:
-        """Return the message of a line; None if it is damaged."""
+        """Return the message of a line, or None if the line is damaged."""
         try:
             name, *values = line.decode().split(self.delimiter)
             form = self.formats.get(name)
             if form is None or len(values) < len(form.format):
                 return None
             message = DFReader.DFMessage(form, values, False, self)
-            # Each value is converted.
+            # This converts each value, so that a damaged one raises an exception here.
             message.to_dict()
             if name == "FMT":
                 self.offset = here
@@ -158,7 +159,7 @@ class Lines(DFReader.DFReader_text):
         return message
 
     def loss(self) -> Loss | None:
-        """Return the lines without a message; None for a whole log."""
+        """Return the loss of lines that hold no message, or None for a whole log."""
         if not self.lost_us:
             return None
         what = f"{len(self.lost_us)} of {self._count} lines hold no message"
@@ -166,8 +167,8 @@ class Lines(DFReader.DFReader_text):
 
 
 def stamp_us(message: Any, before_us: float) -> float:
-    """Return the stamp of a message, us, or `before_us` if it has none, as MODE of 2014 and before.
+    """Return the stamp of a message, us, or `before_us` if it has none.
 
-    Logs of that time have ms.
+    In logs of 2014 and before, MODE has no stamp, and the other messages have a stamp in ms.
     """
     return float(getattr(message, "TimeUS", 1e3 * getattr(message, "TimeMS", 1e-3 * before_us)))

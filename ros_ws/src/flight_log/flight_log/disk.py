@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import IO
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
-RESERVE_STEP = 64 * 1024  # bytes; the reserve grows by at least this
+RESERVE_STEP = 64 * 1024  # least growth of the reserve, bytes
 
 
 def free_bytes(folder: Path) -> int:
-    """Return how many bytes an unprivileged user may still write to the disk of a folder."""
+    """Return how many bytes an unprivileged user can still write to the disk of a folder."""
     disk = os.statvfs(folder)
     return disk.f_bavail * disk.f_frsize
 
@@ -22,8 +22,8 @@ def free_bytes(folder: Path) -> int:
 def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:
     """Lock a file until the stream is closed.
 
-    Returns False if a second process, such as a recorder, holds the lock. A file system without
-    locks always grants it.
+    Returns False if a second process, such as a recorder, holds the lock. On a file system without
+    locks, it always returns True.
     """
     try:
         fcntl.flock(stream, kind | fcntl.LOCK_NB)
@@ -46,9 +46,9 @@ def is_locked(path: Path) -> bool:
 class ReservedFile:
     """A new unbuffered file that reserves disk space, so that it can be finished on a full disk.
 
-    A second, unnamed file takes up the reserve. The first write without space closes that file and
-    then succeeds. The reserve also ends with the process. Until then it holds the data of `keep`,
-    which belong to the end of the file.
+    A second, unnamed file takes up the reserve. When a write finds no space, it closes the second
+    file and then succeeds. The reserve also ends with the process. While the reserve exists, it
+    holds the data of `keep`, which belong to the end of the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -62,7 +62,7 @@ class ReservedFile:
             raise
         try_lock(self._descriptor)
         self._reserved_bytes = 0
-        # Bytes in the reserve, which are in memory once the reserve is free.
+        # Number of bytes of kept data in the reserve. `release` moves them to `_end_data`.
         self._kept_bytes = 0
         self._end_data = bytearray()
         self._position = 0
@@ -85,14 +85,14 @@ class ReservedFile:
             self.full = error.errno in NO_SPACE
 
     def keep(self, data: bytes) -> None:
-        """Keep data for the end of the file: in the reserve while there is one, then in memory."""
+        """Keep data for the end of the file, in the reserve if there is one, else in memory."""
         if not self._reserve.closed:
             try:
                 if os.pwrite(self._reserve.fileno(), data, self._kept_bytes) == len(data):
                     self._kept_bytes += len(data)
                     return
             except OSError as error:
-                # On a file system without fallocate there may be no space.
+                # On a file system without fallocate the reserve has no space of its own.
                 if error.errno not in NO_SPACE:
                     raise
             self.full = True
@@ -100,11 +100,11 @@ class ReservedFile:
         self._end_data += data
 
     def kept_data(self) -> bytes:
-        """Return the kept data, once the reserve is free."""
+        """Return the kept data. Call `release` first."""
         return bytes(self._end_data)
 
     def release(self) -> None:
-        """Free the reserve."""
+        """Free the reserve, and move the kept data into memory."""
         if not self._reserve.closed:
             self._end_data += os.pread(self._reserve.fileno(), self._kept_bytes, 0)
             self._reserve.close()

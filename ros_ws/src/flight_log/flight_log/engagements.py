@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The engagements of a bridge in a log, by the reports of the bridge on `bridge/engagement`."""
+"""The engagements of a bridge in a log, from its reports on `bridge/engagement`."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -15,17 +15,17 @@ ENGAGED = "ENGAGED"  # the key of a report
 
 
 class Engagement(NamedTuple):
-    """A span in which an autopilot was engaged. Times in ns, by the clock of the stamps."""
+    """A span in which a bridge was engaged. Its times, ns, are by the clock of the stamps."""
 
     start_ns: int
-    stop_ns: int | None  # None if the log ends before
-    reason: str  # why it ended
+    stop_ns: int | None  # None if the log ends before the engagement
+    reason: str  # why the engagement ended
 
 
 def engagements_of(reports: Iterable[tuple[int, bytes]]) -> list[Engagement] | None:
-    """Return the engagements, in order, from the reports of a bridge; None if there is none.
+    """Return the engagements, in order, from the reports of a bridge.
 
-    A report is the time of sending and the message.
+    A report is the time of sending, ns, and the message. Returns None if there is no report.
     """
     spans: list[Engagement] | None = None
     for sent_ns, data in reports:

@@ -29,7 +29,7 @@ IMPORTABLE = frozenset({ULOG, DATAFLASH, TLOG})
 """Kinds of logs of autopilots from which `rise-di import` makes a bag."""
 
 PACKED = (ZSTD, LZ4)
-"""Kinds that may hold a log."""
+"""Kinds of packed files, which can hold a log."""
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # RFC 8878, section 3.1.1
 LZ4_MAGIC = b"\x04\x22\x4d\x18"  # LZ4 frame format, Magic Number
@@ -41,7 +41,7 @@ MAGICS = MappingProxyType(
         ZSTD_MAGIC: ZSTD,
         LZ4_MAGIC: LZ4,
         b"ULog\x01\x12\x35": ULOG,  # PX4 guide, ULog file format
-        # A packet with the identity FMT (ArduPilot, AP_Logger/LogStructure.h).
+        # the head of a packet with the identity FMT (ArduPilot, AP_Logger/LogStructure.h)
         b"\xa3\x95\x80": DATAFLASH,
         b"FMT, 128, 89,": "a DataFlash log of ArduPilot as text",
         b"H Product:Blackbox": "a blackbox log of Betaflight or INAV",
@@ -69,9 +69,9 @@ MAGICS = MappingProxyType(
 # POSIX.1-2017, pax, ustar Interchange Format
 TAR_PLACE = 257
 TAR = b"ustar"
-# First byte of a packet of MAVLink 2 and 1 (MAVLink guide, Packet Serialization).
+# first byte of a packet of MAVLink 2 and of MAVLink 1 (MAVLink guide, Packet Serialization)
 MAVLINK = (b"\xfd", b"\xfe")
-# us since 1970, before each packet of a tlog (MAVLink guide, mavlogdump).
+# the time before each packet of a tlog, us since 1970 (MAVLink guide, mavlogdump)
 TLOG_TIME = struct.Struct(">Q")
 TLOG_YEARS = (2000, 2100)
 HEAD_BYTES = 4096
@@ -90,9 +90,9 @@ def file_kind(path: Path) -> str:
 def kind_of_head(head: bytes) -> str:
     """Name the kind of a file by its first HEAD_BYTES bytes.
 
-    Bytes of no kind in the table are a text or unknown bytes.
+    If the bytes are of no kind in the table, they are a text or unknown bytes.
     """
-    # A recorder that is killed at its start also leaves such a file.
+    # A recorder that is killed at its start leaves a file with only the first bytes of an MCAP.
     if MCAP0_MAGIC.startswith(head):
         return BEGUN if head else EMPTY
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip(b" \t\r\n")
@@ -116,9 +116,10 @@ def kind_of_head(head: bytes) -> str:
 
 
 def tlog_start(head: bytes) -> int | None:
-    """Find the first packet with its time before it; None if there is none.
+    """Find the place of the first packet with a time before it, or return None.
 
-    The text that a radio sends at its start may come before it; a second packet must then follow.
+    The text that a radio sends at its start can come before this packet. If so, a second packet
+    must follow.
     """
     for start in range(len(head) - TLOG_TIME.size):
         end = _packet_end(head, start)
@@ -128,12 +129,13 @@ def tlog_start(head: bytes) -> int | None:
 
 
 def _packet_end(head: bytes, start: int) -> int:
-    """Return the end of a packet of MAVLink behind its time; 0 if there is none."""
+    """Return the end of a packet of MAVLink that follows its time, or 0 if there is no packet."""
     place = start + TLOG_TIME.size
     magic = head[place : place + 1]
     if magic not in MAVLINK or not _is_time(*TLOG_TIME.unpack_from(head, start)):
         return 0
-    # Beside the payload, MAVLink guide, Packet Serialization; a signature has 13 bytes.
+    # `frame` is the size without the payload (MAVLink guide, Packet Serialization). A signature has
+    # 13 bytes.
     size, flags = (*head[place + 1 : place + 3], 0, 0)[:2]
     frame = 8 if magic == MAVLINK[1] else 12 + 13 * (flags & 1)
     return place + frame + size
@@ -145,11 +147,11 @@ def _is_time(microseconds: int) -> bool:
 
 
 def _text_kind(head: bytes) -> str:
-    """Name the kind of a text; unknown bytes are no text."""
+    """Name the kind of a text, or say that the bytes are no text."""
     try:
         text = head.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        # A character may be cut at the end of the head.
+        # The last character can be cut at the end of the head.
         if error.start < len(head) - 4:
             return "a file of unknown content"
         text = head[: error.start].decode("utf-8-sig")

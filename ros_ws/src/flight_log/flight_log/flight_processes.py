@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The processes of a flight in a log.
 
-When a process was ready follows from its line on /rosout, how long it lived from its samples.
+A line on /rosout tells when a process was ready, and its samples tell how long it lived.
 """
 
 import re
@@ -20,10 +20,10 @@ from flight_log.named_vectors import typestore
 
 ROSOUT = "/rosout"
 LOG = "rcl_interfaces/msg/Log"
-# The text of the line in CDR: its length with the final zero, and its bytes.
+# The text "ready" in CDR: the length with the final zero, then the bytes.
 READY = b"\x06\x00\x00\x00ready\x00"
 UNNAMED = "a publisher without a name"
-INSTANCE = re.compile(r"(/.+)#\d+")  # node and process id
+INSTANCE = re.compile(r"(/.+)#\d+")  # name of a node, and the id of its process
 
 
 @dataclass(frozen=True, kw_only=True, order=True)
@@ -35,7 +35,7 @@ class SampleSpan:
     samples: int
 
     def joined(self, later: "SampleSpan") -> "SampleSpan":
-        """Join two spans."""
+        """Return the span from the first to the last sample of two spans."""
         return SampleSpan(
             first_ns=min(self.first_ns, later.first_ns),
             last_ns=max(self.last_ns, later.last_ns),
@@ -44,7 +44,7 @@ class SampleSpan:
 
 
 def ready_times(lines: Iterable[bytes]) -> list[tuple[str, int]]:
-    """Return node and system time, ns, of each line "ready" of a flight's nodes, in order."""
+    """Return the node and the system time, ns, of each line "ready", in the order of time."""
     times = []
     for data in lines:
         try:
@@ -64,12 +64,12 @@ def ready_times(lines: Iterable[bytes]) -> list[tuple[str, int]]:
 def flight_processes(
     spans: Mapping[str, SampleSpan], ready: Iterable[tuple[str, int]], namespace: str
 ) -> dict[str, Process]:
-    """Return the processes by name, "/controller#4711", from the `spans` of the publishers.
+    """Return the processes by name, such as "/controller#4711", from the `spans` of publishers.
 
-    A node that was restarted is several processes. A process was ready at the last such time of its
-    node before its first sample. A node without samples, such as the recorder, has no process id,
-    and in lockstep no node has one. Beside nodes of the stack every publisher counts, even `ros2
-    topic pub`, which gives no name.
+    A node that was restarted is several processes. A process was ready at the last time in `ready`
+    at which its node was ready before the first sample of the process. A node without samples, such
+    as the recorder, has no process id in its name, and in lockstep no node has one. If there are
+    nodes of the stack, every other publisher counts, too, even `ros2 topic pub`, which has no name.
     """
     waiting: dict[str, list[int]] = {}
     for node, time_ns in ready:
@@ -108,12 +108,16 @@ def flight_processes(
     }
 
 
-SILENT_NS = NANOSECONDS // 5  # `aircraft.max_age`, after which another publisher is admitted
-SILENT_PERIODS = 3  # the same for a slow publisher
+# silence of a publisher after which the next one is admitted, as `aircraft.max_age`
+SILENT_NS = NANOSECONDS // 5
+SILENT_PERIODS = 3  # the same silence for a slow publisher, in periods of its samples
 
 
 def admitted(signal: Signal) -> Signal:
-    """Keep what the nodes admit: the first publisher, and after a silence the next."""
+    """Keep the samples that the nodes admit.
+
+    They are those of the first publisher, and after a silence of it those of the next.
+    """
     if signal.sender is None:
         return signal
     keep = np.zeros(len(signal.stamp_ns), dtype=np.bool_)
@@ -130,14 +134,15 @@ def admitted(signal: Signal) -> Signal:
     return signal if keep.all() else signal.where(keep)
 
 
-RESTART = 10  # a tick number that falls by more than this belongs to another controller
+RESTART = 10  # if a tick number falls by more than this, another controller has started
 
 
 def controller_starts(number: FloatArray) -> list[int]:
-    """Find where a new controller begins in the numbers of ticks (N,), in order of time.
+    """Find the indices at which a new controller begins, from the numbers of ticks, (N,).
 
-    Two ticks of one instant may be stored in either order, so a number that is a little less, and
-    new to the controller, does not begin a new one.
+    The numbers are in the order of time. Two ticks of one instant can be stored in either order. A
+    number that is a little less than the one before, and that this controller has not had yet,
+    therefore does not begin a new controller.
     """
     starts = []
     first = 0

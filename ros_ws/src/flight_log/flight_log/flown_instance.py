@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the sensor or instance in an autopilot's log with which it flew.
+"""Finds which instance of each message in an autopilot's log the autopilot flew with.
 
 Sources: ArduPilot, AP_Logger/LogStructure.h (ARSP: H healthy, U used, Pri primary; IMU: GH),
 AP_InertialSensor.cpp (INS_USE), AP_Airspeed.cpp (ARSPD_USE); ArduPlane/Log.cpp (CTUN.As: the
@@ -17,22 +17,26 @@ from flight_core.parameters import ParameterError, require
 from flight_log.log_samples import Instances
 from flight_log.vehicle_tables import PLANE, Choice, MessageTable, Parameters
 
-STILL = 0.1  # fraction of the largest motion: an instance with less does not fly
-UNLIKE = 0.4  # fraction of a quantity's deviation by which two sensors of it differ at most
-MOST = 0.5  # fraction of the samples, and of the airspeed of a flight
+STILL = 0.1  # an instance does not fly if it moves less than this fraction of the largest motion
+# Two sensors agree if they differ by at most this fraction of the quantity's standard deviation.
+UNLIKE = 0.4
+# A flag counts as set if it is set in this fraction of the samples. An airspeed counts as that of a
+# flight if it is this fraction of the largest one.
+MOST = 0.5
 AIRSPEEDS = frozenset({"Airspeed", "true_airspeed_m_s"})
-TYPICAL = 90.0  # percentile of an airspeed
-SURFACES = ("vehicle_torque_setpoint", "actuator_controls_0")  # of a VTOL of PX4, by the instance 1
+TYPICAL = 90.0  # percentile that counts as the typical value of an airspeed
+# messages whose instance 1 is that of the surfaces of a VTOL of PX4
+SURFACES = ("vehicle_torque_setpoint", "actuator_controls_0")
 CORES = ("XKF1", "NKF1", "EKF1")
 
 
 def instances_of_flight(
     instances: Instances, fields: Mapping[str, Set[str]], parameters: Parameters, choice: Choice
 ) -> tuple[dict[str, MessageTable], list[tuple[str, str]]]:
-    """Return a table per message, and the choice among several instances with its reason.
+    """Return one table for each message, and each choice among several instances with its reason.
 
-    `fields` are the fields that are read, by message; other messages give their first instance.
-    Raises ParameterError if two unlike instances remain.
+    `fields` has the fields that are read by message. For any other message the first instance is
+    taken. Raises ParameterError if two unlike instances remain.
     """
     for name in choice.instances:
         require(
@@ -95,14 +99,15 @@ def _of_motion(name: str, tables: Mapping[int, MessageTable], fields: Set[str]) 
 
 
 def moving_numbers(motions: Mapping[int, float], least: float = STILL) -> list[int]:
-    """Return the numbers of all motions above a fraction of the largest motion."""
+    """Return the numbers of the instances that move at least a fraction of the largest motion."""
     return [number for number, motion in motions.items() if motion >= least * max(motions.values())]
 
 
 def _motion(table: MessageTable, fields: Set[str]) -> float:
-    """Sum the deviations of the fields, or return the typical value of an airspeed.
+    """Return a measure of the motion that an instance shows.
 
-    A dead sensor has no airspeed.
+    It is the typical value of an airspeed, which is 0 for a dead sensor. For other messages, it is
+    the sum of the standard deviations of the fields.
     """
     for field in fields & AIRSPEEDS & table.fields.keys():
         finite = table.fields[field][np.isfinite(table.fields[field])]
@@ -150,14 +155,15 @@ def _usable_sensors(tables: Mapping[int, MessageTable], parameters: Parameters) 
 
 
 def _share(table: MessageTable, field: str) -> float:
-    """Return the fraction of the samples in which a flag is set; 1 if there is no such flag."""
+    """Return the fraction of the samples in which a flag is set, or 1 if there is no such flag."""
     return float(np.mean(table.fields[field] != 0.0)) if field in table.fields else 1.0
 
 
 def _airspeed(sensors: Mapping[int, MessageTable]) -> tuple[MessageTable, str]:
-    """Take the primary airspeed sensor at every instant at which it is healthy, else one in use.
+    """Return the airspeed of the primary sensor, or else of one that is healthy and in use.
 
-    NaN stands for a sensor that is not healthy.
+    The primary sensor can change in flight. A value is NaN where the sensor is not healthy. The
+    second result says which sensor was taken.
     """
     tables = {number: _healthy(table) for number, table in sensors.items()}
     live = {
@@ -186,9 +192,10 @@ def _airspeed(sensors: Mapping[int, MessageTable]) -> tuple[MessageTable, str]:
 def _reason_against_airspeed(
     sensors: Mapping[int, MessageTable], parameters: Parameters
 ) -> Refusal | None:
-    """Say why the autopilot flew by none of its airspeed sensors, by U and H, else ARSPD_USE.
+    """Return why the autopilot flew by none of its airspeed sensors.
 
-    Returns None if it flew by one, or if the log does not say.
+    The reason comes from the flags U and H. If a log lacks U, ARSPD_USE is taken. Returns None if
+    the autopilot flew by a sensor, or if the log does not tell.
     """
     reasons = []
     for number, table in sorted(sensors.items()):
@@ -206,7 +213,7 @@ def _reason_against_airspeed(
 
 
 def _has_estimate(instances: Instances) -> bool:
-    """Return whether CTUN has an airspeed: the estimate by which ArduPlane flies."""
+    """Return whether CTUN has an airspeed, the estimate by which ArduPlane flies."""
     return any({"As", "Aspd"} & table.fields.keys() for table in instances.get("CTUN", {}).values())
 
 
@@ -218,7 +225,7 @@ def _healthy(table: MessageTable) -> MessageTable:
 
 
 def _primary(tables: Mapping[int, MessageTable]) -> tuple[list[int], MessageTable] | None:
-    """Return the samples of the primary sensor at every instant, and the numbers of the sensors.
+    """Return the numbers of all sensors that were primary, and the samples of the primary one.
 
     Returns None for a log without `Pri`.
     """

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a growing log by `Scan`: a call continues at the end of the last call.
+"""Reads a growing log by `Scan`. Each call continues where the last call ended.
 
-A finished log is read in the same way. A packed log is finished, so `open_log` reads it. A record
-is read once it is whole; a chunk in progress is never read.
+A finished log is read in the same way. A packed log is always finished, so `open_log` reads it. A
+record is read when it is whole, so a chunk in progress is not read yet.
 """
 
 import math
@@ -27,7 +27,7 @@ from flight_log.scan import MessageBatch, Scan
 class Messages(NamedTuple):
     """Messages of a topic in the order of the log."""
 
-    topic: str  # in full
+    topic: str  # full name
     type_name: str
     sent_ns: list[int]
     data: list[bytes]  # CDR
@@ -37,8 +37,9 @@ class Messages(NamedTuple):
 class _Channel:
     topic: str
     type_name: str
-    rate: float  # highest rate that is wanted, Hz; 0 for none, infinite for all messages
-    step: int = 0  # every step-th message is read; 0 until two messages gave their distance
+    # highest rate that is wanted, Hz: 0 for no messages, infinite for all messages
+    rate: float
+    step: int = 0  # every step-th message is read; 0 until two messages have shown their period
     skip: int = 0  # number of messages before the next one that is read
 
     def chosen(self, batch: MessageBatch) -> slice:
@@ -57,10 +58,11 @@ class _Channel:
 
 
 class Follower:
-    """Follows the log of a run: the folder of a bag, with or without a file yet, or an MCAP file.
+    """Follows the log of a run, which is the folder of a bag or an MCAP file.
 
-    `rate_of(topic, type_name)` is the highest wanted rate of the messages of a topic, Hz: infinite
-    for no limit, 0 for no messages. `remaps` are names of the stack by topics of the log.
+    The folder need not have a file yet. `rate_of(topic, type_name)` returns the highest wanted rate
+    of the messages of a topic, Hz. It is infinite for no limit, and 0 for no messages. `remaps` has
+    names of the stack by topic of the log.
     """
 
     def __init__(
@@ -72,28 +74,28 @@ class Follower:
         self.run = run
         self.complete = False  # whether the end of the data has been read
         self.fault = ""  # why no more of the log can be read
-        # Definitions of the message types that have occurred, ros2msg, by name.
+        # Definitions (ros2msg) of the message types that have occurred, by name.
         self.definitions: dict[str, str] = {}
         self._rate_of = rate_of
         self._remaps = remaps
         self._read_files: list[Path] = []
-        self._damaged = 0  # records of these files that could not be read
+        self._damaged = 0  # number of records of these files that could not be read
         self._pending: deque[Messages | Attachment | Metadata] = deque()
         self._begin_file()
 
     def _begin_file(self) -> None:
         self._path: Path | None = None
         self._scan: Scan | None = None
-        self._size = 0  # bytes, at the last look
-        self._identity = (0, 0)  # device and inode of the file, once something of it has been read
+        self._size = 0  # size of the file at the last look, bytes
+        self._identity = (0, 0)  # device and inode of the file, after something has been read
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, _Channel] = {}
-        # Records of a packed file.
+        # records of a packed file that are still to be read
         self._finished: Iterator[object] | None = None
 
     @property
     def path(self) -> Path | None:
-        """Present file; None before the first file.
+        """The file that is being read, or None if there is no file yet.
 
         Raises ParameterError for a folder with several bags.
         """
@@ -124,8 +126,8 @@ class Follower:
     def read(self) -> Iterator[Messages | Attachment | Metadata]:
         """Yield the records since the last call.
 
-        You may stop the iteration; the next call continues. Raises OSError if the file cannot be
-        read, and ParameterError for a folder with several bags.
+        You can stop the iteration, and the next call continues there. Raises OSError if the file
+        cannot be read, and ParameterError for a folder with several bags.
         """
         yield from self._pending_records()
         while not self.fault and (path := self.path) is not None:
@@ -177,12 +179,12 @@ class Follower:
         self._damaged += not self._scan.complete
 
     def _pending_records(self) -> Iterator[Messages | Attachment | Metadata]:
-        """Yield the decoded records; if the caller stops, the next call yields the rest."""
+        """Yield the decoded records. If the caller stops, the next call yields the rest."""
         while self._pending:
             yield self._pending.popleft()
 
     def _take(self, records: Iterable[object]) -> None:
-        """Add what records hold to the pending records."""
+        """Add the content of records to the pending records."""
         for record in records:
             if isinstance(record, MessageBatch):
                 if (channel := self._channels.get(record.channel_id)) and channel.rate > 0.0:

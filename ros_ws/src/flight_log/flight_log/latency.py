@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Latency of the loop from y to u, by the recorded times of sending."""
+"""Latency of the loop from y to u, from the recorded times of sending."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -23,11 +23,11 @@ class Times(NamedTuple):
 
 
 def latency(times: Mapping[str, Sequence[Times]]) -> Signal | None:
-    """Compute the time from the sending of y to the sending of the u with the stamp of y, s.
+    """Compute the time from the sending of y to the sending of the u with the same stamp, s.
 
-    The signal has one channel, by the stamps of u. `times` holds the times by the full names of the
-    topics y and u. Returns None for a log without y or u, with several aircraft, or with equal
-    times, as in a flight in one process.
+    The signal has one channel and the stamps of u. `times` has the times by the full names of the
+    topics y and u. Returns None for a log without y or u or with several aircraft. It also returns
+    None if u has the times of y, as in a flight in one process.
     """
     topics = {topic.rpartition("/")[2]: topic for topic in times}
     if len(times) != len(TOPICS) or len(topics) != len(TOPICS) or not all(times.values()):
@@ -41,7 +41,7 @@ def latency(times: Mapping[str, Sequence[Times]]) -> Signal | None:
 
 
 def _last_of_each(times: Sequence[Times]) -> Times:
-    """Return the times in the order of the stamps; of equal stamps only the last time stays."""
+    """Return the times in the order of the stamps, with only the last time of equal stamps."""
     stamp_ns, sent_ns = (np.concatenate(arrays)[::-1] for arrays in zip(*times, strict=True))
     unique_ns, place = np.unique(stamp_ns, return_index=True)
     return Times(unique_ns, sent_ns[place])

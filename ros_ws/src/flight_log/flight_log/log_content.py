@@ -59,25 +59,27 @@ from flight_log.scan import MessageBatch
 ROUTE = "route"
 
 
-# Messages that are decoded together. With 1024 the memory of each table would be new.
+# Number of messages that are decoded together. With 1024, each table would need fresh memory.
 BATCH = 512
 
 
-LEAST_CLOCK_STEP_NS = NANOSECONDS  # a stamp precedes its sending only by the age of the sample
+# Least difference between a stamp and its time of sending that shows a step of the system clock. In
+# other cases the difference is only the age of the sample.
+LEAST_CLOCK_STEP_NS = NANOSECONDS
 
 
-RESTING = ("u", "internals")  # topics whose stamps may repeat during a failsafe
+RESTING = ("u", "internals")  # topics whose stamps can repeat during a failsafe
 
 
-UNSTAMPED = ("route",)  # plans, which are often published without a stamp
+UNSTAMPED = ("route",)  # topics that are often published without a stamp
 
 
 SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w .()-]{0,99}\.yaml")
-"""Names under which the scenario of a log may be written beside it: neither metadata.yaml nor a
-path to another folder."""
+"""Permitted names of the file into which the scenario of a log is written, in the folder of the
+log. A name must be neither metadata.yaml nor a path to another folder."""
 
 
-MOST_PUBLISHERS = 64  # most publishers of a topic that are counted separately
+MOST_PUBLISHERS = 64  # largest number of publishers of a topic that are counted separately
 
 
 class StoredFile(NamedTuple):
@@ -88,21 +90,21 @@ class StoredFile(NamedTuple):
 
 
 class _Publisher:
-    """Messages of a topic with one sender, up to a batch, and the clock of their stamps."""
+    """The messages of one sender on a topic: those not decoded yet, and counts of all."""
 
     def __init__(self) -> None:
         # Tables of messages of one length, with their log times and the steps of their numbers.
         self.batch: list[tuple[Table, NDArray[np.int64], NDArray[np.int64]]] = []
-        self.batched = 0  # messages
+        self.batched = 0  # number of messages in `batch`
         self.clock = StampClock()
-        self.name: str | None = None  # None without a sample
-        self.zeros = 0  # samples with a zero stamp that `signal` leaves out
-        self.refused = 0  # damaged, or not finite
-        self.kept: Counter[tuple[str, ...]] = Counter()  # samples by their names
+        self.name: str | None = None  # name of the sender, or None before its first sample
+        self.zeros = 0  # number of samples with a zero stamp that `signal` leaves out
+        self.refused = 0  # number of samples that are damaged or not finite
+        self.kept: Counter[tuple[str, ...]] = Counter()  # number of samples by their channels
         self.messages = 0
-        # Least and largest lead of a stamp over the reception; None without a time of it.
+        # least and largest lead of a stamp over its reception, or None if no reception has a time
         self.leads_ns: tuple[int, int] | None = None
-        self._number: int | None = None  # of the last message
+        self._number: int | None = None  # number of the last message
         self._numbered = self._restarted = False
         self._lost = 0
 
@@ -112,7 +114,7 @@ class _Publisher:
         self._lost += int((steps[steps > 1] - 1).sum())
         self._numbered = self._numbered or bool(sequence.any())
         self._number = int(sequence[-1])
-        # A restarted publisher under the same name.
+        # If a number falls, the publisher has restarted under the same name.
         self._restarted = self._restarted or bool(np.any(steps < 0))
         self.messages += len(table)
         self.batch.append((table, log_ns, steps))
@@ -126,36 +128,36 @@ class _Publisher:
             self.leads_ns = min(least, int(leads_ns.min())), max(largest, int(leads_ns.max()))
 
     def has_clock_of(self, other: "_Publisher") -> bool:
-        """Return whether every stamp is by another publisher's clock, as far as the log tells."""
+        """Return whether the log leaves it open that another publisher's clock made every stamp."""
         if self is other or self.leads_ns is None or other.leads_ns is None:
             return True
         (least, largest), (least_of_other, largest_of_other) = self.leads_ns, other.leads_ns
         return least_of_other - LATE_NS <= least and largest <= largest_of_other + LATE_NS
 
     def recording(self) -> Recording:
-        """Return the stamps in the order of the recording."""
+        """Return what the stamps show in the order of the recording."""
         is_counted = self._numbered and not self._restarted
         return self.clock.recording(self.zeros)._replace(lost=self._lost if is_counted else None)
 
 
 class TopicSamples:
-    """Samples of a topic, decoded in batches; those with equal names are the signal.
+    """The samples of a topic, which are decoded in batches. Those with equal names are the signal.
 
-    Clock, numbers and damage are counted for each sender, so that those of a foreign publisher are
-    not blamed on another one.
+    Steps of the clock, lost numbers and damage are counted for each sender, so that those of a
+    foreign publisher are not blamed on another one.
     """
 
     def __init__(self, decode: Decoder, expected: int) -> None:
         self._decode = decode
         self._expected = expected
         self._publishers: dict[bytes, _Publisher] = {}  # by the bytes of their names
-        self._samples: dict[tuple[str, ...], Columns] = {}  # by names
-        self.spans: dict[str, SampleSpan] = {}  # by publisher
+        self._samples: dict[tuple[str, ...], Columns] = {}  # by the names of the channels
+        self.spans: dict[str, SampleSpan] = {}  # by the name of the publisher
 
     def add(self, table: Table, log_ns: NDArray[np.int64], sequence: NDArray[np.int64]) -> None:
-        """Add messages of one length, a row each, with log times and the publisher's numbers."""
+        """Add messages of one length, one in each row, with log times and publisher's numbers."""
         for sender, rows in rows_by_sender(table):
-            # A log with many names is hostile.
+            # A log with very many publishers is hostile.
             known = sender in self._publishers or len(self._publishers) < MOST_PUBLISHERS
             publisher = self._publishers.setdefault(sender if known else b"", _Publisher())
             part = table if rows is None else table[rows]
@@ -231,9 +233,9 @@ class TopicSamples:
         return names, values
 
     def signal(self, name: str) -> Signal | None:
-        """Return the samples of a topic in the order of the stamps; None without a stamped sample.
+        """Return the samples of a topic in the order of the stamps, or None if none has a stamp.
 
-        In RESTING topics, equal stamps may follow one another, so that a stamp of 0 may be flight
+        In RESTING topics, equal stamps can follow one another, so several stamps of 0 can be flight
         time. A plan needs no stamp.
         """
         for publisher in self._publishers.values():
@@ -245,7 +247,7 @@ class TopicSamples:
         columns = self._samples[names]
         signal = columns.signal(tuple(map(printable, names)))
         keep = ~self._unset_zeros(name, signal, columns)
-        # The nodes refuse a stamp far from their clock, and so the publisher of such a sample.
+        # The nodes refuse a stamp far from their clock, so they refuse its publisher.
         most = self._most()
         for publisher in self._publishers.values():
             if publisher.name in columns.senders and not publisher.has_clock_of(most):
@@ -258,7 +260,7 @@ class TopicSamples:
             order = np.argsort(signal.stamp_ns, kind="stable")
             stamps = signal.stamp_ns[order]
             values = signal.values[order]
-            # A part of the log may be there twice.
+            # A span of the log can be there twice.
             again = (np.diff(stamps) == 0) & (np.diff(values, axis=0) == 0.0).all(axis=1)
             keep = np.append(True, ~again)
             sender = None if signal.sender is None else signal.sender[order][keep]
@@ -266,7 +268,10 @@ class TopicSamples:
         return signal
 
     def _unset_zeros(self, name: str, signal: Signal, columns: Columns) -> NDArray[np.bool_]:
-        """Mask the samples whose zero stamp was not set, shape (N,), noted for each sender."""
+        """Return a mask of the samples whose stamp was left at zero, shape (N,).
+
+        Their number is also stored for each publisher.
+        """
         unset = np.zeros(len(signal.stamp_ns), dtype=np.bool_)
         if name in UNSTAMPED or not np.any(signal.stamp_ns == 0):
             return unset
@@ -276,7 +281,7 @@ class TopicSamples:
             zero = stamps == 0
             zeros = int(np.count_nonzero(zero))
             usual = len(stamps) - 1 if name in RESTING else 1
-            # A recorder may take each message twice.
+            # A recorder can store each message twice.
             if zeros > usual:
                 usual = int(np.unique(stamps[~zero], return_counts=True)[1].max(initial=usual))
             if zeros and (zeros > max(usual, 1) or stamps.max() > SINCE_EPOCH_NS):
@@ -291,9 +296,9 @@ class TopicSamples:
         return max(self._publishers.values(), key=lambda publisher: publisher.kept.total())
 
     def _names(self) -> tuple[str, ...]:
-        """Return the names of the samples of the publisher with the most of them.
+        """Return the names of the channels of the publisher with the most samples.
 
-        They are the first ones, or those of the majority if samples have other names too.
+        If its samples have different names, they are the most frequent ones that include the first.
         """
         most = self._most()
         first = next(iter(most.kept))
@@ -302,7 +307,7 @@ class TopicSamples:
         )
 
     def of_flight(self, signal: Signal | None) -> list[_Publisher]:
-        """Return the publishers of the samples that the nodes admit; all if there is no signal."""
+        """Return the publishers whose samples the nodes admit, or all if there is no signal."""
         publishers = [*self._publishers.values()]
         if signal is None or not self._samples:
             return publishers
@@ -312,7 +317,7 @@ class TopicSamples:
         return [publisher for publisher in publishers if publisher.name in names]
 
     def further_publishers(self, signal: Signal | None) -> list[str]:
-        """Name the other publishers, "" for one without a name."""
+        """Return the names of the publishers that are not admitted. A name can be ""."""
         of_flight = self.of_flight(signal)
         return [
             sender[:-1].decode(errors="replace") if publisher.name is None else publisher.name
@@ -321,12 +326,12 @@ class TopicSamples:
         ]
 
     def overlap(self) -> bool:
-        """Return whether publishers with samples sent at the same time."""
+        """Return whether two publishers sent samples at the same time."""
         spans = sorted(self.spans.values())
         return any(before.last_ns >= after.first_ns for before, after in pairwise(spans))
 
     def recording(self, signal: Signal | None = None) -> Recording:
-        """Return the stamps of the flight's publishers as recorded; call `signal` first."""
+        """Return what the stamps of the flight's publishers show. Call `signal` first."""
         recordings = [publisher.recording() for publisher in self.of_flight(signal)]
         if len(recordings) == 1:
             return recordings[0]
@@ -362,19 +367,23 @@ class LogContent:
         self.metadata: dict[str, Mapping[str, str]] = {}
         self.attachments: list[StoredFile] = []
         self.truncated: list[str] = []  # names of the truncated files
-        self.missing: LostPart | None = None  # the files that are not there
+        self.missing: LostPart | None = None  # files that the folder lacks
         self.last_ns = 0  # log time of the last message
         self.known_end_ns = 0  # the latest log time in any index or metadata
-        self.sent = defaultdict[str, list[Times]](list)  # of y and u by full topic name
-        self.texts: list[StoredText] = []  # what the log says in words
-        self.diagnostics: list[bytes] = []  # of /diagnostics: those with an age of u
-        self.times: Times | None = None  # of the last y or u of a chunk
+        # stamps and times of sending of y and u, by full topic name
+        self.sent = defaultdict[str, list[Times]](list)
+        self.texts: list[StoredText] = []  # messages that hold text
+        self.diagnostics: list[bytes] = []  # messages of /diagnostics with an age of u
+        self.times: Times | None = None  # times of the last batch of y or u
         self.kinds: dict[str, str] = {}  # types of all topics, by full name
 
     def reader_of(
         self, topic: str, type_name: str, expected: int
     ) -> Callable[[MessageBatch], None] | None:
-        """Make a receiver of a topic's `expected` messages; None if the topic is unused."""
+        """Return a function that takes the messages of a topic, or None if the topic is unused.
+
+        `expected` is the number of messages in the index.
+        """
         samples = self.samples_of(topic, type_name, expected)
         is_timed = topic.rpartition("/")[2] in TIMED_TOPICS
         if samples is not None:
@@ -406,7 +415,8 @@ class LogContent:
     def _time_of_stamps(self, sent_ns: np.int64) -> int:
         """Convert a time of sending to the clock of the stamps.
 
-        The nodes keep their time if the system clock is set.
+        The two clocks differ if the system clock is set in flight, because the nodes keep their
+        time.
         """
         if self.times is not None:
             nearest = np.argmin(np.abs(self.times.sent_ns - sent_ns))
@@ -416,7 +426,7 @@ class LogContent:
         return int(sent_ns)
 
     def samples_of(self, topic: str, type_name: str, expected: int = 0) -> TopicSamples | None:
-        """Return the samples of a topic; None for a type without named vectors or waypoints."""
+        """Return the samples of a topic, or None if its type has no named vectors or waypoints."""
         is_route = topic.rpartition("/")[2] == ROUTE and type_name == PATH
         if (
             topic not in self.topics
@@ -439,13 +449,19 @@ class LogContent:
                 self.attachments.append(StoredFile(name, record.data))
 
     def truncated_at(self, end: float | None) -> list[LostPart]:
-        """Return the lost ends; `end` is the flight time of the last sample, s, or None."""
+        """Return the lost ends of files.
+
+        `end` is the flight time of the last sample, s, or None if there is no sample.
+        """
         where = "" if end is None else f", t = {end:.3f} s"
         text = f"is truncated: read up to its last complete chunk{where}"
         return [LostPart(sentence=f"{name} {text}", is_end=True) for name in self.truncated]
 
     def notes_at(self, end: float | None) -> list[str]:
-        """Return the notes; `end` is the flight time of the last sample, s, or None."""
+        """Return the notes about the log.
+
+        `end` is the flight time of the last sample, s, or None if there is no sample.
+        """
         missing = seconds(self.known_end_ns - self.last_ns)
         more = f"; {missing:.3f} s are missing after it" if missing > 0 and self.last_ns else ""
         truncated = [f"{lost.sentence}{more}" for lost in self.truncated_at(end)]
@@ -465,7 +481,10 @@ class LogContent:
 
 
 def read_content(run: Path, remaps: Mapping[str, str]) -> LogContent:
-    """Read every file of a bag; `remaps` by full names. Raises ParameterError."""
+    """Read every file of a bag.
+
+    `remaps` has full names of the stack by topic of the log. Raises ParameterError.
+    """
     log = LogContent(remaps)
     files = log_files(run)
     if is_folder(run):
@@ -477,7 +496,7 @@ def read_content(run: Path, remaps: Mapping[str, str]) -> LogContent:
 
 
 def _add_metadata(folder: Path, log: LogContent) -> None:
-    """Add what metadata.yaml says of a bag.
+    """Add what metadata.yaml tells about a bag.
 
     If the file cannot be read, a note names the repair command.
     """
@@ -532,7 +551,7 @@ def _read_file(file: Path, log: LogContent) -> None:
         raise ParameterError(
             f"{file}: cannot be read ({error.strerror}), expected {A_RUN}"
         ) from None
-    # Put what the file says of the whole log into its notes.
+    # Note what this file tells about the whole log.
     if first_ns < before_ns - NANOSECONDS and file.parent.name != ROSBAG2:
         log.notes.append(
             f"{file.name} begins before the end of the part before: the parts are out of order, "

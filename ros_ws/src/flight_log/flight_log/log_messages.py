@@ -20,17 +20,20 @@ WARN = 30  # level of rcl_interfaces/msg/Log
 CONTROL = "control"  # name of the node that carries out the requests of a page
 PARAMETER = "parameter"
 MAX_TEXT = 400  # characters of a text from the log
-CUT = " ..."  # end of a longer text
-LAST_NS = 3 * NANOSECONDS  # end of a log: a node that waits says so every 2 s
-MAX_VALUES = 16  # most values of a parameter that are shown: one per channel, but not a matrix
+CUT = " ..."  # mark at the end of a longer text
+# length of the end of a log in which last words count: a node that waits says so every 2 s
+LAST_NS = 3 * NANOSECONDS
+# largest number of values of a parameter that are shown: one for each channel, but not a matrix
+MAX_VALUES = 16
 
 
 @dataclass(frozen=True, kw_only=True)
 class LogMessage:
-    """A message of a flight. `stamp_ns` is as in the samples, or by the clock of the host.
+    """A message of a flight, for the user.
 
-    `kind` is "warning", "error", "control", "parameter", "learning" or "bridge"; on the live page
-    also "mode" or "route". For a parameter, `namespace` is that of its node.
+    `stamp_ns` is by the clock of the samples, or by that of the host. `kind` is "warning", "error",
+    "control", "parameter", "learning" or "bridge", and on the live page also "mode" or "route". If
+    the message is about a parameter, `namespace` is the namespace of its node.
     """
 
     stamp_ns: int
@@ -41,16 +44,16 @@ class LogMessage:
 
 @dataclass(frozen=True, kw_only=True)
 class StoredText:
-    """A message that may be a LogMessage, as stored."""
+    """A stored message that can become a LogMessage."""
 
-    topic: str  # in full
+    topic: str  # full name
     type_name: str
     sent_ns: int
     data: bytes
 
 
 def holds_texts(topic: str, type_name: str) -> bool:
-    """Return whether the messages of a topic may be LogMessages."""
+    """Return whether the messages of a topic can become LogMessages."""
     return (
         (topic, type_name) in {(ROSOUT, LOG), (PARAMETER_EVENTS, PARAMETER_EVENT)}
         or (topic.endswith(f"/{LEARNING}") and type_name == DIAGNOSTIC_ARRAY)
@@ -61,9 +64,10 @@ def holds_texts(topic: str, type_name: str) -> bool:
 def log_message(
     message: Any, type_name: str, sent_ns: int, *, has_begun: bool = True
 ) -> LogMessage | None:
-    """Turn a decoded message into a LogMessage; None for information and empty messages.
+    """Return a decoded message as a LogMessage, or None for mere information or an empty message.
 
-    Before the first sample, with `has_begun` False, starting nodes still declare parameters.
+    Set `has_begun` to False before the first sample. New parameters are then no changes, because
+    starting nodes still declare them.
     """
     if type_name == LOG:
         if message.level >= WARN:
@@ -91,7 +95,10 @@ def log_message(
 
 
 def log_messages(texts: Iterable[StoredText], namespace: str, first_ns: int) -> list[LogMessage]:
-    """Return the messages of an aircraft in a log by stamp; `first_ns` is its first sample's."""
+    """Return the messages of an aircraft in a log, in the order of their stamps.
+
+    `first_ns` is the stamp of the first sample of the aircraft.
+    """
     messages = []
     for stored in texts:
         is_shared = stored.topic in {ROSOUT, PARAMETER_EVENTS}

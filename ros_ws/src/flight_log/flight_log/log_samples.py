@@ -12,15 +12,14 @@ from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
 from flight_log.vehicle_tables import PARAMETER, MessageTable, ParameterRecord, Parameters
 
-LARGEST = 2**62  # ns; a larger stamp is damaged
-# ns. An autopilot whose clock goes back by more has started again; a link may be lost.
-STEP_NS = NANOSECONDS
-LOST_NS = 60 * NANOSECONDS
-AGREEING = 5  # samples that must agree on another time before it counts as that of the clock
+LARGEST = 2**62  # largest stamp that is not damaged, ns
+STEP_NS = NANOSECONDS  # if the clock goes back by more, ns, the autopilot has started again
+LOST_NS = 60 * NANOSECONDS  # longest gap between samples that agree, as a link can be lost, ns
+AGREEING = 5  # number of samples that must agree on another time before it counts as true
 
 Sample = tuple[tuple[str, int], int, Any]
-"""Name and instance, stamp in ns and content of a message; the content of a PARAMETER is a name and
-a value."""
+"""Name and instance, stamp in ns and content of a message. If the message is a PARAMETER, the
+content is a name and a value."""
 
 Instances = dict[str, dict[int, MessageTable]]
 """The tables of the messages, by name and by the number of the instance."""
@@ -33,17 +32,16 @@ def tables_of(
 ) -> tuple[Instances, Parameters, str]:
     """Return the messages as tables, the parameters, and a sentence on what was left out.
 
-    A field that the first message lacks is absent.
-
-    If the clock goes back by more than STEP_NS, as when an autopilot starts again, only the longest
-    part counts. A stamp is damaged, and its sample is left out, if fewer than AGREEING samples in a
-    row agree with it. A parameter belongs to the part of the next sample, because an autopilot that
-    starts writes its parameters first.
+    If the first message of a table lacks a field, the table lacks it, too. If the clock goes back
+    by more than STEP_NS, as when an autopilot starts again, a new part begins, and only the longest
+    part counts. If fewer than AGREEING samples in a row agree with a stamp, the stamp is damaged,
+    and its sample is left out. A parameter belongs to the part of the next sample, because an
+    autopilot writes its parameters first when it starts.
     """
     parts = [list[Sample]()]
     newest_ns = 0
-    strays: list[Sample] = []  # the samples before, near each other and not near those of the part
-    settings = [list[Sample]()]  # by part
+    strays: list[Sample] = []  # last samples, which agree with each other but not with the part
+    settings = [list[Sample]()]  # the parameters of each part
     next_settings: list[Sample] = []
     for sample in samples:
         if sample[0] == SETTING:
@@ -116,7 +114,10 @@ def is_number(value: object) -> bool:
 
 
 def near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Mask the stamps near the median of the five around them; a damaged stamp is not near."""
+    """Return a mask of the stamps near the median of the five around them.
+
+    A damaged stamp is not near.
+    """
     if len(stamp_ns) <= 2:
         return np.ones(len(stamp_ns), dtype=bool)
     fives = np.lib.stride_tricks.sliding_window_view(np.pad(stamp_ns, 2, mode="reflect"), 5)
@@ -125,6 +126,6 @@ def near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def table_of(stamp_ns: NDArray[np.int64], fields: Mapping[str, FloatArray]) -> MessageTable:
-    """Make a table in the order of its stamps, without samples of a repeated stamp."""
+    """Make a table in the order of its stamps, with the first sample of each repeated stamp."""
     stamps, places = np.unique(stamp_ns, return_index=True)
     return MessageTable(stamps, {name: values[places] for name, values in fields.items()})

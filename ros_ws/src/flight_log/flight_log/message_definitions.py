@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Message definitions for MCAP and rosbag2: of the installed packages, or else of rosbags.
+"""Message definitions for MCAP and rosbag2, from the installed packages or else from rosbags.
 
 No ROS is needed at run time.
 """
@@ -27,11 +27,11 @@ class MessageDefinition(NamedTuple):
 def definition(name: str) -> MessageDefinition:
     """Return the definition of "pkg/msg/Type".
 
-    The text is the main definition, then for each referenced type a line of 80 "=", "MSG: pkg/Type"
-    and its definition (MCAP registry, schema encoding ros2msg). The hash is that of REP 2016, read
-    from the JSON of the package. rosbags knows the common types of ROS 2 Jazzy, with the same
-    fields and the same hash, but without comments. Raises ParameterError if neither an installed
-    package nor rosbags has the type.
+    The text is the main definition. For each referenced type, a line of 80 "=", a line "MSG:
+    pkg/Type" and its definition follow (MCAP registry, schema encoding ros2msg). The hash by REP
+    2016 comes from the JSON of the package. rosbags has the common types of ROS 2 Jazzy with the
+    same fields and the same hash, but without comments. Raises ParameterError if neither an
+    installed package nor rosbags has the type.
     """
     try:
         description = json.loads(read_definition(name, "json"))

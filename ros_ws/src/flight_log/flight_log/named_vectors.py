@@ -33,15 +33,15 @@ JOINT_STATE_TYPES = {
 
 PATH = "nav_msgs/msg/Path"
 WAYPOINT = ("number", "north", "east", "altitude")
-"""Channels of a sample of a route: the number of the waypoint in its message, and m."""
+"""Channels of a waypoint of a route: its number in the message, and its position, m."""
 
 STAMP = slice(4, 12)  # int32 seconds and uint32 nanoseconds, after the 4 bytes of the encapsulation
-SENDER_PLACE = STAMP.stop + 4  # of header.frame_id, behind its length
-# plain CDR, by the first two bytes
+SENDER_PLACE = STAMP.stop + 4  # place of header.frame_id, after the 4 bytes of its length
+# byte order of plain CDR, by the first two bytes of a message
 BYTE_ORDERS: Mapping[bytes, Literal["big", "little"]] = MappingProxyType(
     {b"\x00\x00": "big", b"\x00\x01": "little"}
 )
-MAX_FLIGHT_TIME = 1e9  # s; a larger value is not a flight time
+MAX_FLIGHT_TIME = 1e9  # largest value that counts as a flight time, s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ class Samples:
     names: tuple[str, ...]
     stamp_ns: NDArray[np.int64]  # (N,), the instant of each sample
     values: FloatArray  # (N, k)
-    sender: str = ""  # the publisher's instance
+    sender: str = ""  # name of the publisher with its process, as "/controller#4711"
 
 
 class Decoded(NamedTuple):
@@ -61,7 +61,7 @@ class Decoded(NamedTuple):
     """
 
     samples: list[Samples]
-    unreadable: int
+    unreadable: int  # number of messages that could not be decoded
 
 
 Table = NDArray[np.uint8]
@@ -72,7 +72,7 @@ Decoder = Callable[[Table], Decoded]
 
 @cache
 def typestore() -> Typestore:
-    """Return the message types of ROS 2 Jazzy, made once, because loading takes 70 ms."""
+    """Return the message types of ROS 2 Jazzy. They are loaded once, because this takes 70 ms."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -87,14 +87,14 @@ def joint_state_types() -> Typestore:
 
 
 def full_name(type_name: str) -> str:
-    """Return the full name of a message type, "pkg/msg/Type", also for the short "pkg/Type"."""
+    """Return the full name "pkg/msg/Type" of a message type, given this or the short "pkg/Type"."""
     return type_name.replace("/", "/msg/") if type_name.count("/") == 1 else type_name
 
 
 def decoder(type_name: str) -> Decoder | None:
-    """Return a decoder from messages of a type to named vectors; None if the type has none.
+    """Return a decoder of a message type, or None if its messages are no named vectors.
 
-    A decoder serves one topic. A call takes several messages in their order.
+    Use one decoder for each topic. A call takes several messages in their order.
     """
     return _JointStateDecoder() if type_name == JOINT_STATE else None
 
@@ -122,9 +122,10 @@ def stamps_of(table: Table) -> NDArray[np.int64]:
 
 
 def rows_by_sender(table: Table) -> list[tuple[bytes, NDArray[np.int64] | None]]:
-    """List the senders in the headers of messages, as bytes, with their rows; None for all rows.
+    """List the senders in the headers of messages, as bytes, each with its rows.
 
-    A message without a header in plain CDR has the sender b"".
+    If all rows have one sender, its rows are None. A message without a header in plain CDR has the
+    sender b"".
     """
     count = len(table)
     first = _sender(table[0])
@@ -152,9 +153,9 @@ def _sender(row: NDArray[np.uint8]) -> bytes:
 
 
 def flight_start_ns(stamp_ns: int, t: float) -> int | None:
-    """Return the stamp of flight time 0, from a sample of `truth` with t in s: stamp - t.
+    """Return the stamp of flight time 0, ns, which is the stamp minus t of a sample of `truth`.
 
-    Returns None if t is not a flight time.
+    t is in s. Returns None if t is not a flight time.
     """
     return stamp_ns - nanoseconds(t) if abs(t) <= MAX_FLIGHT_TIME else None
 
@@ -198,7 +199,7 @@ def _position(message: bytes, marks: FloatArray) -> slice:
 def decode_routes(table: Table) -> Decoded:
     """Decode routes of nav_msgs/Path in the frame map (east, north, up).
 
-    A waypoint becomes a sample with the channels WAYPOINT.
+    Each waypoint becomes a sample with the channels WAYPOINT.
     """
     samples = []
     unreadable = 0
@@ -218,7 +219,7 @@ def decode_routes(table: Table) -> Decoded:
 
 
 class _JointStateDecoder:
-    """sensor_msgs/JointState with names and positions."""
+    """A decoder of sensor_msgs/JointState with names and positions."""
 
     def __init__(self) -> None:
         self._store = joint_state_types()
@@ -267,7 +268,7 @@ class _JointStateDecoder:
         return Decoded(samples, unreadable)
 
     def _same_layout(self, table: Table) -> NDArray[np.bool_]:
-        """Mask the messages with the learnt layout."""
+        """Return a mask of the messages that have the learnt layout."""
         if not self._names or table.shape[1] != self._template.nbytes:
             return np.zeros(len(table), dtype=np.bool_)
         different = table.view("<u4") ^ self._template
@@ -277,7 +278,8 @@ class _JointStateDecoder:
     def _learn(self, message: bytes) -> None:
         """Learn the byte layout of a message.
 
-        Marked values are serialised with the same strings. The marks are then where the values are.
+        Marks in place of the values are serialised with the same strings. Where the marks are in
+        the result, the values are in the message.
         """
         try:
             vector: Any = self._store.deserialize_cdr(message, JOINT_STATE)

@@ -44,18 +44,18 @@ from flight_log.scan import MAX_CHUNK_BYTES, MessageBatch, Scan
 
 A_RUN = "the folder of a run or an MCAP file"
 ROSBAG2 = "rosbag2"
-"""Folder inside the folder of a run with the bag of `ros2 bag record`, if that recorded the flight.
-A log beside it has the attachments."""
+"""Folder in the folder of a run with the bag of `ros2 bag record`, if this program recorded the
+flight. The log in the folder of the run then has only the attachments."""
 
-NAMED = 5  # most files, folders or topics that a sentence names
+NAMED = 5  # largest number of files, folders or topics that a sentence names
 COPY_BYTES = 1 << 20
 UNPACK = {".zst": "zstd -d", ".zstd": "zstd -d", ".lz4": "lz4 -d"}
 
 
 def log_files(run: Path) -> list[Path]:
-    """List the files of a log in the order of recording; those of the folder ROSBAG2 come last.
+    """List the files of a log in the order of recording, with those in ROSBAG2 last.
 
-    Raises ParameterError for a path without a log, in a sentence that names what is there.
+    If the path has no log, raises ParameterError with a sentence on what is there.
     """
     files = [*bag_files(run), *(bag_files(run / ROSBAG2) if is_folder(run / ROSBAG2) else ())]
     kinds = [file_kind(file) for file in files]
@@ -111,8 +111,8 @@ def _some(names: Sequence[str]) -> str:
 def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list[str]:
     """Name the files of a bag that metadata.yaml lists but the folder lacks.
 
-    Without metadata.yaml they are those of the numbers from 0, where rosbag2 begins, to the last.
-    Renamed files are compared by number.
+    If there is no metadata.yaml, the bag should have every number from 0, where rosbag2 begins, to
+    the last number in the folder. Renamed files are compared by number.
     """
     paths = information.get("relative_file_paths")
     file_names = [Path(str(path)).name for path in paths] if isinstance(paths, list) else []
@@ -148,9 +148,9 @@ def open_scan(file: Path) -> Iterator[Scan]:
 
 
 def _unpack(file: Path, plain: Path, kind: str) -> None:
-    """Write the content of a packed file; for a truncated file, its beginning.
+    """Write the content of a packed file.
 
-    Raises ParameterError.
+    If the file is truncated, only the beginning is written. Raises ParameterError.
     """
     limit = shutil.disk_usage(plain.parent).free // 2
     open_packed: Any = lz4.frame.open if kind == LZ4 else zstandard.open
@@ -203,10 +203,10 @@ def log_topics(run: Path, remaps: Mapping[str, str] = {}) -> dict[str, str]:
 
 
 def plain_message(data: bytes) -> bytes:
-    """Return a message that `ros2 bag record` may have compressed, without the compression.
+    """Return a message without the compression of `ros2 bag record`, if it has any.
 
-    A compressed message begins as no CDR does. A damaged message stays as it is, since no decoder
-    takes it.
+    No message in CDR begins like a compressed one. A damaged message stays as it is, because no
+    decoder accepts it.
     """
     if data[:4] != ZSTD_MAGIC:
         return data
@@ -219,7 +219,10 @@ def plain_message(data: bytes) -> bytes:
 
 
 def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
-    """Decompress the messages of a batch as `plain_message` does; their lengths may then differ."""
+    """Decompress the messages of a batch as `plain_message` does.
+
+    Afterwards their lengths can differ, so they come in batches of equal length.
+    """
     if not len(batch.data) or batch.data[0, :4].tobytes() != ZSTD_MAGIC:
         yield batch
         return
@@ -237,7 +240,7 @@ def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
 
 
 def require_mcap(file: Path) -> None:
-    """Refuse a file that is no MCAP file, by its kind; an empty file passes."""
+    """Refuse a file that is no MCAP file, and name its kind. An empty file passes."""
     kind = file_kind(file)
     if kind in PACKED and file.name.endswith(PACKED_SUFFIXES):
         kind += f", which {UNPACK[file.suffix]} unpacks"

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Playback schedule of a log: the messages and the times to send them.
 
-It needs no ROS; `flight_bringup.player` sends.
+It needs no ROS. `flight_bringup.player` sends the messages.
 """
 
 import re
@@ -24,15 +24,15 @@ from flight_log.tape_reader import A_FLIGHT, chosen_namespace, names_within, top
 CLOCK = "/clock"  # never played: the player publishes its own clock
 
 SHARED = ("/diagnostics", "/parameter_events", "/rosout")
-"""Topics on which every node of a domain may publish. They are played only by name."""
+"""Topics on which every node of a domain can publish. They are played only if they are named."""
 
-# most messages of a latched topic; a lockstep flight keeps 20,000, which is no latch
+# largest depth of a latched topic; a lockstep flight keeps 20,000 messages, which is no latch
 MAX_LATCHED = 100
 # A stamp further than a day from the host's clock is flight time, as in lockstep.
 MAX_CLOCK_OFFSET_NS = 86_400 * NANOSECONDS
 NO_FIELD = re.compile(r"\s*(#|$|\S+\s+\w+\s*=)")  # a comment, an empty line, a constant
 STAMPED = re.compile(r"\s*((std_msgs(/|::)(msg::)?)?Header|builtin_interfaces(/|::)(msg::)?Time)\s")
-IDL_STRUCT = re.compile(r"\bstruct\s+\w+\s*\{")  # the first is the type itself
+IDL_STRUCT = re.compile(r"\bstruct\s+\w+\s*\{")  # the first match is the type itself
 
 
 class ScheduledMessage(NamedTuple):
@@ -50,7 +50,8 @@ class Playback(NamedTuple):
     types: Mapping[str, str]  # type names by full topic name
     messages: Sequence[ScheduledMessage]
     start_ns: int  # the instant of flight time 0
-    skipped: Mapping[str, str]  # by full topic name the encoding, which no ROS topic has
+    # kind of the messages that no ROS topic can have, by full topic name
+    skipped: Mapping[str, str]
 
     def t(self, due_ns: int) -> float:
         """Return the flight time of an instant, s."""
@@ -60,14 +61,14 @@ class Playback(NamedTuple):
 def read_playback(
     run: Path, topics: Sequence[str] = (), start: float = 0.0, namespace: str | None = None
 ) -> Playback:
-    """Read the messages of a log from flight time `start` in s.
+    """Read the messages of a log from the flight time `start`, s.
 
-    `topics` are full or last names; if they are empty, every topic except SHARED is played.
-    `namespace` selects an aircraft; None plays every aircraft. Topics without CDR, such as with
-    JSON, are skipped.
+    `topics` are full names or their last parts. If there are none, every topic except SHARED is
+    played. `namespace` selects an aircraft. If it is None, every aircraft is played. Topics in an
+    encoding other than CDR, such as JSON, are skipped.
 
     A message is due at its time of sending. In the log of a lockstep flight the host's clock has no
-    meaning, so a message is due at its stamp, but not before the messages sent earlier. Raises
+    meaning, so a message is due at its stamp, but not before messages that were sent before. Raises
     ParameterError if the log cannot be read, lacks a topic or the namespace, or ends before the
     start.
     """
@@ -165,7 +166,7 @@ def _latched(
 
 
 def latched_depth(qos: str) -> int:
-    """Return the number of messages for a late subscriber; 0 for a volatile topic.
+    """Return how many messages a topic keeps for a late subscriber, which is 0 if it is volatile.
 
     `qos` is the YAML list of the offered profiles of rosbag2.
     """
@@ -183,14 +184,14 @@ def latched_depth(qos: str) -> int:
 
 
 def _unsendable_kind(message: StoredMessage) -> str | None:
-    """Name the kind of a message that no ROS topic can have; None for a message of a ROS topic."""
+    """Name the kind of a message that no ROS topic can have, or return None for any other."""
     if message.encoding != "cdr":
         return f"{message.type_name} in {message.encoding}".strip()
     return None if message.type_name else "no type"
 
 
 def _definition(message: StoredMessage) -> str:
-    """Return the definition of a type as text: of the installed package, or else of the log."""
+    """Return the definition of a message's type, from the installed package or else the log."""
     try:
         return definition(message.type_name).text
     except ParameterError:

@@ -41,8 +41,8 @@ STACK = (
     "rise_di",
     "rise_di_controller",
 )
-# The dependencies that affect the numbers and the bytes of a flight; the middleware by the names of
-# its wheels.
+# The dependencies that affect the numbers and the bytes of a flight. The middleware has the names
+# of its wheels.
 DEPENDENCIES = (
     "jsbsim",
     "mcap",
@@ -61,7 +61,7 @@ GIT_TIMEOUT = 5.0  # s
 
 
 def provenance() -> dict[str, dict[str, str]]:
-    """Return the provenance of this process now; what cannot be determined is left out."""
+    """Return the provenance of this process now, without what cannot be determined."""
     return {
         FLIGHT: {
             "start": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -74,7 +74,7 @@ def provenance() -> dict[str, dict[str, str]]:
 
 
 def recorded_arithmetic(metadata: Mapping[str, Mapping[str, str]]) -> str:
-    """Return the arithmetic of u in a log, or that of this version if the log has none."""
+    """Return the version of the arithmetic in a log, or the present one if the log has none."""
     return metadata.get(VERSIONS, {}).get("arithmetic", ARITHMETIC)
 
 
@@ -97,7 +97,7 @@ def versions() -> dict[str, str]:
 def revision(source: Path) -> dict[str, str]:
     """Return the git commit of a source file, and `dirty`, "true" if a tracked file was changed.
 
-    The result is empty without a commit.
+    The result is empty if the file is in no commit.
     """
     git = shutil.which("git")
     if git is None:

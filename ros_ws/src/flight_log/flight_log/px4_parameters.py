@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The loop of the body rates of PX4 from its parameters: rate, and delay by the gyro's filters.
+"""Rate of PX4's body-rate loop, and delay of the gyro's filters, from the parameters of PX4.
 
 Sources: PX4 guide, "MC Filter Tuning and Control Latency", and parameter reference; the parameter
 file of QGroundControl: vehicle, component, name, value, type.
@@ -31,23 +31,24 @@ DEFAULTS: Mapping[str, float] = MappingProxyType(
 
 EXPECTED = "a parameter file of QGroundControl, or a ULog"
 COLUMNS = 5  # columns of a row of a parameter file
-LIKE_PART = 1.05  # of the rate of the law; a faster gyro is interpolated (rise_di_rates.c)
+# if the gyro is faster than the law by more than this factor, it is interpolated (rise_di_rates.c)
+LIKE_PART = 1.05
 
 
 class RateLoop(NamedTuple):
     """The timing of a law inside PX4."""
 
-    rate: float  # of the law, Hz
-    delay: float  # from the rates to the torque, s
-    filters: float  # s, part that the gyro's filters cause
-    origin: str  # what they come from
+    rate: float  # rate of the law, Hz
+    delay: float  # delay from the rates to the torque, s
+    filters: float  # part of this delay that the gyro's filters cause, s
+    origin: str  # the file and the settings that these numbers come from
 
 
 def rate_loop(path: Path, rate: float | None = None, logged: float = 0.0) -> RateLoop:
-    """Return the loop for a law at a rate, by default at that of the gyro.
+    """Return the loop for a law at a rate, which is by default the rate of the gyro.
 
-    The gyro has IMU_GYRO_RATEMAX, or the lower rate at which its samples were `logged`, Hz, unless
-    they were too rare for the law.
+    The rate of the gyro is IMU_GYRO_RATEMAX. If its samples were `logged` at a lower rate, Hz, that
+    is still enough for the law, this lower rate counts.
 
         delay = 1 / (sqrt(2) pi f) + sum_k b_k / (2 pi f_k^2) + 1 / rate + wait
 

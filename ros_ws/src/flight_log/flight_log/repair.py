@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Repairs a truncated or damaged bag, such as a killed recorder leaves behind.
+"""Repairs a truncated or damaged bag, which a killed recorder leaves behind.
 
 Every rosbag2 reader accepts the result. It needs no ROS.
 """
@@ -33,7 +33,7 @@ from flight_log.scan import Scan
 
 
 class FileRepair(NamedTuple):
-    """The result for a file."""
+    """The result of a repair for one file."""
 
     path: Path
     messages: int  # messages in the file now
@@ -44,7 +44,7 @@ class FileRepair(NamedTuple):
 
 
 class Repair(NamedTuple):
-    """The result for a bag."""
+    """The result of a repair for a bag."""
 
     files: tuple[FileRepair, ...]
     wrote_metadata: bool
@@ -56,11 +56,11 @@ def repair(run: Path) -> Repair:
     """Rebuild the damaged files in the folder of a bag, and metadata.yaml.
 
     A damaged file is truncated or has damaged parts. A rebuilt file holds every readable record and
-    has an index. It replaces the damaged file atomically, which stays as *.damaged. An intact bag
-    does not change. metadata.yaml keeps the names of missing files. If you name a single file of a
-    bag, only that file is repaired, not metadata.yaml. Raises ParameterError without a bag, while a
-    recorder writes the bag, for a bag without a readable message, for a metadata.yaml of another
-    program, and for a folder that cannot be written.
+    has an index. It replaces the damaged file atomically, and the damaged file stays as *.damaged.
+    An intact bag does not change. metadata.yaml keeps the names of missing files. If you name a
+    single file of a bag, only this file is repaired, but not metadata.yaml. Raises ParameterError
+    if there is no bag, if a recorder still writes it, if no message can be read, if metadata.yaml
+    is of another program, or if the folder cannot be written.
     """
     # `log_files` says what is there.
     files = bag_files(run) or log_files(run)
@@ -98,10 +98,10 @@ def repair(run: Path) -> Repair:
 
 
 def _previous_metadata(path: Path) -> tuple[Mapping[str, Any], int]:
-    """Return the content of metadata.yaml and the log time of the last message.
+    """Return the content of metadata.yaml and the log time of the last message, ns.
 
-    They are empty and 0 for a missing or damaged file. Raises ParameterError for a file of another
-    program, which must not be replaced.
+    If the file is missing or damaged, they are an empty mapping and 0. Raises ParameterError for a
+    file of another program, which must not be replaced.
     """
     try:
         return read_bag_metadata(path.parent)
@@ -203,9 +203,9 @@ class _FileScan:
         )
 
     def _copy(self, writer: Writer) -> None:
-        """Copy the records, schemas and channels first.
+        """Copy the readable records, with the schemas and channels first.
 
-        The index also knows the channels of a damaged chunk.
+        All channels are copied, because the index has those of a damaged chunk, too.
         """
         writer.start(profile="ros2", library="rise-di repair")
         schemas = {
@@ -243,10 +243,10 @@ class _FileScan:
 def _keep_damaged(path: Path) -> Path:
     """Give the damaged file a second name, which stays after the replacement.
 
-    On a file system without hard links it is a copy.
+    On a file system without hard links, a copy gets this name.
     """
     number = 1
-    # A link to nothing also has the name.
+    # `lexists` is also true for a link to nothing, whose name is taken as well.
     while os.path.lexists(
         damaged := path.with_name(f"{path.name}.damaged{f'-{number}' if number > 1 else ''}")
     ):

@@ -16,7 +16,7 @@ from flight_core.parameters import ParameterError, require
 
 ROSBAG2_VERSION = 9
 METADATA = "metadata.yaml"
-INFORMATION = "rosbag2_bagfile_information"  # the only key in it
+INFORMATION = "rosbag2_bagfile_information"  # the only key at the top of metadata.yaml
 
 
 class TopicCount(NamedTuple):
@@ -58,16 +58,17 @@ def plain_name(name: str) -> str:
 
 
 def part_number(name: str) -> int | None:
-    """Return the number of a file in a bag; None if it has none."""
+    """Return the number of a file in a bag, or None if its name has no number."""
     number = re.search(r"_(\d{1,9})$", Path(plain_name(name)).stem)
     return None if number is None else int(number[1])
 
 
 def bag_files(run: Path) -> list[Path]:
-    """List the files of a bag in the order of their numbers; empty if there are none.
+    """List the files of a bag in the order of their numbers.
 
-    If the path is a file, it is that file itself. A file that is unpacked beside its packed file
-    replaces it. Raises ParameterError if the files in the folder are not parts of a single bag.
+    If the path is a file, the list has only this file. If a file is there both packed and unpacked,
+    the list has the unpacked one. Raises ParameterError if the files in the folder are not parts of
+    a single bag.
     """
     if is_file(run):
         return [run]
@@ -163,7 +164,7 @@ def bag_metadata_yaml(
 
 
 def _order(name: str) -> tuple[int, str]:
-    """Return the key that sorts the files of a bag by number: _2 before _10."""
+    """Return the key that sorts the files of a bag by number, so that _2 is before _10."""
     return len(plain_name(name)), name
 
 
@@ -179,7 +180,7 @@ def _entries(information: Mapping[str, Any], names: Sequence[str]) -> list[dict[
 
 
 def _profiles(qos: str) -> list[Any]:
-    """Return the offered profiles in a channel's metadata; empty if they are no YAML list."""
+    """Return the offered profiles in a channel's metadata, or [] if they are no YAML list."""
     try:
         profiles = parse_yaml(qos, "qos", "a list")
     except ParameterError:
