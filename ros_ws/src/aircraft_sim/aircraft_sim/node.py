@@ -190,9 +190,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
             self._ages_of_u.append(now_ns - sample.stamp_ns)
 
     def _max_u_age_ns(self) -> int:
-        """Return the age limit of a u by its stamp, that of the y it was computed from.
+        """Return the age limit of a u by its stamp, which is the stamp of the y it came from.
 
-        The middleware of a controller that was stopped sends the last u when the process continues.
+        The limit is needed because the middleware of a controller that was stopped sends the last u
+        when the process continues.
         """
         return self._max_age_ns + nanoseconds(self.parameters.sensors.delay)
 
@@ -203,7 +204,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
     def _timeouts_ns(self) -> tuple[int, int]:
         """Return the timeouts of the publisher of u.
 
-        Another node may take over once u has reached trim.
+        Another node can take over after u has reached trim.
         """
         return self._max_age_ns, self._max_age_ns + nanoseconds(
             self.parameters.hold + self.parameters.ramp

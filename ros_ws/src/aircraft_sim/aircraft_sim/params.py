@@ -70,14 +70,14 @@ from flight_core.parameters import (
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray
 
-SHORTEST_STEP = 1e-5  # s: 100,000 integrations for a second of flight, which take about 5 s
+SHORTEST_STEP = 1e-5  # s; 100,000 integrations for a second of flight take about 5 s
 
 
 class AircraftChannels(NamedTuple):
     """Outputs and inputs of an aircraft of any kind."""
 
     outputs: dict[str, Unit]  # in the order of y
-    inputs: dict[str, Unit]  # in the order of u; display units, topics are SI
+    inputs: dict[str, Unit]  # in the order of u, with units for display (topics are in SI)
     positive: dict[str, str]  # what a positive value of each input does, such as "nose down"
     speed: float  # trim speed V0, m/s
 
@@ -172,7 +172,7 @@ class AircraftConfig(NodeConfig):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Return the faults that may begin and end in flight.
+        """Return the parameters of faults that can begin and end in flight.
 
         They are faults of effectors and sensors, gusts, and the start of a drift.
         """
@@ -315,9 +315,9 @@ class AircraftConfig(NodeConfig):
         return {end: getattr(self.actuators, end) for end in effector_faults.ENDS}
 
     def _no_thrust(self) -> FloatArray:
-        """Return the inputs without thrust, deviations from trim, SI; nan if unknown.
+        """Return the value of each input at which it gives no thrust, from trim, SI.
 
-        For JSBSim the throttle is -1 until the model has its trim.
+        It is nan if unknown, and -1 for JSBSim's throttle until the model knows its trim.
         """
         if self.is_jsbsim:
             inputs = self.flight_condition().inputs()
@@ -386,7 +386,7 @@ class AircraftConfig(NodeConfig):
         return self.turbulence is not None and self.turbulence.rotary
 
     def nominal_airframe(self) -> Airframe:
-        """Return the named airframe, with the axes of the rotary gusts that act."""
+        """Return the named airframe, with the axes of rotary gusts if these act."""
         airframe = load_airframe(self.airframe)
         return airframe.with_rotary_gusts() if self.has_rotary_gusts else airframe
 
@@ -407,7 +407,7 @@ class AircraftConfig(NodeConfig):
         )
 
     def drifted_airframe(self) -> Airframe:
-        """Return the airframe in flight after its drift."""
+        """Return the airframe after its drift, or the airframe in flight if it does not drift."""
         airframe = self.sampled_airframe()
         section = self.drift
         if section is None:
@@ -508,12 +508,12 @@ class AircraftConfig(NodeConfig):
         return WindModel(self.gust_arrays(AXES), turbulence, self.relative_wind())
 
     def ground(self) -> float | None:
-        """Return the altitude of the ground, m, as in `pose`; None if no section states one."""
+        """Return the altitude of the ground in `pose`, m, or None if no section states it."""
         section = self.microburst if self.shear is None else self.shear
         return None if section is None else section.ground
 
     def relative_wind(self) -> RelativeWind | None:
-        """Return the wind that differs from place to place; None if there is none."""
+        """Return the wind that depends on the place, or None if the wind is the same everywhere."""
         field = wind_field_of(self.wind, self.shear, self.microburst)
         start = Start(**self.start.model_dump())
         return None if field is None else RelativeWind(field, start, self.altitude or 0.0)
@@ -534,7 +534,7 @@ class AircraftConfig(NodeConfig):
         # The turbulence is off, or has the intensity 0.
         if section is None or not (section.wind or section.sigma):
             return None
-        # None where it has no effect
+        # An intensity is None at an altitude where it has no effect.
         spectrum = dryden(section.altitude, section.wind or 0.0, section.sigma or 0.0)
         every = (*AXES, *ROTARY)
         places = [every.index(axis) for axis in axes]
@@ -557,17 +557,14 @@ class AircraftConfig(NodeConfig):
         )
 
     def pose_every(self) -> int:
-        """Return the number of the aircraft's instants from pose to pose."""
+        """Return the period of pose as a number of the aircraft's periods."""
         rate = self.pose.rate
         if rate is None:
             return every(self.rate)
         return divide(period_ns(rate, "pose.rate"), period_ns(self.rate, "rate"), "rate", "")
 
     def pose_sensors(self) -> Sensors | None:
-        """Return the errors of pose as arrays, ordered as `channels.POSE`; None if ideal.
-
-        They are independent of the errors of y.
-        """
+        """Return the errors of pose, ordered as `channels.POSE` and independent of those of y."""
         pose = self.pose
         if not (
             pose.delay
@@ -594,7 +591,7 @@ STILL_AIR = Gust(start=0.0, speed=0.0, length=1.0)
 
 
 def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:
-    """Return the values as an array; None if missing or, with zero_is_none, if all are zero."""
+    """Return the values as an array, or None if none are given, or zeros with `zero_is_none`."""
     if not values or (zero_is_none and not any(values)):
         return None
     return np.array(values, dtype=np.float64)

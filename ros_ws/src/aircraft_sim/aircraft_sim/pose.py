@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pose of the aircraft: attitude, position and velocity over ground as absolute values.
 
-Guidance and the log take it. Position is in a local tangent plane whose origin is below the
+Guidance and the log take the pose. Position is in a local tangent plane whose origin is below the
 aircraft at t = 0, unless the aircraft starts elsewhere. A steady wind moves the air mass as a
 whole, so the flight relative to the air is as in still air, and only the pose includes the wind
 (Galilean invariance).
@@ -18,8 +18,8 @@ from flight_core.channels import POSE
 from flight_core.vectors import FloatArray, Scalar, array_namespace
 
 RATE = 50.0
-"""Hz, highest rate of pose without `pose.rate`. The aircraft publishes it at every k-th instant,
-with the least such k."""
+"""Highest rate of pose if `pose.rate` is not given, Hz. The aircraft publishes pose at every k-th
+instant, with the least k for which the rate is not higher."""
 
 
 def every(rate: float) -> int:
@@ -71,8 +71,8 @@ class Start(NamedTuple):
 def over_ground(pose: FloatArray, t: float, wind: Sequence[float], start: Start) -> FloatArray:
     """Turn a pose relative to the air mass into one over ground after t s of a steady wind.
 
-    The wind is in m/s to the north and to the east. The pose is that of a flight from the origin to
-    the north; the heading of the start turns it, and the place of the start moves it.
+    The wind is in m/s to the north and to the east. The given pose is that of a flight that starts
+    at the origin and heads north. It is turned by the heading of the start, and moved to its place.
     """
     pose_over_ground = pose.copy()
     if start.heading:

@@ -146,7 +146,7 @@ class MicroburstConfig(Config):
 def require_one_wind(
     wind: Sequence[float], shear: ShearConfig | None, burst: MicroburstConfig | None
 ) -> None:
-    """Refuse a wind beside a table of the wind, and two altitudes of the ground."""
+    """Refuse a steady wind in addition to a table of the wind, and two altitudes of the ground."""
     if shear is not None and shear.law == "table":
         expected = "0 beside shear.law table, which has the whole wind"
         require(not any(wind), "wind", list(wind), expected)
@@ -159,7 +159,7 @@ def require_one_wind(
 def wind_field_of(
     wind: Sequence[float], shear: ShearConfig | None, burst: MicroburstConfig | None
 ) -> wind_field.WindField | None:
-    """Return the wind as a function of place; None if it is the same everywhere."""
+    """Return the wind as a function of place, or None if it is the same everywhere."""
     section = burst if shear is None else shear
     if section is None:
         return None
@@ -174,7 +174,7 @@ def wind_field_of(
 class BiasConfig(Config):
     """A bias on x_dot of a state.
 
-    It rises from 0 to the value along half a cosine, or in a step if rise is 0.
+    It rises from 0 to `value` along half a cosine. If `rise` is 0, it rises in a step.
     """
 
     start: NonNegative = Field(description="instant at which it begins, s")
@@ -193,7 +193,7 @@ class SineConfig(Config):
 
 
 class DrawConfig(Config):
-    """Entries of A and B are multiplied by 1 + d, with d drawn from a seed."""
+    """A draw of aircraft: entries of A and B are multiplied by 1 + d, with d drawn from a seed."""
 
     A: float = Field(default=0.0, ge=0, lt=1, description="largest relative d of an entry of A")
     B: float = Field(default=0.0, ge=0, lt=1, description="largest relative d of an entry of B")
@@ -202,9 +202,10 @@ class DrawConfig(Config):
 
 
 class UncertaintyConfig(DrawConfig):
-    """An aircraft sampled around the airframe: every entry is multiplied by 1 + d, d independent.
+    """An aircraft that is sampled around the airframe.
 
-    The rows of angles stay as they are.
+    Every entry of A and B is multiplied by 1 + d, with an independent d for each. The rows of
+    angles stay as they are.
     """
 
     entries: tuple[str, ...] = Field(
@@ -238,9 +239,9 @@ class UncertaintyConfig(DrawConfig):
 
 
 class DriftConfig(DrawConfig):
-    """A and B change in flight, as by ice or by damage.
+    """A change of A and B in flight, as by ice or by damage.
 
-    Every entry is multiplied by 1 + d, d uniform and independent.
+    Every entry is multiplied by 1 + d, with an independent and uniform d for each.
     """
 
     start: Annotated[float, Field(ge=0, allow_inf_nan=True)] = Field(
@@ -254,8 +255,8 @@ class DriftConfig(DrawConfig):
         require(self.A > 0.0 or self.B > 0.0, "A", "0, and B 0", "how far A or B change")
 
 
-# One value per channel; an empty list means ideal channels. A limit may be infinite (.inf in YAML),
-# which means no limit on that channel.
+# These lists have one value for each channel. An empty list means that all channels are ideal. An
+# infinite limit (.inf in YAML) means that its channel has no limit.
 NonNegativesOrNone = tuple[NonNegative, ...]
 
 
@@ -275,9 +276,10 @@ Times = Upper  # from 0 on, .inf for never
 
 
 class ActuatorConfig(Config):
-    """The actuators, a value per input in the airframe's order.
+    """The actuators.
 
-    A missing list means ideal actuators.
+    Each list has one value for each input, in the airframe's order. If a list is missing, the
+    actuators are ideal in this respect.
     """
 
     lag: NonNegativesOrNone = Field(
@@ -372,6 +374,6 @@ class StartConfig(Config):
 def by_state(
     configs: Mapping[str, Config], keys: Sequence[str], states: Iterable[str]
 ) -> list[FloatArray]:
-    """Return an array per key, over the states, with 0 for a state that is not named."""
+    """Return one array over the states for each key, with 0 for a state that is not named."""
     sections = [configs.get(state) for state in states]
     return [np.array([float(getattr(section, key, 0.0)) for section in sections]) for key in keys]

@@ -54,12 +54,12 @@ def initial_drift(params: Sensors) -> RandomWalk:
 
 
 def measure(number: int, y: FloatArray, drift: RandomWalk, params: Sensors) -> Measured:
-    """Measure y = C x, shape (m,), at sample `number`, not before the sample of `drift`.
+    """Measure y = C x, shape (m,), at sample `number`.
 
         measured = quantised(y + error(number))
 
-    The error of a quantised sample is the measured value less y. Ideal sensors return y to the last
-    bit.
+    The sample must not be earlier than the sample of `drift`. The error of a quantised sample is
+    the measured value minus y. Ideal sensors return y to the last bit.
     """
     added, drift = error(number, drift, params)
     y_measured = y + added
@@ -72,7 +72,7 @@ def measure(number: int, y: FloatArray, drift: RandomWalk, params: Sensors) -> M
 def error(number: int, drift: RandomWalk, params: Sensors) -> tuple[FloatArray, RandomWalk]:
     """Compute the additive error at sample `number`: bias + walk(number) + noise(number), (m,).
 
-    Also returns the random walk at this sample, for the next call. y plays no part.
+    Also returns the random walk at this sample, for the next call. The error does not depend on y.
     """
     drift = walk(number, drift, params)
     added = noise(number, params)
@@ -111,8 +111,8 @@ def noise(number: int, params: Sensors) -> FloatArray:
 def walk(number: int, drift: RandomWalk, params: Sensors) -> RandomWalk:
     """Advance the random walk to sample `number`: w(0) = 0, w(k) = w(k-1) + drift_i n_i(k).
 
-    n is standard normal and independent. The steps of skipped samples are added too, so that the
-    walk does not depend on which samples are measured.
+    n is standard normal and independent. If samples are skipped, their steps are added, too, so
+    that the walk does not depend on which samples are measured.
     """
     if params.drift is None:
         return drift
@@ -140,8 +140,9 @@ def transmit(
 ) -> tuple[DelayLine, DelayLine]:
     """Delay samples at a sample instant: (delay line, now, y) -> (delay line, arrived samples).
 
-    y enters the delay line with the stamp now; None means that the sample is dropped. Samples as
-    old as the delay arrive, the oldest first. A stamp remains the instant of measurement.
+    y enters the delay line with the stamp `now_ns`. If y is None, the sample is dropped. When a
+    sample is as old as the delay, it arrives. The oldest samples come first, and each keeps the
+    instant of its measurement as its stamp.
     """
     line = delay_line if y is None else (*delay_line, StampedVector(now_ns, y))
     arrived = sum(sample.stamp_ns + params.delay_ns <= now_ns for sample in line)

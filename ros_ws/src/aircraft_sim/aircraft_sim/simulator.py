@@ -25,11 +25,11 @@ from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray, StampedVector
 
 WRAPPED = [POSE.index(name) for name in ("phi", "psi")]
-"""Channels of pose that are kept within half a turn."""
+"""Indices in pose of the angles that are wrapped to (-pi, pi]."""
 
 
 class FlightDynamicsModel(Protocol):
-    """What an aircraft must offer between command and sensors."""
+    """The interface of an aircraft between the command u and the sensors."""
 
     @property
     def truth_names(self) -> tuple[str, ...]:
@@ -159,8 +159,8 @@ class Simulator:
         """Advance to sample `number` with u held since the last sample, and measure.
 
         The sample is at `number` periods of flight time. Returns the y that arrive, the oldest
-        first, with stamps in flight time. Raises FlightEnded on the ground, and if the aircraft has
-        diverged: its state, or an output beyond `flight_core.plausible`.
+        first, with stamps in flight time. Raises FlightEnded if the aircraft touches the ground,
+        and if its state has diverged or an output is beyond `flight_core.plausible`.
         """
         t_ns = number * self.period_ns
         self._advance(number, u)

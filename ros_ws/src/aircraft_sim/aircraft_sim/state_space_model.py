@@ -16,7 +16,7 @@ from flight_core.kinematics import heading_rate
 from flight_core.rates import divide, seconds
 from flight_core.vectors import FloatArray
 
-BLOCK = 100  # steps
+BLOCK = 100  # number of steps for which the forcing is computed together
 POSE_STATES = ("V", "alpha", "beta", "phi", "theta", "q", "r")
 """States of an airframe from which its pose follows."""
 
@@ -45,9 +45,8 @@ class StateSpaceModel:
         ]
         self._speed = airframe.speed
         self._euler = parameters.kinematics != "linear"
-        # North, east, altitude.
         self._psi = 0.0
-        self._position = [0.0, 0.0, 0.0]
+        self._position = [0.0, 0.0, 0.0]  # north, east, altitude
         self._over_place = parameters.relative_wind()
         self._wind_here = self._wind_at(0)
         self._wind_dot = np.zeros(3)
@@ -97,14 +96,14 @@ class StateSpaceModel:
             self._wind_dot = (self._wind_here - before) / (2.0 * half)
 
     def _tilted(self, forced: Forcing) -> Forcing:
-        """Add what a tilt takes from the lift to the forcing of a step; nothing for an airplane."""
+        """Return the forcing of a step with the loss of lift in a tilt, which a subclass adds."""
         return forced
 
     def _fly_on(self, dt: float) -> None:
-        """Integrate what no state of the airframe holds, beside heading and place, over a step."""
+        """Integrate over a step what is neither a state of the airframe nor heading or position."""
 
     def _wind_at(self, t_ns: int) -> FloatArray:
-        """Return the wind relative to that of the start: north, east and down, m/s."""
+        """Return the wind minus the wind at the start: north, east and down, m/s."""
         if self._over_place is None:
             return np.zeros(3)
         return self._over_place.at(seconds(t_ns), *self._position)
@@ -161,7 +160,8 @@ class StateSpaceModel:
     def air_angles(self, t_ns: int) -> FloatArray:
         """See FlightDynamicsModel.
 
-        They are x less the wind along the axis of the angle over V0, `disturbance.AIR_STATE`.
+        Each is the state of x minus w / V0, where w is the wind along the axis that
+        `disturbance.AIR_STATE` pairs with the angle.
         """
         x = self._states()
         wind = self._block.wind[2 * ((t_ns - self._block_ns) // self._plant.step_ns)]

@@ -23,8 +23,8 @@ KINEMATIC = ("theta", "phi", "psi")
 airframes."""
 
 WindEffect = Literal["air_relative", "published"]
-"""How wind acts on x_dot of an uncertain aircraft: by its own A, or as on the published airframe.
-See `wind_factors`."""
+"""How wind acts on x_dot of an uncertain aircraft: through the aircraft's own A, or as on the
+published airframe. See `wind_factors`."""
 
 AIR_RELATIVE: WindEffect = "air_relative"
 
@@ -36,7 +36,7 @@ standard deviations; or the two limits, with equal probability."""
 class Spread(NamedTuple):
     """How the entries of A and B are drawn."""
 
-    # Uncertainty by entry, named as in `drawn_entries`.
+    # largest relative deviation of an entry, by its name as in `drawn_entries`
     entries: Mapping[str, float] = MappingProxyType({})
     distribution: Distribution = "uniform"
 

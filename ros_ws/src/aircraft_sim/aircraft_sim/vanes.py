@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Vanes: angle of attack and sideslip relative to the air.
 
-Icing acts before the sensor, lost readings come after it.
+Icing acts before the sensor, and readings are lost after it.
 """
 
 from collections.abc import Sequence
@@ -24,16 +24,17 @@ ANGLES = ("alpha", "beta")
 class Vanes(NamedTuple):
     """Parameters of k vanes."""
 
-    places: Sequence[int]  # (k,) in ANGLES
-    frozen_at: FloatArray  # (k,) s, from when a vane keeps its angle; infinite for never
+    places: Sequence[int]  # (k,) indices in ANGLES
+    # (k,) flight time from which a vane keeps its angle, s, infinite for never
+    frozen_at: FloatArray
     dropout: float  # probability that a reading of a vane is lost, independently for each vane
     seed: int
 
 
 class VaneSensorsConfig(Config):
-    """Vanes are more channels of y: alpha and beta relative to the air.
+    """The vanes, which add the channels alpha and beta relative to the air to y.
 
-    The errors of `sensors` apply to them too.
+    The errors of `sensors` apply to these channels, too.
     """
 
     channels: tuple[Literal["alpha", "beta"], ...] = Field(

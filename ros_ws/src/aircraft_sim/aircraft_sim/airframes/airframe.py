@@ -60,7 +60,7 @@ AIRPLANE_STATES = {
 class Input(Config):
     """An input: the unit of its column of B, and the effect of a positive value.
 
-    It may also say at which value an engine or a rotor stands still.
+    For an engine or a rotor, `no_thrust` can say at which value it gives no thrust.
     """
 
     unit: Unit = Field(description="unit of this column of B")
@@ -293,7 +293,10 @@ class Airframe(Config):
         )
 
     def matrix_c(self) -> FloatArray:
-        """Return C, shape (m, n), SI: C_ij unit_i / unit_j; without `C` it selects the outputs."""
+        """Return C, shape (m, n), SI: C_ij unit_i / unit_j.
+
+        If the file has no `C`, the matrix selects the outputs from the states.
+        """
         if self.C:
             return (
                 np.array(self.C)
@@ -466,13 +469,13 @@ def airframes() -> list[str]:
 
 
 def load_airframe(name: FilePath | Airframe) -> Airframe:
-    """Load an airframe by name in the library or by path of a file; return an Airframe as it is.
+    """Load an airframe by its name in the library, or from the path of a file.
 
     Args:
         name: Name in the library, path of an airframe file (.yaml), or an Airframe.
 
     Returns:
-        The airframe, validated.
+        The airframe, validated. An Airframe is returned as it is.
 
     Raises:
         ParameterError: No airframe has the name, or the file is invalid.

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 from flight_core.vectors import Array, array_namespace
 
-# s, used for lag 0: exp(-dt / 1e-30) is exactly 0, in float32 too, and there is no division by 0.
+# Lag that replaces a lag of 0, s. There is no division by 0, and exp(-dt / 1e-30) is exactly 0, in
+# float32, too.
 MIN_LAG = 1e-30
 
 
@@ -24,29 +25,30 @@ class Actuators(NamedTuple):
     upper: Array | None = None  # (m,) upper end stop, deviation from trim, inf = none
     rate: Array | None = None  # (m,) largest rate, units of u / s, inf = none
     dead_zone: Array | None = None  # (m,) half-width, 0 = none
-    stuck_at: Array | None = None  # (m,) when it gets stuck, s of flight time, inf = never
-    # (m,) when it goes to `no_thrust` for good, s of flight time, inf = never
+    # The times of faults are flight times, s, and inf means never.
+    stuck_at: Array | None = None  # (m,) when the actuator gets stuck
+    # (m,) when the actuator goes to `no_thrust` for good
     lost_at: Array | None = None
-    # (m,) when its effect becomes `weak_effect` of what it was, s of flight time, inf = never
+    # (m,) when the effect of the actuator is multiplied by `weak_effect`
     weak_at: Array | None = None
     weak_effect: Array | None = None  # (m,) factor
-    # (m,) when its lag becomes at least `slow_lag`, s of flight time, inf = never
+    # (m,) when the lag of the actuator becomes at least `slow_lag`
     slow_at: Array | None = None
     slow_lag: Array | None = None  # (m,) s
-    # (m,) when it gets the backlash `loose_play`, s of flight time, inf = never
+    # (m,) when the actuator gets the backlash `loose_play`
     loose_at: Array | None = None
     loose_play: Array | None = None  # (m,) half-width of the backlash
-    # (m,) when it runs away to `hard_over_to`, s of flight time, inf = never
+    # (m,) when the actuator runs away to `hard_over_to`
     hard_over_at: Array | None = None
     hard_over_to: Array | None = None  # (m,) end stop, deviation from trim
     backlash: Array | None = None  # (m,) half-width of the backlash in force, see `in_force`
-    runs_to: Array | None = None  # (m,) end stop of a runaway in force; nan: follows the command
-    # (m,) position in which it gives no thrust, deviation from trim, of a surface 0
+    runs_to: Array | None = None  # (m,) end stop of a runaway in force, nan if there is none
+    # (m,) position in which the effector gives no thrust, deviation from trim, 0 for a surface
     no_thrust: Array | None = None
 
 
 def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
-    """Advance the actuator positions by a step, shape (m,), with the command held over it.
+    """Advance the actuator positions, (m,), by a step over which the command is held.
 
         target  = command - clip(command, -dead_zone, dead_zone)
             dead zone: zero inside, no jump at the edge
@@ -113,7 +115,7 @@ def move(
 ) -> tuple[Array, Array]:
     """Return the positions at the end of a step from t, and the mean input over the step.
 
-    The input is that of the aircraft. Both include faults and have shape (m,).
+    The mean is the input of the aircraft. Both results include faults and have the shape (m,).
     """
     now = in_force(t, position, params)
     end = step(position, command, dt, now)
@@ -180,15 +182,15 @@ def _input(position: Array, command: Array, params: Actuators) -> Array:
 def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Array:
     """Apply faults to the actuator positions at the end of a step from t on, shape (m,).
 
-    The positions may also be means over the step.
+    The positions can also be means over the step.
 
         t >= stuck_at    position    the actuator keeps the position
         t >= lost_at     no_thrust
             an engine or a rotor stops at once, a surface floats at trim; also if stuck before
         else             new
 
-    `position` is the one at t, `new` the one without faults. A fault within a step acts from the
-    next step on.
+    `position` is the position at t, and `new` the position at the end of the step without faults.
+    If a fault begins within a step, it acts from the next step on.
     """
     xp = array_namespace(position)
     if params.stuck_at is not None:

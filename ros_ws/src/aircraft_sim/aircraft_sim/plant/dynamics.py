@@ -51,7 +51,7 @@ class Aircraft(NamedTuple):
     bias: Bias | None = None
     sines: Sines | None = None
     kinematics: EulerKinematics | None = None
-    # (n,) term of x_dot if the matrices belong to another airspeed than the trim's
+    # (n,) term of x_dot if the matrices belong to an airspeed other than the trim speed
     trim: Array | None = None
 
 
@@ -61,7 +61,7 @@ def f(t: Any, x: Array, params: Aircraft, turbulence: Array | None = None) -> Ar
         f = gravity @ sin(x) + gain @ (x[first] x[second]) + gust_direction @ (w(t) + turbulence)
             + bias(t) + sines(t) + kinematics(x)
 
-    `turbulence` is the wind along the G axes, shape (G,), m/s, or None for no turbulence. x may
+    `turbulence` is its wind along the G axes, shape (G,), m/s, or None for no turbulence. x can
     hold N states in columns, (n, N).
     """
     return f_state(x, params) + f_time(t, wind(t, params, turbulence), params)

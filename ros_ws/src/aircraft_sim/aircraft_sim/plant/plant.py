@@ -18,16 +18,18 @@ from flight_core.integrators import rk4
 from flight_core.rates import divide, seconds
 from flight_core.vectors import Array, array_namespace
 
-# SI. A state above this limit counts as diverged; no state of an aircraft in flight comes near it.
+# A state whose magnitude exceeds this limit, SI, counts as diverged. No state of an aircraft in
+# flight comes near it.
 DIVERGENCE_LIMIT = 1e6
 
-SHORTEST_DRIFT = 1e-9  # s, replaces a duration of 0, so that nothing is divided by 0
+SHORTEST_DRIFT = 1e-9  # duration that replaces 0, s, so that nothing is divided by 0
 
 
 class Drift(NamedTuple):
     """A change of A, B and the effect of wind in flight.
 
-    The factors on their entries are those after `duration`; before that they change linearly.
+    A, B and `wind` are the factors on the entries after `duration`. Until then the factors change
+    linearly from 1.
     """
 
     start: float  # s of flight time
@@ -47,18 +49,19 @@ def share(t: Array, start: Any, duration: Any) -> Array:
 class OverAirspeed(NamedTuple):
     """How A, B and the trim follow the airspeed V0 + V.
 
-    It has exponents of the ratio to V0, and trims at K ratios.
+    Entries follow powers of the ratio of the airspeed to V0, with the exponents in `A`, `B`,
+    `gravity` and `wind`. The trim is given at K ratios.
     """
 
     speed: float  # V0, m/s
-    place: int  # of V in x
+    place: int  # index of V in x
     A: Array  # (n, n) exponents of the entries
     B: Array  # (n, m)
     gravity: Array  # (n, n)
     wind: Array  # (n, G)
     ratio: Array  # (K,) rising
-    x: Array  # (K, n) of the trims, deviations from that at V0
-    u: Array  # (K, m)
+    x: Array  # (K, n) states of the trims, deviations from the trim at V0
+    u: Array  # (K, m) inputs of the trims, deviations from the trim at V0
 
 
 class PlantParams(NamedTuple):
@@ -70,10 +73,10 @@ class PlantParams(NamedTuple):
 
     aircraft: Aircraft
     actuators: Actuators
-    step_ns: int  # of the integration
-    turbulence: Turbulence | None = None  # of one step; None without turbulence
+    step_ns: int  # integration step
+    turbulence: Turbulence | None = None  # filters for one step, or None without turbulence
     drift: Drift | None = None
-    over_airspeed: OverAirspeed | None = None  # None: A and B are those of the trim speed
+    over_airspeed: OverAirspeed | None = None  # if None, A and B stay those of the trim speed
 
 
 def aircraft_at(t_ns: int, plant: PlantParams, x: Array | None = None) -> Aircraft:
@@ -121,8 +124,9 @@ class AircraftState(NamedTuple):
     """State of the plant, deviations from trim, SI."""
 
     x: Array  # (n,)
-    position: Array  # (m,) of the actuators
-    turbulence: Array | None = None  # (s,) of the turbulence filters; None without turbulence
+    position: Array  # (m,) positions of the actuators
+    # (s,) state of the turbulence filters, or None without turbulence
+    turbulence: Array | None = None
 
 
 def initial_state(plant: PlantParams) -> AircraftState:
@@ -140,7 +144,7 @@ def initial_state(plant: PlantParams) -> AircraftState:
 def forcing(t_ns: int, steps: int, plant: PlantParams, x: Array | None = None) -> Forcing:
     """Compute the forcing at the beginnings, middles and ends of steps from t and x on.
 
-    These are 2 steps + 1 instants; the aircraft is the one at t.
+    These are 2 steps + 1 instants. For all of them the aircraft is taken as it is at t.
     """
     halves = array_namespace(plant.aircraft.A).arange(2 * steps + 1, dtype=plant.aircraft.A.dtype)
     return dynamics.at_times(
@@ -170,9 +174,9 @@ def advance(
     spectrum is exact at the steps, with a hold in between. Time is counted in ns, so that steps add
     up exactly.
 
-    The aircraft at t acts during the whole duration. n_k follow from the seed. `forced` is the
-    `forcing` of these steps, if the caller has already computed it. Raises ParameterError if the
-    step does not divide the duration.
+    A and B are taken at t for the whole duration. The normal numbers n_k follow from the seed. If
+    the caller has already computed the `forcing` of these steps, it can be given as `forced`.
+    Raises ParameterError if the step does not divide the duration.
     """
     x, position, z = state
     aircraft = aircraft_at(t_ns, plant, x)
