@@ -48,9 +48,8 @@ def parse_sections(
     Sections of nodes that are not among `schemas` are left out. A section in `optional` can be
     absent or an empty mapping. Every parameter of it then has its default. Parameters of ROS itself
     are left out, but if a node follows /clock, `use_sim_time` of the section `flight` becomes true.
-    `namespace` is the namespace of the nodes, "" for the root. If it is None, the nodes can be in
-    any namespace. Set `with_general` for a parameter file in addition to a scenario. If the file
-    has no section for a node, the parameters for all nodes then make up this section.
+    `namespace` is the namespace of the nodes, "" for the root. If it is None, any namespace will
+    do. If `with_general` is set and a node has no section, parameters for all nodes make one up.
 
     Raises ParameterError with the path if the content is no scenario file or too long, has a
     duplicate key, lacks a section, or names nodes of two namespaces while `namespace` is None.

@@ -22,9 +22,9 @@ PARAMETER_EVENT = "rcl_interfaces/msg/ParameterEvent"
 
 
 class StoredMessage(NamedTuple):
-    """A message. Times in ns of the recorder's clock."""
+    """A message as stored. Its times are in ns, by the recorder's clock."""
 
-    topic: str  # in full
+    topic: str  # full name
     type_name: str
     definition: str  # of the type, as text
     received_ns: int

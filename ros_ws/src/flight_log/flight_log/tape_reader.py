@@ -132,7 +132,7 @@ class RecordedRun(NamedTuple):
 
 
 def topics_text(topics: Mapping[str, str]) -> str:
-    """List topics with their types, for a sentence; "" if there are none."""
+    """List topics with their types for a sentence, or return "" if there are none."""
     names = [f"{topic} ({type_name or 'no type'})" for topic, type_name in sorted(topics.items())]
     surplus = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {surplus} more topics" if surplus > 0 else "")
@@ -299,9 +299,10 @@ def _publishers(senders: Sequence[str]) -> str:
 
 
 def _is_before_epoch(start_ns: int, spans: Mapping[str, SampleSpan]) -> bool:
-    """Return whether processes stamped by /clock.
+    """Return whether the processes took their stamps from /clock.
 
-    Stamps by the host's time are since the epoch, and in lockstep a node leaves out its process id.
+    Stamps by the host's clock would count from the epoch, and in lockstep the names would lack the
+    process id.
     """
     return start_ns <= SINCE_EPOCH_NS and any(INSTANCE.fullmatch(sender) for sender in spans)
 

@@ -20,9 +20,8 @@ from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
 
 DEGREE = math.pi / 180.0
-# Channels that are read.
-STICKS = 16
-SERVOS = 16
+STICKS = 16  # number of channels of the transmitter that are read
+SERVOS = 16  # number of servos that are read
 
 
 class MessageTable(NamedTuple):
@@ -35,7 +34,7 @@ class MessageTable(NamedTuple):
     fields: Mapping[str, FloatArray]
 
     def at(self, field: str, stamp_ns: NDArray[np.int64]) -> FloatArray:
-        """Return the newest value of a field at some instants, (n,); NaN before the first."""
+        """Return the newest value of a field at some instants, (n,), or NaN before the first."""
         places = np.searchsorted(self.stamp_ns, stamp_ns, side="right") - 1
         return np.where(places < 0, np.nan, self.fields[field][places])
 

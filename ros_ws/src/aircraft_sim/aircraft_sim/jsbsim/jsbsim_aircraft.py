@@ -97,7 +97,7 @@ def _number(text: str) -> float:
 
 
 class JsbsimQuantity(NamedTuple):
-    """A state: a property of JSBSim and the SI value of its unit."""
+    """A quantity of JSBSim: its property, and the factor that converts its unit to SI."""
 
     property: str
     si: float
@@ -177,7 +177,7 @@ class FlightCondition(NamedTuple):
     name: str  # of the aircraft, without PREFIX, or the absolute path of its model
     speed: float  # true airspeed, m/s
     altitude: float  # above sea level, m
-    step_ns: int  # of the integration
+    step_ns: int  # integration step
     named: tuple[tuple[str, NamedProperties], ...] = ()  # the user's own properties, by input
 
     @property
@@ -218,8 +218,8 @@ class WindModel(NamedTuple):
     """Wind along the AXES of `disturbance`."""
 
     gusts: Gusts
-    turbulence: Turbulence | None  # of one step; None without turbulence
-    over_place: RelativeWind | None = None  # None: the wind is the same everywhere
+    turbulence: Turbulence | None  # filters for one step, or None without turbulence
+    over_place: RelativeWind | None = None  # None if the wind is the same everywhere
 
 
 @cache
@@ -332,7 +332,7 @@ def _model_file(path: Path, airframe: str) -> Path:
 
 
 def _first_element(path: Path) -> str:
-    """Read the name of the first element of an XML file; "" for a file that is not XML."""
+    """Read the name of the first element of an XML file, or return "" if the file is not XML."""
     try:
         _, element = next(ElementTree.iterparse(path, events=("start",)))  # noqa: S314 - no entity is in a first element
         return str(element.tag)

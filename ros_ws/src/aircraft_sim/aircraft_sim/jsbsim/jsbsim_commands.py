@@ -25,15 +25,15 @@ FROZEN: Mapping[str, float] = {
 """Properties that freeze position, velocity, attitude and fuel, while engines and flight control
 systems run on."""
 
-PART = 0.2  # of a command, by which it is moved to see its effect
-MOVED = 0.5  # s of frozen flight after that, in which an engine begins to respond
-AFTERWARDS = 10.0  # s, in which an engine returns
+PART = 0.2  # change of a command by which its effect is tested
+MOVED = 0.5  # frozen flight after this change, in which an engine begins to respond, s
+AFTERWARDS = 10.0  # frozen flight after the test, in which an engine returns, s
 # Multiple of the difference between two equal runs (an engine may still settle) beyond which a
 # change counts as an effect.
 NOISE = 2.0
 SYSTEMS = ("flight_control", "autopilot", "system")
 CONVENTION = "-cmd-norm"  # at the end of JSBSim's own commands
-LEAST = 1e-6  # m/s^2, rad/s^2
+LEAST = 1e-6  # least change of an acceleration that counts as an effect, m/s^2 or rad/s^2
 
 
 @contextmanager

@@ -31,15 +31,16 @@ from flight_core.units import FOOT, GRAVITY
 from flight_core.vectors import FloatArray
 
 RATES = ("p", "q", "r")
-MOTION = 0.01  # rad/s of a rate, and wind over V0: small beside the tables of a model
+# change of a rate, rad/s, and of wind / V0, which is small compared with the tables of a model
+MOTION = 0.01
 SIZES = (0.05, 0.1, 0.2)
 """Steps of a command: the small ones stay linear, the large ones exceed a hysteresis or reach a
 rate limit."""
 MAX_STEP_FRACTION = 0.9  # upper bound of a step, as a fraction of the distance to the end stop
 SURFACE_TIME = 0.5  # s of frozen flight: long enough for flight control systems
 ENGINE_TIME = 20.0  # s: a turbine at altitude spools up in less
-STILL = 1e-6  # m/s^2, rad/s^2: less than this, and a step moves nothing
-LEAST = 1e-6  # SI: an entry below this is rounding
+STILL = 1e-6  # a step that changes accelerations by less moves nothing, m/s^2 or rad/s^2
+LEAST = 1e-6  # an entry below this is rounding, SI
 
 
 class Linearization(NamedTuple):
@@ -128,7 +129,7 @@ class _InputSteps(NamedTuple):
 
 
 def _steps(condition: FlightCondition, trim: Trim, name: str) -> _InputSteps | None:
-    """Record the response to steps of an input both ways; None if its output does not move."""
+    """Record the response to steps of an input both ways, or return None if no output moves."""
     output = driven(name)
     place = list(INPUTS).index(name)
     travel = MAX_STEP_FRACTION * float(min(-trim.lower[place], trim.upper[place]))

@@ -44,7 +44,7 @@ POSE = (
 THROTTLE = list(INPUTS).index("throttle")
 
 LEAST_FUEL = 1.0
-"""lb, in all tanks: an engine that stops with less than this is out of fuel."""
+"""Fuel in all tanks, lb. If an engine stops with less than this, it is out of fuel."""
 
 
 class JsbsimModel:
@@ -56,7 +56,7 @@ class JsbsimModel:
         wind+     = gusts(t_k + dt) + turbulence.wind(z+), along the heading, to the right and down
         commands  = trim + actuators.effect(t_k, position+), then JSBSim runs
 
-    Engines whose throttle is lost have it at 0, and no fuel or ignition.
+    If the throttle of an engine is lost, it is at 0, and the engine has no fuel or no ignition.
 
     JSBSim integrates the forces of the step before, then computes the forces of the new commands
     and the new wind, so commands and wind act a step later. Since it computes forces at an instant,
