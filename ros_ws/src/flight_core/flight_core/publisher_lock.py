@@ -28,7 +28,7 @@ class PublisherLock:
 
     Then it locks to the next publisher. A restarted node, which has the same name, can take over
     earlier than a different node. If the receiving node overruns, the time of the overrun does not
-    count as silence of the publisher.
+    count as silence of the publisher, but the first sample after it can come from another one.
 
     The middleware numbers the messages of a publisher. If the numbers go back, two publishers use
     the same name. Neither is admitted then, because either can be forged.
