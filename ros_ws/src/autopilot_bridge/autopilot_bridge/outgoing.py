@@ -89,7 +89,7 @@ def prepare_message(
 
 
 def field_type(name: str) -> Any:
-    """Return the class of a map's type, from a message package or from MAVLink."""
+    """Return the class of a message that a map names, from a message package or from MAVLink."""
     package, _, kind = name.split("/")
     return mavlink_link.mavlink_type(kind) if package == MAVLINK else message_type(name)
 

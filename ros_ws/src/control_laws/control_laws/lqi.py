@@ -120,16 +120,17 @@ def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, Fl
 
 
 def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:
-    """Compute the gain of least cost over z+ = F z + G u, for N weights: (m, n + 3 m, N).
+    """Compute the gain of least cost along z+ = F z + G u for N sets of weights, (m, n + 3 m, N).
 
     The cost is the sum of e'Q e + q'Q_i q + u'R u:
 
         Q = 1 / size^2,  Q_i = integral^2 / size^2,  R = (effort / input_scale)^2 / size^2,
             q the integral of e
 
-    `integral` (m, N) is in 1/s; `effort` (m, N), s, is the abs(e) that costs as much as an input of
-    unit response; `fade` (1, N) is in 1/s. Source: E. Kreindler, D. Rothschild, AIAA J. 14(7),
-    1976, for model following; B. D. O. Anderson, J. B. Moore, "Optimal Control", ch. 9.
+    `integral` (m, N) is in 1/s; `effort` (m, N) is in s: an input that moves y at the rate a costs
+    as much as an error of `effort` a. `fade` (1, N) is in 1/s. Source: E. Kreindler, D. Rothschild,
+    AIAA J. 14(7), 1976, for model following; B. D. O. Anderson, J. B. Moore, "Optimal Control", ch.
+    9.
     """
     size = (model.C @ model.size)[:, None]
     gains_by_set = []

@@ -27,7 +27,7 @@ class DrawnFleet(NamedTuple):
     equipment: dict[str, FloatArray]  # by name, (N,) each
 
     def on_device(self, course: Course, vehicle: Vehicle) -> tuple[FleetMatrices, Vehicle]:
-        """Return the aircraft for the compiled loop, and the vehicle with their equipment."""
+        """Return the drawn aircraft for the compiled loop, and the vehicle with their equipment."""
         delay = self.equipment.get(equipment.DELAY, np.zeros(1))
         fleet = batch_matrices.assemble(
             self.A,

@@ -84,7 +84,7 @@ class _AircraftResult:
 def _separated(
     fleet: Fleet, flights: Sequence[MemberFlight], reported: Mapping[str, _AircraftResult]
 ) -> dict[str, _AircraftResult]:
-    """Rewrite the reports of the aircraft that came nearer to another one than they may."""
+    """Rewrite the reports of those aircraft that violated the separation of their fleet."""
     tracks = {name: result.track for name, result in reported.items() if result.track is not None}
     shortfalls = separation_shortfalls(tracks, fleet.separation)
     return {

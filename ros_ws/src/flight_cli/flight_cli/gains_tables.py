@@ -71,7 +71,7 @@ class GainSets(NamedTuple):
 
     @property
     def first(self) -> Assessment:
-        """Return the first gain set, which is the one that was checked."""
+        """Return the first gain set. After a check, it is the one that was checked."""
         return next(iter(self.answers.values()))
 
     @property

@@ -166,7 +166,10 @@ def _show_topics(console: Console, title: str, tape: Tape) -> None:
 
 
 def _numbers(instances: list[str]) -> dict[str, int]:
-    """Parse MESSAGE=NUMBER into numbers by message. Raises ParameterError."""
+    """Parse texts such as MESSAGE=NUMBER into numbers by message.
+
+    Raises ParameterError if a text has another form.
+    """
     numbers = {}
     for text in instances:
         message, _, number = text.partition("=")

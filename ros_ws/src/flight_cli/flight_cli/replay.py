@@ -251,7 +251,7 @@ def _count_by_group(result: ReplayResult) -> dict[str, int]:
 
 
 def _u_figures(result: ReplayResult, inputs: tuple[str, ...]) -> dict[str, dict[str, float]]:
-    """Return figures of the difference of u for each input, in the input's unit.
+    """Return figures of the computed u minus the recorded u for each input, in its unit.
 
     They are the rms, the largest difference, its time, and the rms of the recorded u. They are NaN
     if there is no u.

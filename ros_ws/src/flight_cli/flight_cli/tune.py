@@ -142,7 +142,10 @@ class Tune:
             raise typer.Exit(UNPROVED)
 
     def _target(self) -> tuple[str, Path]:
-        """Return the autopilot and its folder. Raises ParameterError unless one is named."""
+        """Return the autopilot that was named, and its folder.
+
+        Raises BadParameter unless exactly one is named.
+        """
         folders = {"px4": self.px4, "ardupilot": self.ardupilot}
         named = {name: path for name, path in folders.items() if path is not None}
         if len(named) != 1:

@@ -405,7 +405,7 @@ class Guidance:
     def _row(
         self, inputs: Inputs, state: GuidanceState, commands: StepCommands, now_ns: int
     ) -> FloatArray:
-        """Return the sample of the log for a step at an instant."""
+        """Return the row that guidance logs for a step at an instant."""
         sample = guidance_log.GuidanceSample(
             inputs=inputs,
             state=state,

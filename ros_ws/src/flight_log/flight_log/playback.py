@@ -184,7 +184,7 @@ def latched_depth(qos: str) -> int:
 
 
 def _unsendable_kind(message: StoredMessage) -> str | None:
-    """Name the kind of a message that no ROS topic can have, or return None for any other."""
+    """If no ROS topic can carry a message, return what kind it is; otherwise return None."""
     if message.encoding != "cdr":
         return f"{message.type_name} in {message.encoding}".strip()
     return None if message.type_name else "no type"

@@ -321,7 +321,7 @@ def _spans(topics: Iterable[tuple[str, Mapping[str, SampleSpan]]]) -> dict[str, 
 
 
 def stored_scenario(path: Path) -> StoredFile:
-    """Read a scenario file as a file inside a log.
+    """Read a scenario file into the form in which a log has an attached file.
 
     Raises ParameterError if it cannot be read.
     """

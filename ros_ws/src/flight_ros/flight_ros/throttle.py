@@ -16,7 +16,10 @@ class Throttle:
         self._passed_ns: dict[str, int] = {}  # when a line last passed, by its text
 
     def due(self, line: str) -> bool:
-        """Return whether the line has not passed for a period; if so, it passes now."""
+        """Return whether the line may pass, since it has not passed for a period.
+
+        If it may, it counts as passed now.
+        """
         now_ns = time.monotonic_ns()
         due = now_ns - self._passed_ns.get(line, -self._period_ns) >= self._period_ns
         if due:

@@ -100,7 +100,7 @@ class FlightLink(Protocol):
         """Disengage the bridge."""
 
     def cancel(self) -> None:
-        """End the wait of a method on the worker thread."""
+        """Interrupt a method that waits on the worker thread."""
 
     def resume(self) -> None:
         """Wait again, after `cancel`."""

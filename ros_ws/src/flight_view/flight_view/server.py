@@ -315,7 +315,7 @@ class _LimitedServer(HTTPServer):
     def admit(self, stream: IOStream) -> bool:
         """Keep a connection that has shown the token, and return whether it is kept.
 
-        It is not if there are MAX_CONNECTIONS already.
+        If there are MAX_CONNECTIONS already, a new one is not kept.
         """
         self._leave_out_closed()
         if sum(self._admitted.values()) < MAX_CONNECTIONS:

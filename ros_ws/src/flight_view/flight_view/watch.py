@@ -69,7 +69,8 @@ def newest_run(runs: Path, namespace: str | None = None) -> Path:
 def namespaces(run: Path) -> list[str | None]:
     """Return the namespaces of the aircraft in the log of a run.
 
-    If the log has no aircraft yet, return None alone, which stands for the first one to come.
+    If the log has no aircraft yet, return a list of None, which stands for the first one that
+    comes.
     """
     with suppress(ParameterError, OSError):
         return [*aircraft_namespaces(log_topics(run))] or [None]

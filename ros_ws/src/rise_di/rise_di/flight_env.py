@@ -68,9 +68,9 @@ def _channels(scenario: Scenario) -> _Channels:
 
 
 def _without_models(scenario: Scenario) -> Scenario:
-    """Return the scenario with nothing but the law, whose place the agent takes.
+    """Return the scenario with the bare law alone, which the agent replaces.
 
-    The models of a law, or a learner, do not bind the agent.
+    Feedforward, observer, schedule and learner are left out: they say nothing to an agent.
     """
     models = ("feedforward", "observer", "schedule", "learn")
     return scenario.vary(

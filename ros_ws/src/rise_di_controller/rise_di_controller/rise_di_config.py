@@ -428,7 +428,7 @@ class RiseDiConfig(ControllerConfig):
         return nominal
 
     def tuned_law(self) -> TunedLaw:
-        """Return the law with parameters, extended by the observer or the schedule, if any."""
+        """Return the law with its parameters, with the observer and the schedule if it has them."""
         law = super().tuned_law()
         if self.schedule is None:
             return law

@@ -460,7 +460,7 @@ def _avl_body(body: Mapping[str, str | float]) -> list[float]:
 
 
 def _avl_values(text: str) -> dict[str, float]:
-    """Read the numbers in the file of AVL's command ST by name."""
+    """Read the file that AVL's command ST writes, and return its numbers by name."""
     require(
         "X aft" not in text,
         "axes",

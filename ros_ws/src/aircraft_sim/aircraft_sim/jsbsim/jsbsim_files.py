@@ -129,9 +129,9 @@ def model_files(model: Path) -> ModelFiles:
 
 
 def _places(model: Path, element: str, name: str) -> Iterator[_Place]:
-    """Yield the files of a name in the folders of an element, in JSBSim's order.
+    """Yield the files called `name` in the folders of an element, in the order of JSBSim.
 
-    Raises ParameterError for a link to elsewhere.
+    Raises ParameterError if such a file is a link that leaves its folder.
     """
     root = root_of(model)
     folders = [

@@ -138,7 +138,10 @@ def require_possible(
 def arrays(
     faults: Sequence[Fault], stops: dict[str, Sequence[float]], inputs: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the faults as fields of `actuators.Actuators`, shapes (m,), infinite for never."""
+    """Return the faults as fields of `actuators.Actuators`, each of shape (m,).
+
+    The begin of a fault is infinite for an input that never has it.
+    """
     columns: dict[str, Any] = {}
     for fault in faults:
         kind = KINDS[fault.kind]

@@ -166,7 +166,7 @@ class _Comparison:
     def _difference(
         self, k: int, recorded: FloatArray, computed: FloatArray
     ) -> ReplayDifference | None:
-        """Return the first channel of step k that has a different bit."""
+        """Return the first channel of step k whose recorded and computed values differ in a bit."""
         columns = np.flatnonzero(recorded.view(np.int64) != computed.view(np.int64))
         if len(columns) == 0:
             return None

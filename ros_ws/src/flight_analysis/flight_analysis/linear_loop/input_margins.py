@@ -507,7 +507,10 @@ def _gain_margins(
 
 
 def _narrow(decrease: FloatArray, increase: FloatArray, place: tuple[int, int], L: float) -> None:
-    """Narrow the limits of the gain to the factor 1 / abs(L) where L is real, if L < 0."""
+    """Narrow the gain margin at a frequency at which L is real and negative.
+
+    There the loop would pass through -1 at the factor 1 / abs(L).
+    """
     if L < 0.0:
         factor = -1.0 / L
         if factor > 1.0:

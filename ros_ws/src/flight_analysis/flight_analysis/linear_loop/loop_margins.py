@@ -89,9 +89,9 @@ class LinearLoop(NamedTuple):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the names and of the numbers, to DIGITS digits, of the loop and of its box.
+        """SHA-256 of the loop and its box: of their names, and of their numbers to DIGITS digits.
 
-        The box is divided by its size, because a guarantee finds the size.
+        The box is scaled to the size 1 first, because its size is a result of a guarantee.
         """
         loop = self.loop
         arrays = [*self.nominal, *self.law, loop.lag, loop.delay, loop.period]

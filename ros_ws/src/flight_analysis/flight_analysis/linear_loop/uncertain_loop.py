@@ -274,7 +274,7 @@ def sensitivity_slopes(
     """Compute S, (F, m, m), and its slopes along d, (F, k, m, m), at the frequencies w, (F,).
 
     S is that of the aircraft with the deviations d, (k,), and w is in rad/s. The loop must have
-    disks in all inputs, and u must be in time.
+    disks in all inputs, and no late u.
     """
     around = loop.at(d)
     p, k = loop.uncertain, len(d)

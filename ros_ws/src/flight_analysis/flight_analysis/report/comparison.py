@@ -210,7 +210,7 @@ def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
 
 
 def _row(figures: Sequence[Mapping[str, Any]], column: Column, unit: DisplayUnit) -> ComparisonRow:
-    """Return a metric of each flight in a row; `unit` is that of the row."""
+    """Return the row of a table with one metric of every flight, in `unit`."""
     values = [column.value(each) for each in figures]
     first = values[0]
     ratios = tuple(None if value is None or not first else value / first for value in values)

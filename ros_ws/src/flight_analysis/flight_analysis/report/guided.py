@@ -426,9 +426,9 @@ def top_speed(tape: Tape, trim: float) -> float | None:
 
 
 def flown_speed(tape: Tape, trim: float) -> FloatArray:
-    """Return the airspeed at the samples of `guidance`, m/s: `trim` and V of y.
+    """Return the airspeed at the samples of `guidance`, m/s: the trim speed plus V of y.
 
-    For a multicopter, which has no V in y, it is the speed over ground.
+    If y has no V, as that of a multicopter, it is the speed over ground.
     """
     log = tape["guidance"]
     over_ground: FloatArray = np.hypot(log["pose.v_north"], log["pose.v_east"])

@@ -231,7 +231,8 @@ def _linear_errors(
 def _reach(controller: ControllerConfig, aircraft: AircraftConfig | None) -> Reach:
     """Return how far and how fast the actuators can follow each input of the law.
 
-    If an allocation distributes an input, the first effector that reaches its limit ends it.
+    If an allocation distributes an input over several effectors, the input reaches only as far as
+    the first effector that comes to its limit.
     """
     m = len(controller.inputs)
     if aircraft is None:

@@ -321,8 +321,8 @@ def time_series_figure(
 def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
     """Set size, margins and colours of a figure.
 
-    Above the rows there is room for the legend and for `labels` pixels, and under them `below`
-    pixels for the axis.
+    The margin above the rows has room for the legend, if there is one, and for `labels` pixels. The
+    margin below them has `below` pixels, for the axis.
     """
     above = 24 * any(trace.get("showlegend") for trace in figure.data) + labels
     rows = figure.height * figure.rows

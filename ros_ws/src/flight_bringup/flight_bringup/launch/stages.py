@@ -449,11 +449,11 @@ class _Begin:
 def end_with_log(
     flight: Flight, lead: float, end_time: float, duration: float, *, by_rosbag2: bool
 ) -> list[Action]:
-    """End a flight once the log holds y, y_m and u to the system time `end_time`, s.
+    """End a flight once the log holds y, y_m and u up to the system time `end_time`, s.
 
-    The flight of `duration` began with `lead`. If the log gets no u, as when a bridge is not
-    engaged, the flight ends after the duration. If the log stops on the way, it ends LOG_TIMEOUT
-    later.
+    The flight lasts `lead` and `duration`, s. If the log gets no u, as when a bridge is not
+    engaged, the flight ends after that. If the log stops growing before `end_time`, it ends
+    LOG_TIMEOUT after its duration.
     """
     last = [-math.inf]  # monotonic time of the last change of the log, s
 

@@ -54,7 +54,7 @@ class Level(NamedTuple):
 
 
 class LawResult(NamedTuple):
-    """Results of a law; channels in the law's order, SI."""
+    """Results of one law in a comparison, SI, with the channels in the order of the law."""
 
     law: str
     objective: str  # name of the objective of its tuning

@@ -202,9 +202,9 @@ def fastest_zero(A: FloatArray, B: FloatArray, C: FloatArray) -> float:
 def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return P (n, m), N (n, n - m) and H (n, n - m) with x = P y + N eta, eta = H' x.
 
-    y are the outputs, and eta the n - m other states. Raises ParameterError unless C (m, n) has
-    full rank. eta consists of the states that C contains least, by a QR
-    decomposition with pivoting. If C selects states, P = C' and N = H.
+    y are the outputs. A QR decomposition of C with pivoting picks the m states on which y depends
+    most, and eta has the n - m others. Raises ParameterError unless C (m, n) has full rank. If C
+    selects states, P = C' and N = H.
     """
     m, n = C.shape
     _, R, pivots = qr(C, pivoting=True)

@@ -256,7 +256,7 @@ class _Measured(NamedTuple, Generic[Controller]):
 class _Loops(Generic[Controller]):
     """The loops of a search, each built and measured once.
 
-    A place has the exponents of `slower`, followed by those of `lower`.
+    A place is a point of the search: the exponents of `slower`, followed by those of `lower`.
     """
 
     def __init__(
@@ -372,7 +372,10 @@ def _stacked(candidates: Sequence[Candidate[Controller]]) -> LinearLoop:
 
 
 def _worst_phase(loop: LinearLoop) -> float:
-    """Return the smallest phase margin of the uncertain aircraft, rad, or infinity."""
+    """Return the smallest phase margin of the uncertain aircraft, rad.
+
+    It is infinite if the loop has only the nominal aircraft.
+    """
     if len(loop.plant.A) == 1:
         return math.inf
     uncertain = loop.plant._replace(A=loop.plant.A[1:], B=loop.plant.B[1:])

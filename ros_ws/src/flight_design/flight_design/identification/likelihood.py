@@ -347,8 +347,8 @@ class Likelihood:
     def levels(self, theta: FloatArray) -> NDArray[np.int64]:
         """Return the level of the wind in each span, (spans,), for theta, (p,).
 
-        Every level predicts the span from the estimates at its beginning. The calmest level is
-        taken whose log-likelihood is within CHANGE of the best.
+        Each level predicts a span from the estimates at the begin of this span. Of the levels whose
+        log-likelihood is within CHANGE of the best, the calmest is taken.
         """
         models = self.models(theta[None], self._usable)
         bank = models.bank.by_level()

@@ -202,9 +202,10 @@ class Effects(Search):
         dead: int | None = None,
         levels: NDArray[np.int64] | None = None,
     ) -> Least:
-        """Minimise J from theta, (p,), or from 0, with kappa >= `lower` or with one input dead.
+        """Minimise J from theta, (p,), or from 0 without one.
 
-        Theta decides the winds, unless `levels` gives them.
+        Every kappa is at least `lower`. If an input `dead` is given, it has no effect. At each step
+        the levels of the wind follow from theta, unless `levels` gives them.
         """
         self._lower[: self.count] = lower
         self._upper[: self.count] = MOST

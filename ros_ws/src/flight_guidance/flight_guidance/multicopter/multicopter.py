@@ -267,8 +267,8 @@ def _along_route(
 ) -> tuple[GuidanceState, float]:
     """Put the state on the leg once its start is reached, and on the next leg once it ends.
 
-    A leg ends when it is passed, or when the wait there is over. Also returns the distance by which
-    the end of the leg is missed, m, else 0.
+    A leg ends when the aircraft has passed its end or, if the leg waits there, when the wait is
+    over. Also returns the distance by which the end of the leg is missed, m, else 0.
     """
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]

@@ -55,7 +55,7 @@ class ObserverParams(NamedTuple):
 
 
 class PastTick(NamedTuple):
-    """A tick in the record from which a new observer starts."""
+    """A tick of the recent record, over which a new observer runs to get its first estimates."""
 
     e: Array | None  # (m,); None for a tick without a y
     u: Array  # (m,) u less the trim and the feedforward of the tick

@@ -116,9 +116,9 @@ class Fallback(NamedTuple):
 class Updates:
     """Decides when proposals are due: at the first tick, and at given times counted from it.
 
-    At the first tick the rough model is proposed as it is. Between those times, and after the last
-    of them, the aircraft is tested every `learn.check`, unless one of these times follows
-    the test within another `learn.check`.
+    At the first tick the rough model is proposed as it is. From the first given time on, the
+    aircraft is also tested every `learn.check`. A test is left out if a given time follows it
+    within less than one `learn.check`.
     """
 
     def __init__(self, settings: LearnConfig) -> None:
@@ -509,7 +509,7 @@ def design_changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, An
 
 
 def _designed_values(parameters: ControllerConfig) -> dict[str, Any]:
-    """Return the values of DESIGNED by dotted name."""
+    """Return the parameters that a design sets, those in DESIGNED, by dotted name."""
     values = flatten(parameters.model_dump())
     return {name: value for name, value in values if name.split(".")[0] in DESIGNED}
 
