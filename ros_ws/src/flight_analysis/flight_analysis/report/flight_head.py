@@ -178,7 +178,9 @@ def _models_text(flight: RecordedFlight) -> str:
     if not flight.summary["models"]:
         return ""
     count = len(learned_spans(flight))
-    return f"{count or 'No'} learned model{'' if count == 1 else 's'} flew"
+    if not count:
+        return "No model of the aircraft that was learned in flight flew"
+    return f"{count} model{'' if count == 1 else 's'} of the aircraft, learned in flight, flew"
 
 
 def learned_spans(flight: RecordedFlight) -> list[Mapping[str, Any]]:

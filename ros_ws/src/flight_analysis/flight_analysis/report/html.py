@@ -153,7 +153,7 @@ def _not_judged(flight: RecordedFlight) -> Verdict:
     return Verdict(
         headline="Not judged.",
         colour=Colour.PLAIN,
-        text=f"The log has {lack}, so that nothing says how large an error may be.",
+        text=f"The log has {lack}, so its errors cannot be judged.",
         step=Step(
             sentence="Lay it over another log:",
             command=f"rise-di report {run_argument(flight)} OTHER",
