@@ -67,7 +67,7 @@ def test_output_that_is_off_is_red_first_and_over_its_limit(servo: Scenario, tap
     assert verdict.colour is Colour.BAD
     assert verdict.headline.startswith("r off by 17 deg/s rms")
     assert verdict.step is not None
-    assert verdict.step.command == "rise-di gains check osprey_servo"
+    assert verdict.step.command == "rise-di gains check osprey --scenario osprey_servo"
     over = [tile.name.partition(",")[0] for tile in tiles_of(flight) if not tile.is_within]
     assert over == ["yaw rate r"]
 

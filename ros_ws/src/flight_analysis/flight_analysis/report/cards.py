@@ -7,9 +7,14 @@ import math
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.linear_loop.certificate import kept_guarantee
 from flight_analysis.linear_loop.guarantee import Guarantee
-from flight_analysis.linear_loop.loop_margins import LinearLoop, LoopMargins, loop_margins
+from flight_analysis.linear_loop.loop_margins import LoopMargins, loop_margins
 from flight_analysis.report.display_units import format_seconds, format_value
-from flight_analysis.report.flight_head import learned_spans, run_argument, scenario_argument
+from flight_analysis.report.flight_head import (
+    gains_command,
+    learned_spans,
+    run_argument,
+    scenario_argument,
+)
 from flight_analysis.report.flown_models import FlownLoops
 from flight_analysis.report.margin_figures import MARGIN_WORDS, decibels, guarantee_text
 from flight_analysis.report.page import Card, Step
@@ -19,11 +24,12 @@ from flight_analysis.report.summary import RecordedFlight
 def claims(flight: RecordedFlight, scenario: Scenario, flown: FlownLoops) -> list[Card]:
     """Return the cards of a flight: margins, guarantee, learned models and replay."""
     cards = []
+    name = scenario_argument(flight, scenario)
     if len(flown.loops) == 1:
         loop = flown.loops[0].loop
         cards = [
-            _margin_card(loop_margins(loop), scenario),
-            _guarantee_card(loop, kept_guarantee(loop), scenario),
+            _margin_card(loop_margins(loop), gains_command("check", scenario, name)),
+            _guarantee_card(kept_guarantee(loop), gains_command("guarantee", scenario, name)),
         ]
     elif flown.loops:
         cards = [_changed_card(flown)]
@@ -34,11 +40,9 @@ def claims(flight: RecordedFlight, scenario: Scenario, flown: FlownLoops) -> lis
     return cards
 
 
-def _margin_card(margins: LoopMargins, scenario: Scenario) -> Card:
+def _margin_card(margins: LoopMargins, command: str) -> Card:
     """Return how far the loop is from instability, at the input where it is nearest."""
-    step = Step(
-        sentence="Compute them again:", command=f"rise-di gains check {scenario_argument(scenario)}"
-    )
+    step = Step(sentence="Compute them again:", command=command)
     nominal = margins.nominal
     if not nominal.stable:
         return Card(title="Margins", sentences=["The linear loop is unstable."], step=step)
@@ -66,9 +70,8 @@ def _margin_card(margins: LoopMargins, scenario: Scenario) -> Card:
     )
 
 
-def _guarantee_card(loop: LinearLoop, promise: Guarantee | None, scenario: Scenario) -> Card:
+def _guarantee_card(promise: Guarantee | None, command: str) -> Card:
     """Return what is guaranteed for aircraft other than that of the file."""
-    name = scenario_argument(scenario)
     title = "Guarantee"
     if promise is None:
         return Card(
@@ -76,11 +79,14 @@ def _guarantee_card(loop: LinearLoop, promise: Guarantee | None, scenario: Scena
             sentences=[
                 "No guarantee has been computed for this loop, or none holds for its aircraft."
             ],
-            step=Step(sentence="Compute one:", command=f"rise-di gains guarantee {name}"),
+            step=Step(sentence="Compute one:", command=command),
         )
     if promise.stable == 0.0:
         return Card(title=title, sentences=guarantee_text(promise))
     stable = math.floor(1e3 * promise.stable) / 10.0
+    late = f", and u up to {1e3 * promise.late:g} ms late" if promise.late else ""
+    lags = ("lags",) if promise.has_exact_lags else ()
+    exact = ", ".join((*promise.exact, *lags, "delay", "period"))
     first = promise.unstable
     found = (
         "No unstable aircraft was found within 99 %."
@@ -90,19 +96,19 @@ def _guarantee_card(loop: LinearLoop, promise: Guarantee | None, scenario: Scena
     )
     sentences = [
         (
-            "Each number of the aircraft's model, A and B, may be wrong: the linear loop is proved "
+            "The numbers of the aircraft's model, A and B, may be wrong: the linear loop is proved "
             f"stable for every aircraft whose entries differ by up to {stable:.1f} % from those "
-            "of the file."
+            f"of the file{late}."
         ),
         found,
         (
-            "Entries that are 0 in the file are taken as 0, and lags, delay and period as exact: "
-            "the proof is of small deviations, without limits of the actuators."
+            f"Taken as exact are {exact}, and each entry that is 0 in the file. The proof is of "
+            "small deviations, without limits of the actuators."
         ),
     ]
     step = Step(
         sentence="Write the proof, which another program checks:",
-        command=f"rise-di gains guarantee {name} --certificate certificate.json",
+        command=f"{command} --certificate certificate.json",
     )
     if promise.certificate:
         sentences.append(f"Its certificate is {promise.certificate}.")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.scenario_library import scenarios
+from flight_analysis.closed_loop.scenario_library import find_scenario, scenarios
 from flight_analysis.report import guided
 from flight_analysis.report.display_units import (
     NO_UNIT,
@@ -24,6 +24,7 @@ from flight_analysis.report.page import Colour, Step, Tile, Verdict
 from flight_analysis.report.sample_counts import is_simulated
 from flight_analysis.report.summary import RecordedFlight, command_results
 from flight_core.outcome import STATUS_HOST, Aim, End
+from flight_guidance.guidance_state import Lateral
 from flight_log.clock import SINCE_EPOCH_NS
 
 # ---- Title
@@ -77,6 +78,9 @@ def pace(flight: RecordedFlight) -> str:
 
 # ---- Verdict
 
+FLOWN = ("aircraft", "reference_model", "controller", "guidance")
+"""Sections of a scenario that decide a flight, apart from its length."""
+
 FILE_MODEL = "file"  # name of the model of the file, which a learner may fly
 NEXT = {
     Aim.ERROR: "Ask whether its loop is stable, and with what margins:",
@@ -91,7 +95,7 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
     sentence = f"{outcome['sentence'][:1].upper()}{outcome['sentence'][1:]}."
     injected = _injected(scenario)
     texts = [injected, command_results(flight.summary)]
-    name = scenario_argument(scenario)
+    name = scenario_argument(flight, scenario)
     if outcome["status"] == STATUS_HOST:
         headline = "No finding about the law."
         texts = [sentence, injected]
@@ -129,7 +133,7 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
             sentence="See the flight again:", command=f"rise-di watch {run_argument(flight)}"
         )
         if not injected:
-            step = _next_step(outcome, name, step)
+            step = _next_step(outcome, scenario, name, step)
     return Verdict(
         headline=headline,
         colour=colour,
@@ -142,17 +146,17 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
     )
 
 
-def _next_step(outcome: Mapping[str, Any], scenario: str, otherwise: Step) -> Step:
+def _next_step(outcome: Mapping[str, Any], scenario: Scenario, name: str, otherwise: Step) -> Step:
     """Return what to do about a flight that falls short, by its gravest shortfall."""
     order = list(Aim)
     aims = sorted((Aim(each["aim"]) for each in outcome["shortfalls"]), key=order.index)
     gravest = aims[0] if aims else None
-    if gravest is Aim.ERROR:
-        return Step(sentence=NEXT[gravest], command=f"rise-di gains check {scenario}")
+    if gravest is Aim.ERROR and not scenario.aircraft.is_jsbsim:
+        return Step(sentence=NEXT[gravest], command=gains_command("check", scenario, name))
     if gravest is Aim.LOG:
-        return Step(sentence=NEXT[gravest], command=f"rise-di fly {scenario} --lockstep")
+        return Step(sentence=NEXT[gravest], command=f"rise-di fly {name} --lockstep")
     if outcome["end"] == End.NEVER_FLEW:
-        return Step(sentence="See what the nodes say:", command=f"rise-di fly {scenario} --verbose")
+        return Step(sentence="See what the nodes say:", command=f"rise-di fly {name} --verbose")
     return otherwise
 
 
@@ -162,15 +166,16 @@ def _route_text(flight: RecordedFlight) -> str:
     if not legs:
         return ""
     flown = sum(leg["result"] == "flown" for leg in legs)
-    on_last = " and was on the last one at the end" if flown == len(legs) - 1 else ""
-    text = f"It flew {flown} of {len(legs)} legs of its route{on_last}"
-    crossed = flight.tape["guidance"].names if "guidance" in flight.tape else ()
-    if "xtrack" in crossed:
-        beside = np.abs(flight.tape["guidance"]["xtrack"])
-        beside = beside[np.isfinite(beside)]
-        if len(beside):
-            text += f", at most {np.max(beside):.0f} m beside it"
-    return text
+    on_last = ", the last not to its end" if legs[-1]["result"] == "not ended" else ""
+    text = f"It flew {flown} of the {len(legs)} legs that it began{on_last}"
+    log = flight.tape.signals.get("guidance")
+    if log is None:
+        return text
+    # The way onto a leg and what is not the route do not count.
+    is_on_leg = (log["mode.lateral"] == Lateral.ROUTE) & (log["joining"] == 0.0)
+    beside = np.abs(log["xtrack"][is_on_leg])
+    finite = beside[np.isfinite(beside)]
+    return f"{text}, at most {np.max(finite):.0f} m beside them" if len(finite) else text
 
 
 def _models_text(flight: RecordedFlight) -> str:
@@ -199,10 +204,22 @@ def _injected(scenario: Scenario) -> str:
     return f"The scenario injects: {', '.join(parts)}" if parts else ""
 
 
-def scenario_argument(scenario: Scenario) -> str:
-    """Return how a command names the scenario: by its name, or by the path of its file."""
-    is_known = scenario.name in scenarios()
-    return scenario.name if is_known else shlex.quote(str(scenario.path))
+def scenario_argument(flight: RecordedFlight, scenario: Scenario) -> str:
+    """Return how a command names what flew.
+
+    If the flight had the parameters of a shipped scenario, this is its name. Otherwise it is the
+    file in the folder of the run that holds the parameters that flew.
+    """
+    if scenario.name in scenarios():
+        shipped = find_scenario(scenario.name)
+        if all(getattr(shipped, key) == getattr(scenario, key) for key in FLOWN):
+            return scenario.name
+    return shlex.quote(f"runs/{flight.name}/parameters.yaml")
+
+
+def gains_command(verb: str, scenario: Scenario, name: str) -> str:
+    """Return a command on the gains of a scenario, which has the `name` in commands."""
+    return f"rise-di gains {verb} {shlex.quote(scenario.aircraft.airframe)} --scenario {name}"
 
 
 def run_argument(flight: RecordedFlight) -> str:
