@@ -45,6 +45,26 @@ def test_tolerance_of_a_channel_replaces_that_of_its_size() -> None:
     assert found.outside == pytest.approx(2.0 / 3.0, abs=0.01)
 
 
+def test_gap_and_values_that_are_no_number_are_not_compared_and_that_is_said() -> None:
+    """The second log has nothing from 4 to 8 s, and the first no number in its last tenth."""
+    t = np.linspace(0.0, 10.0, 1001)
+    values = np.where(t > 9.0, np.nan, 1.0)
+    kept = t[(t <= 4.0) | (t >= 8.0)]
+    found = difference(tape("y", t, values), tape("y", kept, np.ones(len(kept))), "y", "phi")
+    assert found is not None
+    assert found.outside == 0.0
+    assert found.compared == pytest.approx(0.5, abs=0.01)
+
+
+def test_angle_between_two_samples_goes_the_short_way() -> None:
+    """Halfway from 179 to -179 deg is 180 deg, and not 0."""
+    ends = np.array([0.0, 1.0])
+    second = tape("pose", ends, np.radians([179.0, -179.0]))
+    found = difference(tape("pose", np.array([0.5]), np.array([np.pi])), second, "pose", "phi")
+    assert found is not None
+    assert found.most == pytest.approx(0.0, abs=1e-9)
+
+
 def test_input_is_held_between_samples_and_output_is_linear() -> None:
     """At 0.5 s a step from 0 to 1 at 1 s is still 0 if held, and 0.5 if linear."""
     first = {topic: tape(topic, np.array([0.5]), np.array([1.0])) for topic in ("y", "u")}

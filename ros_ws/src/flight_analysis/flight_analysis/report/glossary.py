@@ -83,13 +83,13 @@ GLOSSARY = MappingProxyType(
         "which it would then oscillate; the other inputs closed",
         "gain": "the factor by which the effect of one input may change, the other inputs closed",
         "largest S": "the largest factor by which the loop amplifies a disturbance at this "
-        "input; 1 is without a loop, 2 is a common limit",
+        "input; it is 1 without a loop, and 2 at the circle of the Nyquist plot",
         "disk": "the size of the disk of gains and phases around 1 that the loop stands at "
         "this input; from 0, none, to 2",
         "delay": "how much later u may come before the loop is unstable",
         "all inputs": "a disk of its own in each input at the same time; phase and gain are those "
         "that it guarantees, and the delay is that of all inputs together",
-        "damping": "that of the slow modes of the loop; below 0.3 an oscillation is easy to see",
+        "damping": "that of the slow modes of the loop",
         "linear loop": "the law and the aircraft of the file for small deviations, sampled, "
         "with actuators, delay and hold",
     }

@@ -3,7 +3,8 @@
 """Compare the signals that logs have in common, whatever wrote them.
 
 The difference of a signal is taken at the instants of the first log, where the other log has
-samples before and after: y and pose are linear between two samples, and u is held. Each signal has
+samples at most LONGEST_INTERVAL apart: y and pose are linear between two samples, and u is held. A
+value that is no number is not compared. The table says which part was compared. Each signal has
 a tolerance: that of its name, or else TOLERANCE of the largest absolute value in the first log.
 """
 
@@ -12,8 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flight_analysis.metrics import LONGEST_INTERVAL
 from flight_analysis.report.display_units import (
     NO_UNIT,
+    NO_VALUE,
     POSE_UNITS,
     DisplayUnit,
     channel_label,
@@ -42,6 +45,7 @@ class Difference(NamedTuple):
     at: float  # s, where the difference is largest
     tolerance: float
     outside: float  # part of the compared instants
+    compared: float  # part of the instants of the first log
 
 
 def difference(
@@ -55,7 +59,12 @@ def difference(
     instants, values = _samples(second, topic, name)
     if not (len(t) and len(instants)):
         return None
+    if topic == "pose" and name in ANGLES:
+        values = np.unwrap(values)
+    last = np.searchsorted(instants, t, side="right") - 1
+    following = np.minimum(last + 1, len(instants) - 1)
     is_common = (t >= instants[0]) & (t <= instants[-1])
+    is_common &= instants[following] - instants[last] <= LONGEST_INTERVAL
     if not is_common.any():
         return None
     t, before = t[is_common], before[is_common]
@@ -76,6 +85,7 @@ def difference(
         at=float(t[worst]),
         tolerance=tolerance,
         outside=float(np.mean(size > tolerance)),
+        compared=len(t) / len(first[topic].stamp_ns),
     )
 
 
@@ -100,34 +110,41 @@ def difference_table(
     """
     first, *others = flights
     rows = []
+    left_out = []
     named: set[str] = set()
     for label, other in zip(labels(flights)[1:], others, strict=True):
         for topic in TOPICS:
-            if topic not in first.tape or topic not in other.tape:
-                continue
+            in_first, in_other = (
+                each.tape[topic].names if topic in each.tape else () for each in (first, other)
+            )
+            left_out += [f"{topic} {name}" for name in {*in_first} ^ {*in_other}]
             known = POSE_UNITS if topic == "pose" else units
-            common = [name for name in first.tape[topic].names if name in other.tape[topic].names]
+            common = [name for name in in_first if name in in_other]
             for name in in_order(common, known):
                 named.add(name)
                 found = difference(first.tape, other.tape, topic, name, tolerances.get(name))
-                if found is not None:
-                    unit = known.get(name, NO_UNIT)
-                    title = f"{topic} {channel_label(name, known)}"
-                    of_log = f"{label}: {title}" if len(others) > 1 else title
-                    rows.append([of_log, *_cells(found, unit)])
+                title = f"{topic} {channel_label(name, known)}"
+                of_log = f"{label}: {title}" if len(others) > 1 else title
+                rows.append([of_log, *_cells(found, known.get(name, NO_UNIT))])
     for name in tolerances:
         require(name in named, "tolerances", repr(name), one_of(sorted(named), name))
-    heads = ("rms", "largest", "at (s)", "tolerance", "outside, %")
+    heads = ("rms", "largest", "at (s)", "tolerance", "outside, %", "compared, %")
+    absent = ", ".join(sorted(set(left_out)))
     note = (
         f"Unless given, the tolerance is {100 * TOLERANCE:g} % of the largest value in the first "
-        "log. Outside is the part of its instants in which the difference is larger"
+        "log. Outside is the part of the compared instants in which the difference is larger"
     )
+    if absent:
+        note += f". Not in both logs: {absent}"
     return MetricTable("", [Column(group="", head=head) for head in heads], rows, note)
 
 
-def _cells(found: Difference, unit: DisplayUnit) -> list[str]:
-    """Return the cells of a row, in the unit of the signal."""
+def _cells(found: Difference | None, unit: DisplayUnit) -> list[str]:
+    """Return the cells of a row, in the unit of the signal; "0.0" compared if nothing was."""
+    if found is None:
+        return [*[NO_VALUE] * 5, "0.0"]
     rms, most, tolerance = (
         format_value(value, unit.factor) for value in (found.rms, found.most, found.tolerance)
     )
-    return [rms, most, f"{found.at:.2f}", tolerance, f"{100 * found.outside:.1f}"]
+    shares = (f"{100 * share:.1f}" for share in (found.outside, found.compared))
+    return [rms, most, f"{found.at:.2f}", tolerance, *shares]
