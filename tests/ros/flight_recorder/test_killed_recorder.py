@@ -43,10 +43,11 @@ def stamps_and_sequences(folder: Path) -> dict[str, tuple[list[int], list[int]]]
 def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
     """Delay of a recorder's file behind the messages that another process received, s.
 
-    It is that of the topic with the largest delay.
+    It is that of the topic with the largest delay. The messages are taken first: the publishers
+    go on while the file is read, and what they send meanwhile is not the recorder's loss.
     """
-    by_topic = stamps_and_sequences(folder)
     received = [stamp_of(message.message) for message in witness.take()]
+    by_topic = stamps_and_sequences(folder)
     if not received or set(by_topic) != set(SIGNALS):
         return float("inf")
     return max(max(received) - stamps[-1] for stamps, _ in by_topic.values()) / NANOSECONDS
