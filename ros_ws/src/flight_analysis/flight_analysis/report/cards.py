@@ -7,7 +7,7 @@ import math
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.linear_loop.certificate import kept_guarantee
 from flight_analysis.linear_loop.guarantee import Guarantee
-from flight_analysis.linear_loop.loop_margins import LoopMargins, loop_margins
+from flight_analysis.linear_loop.loop_margins import LoopMargins
 from flight_analysis.report.display_units import format_seconds, format_value
 from flight_analysis.report.flight_head import (
     gains_command,
@@ -26,10 +26,12 @@ def claims(flight: RecordedFlight, scenario: Scenario, flown: FlownLoops) -> lis
     cards = []
     name = scenario_argument(flight, scenario)
     if len(flown.loops) == 1:
-        loop = flown.loops[0].loop
+        (single,) = flown.loops
         cards = [
-            _margin_card(loop_margins(loop), gains_command("check", scenario, name)),
-            _guarantee_card(kept_guarantee(loop), gains_command("guarantee", scenario, name)),
+            _margin_card(single.margins, gains_command("check", scenario, name)),
+            _guarantee_card(
+                kept_guarantee(single.loop), gains_command("guarantee", scenario, name)
+            ),
         ]
     elif flown.loops:
         cards = [_changed_card(flown)]
@@ -117,7 +119,7 @@ def _guarantee_card(promise: Guarantee | None, command: str) -> Card:
 
 def _changed_card(flown: FlownLoops) -> Card:
     """Return the card of a flight with several parameter sets, or with a true aircraft."""
-    is_stable = [bool(loop_margins(each.loop).nominal.stable) for each in flown.loops]
+    is_stable = [bool(each.margins.nominal.stable) for each in flown.loops]
     count = len(flown.loops)
     sentence = (
         f"All {count} linear loops of this flight are stable."

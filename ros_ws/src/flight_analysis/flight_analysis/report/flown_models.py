@@ -7,6 +7,8 @@ A loop is around the aircraft of the file, or around the true aircraft of a simu
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -18,8 +20,10 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.linear_loop.certificate import beyond_kept
 from flight_analysis.linear_loop.loop_margins import (
     LinearLoop,
+    LoopMargins,
     distribution,
     linear_loop,
+    loop_margins,
     scenario_loop,
     through_allocation,
 )
@@ -51,13 +55,19 @@ class FlownController(NamedTuple):
         return ", ".join(f"{start:.1f} to {stop:.1f}" for start, stop in self.spans)
 
 
-class FlownLoop(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class FlownLoop:
     """The linear loop of parameters that flew, around an aircraft."""
 
     name: str  # of the parameters; empty for those of the whole flight
     times: str  # of the parameters, s
     aircraft: str  # FILE or TRUE
     loop: LinearLoop
+
+    @cached_property
+    def margins(self) -> LoopMargins:
+        """Return the margins of the loop. A card and a table of the page both show them."""
+        return loop_margins(self.loop)
 
 
 def flown_controllers(
@@ -119,10 +129,10 @@ def flown_loops(
         if any(each.standing is Standing.NO_LOOP for each in around_file.differences):
             continue
         sentences += beyond_kept(around_file)
-        loops.append(FlownLoop(name, times, FILE, around_file))
+        loops.append(FlownLoop(name=name, times=times, aircraft=FILE, loop=around_file))
         if airframe is not None:
             true = _loop_around(airframe, controller, around_file.loop)
-            loops.append(FlownLoop(name, times, TRUE, true))
+            loops.append(FlownLoop(name=name, times=times, aircraft=TRUE, loop=true))
     if loops and not is_simulated(tape):
         sentences.append(UNKNOWN_AIRCRAFT)
     return FlownLoops(loops, tuple(dict.fromkeys(sentences)))

@@ -312,9 +312,9 @@ def _margin_tables(flown: FlownLoops) -> list[tables.MetricTable]:
         return []
     if len(flown.loops) > 1:
         return [margin_figures.flown_margin_table(flown)]
-    loop = flown.loops[0].loop
-    margins = loop_margins(loop)
-    return [margin_figures.margin_table(margins, kept_guarantee(loop), flown.sentences)]
+    (single,) = flown.loops
+    guarantee = kept_guarantee(single.loop)
+    return [margin_figures.margin_table(single.margins, guarantee, flown.sentences)]
 
 
 def _drawn_loops(loops: Sequence[FlownLoop]) -> dict[str, LinearLoop]:

@@ -374,8 +374,6 @@ def _noise(
     not count as noise: the law follows them, and the aircraft is off by as much. Whatever exceeds
     the sensor's declaration is a fault, and does not count either.
     """
-    from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - loads SciPy, which few flights need
-
     count = max(round(NOISE_TIME * controller.rate), 1)
     noise = np.zeros((len(ticks), len(controller.outputs)))
     truth = tape.signals.get("truth")
@@ -385,9 +383,16 @@ def _noise(
     for i, name in enumerate(controller.outputs):
         if f"noise.{name}" in truth.names:
             errors = _at(tape, "truth", f"noise.{name}", ticks)
-            errors -= uniform_filter1d(errors, count, mode="nearest")
+            errors -= _moving_mean(errors, count)
             noise[:, i] = np.clip(errors, -declared[name], declared[name])
     return noise
+
+
+def _moving_mean(values: FloatArray, count: int) -> FloatArray:
+    """Return the mean of the `count` values around each; the ends go on as they are, (N,)."""
+    before = count // 2
+    padded = np.pad(values, (before, count - 1 - before), mode="edge")
+    return np.convolve(padded, np.full(count, 1.0 / count), mode="valid")
 
 
 def _declared_noise(aircraft: AircraftConfig) -> list[float]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_analysis.linear_loop.input_margins import Margins, disk_gain, disk_phase, loop_transfer
-from flight_analysis.linear_loop.loop_margins import LinearLoop, LoopMargins, loop_margins
+from flight_analysis.linear_loop.loop_margins import LinearLoop, LoopMargins
 from flight_analysis.report.display_units import NO_VALUE
 from flight_analysis.report.figures import COLOURS
 from flight_analysis.report.flown_models import FlownLoops
@@ -180,7 +180,7 @@ def flown_margin_table(flown: FlownLoops) -> MetricTable:
         Column(group="delay", head="ms"),
     ]
     rows = [
-        [loop.name or "law", loop.times, loop.aircraft, *least_margins(loop_margins(loop.loop))]
+        [loop.name or "law", loop.times, loop.aircraft, *least_margins(loop.margins)]
         for loop in flown.loops
     ]
     note = (
