@@ -92,3 +92,28 @@ ends.set()
 """
     left = os.SCHED_OTHER if "--fifo" in policy else os.SCHED_BATCH
     assert output(code, with_policy(*policy)).split() == 2 * [str(left)]
+
+
+@pytest.mark.skipif(not THREADS.exists(), reason="no Linux, or no /proc")
+@pytest.mark.skipif(os.cpu_count() == 1, reason="OpenBLAS has one thread on one processor")
+@pytest.mark.parametrize("chosen", [None, "2"])
+def test_command_computes_in_one_thread_unless_the_user_chose(
+    chosen: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """OpenBLAS starts its threads when NumPy is imported, those of SciPy's copy with SciPy."""
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    if chosen is not None:
+        monkeypatch.setenv("OPENBLAS_NUM_THREADS", chosen)
+    code = """
+import os, sys
+from flight_cli.cli import main
+from flight_core.scheduling import THREADS
+sys.argv = ["rise-di", "scenarios"]
+try:
+    main()
+finally:
+    assert "numpy" in sys.modules
+    print("threads:", len(list(THREADS.iterdir())))
+"""
+    last = output(code).splitlines()[-1]
+    assert (last == "threads: 1") == (chosen is None), last

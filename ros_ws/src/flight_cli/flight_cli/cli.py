@@ -25,6 +25,7 @@ from typing import Annotated, Any
 import typer
 
 from flight_cli.words import RiseDiCommand, RiseDiGroup, as_function, without_help_word
+from flight_core.scheduling import compute_in_one_thread
 
 FAILED = 1
 BAD_INPUT = 2
@@ -190,6 +191,7 @@ def _looks_on(words: Sequence[str]) -> bool:
 def main() -> None:
     """Run a command. Bad input ends in one sentence and exit status 2; Ctrl-C is quiet."""
     gc.set_threshold(GARBAGE_THRESHOLD)
+    compute_in_one_thread()
     if _looks_on(sys.argv[1:]):
         with suppress(OSError):
             os.nice(NICE)

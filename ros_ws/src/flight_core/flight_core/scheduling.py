@@ -22,6 +22,17 @@ SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 ATTRIBUTES = "=IIQiIQQQ"
 
 
+def compute_in_one_thread() -> None:
+    """Let the linear algebra of this process, and of those that it starts, use one thread.
+
+    Call it before NumPy is imported, because OpenBLAS reads the number once. Our matrices have at
+    most some hundred rows. On them two threads take longer than one, because each waits for the
+    other, and on a busy host they take several times as long. With one thread, the last bits of a
+    result do not depend on the number of processors either. A number that the user has set is kept.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
 def lower_real_time_priority(levels: int) -> None:
     """Lower the real-time priority (chrt) of every thread of this process, if it has one.
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from flight_core.environment import require_ros_environment
 from flight_core.memory import limit_memory
-from flight_core.scheduling import lower_real_time_priority
+from flight_core.scheduling import compute_in_one_thread, lower_real_time_priority
 from flight_core.signals import handle_shutdown
 from flight_ros import transport
 
@@ -60,6 +60,7 @@ def start_nodes(
     except ValueError as error:  # a ParameterError, whose module a node loads later
         print(f"error: {error}", file=sys.stderr)
         sys.exit(BAD_ENVIRONMENT)
+    compute_in_one_thread()
     lower_real_time_priority(lower_by)
     limit_memory()
     # `run` enables it; collections during the imports find nothing and take a tenth of the time
