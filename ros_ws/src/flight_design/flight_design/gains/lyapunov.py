@@ -14,7 +14,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 from aircraft_sim.plant import dynamics
 from flight_analysis.closed_loop.scenario import Scenario
@@ -212,7 +211,10 @@ def integral(signal: FloatArray, t: FloatArray) -> FloatArray:
 
     The result has the shape of the signal: (N,) or (N, m).
     """
-    return np.asarray(cumulative_trapezoid(signal, t, axis=0, initial=0))
+    means = (signal[1:] + signal[:-1]) / 2.0
+    result = np.zeros_like(signal)
+    np.cumsum((np.diff(t) * means.T).T, axis=0, out=result[1:])
+    return result
 
 
 class Example(NamedTuple):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import ndtri, stdtr
 
 from flight_core.outcome import Refusal
 from flight_core.vectors import FloatArray
@@ -81,7 +81,7 @@ def advantage(
     if len(sums) < 2 or np.ptp(sums) == 0.0:
         return 0.0
     t = np.sum(sums) / (np.sqrt(len(sums)) * np.std(sums, ddof=1))
-    return float(np.sign(t) * stats.norm.isf(stats.t.sf(abs(t), len(sums) - 1)))
+    return float(-np.sign(t) * ndtri(stdtr(len(sums) - 1, -abs(t))))
 
 
 @dataclass(frozen=True)
