@@ -66,9 +66,9 @@ def run(command: list[str], folder: Path) -> None:
 
 
 SHORTER = (
-    (r"(--aircraft|--samples) \d+", r"\1 4"),
-    (r"--duration \d+", "--duration 5"),
-    (r"(rise-di fly \S+ --in-process)(?! --duration)", r"\1 --duration 5"),
+    (r"(--aircraft|--samples) \d+", r"\1 2"),
+    (r"--duration \d+", "--duration 2"),
+    (r"(rise-di fly \S+ --in-process)(?! --duration)", r"\1 --duration 2"),
 )
 
 

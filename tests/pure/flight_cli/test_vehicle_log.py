@@ -1015,7 +1015,10 @@ LOSSES: Mapping[str, tuple[Callable[[bytes, Sequence[int], bytes], bytes], int, 
 def test_log_with_lost_bytes_is_read_on_and_gives_the_aircraft(
     name: str, loss: str, flight: Flight, tmp_path: Path
 ) -> None:
-    """Omega of the whole log and of the damaged one differ by less than their standard errors."""
+    """What is left are samples of the flight, and Omega behind the largest holes is its own.
+
+    A DataFlash log has no checksum: a message whose values the loss overwrites has wrong ones.
+    """
     write, map_name = {**WRITERS, "flight.log": (as_text, "ardupilot")}[name]
     damage, count, filling = LOSSES[loss]
     path = write(tmp_path / name, flight)
@@ -1041,9 +1044,17 @@ def test_log_with_lost_bytes_is_read_on_and_gives_the_aircraft(
             r"(from [\d.]+ to|at) [\d.]+ s of the log",
             result.stderr,
         )
-    response = recorded_response(bag, OUTPUTS, INPUTS)
-    deviations = response.Omega_deviation.diagonal()
-    assert np.abs(response.Omega.diagonal() - OMEGA) / deviations == approx(np.zeros(4), abs=3.0)
+    numbers = np.clip(np.rint(tape.time("y") * RATE).astype(int), 0, len(flight.y) - 1)
+    error = np.stack([tape["y"][name] for name in OUTPUTS], axis=1) - flight.y[numbers]
+    error -= np.median(error, axis=0)  # the speed of trim
+    # A lost V, which has a message of its own, is the one before.
+    is_wrong = np.abs(error) > [1e-3, 0.5, 1e-3, 1e-3]
+    assert is_wrong.sum() <= 2, is_wrong.sum(axis=0)
+    if loss == "blocks of a card":
+        response = recorded_response(bag, OUTPUTS, INPUTS)
+        deviations = response.Omega_deviation.diagonal()
+        errors = np.abs(response.Omega.diagonal() - OMEGA) / deviations
+        assert errors == approx(np.zeros(4), abs=3.0)
 
 
 def test_refusal_of_an_incomplete_log_tells_the_loss(flight: Flight, tmp_path: Path) -> None:
