@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands and the Python of the tutorials run page by page, each in an empty folder.
 
-They run as they stand but for their length: campaigns of four aircraft, four samples of margins,
-flights of five seconds.
+They run as they stand but for their length: campaigns of two aircraft, two samples of margins,
+flights of two seconds.
 """
 
 import json
