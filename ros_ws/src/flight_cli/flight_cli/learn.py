@@ -10,7 +10,6 @@ from pathlib import Path
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 
 from flight_analysis.closed_loop.replay import recorded_scenario
 from flight_analysis.report.display_units import display_units
@@ -70,7 +69,7 @@ class Learn:
             result = learn_again(recorded_run.tape, others)
         for step in result.steps:
             lead = "" if step.proposed else "no model: "
-            say(console, escape(f"t = {step.t:.2f} s: {lead}{step.sentence}"))
+            say(console, f"t = {step.t:.2f} s: {lead}{step.sentence}")
         account = log_account(recorded_run)
         over = "" if account is None else account.over("internals")
         part = f", {over}" if over else ""
@@ -82,7 +81,7 @@ class Learn:
             show_table(console, model_table(models, display_units(scenario), part))
         if result.model is not None and self.write is not None:
             write_text("--write", self.write, learned_yaml(result, str(self.run)))
-            say(console, f"model: {escape(display_path(self.write))}")
+            say(console, f"model: {display_path(self.write)}")
         if self.as_json:
             steps = [step._asdict() for step in result.steps]
             path = None if result.model is None or self.write is None else str(self.write)

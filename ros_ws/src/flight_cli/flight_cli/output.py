@@ -272,7 +272,7 @@ def parse_lags(text: str) -> list[float]:
 
 def say(console: Console, text: str, style: str = "") -> None:
     """Print a text as it is, even if it is longer than a line."""
-    console.print(text, style=style, highlight=False, soft_wrap=True)
+    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
 
 def print_json(value: Any) -> None:
