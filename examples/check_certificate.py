@@ -432,7 +432,7 @@ def system_of(
     sizes = np.abs(wide * (Z @ R @ W + D)) ** 2 + 1e-30
     t, g = (np.r_[step[key], np.zeros(p - known)] for key in "tg")
     for i in range(known, p, k):
-        to = np.exp(2.0 * t[:i]) @ sizes[:i, i : i + k]
+        to = (np.exp(t[:i]) * (1.0 + np.abs(g[:i]))) ** 2 @ sizes[:i, i : i + k]
         t[i : i + k] = np.log(to / (sizes[i : i + k, :i] @ np.exp(-2.0 * t[:i]))) / 4.0
     # v of an entry is scaled as its last coefficient, and is at most `most` times the rest of z.
     scale, most, last = np.exp(t), np.abs(middle) + half, np.exp(t[-k:])
