@@ -55,7 +55,7 @@ from flight_analysis.report.guided import control_errors
 from flight_analysis.report.summary import transients
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
-from flight_design.gains.nominal import unit_sizes
+from flight_core.units import unit_sizes
 from flight_design.gains.observer_selection import with_extended_state_observer
 from flight_design.identification.jsbsim_identification import NOISE_SHARE
 from flight_log.tape_reader import read_run

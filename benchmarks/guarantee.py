@@ -96,7 +96,7 @@ def beyond(linear: LinearLoop, stable: float, count: int) -> str:
     for k in range(0, count, BATCH):
         d = generator.uniform(-1.0, 1.0, (min(BATCH, count - k), len(box.names)))
         d = d if k % (2 * BATCH) else np.sign(d)
-        aircraft = plants_at(linear.nominal, box, d * stable / box.part.max())
+        aircraft = plants_at(linear.nominal, box, d * stable / box.largest)
         z = np.linalg.eigvals(closed_loop(aircraft, linear.law, linear.loop, still))
         radii = np.abs(z).max(axis=-1)
         unstable += int(np.count_nonzero(radii > 1.0 + SPECTRAL_RADIUS_TOLERANCE))

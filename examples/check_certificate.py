@@ -54,10 +54,10 @@ FLOAT32 = 1e-6  # the same for constants in single precision
 COVERED = """\
 covered: deviations constant in time, in the linear loop with this period, delay and lags;
     no mode grows by more than 1e-6 a tick
-not covered: entries that are 0, limits and rates of the inputs, errors beyond the width of the
-    softened sign, filters of sensors, actuators of another order, limits and fade-in of an
-    observer, motion beyond the linear equations, other lags and delays, a late or missed tick, a
-    schedule, deviations that change in time"""
+not covered: entries that are 0 without a line above, limits and rates of the inputs, errors beyond
+    the width of the softened sign, filters of sensors, actuators of another order, limits and
+    fade-in of an observer, motion beyond the linear equations, other lags and delays, a late or
+    missed tick, a schedule, deviations that change in time"""
 
 # The file. Everything that it may hold is stated here, with the range of each number.
 LONGEST = 32_000_000  # bytes
@@ -90,6 +90,7 @@ FIELDS: dict[str, Any] = {
     "inputs": Names("m", 32),
     "effectors": Names("p", 64),
     "names": Names("k", 512),
+    "zeros": Names("z", 512),
     "A": Numbers(("n", "n")),
     "B": Numbers(("n", "m")),
     "C": Numbers(("o", "n")),
@@ -111,7 +112,7 @@ FIELDS: dict[str, Any] = {
     "loop": HEX,
     "digest": HEX,
 }
-OPTIONAL = {"airframe", "scenario", "constants"}
+OPTIONAL = {"airframe", "scenario", "constants", "zeros"}
 MOST_OF = {"q": 512, "steps": 50_000, "ticks": 100}
 STEP = {"low": (0.0, 1e5), "high": (0.0, 1e5), "t": (-100.0, 100.0), "g": (-1e9, 1e9)}
 
@@ -575,9 +576,12 @@ def exact_entries(file: dict[str, Any]) -> list[str]:
     """Return the entries of A and B that are the same number in every aircraft.
 
     Raises ValueError unless an entry NAME of `names` is one number of the aircraft: A[i,j] that is
-    off by `part` of itself, or B[i,j] of an effector, whose row of T multiplies it.
+    off by `part` of itself, or B[i,j] of an effector, whose row of T multiplies it. One of `zeros`
+    is 0, and off by any number.
     """
     states, effectors, T = file["states"], file["effectors"], file["T"]
+    zeros, own = file.get("zeros", []), effectors == file["inputs"]
+    require({*zeros} <= {*file["names"]}, "zeros", zeros, "some of the names")
     rest = {"A": file["A"].copy(), "B": file["B"].copy()}
     places: dict[str, tuple[str, int, int]] = {}
     for i, state in enumerate(states):
@@ -597,9 +601,12 @@ def exact_entries(file: dict[str, Any]) -> list[str]:
         fits = fits and is_equal(changes[letter], part * value * along)
         fits = fits and not changes["B" if letter == "A" else "A"].any()
         require(fits, name, changes[letter].tolist(), f"{part:g} of this entry of the file alone")
-        rest[letter][i] -= value * along
+        if name not in zeros:
+            rest[letter][i] -= value * along
+        elif own or letter == "A":
+            require(file[letter][i, j] == 0.0, name, float(file[letter][i, j]), "0: it is in zeros")
     # Of each entry, either nothing is left or all of it.
-    exact, own = [], effectors == file["inputs"]
+    exact = []
     require(not own or np.array_equal(T, np.eye(len(T))), "T", T.tolist(), "1 and 0: its inputs")
     for letter, columns in (("A", states), ("B", file["inputs"])):
         size, left = np.abs(file[letter]), np.abs(rest[letter])
@@ -775,18 +782,29 @@ def check(file: dict[str, Any]) -> int:
     return count
 
 
+def rounded_down(x: float) -> str:
+    """Write the first three digits of a positive number."""
+    unit = 10.0 ** (np.floor(np.log10(x)) - 2.0)
+    return f"{np.floor(x / unit + 1e-6) * unit:.3g}"
+
+
 def report_of(file: dict[str, Any], count: int) -> str:
     """Return what a proved certificate says."""
     lines = [f"PROVED by {count} bounds: stable for each deviation within"]
-    for name, part in zip(file["names"], file["part"], strict=True):
-        if part:
+    for k, name in enumerate(file["names"]):
+        if file["part"][k]:
             # a position beside the name: row and column from 0
             letter, row, column = re.split(r"[\[,]", name[:-1])
             side = file["states"] if letter == "A" else file["effectors"]
-            place = f"{letter} {file['states'].index(row)}, {side.index(column)}"
-            percent = np.floor(1e3 * file["size"] * part + 1e-6) / 10.0
-            lines.append(f"  {name} ({place}) {percent:g} %")
-    lines.append(f"exact in every aircraft: {', '.join(exact_entries(file)) or 'no entry'}, and 0")
+            i, j = file["states"].index(row), side.index(column)
+            within = f"{np.floor(1e3 * file['size'] * file['part'][k] + 1e-6) / 10.0:g} %"
+            if name in file.get("zeros", []):
+                along = np.eye(len(side))[j] if letter == "A" else file["T"][j]
+                change = file["F" if letter == "A" else "G"][k] @ along / (along @ along)
+                within = f"0 +- {rounded_down(abs(change) * file['size'])}"
+            lines.append(f"  {name} ({letter} {i}, {j}) {within}")
+    exact = ", ".join(exact_entries(file)) or "no entry"
+    lines.append(f"exact in every aircraft: {exact}, and each other 0")
     lines.append(f"certificate {file['loop'][:12]}")
     law = "of the constants in the file" if "constants" in file else "of no exported constants"
     lines.append(f"law: {law}")

@@ -281,7 +281,9 @@ def test_command_writes_a_certificate_and_refuses_what_it_cannot_state(tmp_path:
     flight = rise_di.fly(
         rise_di.find_scenario("osprey_servo", duration=0.5), runs=tmp_path / "runs"
     )
-    assert name in flight.report.read_text()
+    report = flight.report.read_text()
+    assert name in report
+    assert re.search(r"proved stable while each is within \d+\.\d % of its row", report)
     assert name in invoke("replay", str(flight.mcap)).output
     # u with other gains is another loop
     assert "certificate" not in invoke("replay", str(flight.mcap), "--set", "k_s=1").output

@@ -16,6 +16,7 @@ from aircraft_sim.airframes.airframe import Airframe
 from aircraft_sim.atmosphere.disturbance import AIR_STATE
 from flight_core.files import dump_yaml
 from flight_core.parameters import require
+from flight_core.units import ANGLE, ANGLE_SIZE, DIMENSIONLESS, quantity, unit_sizes
 from flight_core.vectors import FloatArray
 
 KINEMATIC = ("theta", "phi", "psi")
@@ -39,9 +40,15 @@ class Spread(NamedTuple):
     # largest relative deviation of an entry, by its name as in `drawn_entries`
     entries: Mapping[str, float] = MappingProxyType({})
     distribution: Distribution = "uniform"
+    # largest deviation of an entry that is 0 as published, as a part of its row; see `row_sizes`
+    zeros: float = 0.0
 
 
 UNIFORM = Spread()
+
+# size of a thrust in newtons, as a part of the thrust in trim: a tenth of the throttle if trim
+# needs half of it
+THRUST_SIZE = 0.2
 
 
 def nominal_and_sampled(
@@ -121,14 +128,16 @@ def sampled_matrices(
 
     The shapes are (count, n, n) and (count, n, m). Every entry is multiplied by 1 + d, with d
     independent and within +-uncertainty, distributed as `spread` says. The rows of angles stay. An
-    aircraft depends only on seed and number, not on `count`. Raises ParameterError for an
-    uncertainty outside [0, 1), and for an unknown entry.
+    entry that is 0 becomes d times its row, with d within +-zeros. An aircraft depends only on seed
+    and number, not on `count`. Raises ParameterError for an uncertainty outside [0, 1), and for an
+    unknown entry.
     """
+    sizes = row_sizes(airframe)
     parts = {
-        "A": np.full(airframe.matrix_a().shape, part_A),
-        "B": np.full(airframe.matrix_b().shape, part_B),
+        "A": np.where(sizes["A"] > 0.0, spread.zeros, part_A),
+        "B": np.where(sizes["B"] > 0.0, spread.zeros, part_B),
     }
-    places = drawn_places(airframe)
+    places = drawn_places(airframe, zeros=spread.zeros > 0.0)
     for name, part in spread.entries.items():
         require(
             name in places,
@@ -142,16 +151,18 @@ def sampled_matrices(
         require(
             0.0 <= part < 1.0, "uncertainty", part, "a part of each entry, 0 <= uncertainty < 1"
         )
+    require(0.0 <= spread.zeros < 1.0, "zeros", spread.zeros, "a part of each row, 0 <= zeros < 1")
     A = airframe.matrix_a()
     B = airframe.matrix_b()
     uniform = random_streams.uniform(first, count, A.size + B.size, random_streams.AIRFRAME, seed)
     is_free = np.array([[float(state not in KINEMATIC)] for state in airframe.states])
 
-    def drawn(matrix: FloatArray, part: FloatArray, numbers: FloatArray) -> FloatArray:
+    def drawn(matrix: FloatArray, name: str, numbers: FloatArray) -> FloatArray:
         d = deviations(numbers.reshape(count, *matrix.shape), spread.distribution)
-        return np.asarray(matrix * (1.0 + is_free * part * d))
+        part = parts[name]
+        return np.asarray(matrix * (1.0 + is_free * part * d) + sizes[name] * part * d)
 
-    return drawn(A, parts["A"], uniform[:, : A.size]), drawn(B, parts["B"], uniform[:, A.size :])
+    return drawn(A, "A", uniform[:, : A.size]), drawn(B, "B", uniform[:, A.size :])
 
 
 def deviations(uniform: FloatArray, distribution: Distribution) -> FloatArray:
@@ -177,19 +188,58 @@ def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str,
     }
 
 
-def drawn_places(airframe: Airframe) -> dict[str, tuple[str, int, int]]:
-    """Locate the entries that `sampled_matrices` draws: matrix, row and column by name."""
-    matrices = {
-        "A": (airframe.matrix_a(), [*airframe.states]),
-        "B": (airframe.matrix_b(), [*airframe.inputs]),
-    }
+def drawn_places(airframe: Airframe, *, zeros: bool = False) -> dict[str, tuple[str, int, int]]:
+    """Locate the entries that `sampled_matrices` draws: matrix, row and column by name.
+
+    With `zeros`, those that are 0 follow, if `row_sizes` has a size for them.
+    """
     rows = [*airframe.states]
+    columns = {"A": rows, "B": [*airframe.inputs]}
+    is_free = np.array([[state not in KINEMATIC] for state in rows])
+    drawn = [{"A": airframe.matrix_a() * is_free, "B": airframe.matrix_b() * is_free}]
+    if zeros:
+        drawn.append(row_sizes(airframe))
     places = {}
-    for matrix, (matrix_values, columns) in matrices.items():
-        for i, j in np.argwhere(matrix_values).tolist():
-            if rows[i] not in KINEMATIC:
-                places[f"{matrix}[{rows[i]},{columns[j]}]"] = (matrix, i, j)
+    for matrices in drawn:
+        for name, matrix in matrices.items():
+            for i, j in np.argwhere(matrix).tolist():
+                places[f"{name}[{rows[i]},{columns[name][j]}]"] = (name, i, j)
     return places
+
+
+def row_sizes(airframe: Airframe) -> dict[str, FloatArray]:
+    """Compute what a whole row is for each entry of A and B that is 0 as published, SI.
+
+        row_i / size_j,   row_i = max over A and B of abs(A_ik) size_k, abs(B_ik) size_k
+
+    so that the entry moves x_dot_i as the largest one of its row does, if both states or inputs are
+    at their sizes. These are 1 m/s, 0.1 rad (/s), a tenth of a throttle, and THRUST_SIZE of the
+    thrust in trim.
+
+    The size is 0 for entries that are not 0, and for those that stay 0 in every aircraft: in rows
+    of angles, in columns of angles, because no force but gravity depends on an angle, and for
+    inputs without a known size.
+    """
+    is_free = np.array([state not in KINEMATIC for state in airframe.states])
+    matrices = {"A": airframe.matrix_a(), "B": airframe.matrix_b()}
+    units = {"A": unit_sizes(airframe.states.values()), "B": input_sizes(airframe)}
+    moved = np.hstack([np.abs(matrices[name]) * units[name] for name in matrices])
+    row = np.max(moved, axis=1, keepdims=True) * is_free[:, None]
+    inverse = {
+        name: np.divide(1.0, unit, out=0.0 * unit, where=unit > 0.0) for name, unit in units.items()
+    }
+    inverse["A"] = inverse["A"] * is_free
+    return {
+        name: np.where(matrix == 0.0, row * inverse[name], 0.0) for name, matrix in matrices.items()
+    }
+
+
+def input_sizes(airframe: Airframe) -> FloatArray:
+    """Return the sizes of the inputs, (p,), SI; 0 for one without a known size."""
+    trim = np.abs(np.nan_to_num(airframe.no_thrust()))
+    dimensions = [quantity(channel.unit).dimension for channel in airframe.inputs.values()]
+    has_range = [dimension in {ANGLE, DIMENSIONLESS} for dimension in dimensions]
+    return np.where(has_range, ANGLE_SIZE, THRUST_SIZE * trim)
 
 
 def with_entries(
@@ -197,13 +247,15 @@ def with_entries(
 ) -> Airframe:
     """Multiply entries of an airframe by 1 + deviation, named as in `drawn_entries`.
 
-    The wind acts as `wind_factors` says.
+    An entry that is 0 becomes the deviation times its row. The wind acts as `wind_factors` says.
     """
     matrices = {"A": airframe.matrix_a().copy(), "B": airframe.matrix_b().copy()}
-    places = drawn_places(airframe)
+    places = drawn_places(airframe, zeros=True)
+    sizes = row_sizes(airframe)
     for name, deviation in deviations.items():
         matrix, i, j = places[name]
-        matrices[matrix][i, j] *= 1.0 + deviation
+        entry = matrices[matrix][i, j]
+        matrices[matrix][i, j] = entry * (1.0 + deviation) + sizes[matrix][i, j] * deviation
     return airframe.with_matrices(
         matrices["A"], matrices["B"], wind_factors(airframe, matrices["A"][None], wind)[0]
     )

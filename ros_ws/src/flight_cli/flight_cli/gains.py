@@ -239,6 +239,10 @@ class Check(_Gains):
         "An entry with a deviation of its own, 'A[q,alpha]=0.6', or of an actuator "
         "'1/lag[elevator]=0.3'; may be repeated."
     )
+    zeros: float = option(
+        "Part of its row that each entry of A and B may be that is 0 in the file, as in 0.1.",
+        default=0.0,
+    )
 
     def execute(self) -> None:
         """Check the gains, and show them."""
@@ -252,7 +256,8 @@ class Check(_Gains):
 
     def _checked(self) -> GainAssessment[Any]:
         entries = named_numbers("entry", self.entry or (), "1/lag[elevator]=0.3")
-        return check_gains(self.airframe, self.scenario, **values_of(self, *STUDY), entries=entries)
+        words = values_of(self, *STUDY, "zeros")
+        return check_gains(self.airframe, self.scenario, **words, entries=entries)
 
     def _exit(self, sets: GainSets) -> None:
         if not loop_verdict(sets.first, sets.promise).holds:
@@ -295,7 +300,7 @@ class Guarantee(Check):
             answer = self._checked()
             status.update("bounding every aircraft of the box")
             loop = answer.loop_with_box()
-            promise = proved(loop, self.late)
+            promise = proved(answer, self.late)
             lines = write_certificate(self.certificate, loop, promise, self.airframe, self.scenario)
             lines += write_unstable(self.worst, promise, self.airframe, self.scenario)
         name = Path(self.scenario).stem

@@ -11,13 +11,13 @@ import numpy as np
 from rich.console import Console
 
 from aircraft_sim.airframes.airframe import load_airframe
-from aircraft_sim.uncertainty import as_yaml, with_entries
+from aircraft_sim.uncertainty import Spread, as_yaml, with_entries
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop import certificate as certificates
 from flight_analysis.linear_loop.certificate import keep, unstated
 from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN
-from flight_analysis.linear_loop.guarantee import LARGEST, Guarantee, guarantee
+from flight_analysis.linear_loop.guarantee import LARGEST, Guarantee, guarantee, zeros_alone
 from flight_analysis.linear_loop.input_margins import disk_gain, disk_phase
 from flight_analysis.linear_loop.loop_margins import LinearLoop
 from flight_analysis.linear_loop.told import Standing
@@ -34,7 +34,7 @@ from flight_design.gains.first_scenario import (
     controller_alone,
     scenario_to_check,
 )
-from flight_design.gains.gain_selection import GainAssessment
+from flight_design.gains.gain_selection import GainAssessment, loop_with_box
 from rise_di.c_code import certificate_sources
 from rise_di_controller.params import ControllerConfig
 
@@ -78,15 +78,21 @@ def require_guarantee(
     require(fits, "certificate", certificate, "a file in a folder that can be written")
 
 
-def proved(loop: LinearLoop, late: float) -> Guarantee:
+def proved(answer: GainAssessment[ControllerConfig], late: float) -> Guarantee:
     """Return the guarantee of a loop, and keep it for the pages of its flights.
 
-    Raises ParameterError before the proof if the aircraft has no linear loop.
+    If the entries that are 0 in the file are not in its box, it also says how far they may go
+    beside exact others. Raises ParameterError before the proof if the aircraft has no linear loop.
     """
+    loop = answer.loop_with_box()
     for each in loop.differences:
         expected = "the aircraft of a linear loop for a guarantee"
         require(each.standing is Standing.TAKEN, "guarantee", each.fact, expected)
     promise = guarantee(loop, late)
+    if not answer.study.spread.zeros:
+        zeros = answer.study._replace(uncertainty=0.0, spread=Spread(zeros=1.0))
+        alone = zeros_alone(loop_with_box(zeros, answer.controller), late)
+        promise = promise._replace(zeros_alone=alone)
     keep(promise)
     return promise
 

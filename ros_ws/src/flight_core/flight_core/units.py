@@ -6,13 +6,16 @@ Values are converted once, when they are loaded. The code then uses only SI and 
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from math import pi
 from types import MappingProxyType
 
+import numpy as np
+
 from flight_core.parameters import ParameterError, one_of
+from flight_core.vectors import FloatArray
 
 GRAVITY = 9.81  # standard gravity as rounded in the airframes, m/s^2
 FOOT = 0.3048  # m, exact: the international foot of 1959
@@ -41,6 +44,9 @@ ANGLE = (1, 0, 0, 0)
 LENGTH = (0, 1, 0, 0)
 SPEED = (0, 1, -1, 0)
 ANGULAR_RATE = (1, 0, -1, 0)
+
+SIZES = {SPEED: 1.0, LENGTH: 1.0}  # m/s, m: the "sizes" in which weights measure states
+ANGLE_SIZE = 0.1  # size of an angle, rad, of a rate, rad/s, and of a value without a dimension
 
 BASE_UNITS: Mapping[str, Quantity] = MappingProxyType(
     {
@@ -103,6 +109,11 @@ def quantity(unit: str, key: str = "unit") -> Quantity:
             mass=total.mass + exponent * base.mass,
         )
     return total
+
+
+def unit_sizes(units: Iterable[str]) -> FloatArray:
+    """Return the sizes of values with these units, SI."""
+    return np.array([SIZES.get(quantity(unit).dimension, ANGLE_SIZE) for unit in units])
 
 
 def si_per_unit(unit: str) -> float:

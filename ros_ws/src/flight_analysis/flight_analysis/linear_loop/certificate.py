@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from flight_analysis.linear_loop.guarantee import Guarantee, Unstable
+from flight_analysis.linear_loop.guarantee import Guarantee, Unstable, Zeros
 from flight_analysis.linear_loop.loop_margins import LinearLoop
 from flight_analysis.linear_loop.told import Standing
 from flight_core.files import write_file
@@ -54,11 +54,11 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
         "outputs": linear.outputs,
         "inputs": linear.inputs,
         **linear.nominal._asdict(),
-        **box._asdict(),
+        **{name: value for name, value in box._asdict().items() if name != "zeros" or value},
         **linear.loop._asdict(),
         "law": linear.law._asdict(),
         "loop": promise.loop,
-        "size": promise.stable / float(box.part.max()),
+        "size": promise.stable / box.largest,
         "parts": promise.proof,
     }
     text = json.dumps(content, sort_keys=True, default=np.ndarray.tolist)
@@ -117,6 +117,10 @@ def _kept(linear: LinearLoop) -> Guarantee | None:
         first = content["unstable"]
         content["unstable"] = None if first is None else Unstable(**first)
         content["exact"] = tuple(content["exact"])
+        if content["zeros_alone"] is not None:
+            first = content["zeros_alone"]["unstable"]
+            unstable = None if first is None else Unstable(**first)
+            content["zeros_alone"] = Zeros(content["zeros_alone"]["stable"], unstable)
         return Guarantee(**{field: content[field] for field in Guarantee._fields})
     except (OSError, ValueError, KeyError, TypeError):
         return None

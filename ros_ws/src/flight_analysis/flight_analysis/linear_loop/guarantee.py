@@ -48,9 +48,17 @@ NAMED = 12  # number of digits of the digest that name a certificate
 class Unstable(NamedTuple):
     """An unstable aircraft."""
 
-    deviation: float  # largest relative deviation of an entry
+    deviation: float  # relative deviation of the entries with the largest one in the box
     frequency: float  # rad/s
-    entries: dict[str, float]  # relative deviation by entry
+    # relative deviation by entry; for one that is 0 in the file the part of its row
+    entries: dict[str, float]
+
+
+class Zeros(NamedTuple):
+    """How far the entries may go that are 0 in the file, while all others are as in the file."""
+
+    stable: float  # every aircraft is stable whose zeros are within this part of their rows
+    unstable: Unstable | None  # the least one found; None if none was found up to LARGEST
 
 
 class Guarantee(NamedTuple):
@@ -67,6 +75,10 @@ class Guarantee(NamedTuple):
     late: float = 0.0
     has_exact_lags: bool = True  # whether no lag of an actuator is in the box
     exact: tuple[str, ...] = ()  # nonzero entries of A and B that are not part of the box
+    # part of its row that each entry becomes that is 0 in the file, while the others are within
+    # `stable`; 0 if it stays 0
+    zeros: float = 0.0
+    zeros_alone: Zeros | None = None  # how far these go beside exact others; None: not computed
     # "entries" and "steps" of each strongly connected part of the loop, as in `proof_of`
     proof: Sequence[dict[str, Any]] = ()
 
@@ -86,6 +98,10 @@ class Guarantee(NamedTuple):
         del content["proof"]
         if self.unstable is not None:
             content["unstable"] = self.unstable._asdict()
+        if self.zeros_alone is not None:
+            first = self.zeros_alone.unstable
+            unstable = None if first is None else first._asdict()
+            content["zeros_alone"] = {"stable": self.zeros_alone.stable, "unstable": unstable}
         return content
 
 
@@ -98,7 +114,7 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     box = linear.box
     require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
     assert box is not None  # noqa: S101 - for mypy
-    largest = float(np.max(box.part))
+    largest = box.largest
     is_lag = np.array([name.startswith(LAG_ENTRY) for name in box.names])
     none = Guarantee(
         uncertainty=largest,
@@ -115,12 +131,14 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
         return none
     uncertain = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
     first = _first_unstable(linear, late)
-    size = (1.0 if first is None else first.deviation) / largest
+    size = 1.0 / float(box.part.max()) if first is None else first.deviation / largest
     # beyond MOST_OF_LAG nothing can be proved for a lag
     most = MOST_OF_LAG / float(box.part[is_lag].max()) if is_lag.any() else np.inf
     exact = first is None or most < size
     proved, proof = _proved(parts_of(uncertain), min(size, most), disks=False, exact=exact)
-    promise = none._replace(stable=largest * proved, unstable=first, proof=proof)
+    promise = none._replace(
+        stable=largest * proved, unstable=first, proof=proof, zeros=box.largest_zero * proved
+    )
     if not promise.holds:
         return promise
     loops = _loops(linear, late)
@@ -133,6 +151,23 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
         # disks in all inputs at once include a disk in one input
         disks[name] = max(_disk(uncertain, (i,), least_found), disk_all)
     return promise._replace(disk=disks, disk_all=disk_all)
+
+
+def zeros_alone(linear: LinearLoop, late: float = 0.0) -> Zeros | None:
+    """Compute how far the entries may go that are 0 in the file, while the others are exact.
+
+    They are the box of the loop. Search and proof are quick: a gap of GAPS[0] is enough, because
+    these boxes have the most entries. Returns None if the box is empty, or if the loop is unstable.
+    """
+    box = linear.box
+    still = np.zeros(len(linear.inputs))
+    if box is None or not is_stable(linear.nominal, linear.law, linear.loop, still):
+        return None
+    first = _first_unstable(linear, late, quick=True)
+    size = (1.0 if first is None else first.deviation) / box.largest
+    parts = parts_of(uncertain_loop(linear.nominal, linear.law, linear.loop, box, late))
+    proved, _ = _proved(parts, size, disks=False, exact=first is None, finer_gaps=())
+    return Zeros(box.largest * proved, first)
 
 
 def _exact_entries(linear: LinearLoop, box: Box) -> tuple[str, ...]:
@@ -153,7 +188,7 @@ def _loops(linear: LinearLoop, late: float) -> list[LoopTiming]:
     return [loop._replace(delay=loop.delay + extra) for extra in sorted({0.0, late})]
 
 
-def _first_unstable(linear: LinearLoop, late: float) -> Unstable | None:
+def _first_unstable(linear: LinearLoop, late: float, *, quick: bool = False) -> Unstable | None:
     """Search for unstable aircraft, and return the one with the least deviation, if any."""
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
@@ -162,7 +197,8 @@ def _first_unstable(linear: LinearLoop, late: float) -> Unstable | None:
     for loop in _loops(linear, late):
         delayed = linear._replace(loop=loop)
         for part in parts_of(uncertain_loop(linear.nominal, linear.law, loop, box)):
-            found += [_confirmed(delayed, d) for d in first_unstable(part, len(box.names), largest)]
+            unstable = first_unstable(part, len(box.names), largest, quick=quick)
+            found += [_confirmed(delayed, d) for d in unstable]
     return min(filter(None, found), key=lambda unstable: unstable.deviation, default=None)
 
 
@@ -175,7 +211,12 @@ def _disk(loop: Channels, inputs: tuple[int, ...], least: float) -> float:
 
 
 def _proved(
-    parts: list[Channels], least: float, *, disks: bool, exact: bool = False
+    parts: list[Channels],
+    least: float,
+    *,
+    disks: bool,
+    exact: bool = False,
+    finer_gaps: Sequence[float] = FINER_GAPS,
 ) -> tuple[float, list[dict[str, Any]]]:
     """Prove the largest size possible below `least`, and return this size and the proof.
 
@@ -190,7 +231,7 @@ def _proved(
             break
     else:
         return 0.0, []
-    for finer in FINER_GAPS if proved == GAPS[0] else ():
+    for finer in finer_gaps if proved == GAPS[0] else ():
         if sum(len(part["steps"]) for part in proof) > FEWER_BOXES:
             break
         tighter = _proof(parts, least / (1.0 + finer), FEWER_BOXES, disks=disks)
@@ -236,6 +277,7 @@ def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:
             entries = {
                 name: float(part) for name, part in zip(box.names, parts, strict=True) if part
             }
-            return Unstable(float(np.abs(parts).max()), turn / linear.loop.period, entries)
+            deviation = float(np.abs(d).max()) * box.largest
+            return Unstable(deviation, turn / linear.loop.period, entries)
         d = EXACT * d
     return None

@@ -20,6 +20,7 @@ from aircraft_sim.uncertainty import (
     deviations,
     drawn_places,
     nominal_and_sampled,
+    row_sizes,
 )
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN, delay_margin
@@ -292,7 +293,7 @@ def _with_deviation(linear: LinearLoop, scenario: Scenario) -> LinearLoop:
         if deviation > ROUNDING:
             part = parts.get(name, 0.0)
             off = max(off, deviation / part if part else np.inf)
-    return linear._replace(off=float(off * linear.box.part.max()))
+    return linear._replace(off=float(off * linear.box.largest))
 
 
 def linear_loop(
@@ -427,20 +428,26 @@ def box_of(
     """Return the box of the aircraft that `nominal_and_sampled` draws around an airframe file.
 
     Its channels are in the law's order. If there is an allocation, B of every effector is
-    uncertain.
+    uncertain. If `spread` has zeros, entries that are 0 in the file become parts of their rows.
     """
     airframe_of_law = through_allocation(airframe, controller)
     T = distribution(airframe, controller)[:, law_order(airframe_of_law, controller)[1]]
-    places = drawn_places(airframe)
-    part = np.array([spread.entries.get(name, uncertainty) for name in places])
+    published = drawn_places(airframe)
+    places = drawn_places(airframe, zeros=spread.zeros > 0.0)
+    zeros = tuple(name for name in places if name not in published)
+    default = [spread.zeros if name in zeros else uncertainty for name in places]
+    part = np.array(
+        [spread.entries.get(name, of) for name, of in zip(places, default, strict=True)]
+    )
     n = len(airframe.states)
     E = np.zeros((n, len(places)))
     F = np.zeros((len(places), n))
     G = np.zeros((len(places), T.shape[1]))
-    matrices = {"A": airframe.matrix_a(), "B": airframe.matrix_b()}
+    sizes = row_sizes(airframe)
+    units = {"A": airframe.matrix_a() + sizes["A"], "B": airframe.matrix_b() + sizes["B"]}
     for entry, (matrix, i, j) in enumerate(places.values()):
         E[i, entry] = 1.0
-        size = part[entry] * matrices[matrix][i, j]
+        size = part[entry] * units[matrix][i, j]
         if matrix == "A":
             F[entry, j] = size
         else:
@@ -450,7 +457,7 @@ def box_of(
         # here the effectors are the inputs of the law, in its order
         order = [effectors.index(name) for name in controller.inputs]
         effectors, T = list(controller.inputs), T[order]
-    return Box(names=tuple(places), part=part, E=E, F=F, G=G, effectors=tuple(effectors), T=T)
+    return Box(tuple(places), part, E, F, G, tuple(effectors), T, zeros)
 
 
 def _some(plant: LinearPlant, names: slice) -> LinearPlant:

@@ -55,12 +55,25 @@ class Box(NamedTuple):
     """
 
     names: tuple[str, ...]
-    part: FloatArray  # (k,) relative deviation of the entry at d_i = 1
+    # (k,) relative deviation of the entry at d_i = 1; of an entry that is 0, the part of its row
+    part: FloatArray
     E: FloatArray  # (n, k)
     F: FloatArray  # (k, n)
     G: FloatArray  # (k, m)
     effectors: tuple[str, ...]
     T: FloatArray  # (p, m)
+    zeros: tuple[str, ...] = ()  # names of the entries that are 0 in the file
+
+    @property
+    def largest(self) -> float:
+        """Largest relative deviation of an entry, or part of a row if only zeros deviate."""
+        is_zero = np.isin(self.names, self.zeros)
+        return float(np.max(self.part[~is_zero], initial=0.0)) or float(self.part.max())
+
+    @property
+    def largest_zero(self) -> float:
+        """Largest part of its row that an entry becomes that is 0 in the file."""
+        return float(np.max(self.part[np.isin(self.names, self.zeros)], initial=0.0))
 
 
 def plants_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:

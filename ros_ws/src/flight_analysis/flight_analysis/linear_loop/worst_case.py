@@ -41,6 +41,7 @@ from rise_di_controller.law.linear_loop import (
 
 SEED = 1  # seed of the random corners at which a search starts
 STARTS = 24  # number of these corners
+FEW_STARTS = 8  # the same for a quick search
 ROUNDS = 12  # largest number of moves to other corners
 POLISHED = 4  # number of corners from which each flip of an entry is tried
 CLIMBERS = 24  # number of further corners at which climbs start
@@ -52,12 +53,14 @@ SLOWEST = 0.05  # a mode below this frequency counts as one at 0 rad/s, rad/s
 REAL = 1e-9  # fraction of an eigenvalue up to which its imaginary part counts as rounding
 
 
-def first_unstable(part: Channels, entries: int, largest: float) -> list[FloatArray]:
+def first_unstable(
+    part: Channels, entries: int, largest: float, *, quick: bool = False
+) -> list[FloatArray]:
     """Find unstable aircraft of a part of the loop, with deviations up to a largest size.
 
     The search looks for a divergence at 0 rad/s, and then for modes near one frequency after the
-    other, up to pi / T. Deviations have the shape (entries,), and each one is smaller than the one
-    before.
+    other, up to pi / T. A `quick` search has FEW_STARTS and no climbs. Deviations have the shape
+    (entries,), and each one is smaller than the one before.
     """
     highest = np.pi / part.period
     count = int(np.ceil(np.log(highest / SLOWEST) / (2.0 * np.log(NEAR))))
@@ -65,7 +68,7 @@ def first_unstable(part: Channels, entries: int, largest: float) -> list[FloatAr
     deviations = []
     least = largest
     for w in (0.0, *windows):
-        size, corner = _oscillation(part, w, least) if w else _divergence(part)
+        size, corner = _oscillation(part, w, least, quick=quick) if w else _divergence(part)
         if size <= least:
             d = np.zeros(entries)
             d[list(part.entries)] = size * corner
@@ -105,17 +108,20 @@ def _divergence(part: Channels) -> tuple[float, FloatArray]:
     return (1.0 / best[first] if best[first] > 0.0 else np.inf), best_corners[first]
 
 
-def _oscillation(part: Channels, frequency: float, largest: float) -> tuple[float, FloatArray]:
+def _oscillation(
+    part: Channels, frequency: float, largest: float, *, quick: bool
+) -> tuple[float, FloatArray]:
     """Find the least size at which a mode near a frequency, rad/s, is unstable, and its corner.
 
     The size is infinite if none is found. From each of STARTS corners, the search grows the size
     until a mode near the frequency leaves abs(z) < 1. Then it moves to the corner at which abs(z)
-    is larger, and repeats this until it knows every such corner. At last it climbs from further
-    corners at a smaller size, as long as one of the climbs ends at an unstable aircraft.
+    is larger, and repeats this until it knows every such corner. At last, unless it is `quick`, it
+    climbs from further corners at a smaller size, as long as one of the climbs ends at an unstable
+    aircraft.
     """
     rng = np.random.default_rng(SEED)
     k = len(part.entries)
-    corners = np.where(rng.random((STARTS, k)) < 0.5, -1.0, 1.0)
+    corners = np.where(rng.random((FEW_STARTS if quick else STARTS, k)) < 0.5, -1.0, 1.0)
     begin = np.sign(_growth(part, np.zeros((1, k)), frequency))
     corners = np.concatenate([np.where(begin == 0.0, 1.0, begin), corners])
     size_by_corner: dict[tuple[float, ...], float] = {}
@@ -130,6 +136,8 @@ def _oscillation(part: Channels, frequency: float, largest: float) -> tuple[floa
         corners = np.array(sorted(fresh))
     ranked = sorted(size_by_corner, key=lambda corner: (size_by_corner[corner], corner))
     least = size_by_corner[ranked[0]]
+    if quick:
+        return least, np.array(ranked[0])
     fresh_corners = np.where(rng.random((CLIMBERS, k)) < 0.5, -1.0, 1.0)
     starts = np.concatenate([np.array(ranked[:POLISHED]), fresh_corners])
     return _nearer(part, frequency, min(least, largest), starts, (least, np.array(ranked[0])))

@@ -16,7 +16,13 @@ from flight_analysis.report.flight_head import (
     scenario_argument,
 )
 from flight_analysis.report.flown_models import FlownLoops
-from flight_analysis.report.margin_figures import MARGIN_WORDS, decibels, guarantee_text
+from flight_analysis.report.margin_figures import (
+    MARGIN_WORDS,
+    decibels,
+    found_percent,
+    guarantee_text,
+    proved_percent,
+)
 from flight_analysis.report.page import Card, Step
 from flight_analysis.report.summary import RecordedFlight
 
@@ -85,7 +91,6 @@ def _guarantee_card(promise: Guarantee | None, command: str) -> Card:
         )
     if promise.stable == 0.0:
         return Card(title=title, sentences=guarantee_text(promise))
-    stable = math.floor(1e3 * promise.stable) / 10.0
     late = f", and u up to {1e3 * promise.late:g} ms late" if promise.late else ""
     lags = ("lags",) if promise.has_exact_lags else ()
     exact = ", ".join((*promise.exact, *lags, "delay", "period"))
@@ -94,18 +99,25 @@ def _guarantee_card(promise: Guarantee | None, command: str) -> Card:
         "No unstable aircraft was found within 99 %."
         if first is None
         else f"The first unstable aircraft that was found has entries that differ by "
-        f"{math.ceil(1e3 * first.deviation) / 10.0:.1f} %."
+        f"{found_percent(first.deviation)}."
+    )
+    alone = promise.zeros_alone
+    zeros = (
+        "."
+        if alone is None
+        else f". If these are wrong instead, and all others right, it is proved stable while each "
+        f"is within {proved_percent(alone.stable)} of its row."
     )
     sentences = [
         (
             "The numbers of the aircraft's model, A and B, may be wrong: the linear loop is proved "
-            f"stable for every aircraft whose entries differ by up to {stable:.1f} % from those "
-            f"of the file{late}."
+            f"stable for every aircraft whose entries differ by up to "
+            f"{proved_percent(promise.stable)} from those of the file{late}."
         ),
         found,
         (
-            f"Taken as exact are {exact}, and each entry that is 0 in the file. The proof is of "
-            "small deviations, without limits of the actuators."
+            f"Taken as exact are {exact}, and each entry that is 0 in the file{zeros} The proof "
+            "is of small deviations, without limits of the actuators."
         ),
     ]
     step = Step(

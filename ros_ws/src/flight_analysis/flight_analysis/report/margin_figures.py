@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from flight_analysis.linear_loop.guarantee import Guarantee
+from flight_analysis.linear_loop.guarantee import Guarantee, Unstable
 from flight_analysis.linear_loop.input_margins import Margins, disk_gain, disk_phase, loop_transfer
 from flight_analysis.linear_loop.loop_margins import LinearLoop, LoopMargins
 from flight_analysis.report.display_units import NO_VALUE
@@ -227,25 +227,26 @@ def guarantee_text(promise: Guarantee) -> list[str]:
     """Say a guarantee in sentences, with what it means by stable and what it takes as exact."""
     if promise.stable == 0.0:
         return ["guarantee: none, not even the aircraft of the file is proved stable"]
-    stable = math.floor(1e3 * promise.stable) / 10.0
     late = f", u up to {1e3 * promise.late:g} ms late" if promise.late else ""
     name = "no certificate: up to what two coefficients of a period leave out"
     if promise.certificate:
         name = f"certificate {promise.certificate}"
     lags = "lags, " if promise.has_exact_lags else ""
-    exact = ", ".join((*promise.exact, f"{lags}delay, period, each entry that is 0"))
-    within = f"the linear loop is stable for every aircraft within {stable:.1f} %{late}"
+    zero = "each entry that is 0"
+    within = f"the linear loop is stable for every aircraft within {proved_percent(promise.stable)}"
+    if promise.zeros:
+        zero = "each other entry that is 0"
+        within += f", entries that are 0 within {proved_percent(promise.zeros)} of their rows"
+    exact = ", ".join((*promise.exact, f"{lags}delay, period, {zero}"))
     lines = [
-        f"guarantee: {within} ({name})",
+        f"guarantee: {within}{late} ({name})",
         f"stable: no mode grows by more than 1e-6 a tick; exact in every aircraft: {exact}",
+        _first_found(promise.unstable),
     ]
-    if promise.unstable is None:
-        lines.append("no unstable aircraft found within 99 %")
-    else:
-        first = promise.unstable
-        deviation = math.ceil(1e3 * first.deviation) / 10.0
+    if (alone := promise.zeros_alone) is not None:
         lines.append(
-            f"the first unstable aircraft found: at {deviation:.1f} % ({first.frequency:.2g} rad/s)"
+            f"entries that are 0, beside exact others: stable within {proved_percent(alone.stable)}"
+            f" of their rows (no certificate without --zeros); {_first_found(alone.unstable)}"
         )
     if not promise.holds:
         percent = 100.0 * promise.uncertainty
@@ -253,6 +254,23 @@ def guarantee_text(promise: Guarantee) -> list[str]:
             f"an aircraft within {percent:g} % may be unstable: no disk margin is guaranteed"
         )
     return lines
+
+
+def proved_percent(part: float) -> str:
+    """Write a part that is proved, rounded down."""
+    return f"{math.floor(1e3 * part) / 10.0:.1f} %"
+
+
+def found_percent(part: float) -> str:
+    """Write a part at which an unstable aircraft was found, rounded up."""
+    return f"{math.ceil(1e3 * part) / 10.0:.1f} %"
+
+
+def _first_found(first: Unstable | None) -> str:
+    if first is None:
+        return "no unstable aircraft found within 99 %"
+    place = f"at {found_percent(first.deviation)} ({first.frequency:.2g} rad/s)"
+    return f"the first unstable aircraft found: {place}"
 
 
 def guarantee_rows(promise: Guarantee, margins: LoopMargins) -> list[tuple[str, float, float]]:

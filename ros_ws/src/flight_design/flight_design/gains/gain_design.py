@@ -32,6 +32,7 @@ from flight_core.arguments import (
     as_numbers_by_name,
 )
 from flight_core.parameters import require
+from flight_core.units import unit_sizes
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control, tuned_gains
 from flight_design.gains.effectors import LAW_INPUT, Effectors, design_allocation, lags_by_input
@@ -43,7 +44,6 @@ from flight_design.gains.first_scenario import (
 )
 from flight_design.gains.gain_selection import GainAssessment, LoopSetting, Selection
 from flight_design.gains.ideal_control import Effected, Flown, Study
-from flight_design.gains.nominal import unit_sizes
 from flight_design.gains.observer_gains import (
     ObserverGains,
     gains_beside_sketch,
@@ -228,6 +228,7 @@ def check_gains(
     samples: int = 100,
     seed: int = 1,
     entries: Mapping[str, float] = UNIFORM.entries,
+    zeros: float = 0.0,
     as_told: bool = False,
 ) -> GainAssessment[ControllerConfig]:
     """Evaluate all conditions on the gains of a scenario, and the margins of its loop.
@@ -245,8 +246,8 @@ def check_gains(
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
-        entries: Deviations by entry, {"A[q,alpha]": 0.6}. {"1/lag[elevator]": 0.3} is that of an
-            actuator, whose lag is otherwise exact.
+        entries: Deviations by entry, {"A[q,alpha]": 0.6}, and of lags, {"1/lag[elevator]": 0.3}.
+        zeros: Largest part of its row that an entry of A or B becomes that is 0 in the file.
         as_told: Whether lags and delay are those of the controller. Set it for an aircraft of your
             own, for which the one in the scenario stands in.
 
@@ -263,10 +264,10 @@ def check_gains(
     flight = scenario_to_check(scenario)
     frame = airframe_to_check(airframe, flight)
     gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
-    spread = Spread(as_numbers_by_name(entries, "entries", '{"1/lag[elevator]": 0.3}'))
-    flown = None
-    if not as_told and controller_alone(scenario) is None:
-        flown = Flown(flight, compare(flight, flight.controller))
+    parts = as_numbers_by_name(entries, "entries", '{"1/lag[elevator]": 0.3}')
+    spread = Spread(parts, zeros=as_number(zeros, "zeros", 0.0, 1.0))
+    is_flown = not as_told and controller_alone(scenario) is None
+    flown = Flown(flight, compare(flight, flight.controller)) if is_flown else None
     studied = study(frame, flight, flight.controller, uncertainty, samples, seed, spread, flown)
     return gain_selection.assess_scenario(flight, studied, gamma_2)
 

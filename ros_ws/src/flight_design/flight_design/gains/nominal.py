@@ -3,19 +3,17 @@
 """The nominal model of an airframe, for observers, filters and model-based laws."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from aircraft_sim.airframes.airframe import Airframe
 from aircraft_sim.uncertainty import KINEMATIC
 from control_laws.nominal_model import NominalModel
-from flight_core.units import ANGLE, DIMENSIONLESS, LENGTH, SPEED, quantity
+from flight_core.units import ANGLE, DIMENSIONLESS, quantity, unit_sizes
 from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import LoopTiming
 
-SIZES = {SPEED: 1.0, LENGTH: 1.0}  # m/s, m: the "sizes" in which weights measure states
-ANGLE_SIZE = 0.1  # size of an angle, rad, of a rate, rad/s, and of a state without a dimension
 ERROR_SHARE = 0.1  # unit of an error in a score as a share of a size: 0.1 m/s or 0.01 rad/s
 
 # mean abs(u_dot) that costs as much as one unit of error
@@ -42,11 +40,6 @@ def activity_units(airframe: Airframe) -> FloatArray:
         else:
             units.append(math.inf if np.isnan(no_thrust) else THRUST_ACTIVITY * abs(no_thrust))
     return np.array(units)
-
-
-def unit_sizes(units: Iterable[str]) -> FloatArray:
-    """Return the sizes of values with these units."""
-    return np.array([SIZES.get(quantity(unit).dimension, ANGLE_SIZE) for unit in units])
 
 
 def airframe_model(

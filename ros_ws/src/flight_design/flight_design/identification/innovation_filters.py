@@ -23,8 +23,9 @@ from control_laws.riccati import correction_of, corrections_near
 from flight_core.parameters import require, require_channels
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
+from flight_core.units import unit_sizes
 from flight_core.vectors import FloatArray
-from flight_design.gains.nominal import airframe_model, unit_sizes
+from flight_design.gains.nominal import airframe_model
 from rise_di_controller.law.linear_loop import LoopTiming
 
 # s at the start of a recording. Innovations in this time do not count, because the filter starts

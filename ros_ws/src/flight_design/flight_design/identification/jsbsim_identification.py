@@ -30,6 +30,7 @@ from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_core.outcome import COMPLETED, FlightEnded, Refusal
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
+from flight_core.units import unit_sizes
 from flight_core.vectors import FloatArray, selection_matrix
 from flight_design.gains import gain_selection, gain_yaml, ideal_control
 from flight_design.gains.airframe_properties import invariant_zeros
@@ -43,7 +44,6 @@ from flight_design.gains.first_scenario import (
 )
 from flight_design.gains.gain_selection import LoopSetting, Selection
 from flight_design.gains.ideal_control import Manoeuvre, Study
-from flight_design.gains.nominal import unit_sizes
 from flight_design.gains.observer_selection import with_extended_state_observer
 from flight_design.gains.requirement import OBSERVER_REQUIREMENT, REQUIREMENT, Requirement
 from flight_design.identification.manoeuvre import (
