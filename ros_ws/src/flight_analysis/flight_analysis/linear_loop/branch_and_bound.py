@@ -24,8 +24,8 @@ from flight_analysis.linear_loop.structured_value import (
 from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
 from flight_core.vectors import FloatArray
 
-LEVELLED = 8  # frequencies at which the ratios of D for the channels of a late u are sought
-DIGITS = 5  # significant digits of D and G in a step of a proof
+LEVELLED = 8  # frequencies at which the ratios of X for the channels of a late u are sought
+DIGITS = 5  # significant digits of X and G in a step of a proof
 
 
 class Region(NamedTuple):
@@ -38,7 +38,7 @@ class Region(NamedTuple):
     half: FloatArray
     low: float  # rad/s
     high: float
-    # D and G of a larger box or of a neighbouring frequency, at which the search begins
+    # X and G of a larger box or of a neighbouring frequency, at which the search begins
     scaling: Scaling | None = None
 
     def halves(self, i: int) -> list["Region"]:
@@ -78,7 +78,7 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
     regions = [Region(centre=np.zeros(len(half)), half=half, low=0.0, high=highest)]
     steps: list[dict[str, Any]] = []
     while regions and len(steps) < most:
-        # Depth first: the last region is the smallest, and its D and G are a good start for the
+        # Depth first: the last region is the smallest, and its X and G are a good start for the
         # next.
         region = regions.pop()
         w = _frequency(region, highest)
@@ -106,9 +106,9 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
 
 
 def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
-    """Round D and G, and return them as `t` and `g` of a step.
+    """Round X and G, and return them as `t` and `g` of a step.
 
-    Rounding is safe, because any D and G prove a bound. The step has only the D and G of the means
+    Rounding is safe, because any X and G prove a bound. The step has only the X and G of the means
     over a period if the others follow from these, as in `tightened_at`.
     """
     count = len(scaling.t) if scaling.g[entries:].any() else entries
@@ -124,9 +124,9 @@ def _frequency(region: Region, highest: float) -> float:
 
 
 def _levelled(part: Channels, scale: FloatArray) -> Channels:
-    """Scale the channels of a late u so that one factor of D serves them at the worst frequency.
+    """Scale the channels of a late u so that one factor of X serves them at the worst frequency.
 
-    A delay can change from tick to tick. Its channels must therefore have the same D at all
+    A delay can change from tick to tick. Its channels must therefore have the same X at all
     frequencies, up to a common factor.
     """
     if not part.late:

@@ -3,13 +3,13 @@
 """Upper bound of the structured singular value of a loop, over intervals of frequency.
 
 mu(M) is the reciprocal of the size of the least Delta = diag(delta_i) for which det(I - M Delta) =
-0, with delta_i real or complex. For any D = diag(exp(t)) and G = diag(g), with g_i = 0 at complex
-channels,
+0, with delta_i real or complex. For any real t and G = diag(g), with g_i = 0 at complex channels,
 
-    mu(M)^2 <= lambda_max(N* N + j (G N - N* G)),    N = D M D^-1
+    mu(M)^2 <= lambda_max(N* N + j (G N - N* G)),    N = exp(t) M exp(-t)
 
-Every D and G gives a valid bound, so ending the search early only costs tightness. Source: M. K.
-H. Fan, A. L. Tits, J. C. Doyle, IEEE Transactions on Automatic Control 36(1), 1991.
+With X = exp(2 t), this is M* X M + j (X G M - M* X G) <= mu^2 X. Every X and G gives a valid bound,
+so ending the search early only costs tightness. Source: M. K. H. Fan, A. L. Tits, J. C. Doyle, IEEE
+Transactions on Automatic Control 36(1), 1991.
 """
 
 from typing import NamedTuple
@@ -24,7 +24,7 @@ RADIUS = 1.0 + SPECTRAL_RADIUS_TOLERANCE  # abs(z) at the limit of stability
 
 BALANCE_ROUNDS = 6  # rounds of Osborne's iteration
 LARGEST_G = 1e3  # limit of abs(g_i)
-LEVELS = 40  # largest number of levels in the search for D and G
+LEVELS = 40  # largest number of levels in the search for X and G
 CENTRING = 6  # largest number of Newton steps at each level
 LENGTHS = tuple(0.6**k for k in range(20))  # lengths of Newton's step that are tried
 CENTRED = 0.5  # decrement of Newton's method at which a point counts as the centre
@@ -47,14 +47,14 @@ DECADES = 6
 
 
 class Scaling(NamedTuple):
-    """The scalings of the bound: t = log D and g, the diagonal of G, each of shape (p,)."""
+    """The scalings of the bound: t = log(X) / 2 and g, the diagonal of G, each of shape (p,)."""
 
     t: FloatArray
     g: FloatArray
 
 
 def balanced(M: ComplexArray) -> FloatArray:
-    """Find log D, (p,), that makes row and column of each channel about equally large.
+    """Find t = log(X) / 2, (p,), that makes row and column of each channel about equally large.
 
     The method is Osborne's iteration.
     """
@@ -72,7 +72,7 @@ def balanced(M: ComplexArray) -> FloatArray:
 
 
 def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
-    """Evaluate the bound of matrices (..., p, p) for given D and G."""
+    """Evaluate the bound of matrices (..., p, p) for given X and G."""
     N = np.exp(scaling.t)[:, None] * M * np.exp(-scaling.t)
     skew = 1j * scaling.g[:, None] * N
     adjoint = np.conj(np.swapaxes(N, -1, -2))
@@ -83,18 +83,18 @@ def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
 def tightened(
     M: ComplexArray, real: int, target: float, alike: int = 0, near: Scaling | None = None
 ) -> tuple[float, Scaling]:
-    """Search for the D and G with the least bound of M, (p, p), and return the bound and both.
+    """Search for the X and G with the least bound of M, (p, p), and return the bound and both.
 
-    The first `real` channels are real, and the next `alike` channels share one factor of D. The
-    search begins at the balanced D, or at `near` if its bound is smaller. `near` has the D and G of
+    The first `real` channels are real, and the next `alike` channels share one factor of X. The
+    search begins at the balanced X, or at `near` if its bound is smaller. `near` has the X and G of
     a similar matrix.
 
-    If the bound gets below `target`, the search ends with D and G in the middle of the set that
+    If the bound gets below `target`, the search ends with X and G in the middle of the set that
     reaches the target. The method of centres on the linear matrix inequality
 
-        F = level D - N* D N - j (G N - N* G) > 0,  trace D = p,  D > 0,  abs(g_i) < LARGEST_G
+        F = level X - N* X N - j (G N - N* G) > 0,  trace X = p,  X > 0,  abs(g_i) < LARGEST_G
 
-    minimises -log det F - log det D - sum log(LARGEST_G^2 - g^2) by Newton's method while the level
+    minimises -log det F - log det X - sum log(LARGEST_G^2 - g^2) by Newton's method while the level
     falls. Source: S. Boyd, L. El Ghaoui, Linear Algebra and its Applications 188, 1993.
     """
     t = balanced(M)
@@ -130,7 +130,7 @@ def tightened_at(
 ) -> tuple[float, Scaling]:
     """Bound a scaled M(w) of a part of the loop, as `tightened` does for the target 1.
 
-    At first D and G are found for the means over a period alone, and the D of the second
+    At first X and G are found for the means over a period alone, and the X of the second
     coefficients balances rows and columns. If this bound is below 1, or w is low, it is returned.
     """
     k = len(part.entries)
@@ -152,9 +152,9 @@ def tightened_at(
 
 
 class Centre(NamedTuple):
-    """D and G of the linear matrix inequality, at a step of the search for its centre."""
+    """X and G of the linear matrix inequality, at a step of the search for its centre."""
 
-    d: FloatArray  # (p,) diagonal of D
+    d: FloatArray  # (p,) diagonal of X
     g: FloatArray  # (real,) entries of G at the real channels
     free: FloatArray  # (p, f) map from f free factors to d: channels with one factor share a column
 
@@ -165,12 +165,12 @@ class Centre(NamedTuple):
         return np.asarray(level * np.diag(self.d) - right)
 
     def bound(self, N: ComplexArray) -> float:
-        """Return the least level for this D and G."""
+        """Return the least level for this X and G."""
         root = np.sqrt(self.d)
         return -float(np.linalg.eigvalsh(self.inequality(N, 0.0) / root[:, None] / root)[0])
 
     def stepped(self, N: ComplexArray, level: float) -> tuple["Centre", float]:
-        """Take a Newton step of D and G, and return the result and the decrement of the step.
+        """Take a Newton step of X and G, and return the result and the decrement of the step.
 
         The decrement is 0 at the centre.
         """
@@ -203,12 +203,12 @@ class Centre(NamedTuple):
         return self, 0.0  # no length helps: only rounding is left
 
     def moved(self, step: FloatArray) -> "Centre":
-        """Move D and G by a step, (p + real,)."""
+        """Move X and G by a step, (p + real,)."""
         f = self.free.shape[1]
         return Centre(self.d + self.free @ step[:f], self.g + step[f:], self.free)
 
     def inside(self, N: ComplexArray, level: float) -> bool:
-        """Return whether the inequality and the limits of D and G hold, and all is finite."""
+        """Return whether the inequality and the limits of X and G hold, and all is finite."""
         if not (self.d.min() > 0.0 and np.abs(self.g).max(initial=0.0) < LARGEST_G):
             return False
         F = self.inequality(N, level)
@@ -220,7 +220,7 @@ class Centre(NamedTuple):
 
 
 def crossings(part: Channels, scaling: Scaling, scale: FloatArray) -> FloatArray:
-    """Find the frequencies, rad/s, at which the bound of diag(scale) M(z) for a D and a G can be 1.
+    """Find the frequencies, rad/s, at which the bound of diag(scale) M(z) for X and G can be 1.
 
     At a z on abs(z) = RADIUS, N* N + j (G N - N* G) has the eigenvalue 1 exactly if z is an
     eigenvalue of a pencil with twice as many states. Source: S. Boyd, V. Balakrishnan, P. Kabamba,
@@ -251,9 +251,9 @@ def crossings(part: Channels, scaling: Scaling, scale: FloatArray) -> FloatArray
 def interval_at(
     part: Channels, w: float, scaling: Scaling, scale: FloatArray
 ) -> tuple[float, float] | None:
-    """Find the interval around w, rad/s, in which D and G keep the bound of diag(scale) M below 1.
+    """Find the interval around w, rad/s, in which X and G keep the bound of diag(scale) M below 1.
 
-    `scaling` has D and G, which were found at w. Returns None if there is no such interval.
+    `scaling` has X and G, which were found at w. Returns None if there is no such interval.
     """
     highest = np.pi / part.period
     ends = crossings(part, scaling, scale)

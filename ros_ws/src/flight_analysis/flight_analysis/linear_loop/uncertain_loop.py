@@ -17,7 +17,7 @@ to input. At each instant the newest u that has arrived acts. The input of a per
 
 with v_j = u_k-j - u_k-j-1. For a shift by j + f periods, 0 <= f < 1, a_i = 1 for i < j, a_j = f,
 b_j = f (1 - f), and all further coefficients are 0. Each coefficient is the middle of its range
-plus a real d, which can change from tick to tick. These channels therefore have one D for all
+plus a real d, which can change from tick to tick. These channels therefore have one X for all
 frequencies, and G = 0.
 """
 

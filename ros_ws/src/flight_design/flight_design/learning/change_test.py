@@ -89,8 +89,9 @@ def change_test(
     winds.
 
     G is 0 while the losses are within LOSS. If a loss is z standard deviations larger than LOSS,
-    2 G = z^2, by S. S. Wilks (Ann. Math. Statist. 9(1), 1938). An input with a loss of LOSS exceeds
-    G = 12 with a probability of 5e-7, and an input with a smaller loss even more seldom.
+    2 G = z^2, by S. S. Wilks (Ann. Math. Statist. 9(1), 1938). In one test a single input with a
+    loss of LOSS exceeds G = 12 with a probability of 5e-7, two of them together with 2e-6, and
+    inputs with smaller losses even more seldom.
 
     The input j is dead if J with abs(kappa_j + 1) <= NONE is lower than the first minimum by more
     than MAX_GAIN, and at most DEAD_WITHIN above the second one. `delays` are the delays of u, s, by
