@@ -111,6 +111,33 @@ def test_surface_of_jsbsim_is_dead_beside_the_disturbances_of_its_learner(
     assert (change.is_found, change.dead) == (bool(dead), dead)
 
 
+@pytest.mark.parametrize(
+    "fault, dead", [("aileron hard_over 1 upper", "aileron"), ("aileron weak 1 -0.5", "")]
+)
+def test_surface_jammed_off_centre_is_dead_and_a_reversed_one_is_not(fault: str, dead: str) -> None:
+    """At 5 deg, while u goes to its stop of 30 deg, as a reversed effect of their ratio would."""
+    jam, stop = np.radians(5.0), np.radians(30.0)
+    stops = {"lower": [-stop] * 4, "upper": [stop, stop, jam if dead else stop, stop]}
+    scenario = find_scenario("osprey_servo").vary(
+        aircraft={
+            "rate": 100.0,
+            "step": 0.01,
+            "gusts": {},
+            "turbulence": {"altitude": 100.0, "wind": 7.7},
+            "actuators": {"lag": ACTUATION.lag.tolist(), "faults": [fault], **stops},
+        },
+        reference_model={"rate": 100.0},
+        flight={"duration": 5.0},
+    )
+    airframe = scenario.aircraft.sampled_airframe()
+    recorded = recording(simulate(scenario), airframe)
+    last = recorded._replace(t=recorded.t[-400:], y=recorded.y[-400:], u=recorded.u[-400:])
+    _, lat = change_test(last, airframe, ACTUATION)
+    assert (lat.is_found, lat.dead) == (True, dead)
+    expected = -jam / stop if dead else -0.5
+    assert lat.left["aileron"] == pytest.approx(expected, abs=0.05)
+
+
 def test_reversed_aileron_is_no_dead_one(damaged: tuple[FlightData, Airframe]) -> None:
     """A model with the aileron the other way round: it has -100 % of that effect, and moves p."""
     recorded, airframe = damaged
