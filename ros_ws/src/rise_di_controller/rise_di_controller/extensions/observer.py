@@ -241,7 +241,7 @@ def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
 
         u_o by `correct`
         u   = law(y, y_m) from the trim u_trim + u_o
-        z  += Phi z + Gamma (u - u_trim)        for the next tick, and again per missed tick
+        z   = Phi z + Gamma (u - u_trim)        for the next tick, and again per missed tick
 
     The law takes the measured e, not the estimate.
     """
