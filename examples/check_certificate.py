@@ -22,6 +22,18 @@ Then no d of the box has one outside: modes are continuous in d. A box c + half 
 c. A part r of z beside N w, norm(r) <= a norm(w), adds at most 2 norm((N - j g)* r) + a^2 to
 the matrix. Along the frequency its largest eigenvalue is convex in what is linear; norms bound
 what is left. Each step of the file halves a box, or proves it from `low` to `high`, rad/s.
+
+A file with the member `limit` has an input that acts as a = phi(u), and w = u - a is cut off: phi
+rises by 0 to 1 times the rise of u. a and w are a channel of their own. For taps h >= 0 at ticks j
+that are not 0, whose sum of h abs(z)^-abs(j) is at most 1, the sum of w (a - h * a) over all ticks
+is not negative (G. Zames, P. Falb, SIAM Journal on Control 6(1), 1968). With m = 1 - sum h e^-ijwT
+
+    diag(1, ..., 1, 0) - N_d* N_d - Y N - N* Y* > 0,  Y = diag(j g, exp(-s) m)
+
+is then what a step proves. N_d are the rows of z in N = diag(exp(t), 1) half M_c diag(exp(-t),
+exp(-s)), whose last row is a. `slowest` is the lowest frequency of the proof. From 0 it proves at
+abs(z) = SETTLING < 1 that every motion settles, since the modes outside are the integrators: they
+are at 1 for each d and move no u. From above 0 it proves at abs(z) = 1 that no motion is periodic.
 """
 
 import hashlib
@@ -39,6 +51,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 RADIUS = 1.0 + 1e-6  # a mode may grow by a millionth a tick: integrators have a mode at 1
+SETTLING = 1.0 - 1e-5  # with a limit, a motion that settles falls by a part of 1e-5 a tick
 ROUNDING = 1e-6  # left of the bound 1 for sums of 100 products whose sizes are up to 1e6
 EPS = np.finfo(float).eps
 TERMS = 4
@@ -58,6 +71,15 @@ not covered: entries that are 0 without a line above, limits and rates of the in
     the width of the softened sign, filters of sensors, actuators of another order, limits and
     fade-in of an observer, motion beyond the linear equations, other lags and delays, a late or
     missed tick, a schedule, deviations that change in time"""
+
+COVERED_WITH_LIMIT = """\
+covered: deviations constant in time, in the loop with this period, delay and lags that is linear
+    but for this input; any lower and upper limit of it, constant in time, and any other curve that
+    never falls and rises by at most 1 per 1
+not covered: entries that are 0 without a line above, limits of the other inputs, rates of all
+    inputs, anti-windup, errors beyond the width of the softened sign, filters of sensors, actuators
+    of another order, limits and fade-in of an observer, motion beyond the equations of the file,
+    other lags and delays, a late or missed tick, a schedule, deviations that change in time"""
 
 # The file. Everything that it may hold is stated here, with the range of each number.
 LONGEST = 32_000_000  # bytes
@@ -109,21 +131,57 @@ FIELDS: dict[str, Any] = {
         "C": Numbers(("m", "q")),
         "D": Numbers(("m", "o")),
     },
+    "limit": {
+        "input": NAME,
+        "slowest": Numbers((), 0.0, 1e5),
+        "lags": Numbers(("h",), -1000.0, 1000.0),
+        "taps": Numbers(("h",), 0.0, 1.0),
+    },
     "loop": HEX,
     "digest": HEX,
 }
-OPTIONAL = {"airframe", "scenario", "constants", "zeros"}
-MOST_OF = {"q": 512, "steps": 50_000, "ticks": 100}
+OPTIONAL = {"airframe", "scenario", "constants", "limit", "zeros"}
+MOST_OF = {"q": 512, "h": 1000, "steps": 50_000, "ticks": 100}
 STEP = {"low": (0.0, 1e5), "high": (0.0, 1e5), "t": (-100.0, 100.0), "g": (-1e9, 1e9)}
+LIMITED_STEP = STEP | {"s": (-100.0, 100.0)}
+
+
+class Limit(NamedTuple):
+    """An input that is cut off, and the multiplier of its inequality."""
+
+    place: int  # of the input
+    slowest: float  # rad/s
+    lags: Array  # ticks
+    taps: Array
+
+    @property
+    def radius(self) -> float:
+        """abs(z) of the proof."""
+        return 1.0 if self.slowest else SETTLING
+
+    def at(self, turn: float) -> complex:
+        """Return m at an angle w T."""
+        return complex(1.0 - self.taps @ np.exp(-1j * self.lags * turn))
 
 
 class Loop(NamedTuple):
-    """[[A, W, V], [Z, D, V_z], [S, 0]]: states, channels, and the rest at the nodes of Gauss."""
+    """[[A, W, V], [Z, D, V_z], [S, 0]]: states, channels, and the rest at the nodes of Gauss.
+
+    If an input is cut off, its channel is the first one.
+    """
 
     big: Array
     K: Array  # squares of its norm from entry to entry
     states: int
     period: float
+    radius: float = RADIUS
+    limit: Limit | None = None
+
+    @property
+    def channels(self) -> slice:
+        """The rows and columns of w and z."""
+        size = (self.limit is not None) + TERMS * len(self.K)
+        return slice(self.states, self.states + size)
 
 
 def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -217,7 +275,9 @@ def fields_of(value: Any, where: str, known: dict[str, Any], sizes: dict[str, in
     return content
 
 
-def parts_from(value: Any, entries: int, period: float) -> dict[tuple[int, ...], list[Any]]:
+def parts_from(
+    value: Any, entries: int, period: float, *, has_limit: bool
+) -> dict[tuple[int, ...], list[Any]]:
     """Return the steps of each part by its entries. Raises ValueError."""
     require(type(value) is list, "parts", value, "a list")
     parts: dict[tuple[int, ...], list[Any]] = {}
@@ -236,12 +296,16 @@ def parts_from(value: Any, entries: int, period: float) -> dict[tuple[int, ...],
         total += len(steps)
         require(total <= MOST_OF["steps"], where, total, f"up to {MOST_OF['steps']} steps")
         for i, step in enumerate(steps):
-            check_step(step, f"{where} step {i}", len(places), np.pi / period)
+            has_s = has_limit and type(step) is dict and "s" in step
+            known_members = LIMITED_STEP if has_s else STEP
+            check_step(step, f"{where} step {i}", len(places), np.pi / period, known_members)
         parts[tuple(places)] = steps
     return parts
 
 
-def check_step(step: Any, where: str, entries: int, highest: float) -> None:
+def check_step(
+    step: Any, where: str, entries: int, highest: float, known: dict[str, tuple[float, float]]
+) -> None:
     """Raise ValueError unless a step has the members, sizes and ranges of one of the two kinds."""
     if type(step) is dict and "halve" in step:
         members(step, where, ["halve"], set())
@@ -249,10 +313,10 @@ def check_step(step: Any, where: str, entries: int, highest: float) -> None:
         is_entry = type(place) is int and 0 <= place < entries
         require(is_entry, f"{where} halve", place, f"a number of an entry, 0 to {entries - 1}")
         return
-    members(step, where, [*STEP], set())
+    members(step, where, [*known], set())
     count = len(step["t"]) if type(step["t"]) is list else 0
     sizes = {"c": count}
-    for name, (low, high) in STEP.items():
+    for name, (low, high) in known.items():
         shape = ("c",) if name in {"t", "g"} else ()
         numbers(step[name], f"{where} {name}", Numbers(shape, low, high), sizes)
     fits = count in {entries, 2 * entries, 3 * entries, TERMS * entries}
@@ -282,11 +346,29 @@ def read(path: Path) -> dict[str, Any]:
     file: dict[str, Any] = fields_of(content, "", FIELDS, sizes)
     ticks = float(file["delay"] / file["period"])
     require(ticks <= MOST_OF["ticks"], "delay", ticks, f"up to {MOST_OF['ticks']} periods")
-    file["parts"] = parts_from(content["parts"], len(file["names"]), float(file["period"]))
+    has_limit = "limit" in file
+    period = float(file["period"])
+    file["parts"] = parts_from(content["parts"], len(file["names"]), period, has_limit=has_limit)
     rest = json.dumps({key: content[key] for key in content if key != "digest"}, sort_keys=True)
     if hashlib.sha256(rest.encode()).hexdigest() != file["digest"]:
         raise ValueError("the digest is not that of the content")
     return file
+
+
+def limit_of(file: dict[str, Any]) -> Limit | None:
+    """Return the limit of a certificate, if it has one. Raises ValueError."""
+    if "limit" not in file:
+        return None
+    name, slowest, lags, taps = (file["limit"][k] for k in ("input", "slowest", "lags", "taps"))
+    require(name in file["inputs"], "limit input", name, "an input of the file")
+    is_ticks = bool((lags == np.round(lags)).all() and (lags != 0.0).all())
+    require(is_ticks and len({*lags}) == len(lags), "limit lags", lags.tolist(), "ticks but 0")
+    limit = Limit(file["inputs"].index(name), float(slowest), lags, taps)
+    total = float(np.sum(taps * limit.radius ** -np.abs(lags))) * (1.0 + 1e-12)
+    require(total <= 1.0, "limit taps", total, "a sum of at most 1")
+    highest = np.pi / float(file["period"])
+    require(limit.slowest < highest, "limit slowest", limit.slowest, f"below {highest:g}")
+    return limit
 
 
 def exponential(M: Array) -> Array:
@@ -303,6 +385,8 @@ def loop_of(file: dict[str, Any]) -> Loop:
     """Return the motion over a period from the numbers of a certificate."""
     A, B, C, E, F, G, lag = (file[key] for key in [*"ABCEFG", "lag"])
     law, T, (n, m), k = file["law"], float(file["period"]), B.shape, E.shape[1]
+    limit = limit_of(file)
+    one = int(limit is not None)
     size, has_lag = n + m, lag > 0.0
     rate = np.diag(1.0 / np.where(has_lag, lag, 1.0))
     drive = np.vstack([B * ~has_lag, rate * has_lag])
@@ -319,10 +403,12 @@ def loop_of(file: dict[str, Any]) -> Loop:
     split = max(file["delay"] / T - ticks, 0.0)
     kept, own = (ticks + 1) * m, len(law["A"])
     states, channels = size + kept + own, TERMS * k
-    u_now = np.hstack([law["D"] @ C, np.zeros((m, m + kept)), law["C"]])
-    inputs = np.vstack([u_now, np.eye(states)[size : size + kept]])
+    # What is cut off follows the states, and the channels follow it.
+    cut = np.zeros((m, 0)) if limit is None else -np.eye(m)[:, [limit.place]]
+    u_now = np.hstack([law["D"] @ C, np.zeros((m, m + kept)), law["C"], cut])
+    inputs = np.vstack([u_now, np.eye(states + one)[size : size + kept]])
     new, old = inputs[ticks * m :][:m], inputs[(ticks + 1) * m :][:m]
-    X, first = over(split), np.eye(size, states)
+    X, first = over(split), np.eye(size, states + one)
     second = X[0] @ first + T * X[1] @ drive @ old
     nodes = np.r_[split * (GAUSS + 1) / 2, split + (1 - split) * (GAUSS + 1) / 2]
     weights = np.r_[split * WEIGHTS, (1 - split) * WEIGHTS] / 2
@@ -338,52 +424,88 @@ def loop_of(file: dict[str, Any]) -> Loop:
         ends.append(T * np.vstack([Y[0] @ E, *(F @ integral @ E for integral in to_z)]))
     values, root = np.array([p(nodes) for p in BASIS]), np.sqrt(weights)[:, None, None]
     ZD, WV = (np.einsum("is,s,sab->iab", values, weights, f) for f in (reads, ends))
-    S = (root * (reads - np.einsum("is,iab->sab", values, ZD))).reshape(-1, states + channels)
+    S = (root * (reads - np.einsum("is,iab->sab", values, ZD))).reshape(-1, states + one + channels)
     V = np.hstack(list(root * (ends - np.einsum("is,iab->sab", values, WV))))
     kernel = np.array([T * F @ over((1.0 + s) / 2.0)[0] @ E for s in GAUSS])
     K = np.einsum("s,skc->kc", WEIGHTS * (1.0 - GAUSS) / 4.0, kernel**2)
     X = over(1.0 - split)
     motion = X[0] @ second + T * X[1] @ drive @ new
-    law_motion = np.hstack([law["B"] @ C, np.zeros((own, m + kept)), law["A"]])
+    still = np.zeros((own, one))
+    law_motion = np.hstack([law["B"] @ C, np.zeros((own, m + kept)), law["A"], still])
     A = np.vstack([motion, inputs[:kept], law_motion])
-    below = np.zeros((kept + own, channels + V.shape[1]))
-    WV = np.vstack([np.hstack([*WV[:, :size], V[:size]]), below])
+    WV = np.pad(np.hstack([*WV[:, :size], V[:size]]), ((0, kept + own), (0, 0)))
+    acts = np.pad(-cut.T @ u_now, ((0, 0), (0, WV.shape[1])))
     none = np.zeros((len(S), V.shape[1]))
-    big = np.block([[A, WV], [np.vstack(list(ZD)), V[size:]], [S, none]])
-    return Loop(big, K, states, T)
+    big = np.block([[A, WV], [acts], [np.vstack(list(ZD)), V[size:]], [S, none]])
+    return Loop(big, K, states, T, RADIUS if limit is None else limit.radius, limit)
 
 
 def parts_of(loop: Loop) -> list[tuple[tuple[int, ...], Loop]]:
     """Return the strongly connected parts and their entries: these have the modes of the loop."""
-    n, k = loop.states, len(loop.K)
-    total = n + k
-    # of each row and column: the state, or the number of states + the entry
-    node = np.r_[0:n, np.tile(np.arange(n, total), (len(loop.big) - n) // k)]
+    n, k, one = loop.states, len(loop.K), int(loop.limit is not None)
+    total = n + one + k
+    # of each row and column: the state, or the number of states + what is cut off + the entry
+    each = np.arange(n + one, total)
+    node = np.r_[0 : n + one, np.tile(each, (len(loop.big) - n - one) // k)]
     reach = np.eye(total)
     np.add.at(reach, (node[:, None], node[None]), np.abs(loop.big) > 0.0)
-    reach[n:, n:] += loop.K
+    reach[n + one :, n + one :] += loop.K
     for _ in range(int(np.ceil(np.log2(total)))):
         reach = (reach @ reach > 0.0).astype(float)
     parts = []
     for member in np.unique(reach * reach.T > 0.0, axis=0):
-        rows, entries = np.flatnonzero(member[node]), np.flatnonzero(member[n:])
+        rows, entries = np.flatnonzero(member[node]), np.flatnonzero(member[n + one :])
         big, K = loop.big[np.ix_(rows, rows)], loop.K[np.ix_(entries, entries)]
-        part = Loop(big, K, int(member[:n].sum()), loop.period)
+        limit = loop.limit if member[n : n + one].any() else None
+        part = loop._replace(big=big, K=K, states=int(member[:n].sum()), limit=limit)
         parts.append((tuple(entries.tolist()), part))
     return parts
 
 
-def is_stable(A: Array) -> bool:
-    """Return whether abs(z) < RADIUS for each eigenvalue: P > 0, P - A' P A / RADIUS^2 > 0."""
-    P, power = np.eye(len(A)), A / RADIUS
+def is_stable(A: Array, radius: float = RADIUS) -> bool:
+    """Return whether abs(z) < radius for each eigenvalue: P > 0, P - A' P A / radius^2 > 0."""
+    P, power = np.eye(len(A)), A / radius
     for _ in range(40):
         with np.errstate(over="ignore", invalid="ignore"):
             P, power = P + power.T @ P @ power, power @ power
     if not np.isfinite(P).all():
         return False
-    left = P - A.T @ P @ A / RADIUS**2
+    left = P - A.T @ P @ A / radius**2
     least = (np.min(np.linalg.eigvalsh(matrix), initial=1.0) for matrix in (P, left + left.T))
     return bool(min(least) > 0.5)
+
+
+def integrators(file: dict[str, Any]) -> int:
+    """Return how many modes are at 1 in every aircraft, and move no u of the limited input.
+
+    The loop rests where A x + B u = 0, B_l C x + (A_l - I) xi = 0 and D_l C x + C_l xi = u. These
+    equations depend on each other, in each aircraft and for each gain of the limited input, if a
+    row multiplied by them is 0 and multiplied by E and by this column of B too. Each such row
+    leaves a direction in which the loop rests: a mode at 1. It is none of the transfer function
+    from what is cut off to u, because no gain of this input moves it.
+    """
+    limit, (A, B, C, E), law = limit_of(file), (file[key] for key in "ABCE"), file["law"]
+    require(limit is not None, "limit", None, "an input")
+    assert limit is not None  # noqa: S101 - for mypy
+    (n, m), q = B.shape, len(law["A"])
+    varied = np.hstack([E, B[:, [limit.place]]])
+    rows = np.block(
+        [
+            [A, B, np.zeros((n, q)), varied],
+            [law["B"] @ C, np.zeros((q, m)), law["A"] - np.eye(q), np.zeros((q, varied.shape[1]))],
+            [law["D"] @ C, -np.eye(m), law["C"], np.zeros((m, varied.shape[1]))],
+        ]
+    )
+    sizes = np.linalg.norm(rows, axis=1)[:, None]
+    return int(np.sum(np.linalg.svd(rows / np.where(sizes > 0.0, sizes, 1.0))[1] < EQUAL))
+
+
+def settles(A: Array, count: int) -> bool:
+    """Return whether all modes but `count` at 1 have abs(z) < SETTLING."""
+    left, _, _ = np.linalg.svd(A - np.eye(len(A)))
+    others, at_one = np.split(left, [len(A) - count], axis=1)
+    is_exact = norm(at_one.T @ A - at_one.T) <= EQUAL
+    return is_exact and is_stable(others.T @ A @ others, SETTLING)
 
 
 def norm(X: Array) -> float:
@@ -417,6 +539,7 @@ class System(NamedTuple):
     gy_by_v: float
     rest_by_w: float
     rest_by_v: float
+    gain: float  # exp(-s) of the limited input
 
 
 def system_of(
@@ -424,30 +547,32 @@ def system_of(
 ) -> System:
     """Return the system of a step. If t lacks coefficients, they balance those before them."""
     n, k, known = part.states, len(part.K), len(step["t"])
-    p = TERMS * k
-    w, rest, c = slice(n, n + p), slice(n + p, None), np.tile(middle, TERMS)
-    around = closed(part.big[: n + p], w, c)
-    (A, W, V), (Z, D, y) = (np.split(side, [n, n + p], axis=1) for side in (around[:n], around[w]))
-    wide = np.tile(half, TERMS)[:, None]
-    R = np.linalg.inv(RADIUS * np.exp(1j * frequency * part.period) * np.eye(n) - A)
-    sizes = np.abs(wide * (Z @ R @ W + D)) ** 2 + 1e-30
+    one, p, w = int(part.limit is not None), TERMS * k, part.channels
+    rest, c = slice(w.stop, None), np.r_[np.zeros(one), np.tile(middle, TERMS)]
+    around = closed(part.big[: w.stop], w, c)
+    (A, W, V), (Z, D, y) = (np.split(side, [n, w.stop], axis=1) for side in (around[:n], around[w]))
+    wide = np.r_[np.ones(one), np.tile(half, TERMS)][:, None]
+    R = np.linalg.inv(part.radius * np.exp(1j * frequency * part.period) * np.eye(n) - A)
+    sizes = (np.abs(wide * (Z @ R @ W + D)) ** 2 + 1e-30)[one:, one:]
     t, g = (np.r_[step[key], np.zeros(p - known)] for key in "tg")
     for i in range(known, p, k):
         to = (np.exp(t[:i]) * (1.0 + np.abs(g[:i]))) ** 2 @ sizes[:i, i : i + k]
         t[i : i + k] = np.log(to / (sizes[i : i + k, :i] @ np.exp(-2.0 * t[:i]))) / 4.0
     # v of an entry is scaled as its last coefficient, and is at most `most` times the rest of z.
-    scale, most, last = np.exp(t), np.abs(middle) + half, np.exp(t[-k:])
-    nodes = (len(part.big) - n - p) // k
-    S = np.tile(most * last, nodes)[:, None] * part.big[rest, : n + p]
+    most, last = np.abs(middle) + half, np.exp(t[-k:])
+    s = np.full(one, step.get("s", 0.0))
+    out, scale = np.exp(np.r_[0.0 * s, t]), np.exp(np.r_[s, t])
+    nodes = (len(part.big) - w.stop) // k
+    S = np.tile(most * last, nodes)[:, None] * part.big[rest, : w.stop]
     through = S[:, w] * c
-    S = S + through @ around[w, : n + p]
+    S = S + through @ around[w, : w.stop]
     V, y = V / np.tile(last, nodes), y / np.tile(last, nodes)
     rest_by_v = norm(np.sqrt(part.K) * np.outer(most * last, 1.0 / last)) + norm(through) * norm(y)
-    scaled = wide * scale[:, None]
-    W, Z, D, y = W / scale, scaled * Z, scaled * D / scale, scaled * y
+    scaled = wide * out[:, None]
+    W, Z, D, y = W / scale, scaled * Z, scaled * D / scale, (scaled * y)[one:]
     # states of which what comes in is as large as what goes out make the norms small
-    into, out = ((np.abs(X) ** 2).sum(axis=a) + 1e-30 for X, a in ((R @ W, 1), (Z @ R, 0)))
-    f = (out / into) ** 0.25
+    into, leave = ((np.abs(X) ** 2).sum(axis=a) + 1e-30 for X, a in ((R @ W, 1), (Z @ R, 0)))
+    f = (leave / into) ** 0.25
     by_x, by_w = S[:, :n] / f, S[:, w] / scale
     return System(
         A=f[:, None] * A / f,
@@ -462,6 +587,7 @@ def system_of(
         gy_by_v=norm(g[:, None] * y),
         rest_by_w=norm(by_w),
         rest_by_v=rest_by_v,
+        gain=float(np.exp(-s[0])) if one else 0.0,
     )
 
 
@@ -473,11 +599,12 @@ def is_positive(X: Array) -> bool:
         return False
 
 
-def is_proved(system: System, period: float, w: float, x: float) -> bool:
+def is_proved(system: System, part: Loop, w: float, x: float) -> bool:
     """Return whether the box has no mode at any frequency from w - x to w + x."""
-    A, W, V, Z, D, S, S_w, g, y_by_v, gy_by_v, rest_by_w, rest_by_v = system
-    n, p = W.shape
-    z, delta = RADIUS * np.exp(1j * w * period), RADIUS * x * period
+    A, W, V, Z, D, S, S_w, g, y_by_v, gy_by_v, rest_by_w, rest_by_v, gain = system
+    (n, p), period = W.shape, part.period
+    one = p - len(g)
+    z, delta = part.radius * np.exp(1j * w * period), part.radius * x * period
     pencil = z * np.eye(n) - A
     R = np.linalg.inv(pencil)
     # The resolvent up to z + delta is R (I + Y - slip)^-1, Y = delta R. Slip is what R as computed
@@ -509,25 +636,36 @@ def is_proved(system: System, period: float, w: float, x: float) -> bool:
     rest = (square**0.5 + sum(moved(S @ R))) / (1.0 - loop_gain)
     y_by_x = norm(left @ V) + norm(left) * (delta * x_by_v + 2.0 * error * norm(V))
     N = D + Z @ right
+    N_d, left_d = N[one:], left[one:]
+    Y = 1j * g
+    if part.limit is not None:
+        Y = np.r_[gain * part.limit.at(w * period), Y]
     added = (norm(np.array(y_by_v)) + y_by_x) * rest
-    N_y = sum(norm(rows) * y for rows, y in zip(np.split(N, TERMS), y_by_v, strict=True))
-    H_added = (N_y + gy_by_v + (norm(N) + np.abs(g).max()) * y_by_x) * rest
-    gram, skew = adjoint(N) @ N, 1j * g[:, None] * N
-    H_left = adjoint(N) @ left + 1j * g[:, None] * left
+    N_y = sum(norm(rows) * y for rows, y in zip(np.split(N_d, TERMS), y_by_v, strict=True))
+    H_added = (N_y + gy_by_v + (norm(N_d) + np.abs(Y).max()) * y_by_x) * rest
+    gram, skew = adjoint(N_d) @ N_d, Y[:, None] * N
+    H_left = adjoint(N_d) @ left_d + Y[:, None] * left
     change = -1j * period * z * (H_left @ right)
+    lost = ROUNDING + 2.0 * (H_added + moved(H_left)[1]) + (sum(moved(left_d)) + added) ** 2
+    if part.limit is not None:
+        # m moves too: what is linear joins `change`
+        lags, taps = part.limit.lags, part.limit.taps
+        slope = 1j * period * np.sum(lags * taps * np.exp(-1j * lags * w * period))
+        change[0] += gain * slope * N[0]
+        far, curved = (np.sum(taps * (x * period * np.abs(lags)) ** i) for i in (1, 2))
+        lost += 2.0 * gain * (far * (sum(moved(left[:1])) + added) + curved / 2.0 * norm(N[0]))
     change = x * (change + adjoint(change))
-    lost = ROUNDING + 2.0 * (H_added + moved(H_left)[1]) + (sum(moved(left)) + added) ** 2
-    room = (1.0 - lost) * np.eye(p) - gram - skew - adjoint(skew)
+    room = np.diag(np.r_[np.zeros(one), np.ones(p - one)] - lost) - gram - skew - adjoint(skew)
     return is_positive(room - change) and is_positive(room + change)
 
 
-def prove(part: Loop, steps: list[dict[str, Any]], size: float, count: int) -> int:
-    """Replay the steps from the whole box, 0 to pi / T, after `count` bounds.
+def prove(part: Loop, steps: list[dict[str, Any]], size: float, slowest: float, count: int) -> int:
+    """Replay the steps from the whole box, `slowest` to pi / T, after `count` bounds.
 
     Returns the number of bounds with these. Raises ValueError.
     """
     k = len(part.K)
-    boxes = [(np.zeros(k), np.full(k, size), 0.0, np.pi / part.period)]
+    boxes = [(np.zeros(k), np.full(k, size), slowest, np.pi / part.period)]
     for number, step in enumerate(steps):
         if not boxes:
             raise ValueError(f"step {number}: the box is proved before it")
@@ -538,6 +676,8 @@ def prove(part: Loop, steps: list[dict[str, Any]], size: float, count: int) -> i
             continue
         if not low <= step["low"] < step["high"] <= high:
             raise ValueError(f"step {number}: not within {low:.6g} to {high:.6g} rad/s, its box")
+        fits = ("s" in step) == (part.limit is not None)
+        require(fits, f"step {number}", [*step], "s where an input is cut off")
         todo, balanced = [(step["low"], step["high"])], np.inf
         while todo:
             begin, end = todo.pop()
@@ -545,7 +685,7 @@ def prove(part: Loop, steps: list[dict[str, Any]], size: float, count: int) -> i
             if not balanced / NEAR < w < NEAR * balanced:
                 system, balanced = system_of(part, middle, half, step, w), w
             count += 1
-            if not is_proved(system, part.period, w, x):
+            if not is_proved(system, part, w, x):
                 if not (x >= NARROWEST * w and count <= MOST):
                     raise ValueError(f"step {number}: not proved at {w:.6g} rad/s")
                 todo += [(begin, w), (w, end)]
@@ -767,17 +907,26 @@ def check(file: dict[str, Any]) -> int:
     exact_entries(file)
     require_range(file)
     loop, count, steps = loop_of(file), 0, dict(file["parts"])
+    slowest = 0.0 if loop.limit is None else loop.limit.slowest
     if not np.isfinite(loop.big).all():
         raise ValueError("the motion over a period is not finite")
+    if loop.radius == SETTLING and not settles(
+        loop.big[: loop.states, : loop.states], integrators(file)
+    ):
+        raise ValueError("the aircraft of the file, d = 0, does not settle")
     for entries, part in parts_of(loop):
-        if not is_stable(part.big[: part.states, : part.states]):
+        motion = part.big[: part.states, : part.states]
+        if not is_stable(motion):
             raise ValueError("the aircraft of the file, d = 0, is not stable")
+        if slowest and not entries and part.states > 1 and not is_stable(motion, SETTLING):
+            raise ValueError("a part without entries may oscillate")
+        require(part.limit is None or len(entries) > 0, "limit", "no entry", "a part with entries")
         if entries and (
             part.big[part.states :, part.states :].any() or part.states or part.K.any()
         ):
             if entries not in steps:
                 raise ValueError(f"no proof for {[file['names'][i] for i in entries]}")
-            count = prove(part, steps.pop(entries), float(file["size"]), count)
+            count = prove(part, steps.pop(entries), float(file["size"]), slowest, count)
     require(not steps, "parts", [*steps], "the parts of the loop alone")
     return count
 
@@ -788,9 +937,20 @@ def rounded_down(x: float) -> str:
     return f"{np.floor(x / unit + 1e-6) * unit:.3g}"
 
 
+def claim_of(file: dict[str, Any]) -> str:
+    """Return what is proved."""
+    if "limit" not in file:
+        return "stable"
+    name, slowest = file["limit"]["input"], file["limit"]["slowest"]
+    if slowest:
+        period = np.floor(20.0 * np.pi / slowest) / 10.0
+        return f"no periodic motion of up to {period:g} s, with any limits of {name},"
+    return f"settles with any limits of {name} around where it settles,"
+
+
 def report_of(file: dict[str, Any], count: int) -> str:
     """Return what a proved certificate says."""
-    lines = [f"PROVED by {count} bounds: stable for each deviation within"]
+    lines = [f"PROVED by {count} bounds: {claim_of(file)} for each deviation within"]
     for k, name in enumerate(file["names"]):
         if file["part"][k]:
             # a position beside the name: row and column from 0
@@ -810,7 +970,7 @@ def report_of(file: dict[str, Any], count: int) -> str:
     lines.append(f"law: {law}")
     lags = ", ".join(f"{lag:g}" for lag in file["lag"])
     lines.append(f"period {file['period']:g} s, delay {file['delay']:g} s, lags [{lags}] s")
-    return "\n".join([*lines, COVERED])
+    return "\n".join([*lines, COVERED_WITH_LIMIT if "limit" in file else COVERED])
 
 
 def main() -> int:
