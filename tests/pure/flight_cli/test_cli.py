@@ -439,6 +439,14 @@ def test_number_of_runs_is_no_folder(
         ("gains select osprey --rate nan", "--rate: found nan, expected 1 to 1000 Hz"),
         ("gains guarantee osprey --late 9", "--late: found 9.0, expected 0 to 0.5 s"),
         (
+            "gains guarantee osprey --saturation flap",
+            "--saturation: found flap, expected an input: elevator, aileron, rudder, thrust",
+        ),
+        (
+            "gains guarantee osprey --saturation rudder --late 0.01",
+            "--saturation: found --late 0.01 beside it, expected u in time",
+        ),
+        (
             "identify log . --airframe osprey --margin 0.1",
             "--margin: found 0.1, expected --refly beside it",
         ),

@@ -13,13 +13,22 @@ from rich.status import Status
 
 from aircraft_sim.airframes.airframe import airframes
 from flight_analysis.closed_loop.scenario_library import scenarios
+from flight_analysis.linear_loop.guarantee import NAMED
+from flight_analysis.linear_loop.loop_margins import LinearLoop
+from flight_analysis.linear_loop.saturation import guarantee_with_limit
 from flight_analysis.report.html import write_loop_page
 from flight_cli.gains_guarantee import (
     proved,
     require_guarantee,
+    require_linear,
     warn_of_controller_alone,
     write_certificate,
     write_unstable,
+)
+from flight_cli.gains_saturation import (
+    limit_text,
+    require_saturation,
+    write_limit_certificate,
 )
 from flight_cli.gains_tables import GainSets, gains_as_json, show_gains
 from flight_cli.gains_verdicts import (
@@ -279,6 +288,9 @@ class Guarantee(Check):
         "Largest time by which u is late, s. It may differ at each tick and in each input.",
         default=0.0,
     )
+    saturation: str | None = option(
+        "Input whose limits may be anywhere: bound what holds with them, by --certificate."
+    )
     certificate: Path | None = option(
         "File for the proof (JSON), which examples/check_certificate.py checks "
         "with nothing but numpy."
@@ -296,10 +308,20 @@ class Guarantee(Check):
             worst=self.worst,
             certificate=self.certificate,
         )
+        require_saturation(
+            self.saturation,
+            scenario=self.scenario,
+            late=self.late,
+            entries=self.entry or (),
+            worst=self.worst,
+        )
         with self._status("checking the gains on uncertain airframes") as status:
             answer = self._checked()
             status.update("bounding every aircraft of the box")
             loop = answer.loop_with_box()
+            if self.saturation is not None:
+                self._bound_limited(answer, loop)
+                return
             promise = proved(answer, self.late)
             lines = write_certificate(self.certificate, loop, promise, self.airframe, self.scenario)
             lines += write_unstable(self.worst, promise, self.airframe, self.scenario)
@@ -307,6 +329,21 @@ class Guarantee(Check):
         sets = GainSets({"scenario": answer}, checked=name, promise=promise)
         self._show(sets, lines, certificate=self.certificate)
         self._exit(sets)
+
+    def _bound_limited(self, answer: GainAssessment[Any], loop: LinearLoop) -> None:
+        """Bound the loop with limits of one input, write the certificate, and show it."""
+        name = self.saturation or ""
+        require_linear(loop)
+        promise = guarantee_with_limit(loop, name)
+        lines = limit_text(name, promise, f"certificate {loop.digest[:NAMED]}, {name}")
+        lines += write_limit_certificate(
+            self.certificate, loop, promise, self.airframe, self.scenario
+        )
+        sets = GainSets({"scenario": answer}, checked=Path(self.scenario).stem, limited=promise)
+        self._show(sets, lines, certificate=self.certificate)
+        self._exit(sets)
+        if promise is None or not promise.holds:
+            raise typer.Exit(LOOP_FAILS)
 
 
 def _loop_of_px4(

@@ -85,9 +85,7 @@ def proved(answer: GainAssessment[ControllerConfig], late: float) -> Guarantee:
     beside exact others. Raises ParameterError before the proof if the aircraft has no linear loop.
     """
     loop = answer.loop_with_box()
-    for each in loop.differences:
-        expected = "the aircraft of a linear loop for a guarantee"
-        require(each.standing is Standing.TAKEN, "guarantee", each.fact, expected)
+    require_linear(loop)
     promise = guarantee(loop, late)
     if not answer.study.spread.zeros:
         zeros = answer.study._replace(uncertainty=0.0, spread=Spread(zeros=1.0))
@@ -95,6 +93,13 @@ def proved(answer: GainAssessment[ControllerConfig], late: float) -> Guarantee:
         promise = promise._replace(zeros_alone=alone)
     keep(promise)
     return promise
+
+
+def require_linear(loop: LinearLoop) -> None:
+    """Raise ParameterError if the aircraft that flies has no linear loop."""
+    for each in loop.differences:
+        expected = "the aircraft of a linear loop for a guarantee"
+        require(each.standing is Standing.TAKEN, "guarantee", each.fact, expected)
 
 
 def write_certificate(

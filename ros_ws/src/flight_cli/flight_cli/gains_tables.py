@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flight_analysis.linear_loop.guarantee import Guarantee
+from flight_analysis.linear_loop.saturation import LimitGuarantee
 from flight_analysis.report.display_units import display_unit
 from flight_analysis.report.glossary import legend
 from flight_analysis.report.margin_figures import (
@@ -63,6 +64,7 @@ class GainSets(NamedTuple):
     selection: Selection | None = None
     checked: str = ""  # name of the scenario that was checked
     promise: Guarantee | None = None
+    limited: LimitGuarantee | None = None
 
     @property
     def titles(self) -> dict[str, Assessment]:
@@ -282,6 +284,7 @@ def gains_as_json(result: GainSets, seed: int) -> dict[str, Any]:
             for name, answer in result.answers.items()
         },
         **({} if promise is None else {"guarantee": promise.as_json()}),
+        **({} if result.limited is None else {"saturation": result.limited.as_json()}),
     }
 
 

@@ -13,5 +13,6 @@
 | `structured_value` | bounds the structured singular value |
 | `branch_and_bound` | proves stability over the box, which it splits where necessary |
 | `guarantee` | the largest box for which stability and a disk are proved |
+| `saturation` | the largest part of a box that is proved with any limits of one input |
 | `certificate` | a guarantee as a file, which can be checked without this stack |
 """

@@ -81,7 +81,7 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
         # Depth first: the last region is the smallest, and its X and G are a good start for the
         # next.
         region = regions.pop()
-        w = _frequency(region, highest)
+        w = frequency_in(region, highest)
         around = part.at(region.centre)
         # Bound mu of the deviations of this region, scaled to 1, at one frequency.
         scale = np.r_[region.half[part.parameters], others]
@@ -90,7 +90,7 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
         interval = interval_at(around, w, scaling, scale) if bound < 1.0 else None
         region = region._replace(scaling=scaling)
         if interval is None:
-            entry = int(np.argmax(_effects(part, M, scaling)))
+            entry = int(np.argmax(effects_of(part, M, scaling)))
             if region.half[entry] < NARROWEST * size:
                 return None  # a mode lies on the circle, and rounding may hide it
             steps.append({"halve": entry})
@@ -116,7 +116,7 @@ def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
     return {"t": t, "g": g}
 
 
-def _frequency(region: Region, highest: float) -> float:
+def frequency_in(region: Region, highest: float) -> float:
     """Choose the frequency at which a region is bounded, first 0 and pi / T, where M is real."""
     if region.low == 0.0:
         return 0.0
@@ -146,7 +146,7 @@ def _levelled(part: Channels, scale: FloatArray) -> Channels:
     return part._replace(W=part.W / size, Z=rows * part.Z, D=rows * part.D / size)
 
 
-def _effects(part: Channels, M: ComplexArray, scaling: Scaling) -> FloatArray:
+def effects_of(part: Channels, M: ComplexArray, scaling: Scaling) -> FloatArray:
     """Estimate how the bound of M falls with the half width of each parameter, up to a factor."""
     scale = np.exp(scaling.t)
     N = scale[:, None] * M / scale

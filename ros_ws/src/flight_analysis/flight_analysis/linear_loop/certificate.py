@@ -23,6 +23,7 @@ import numpy as np
 
 from flight_analysis.linear_loop.guarantee import Guarantee, Unstable, Zeros
 from flight_analysis.linear_loop.loop_margins import LinearLoop
+from flight_analysis.linear_loop.saturation import LimitGuarantee
 from flight_analysis.linear_loop.told import Standing
 from flight_core.files import write_file
 from flight_core.parameters import require
@@ -46,10 +47,23 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
     require(promise.stable > 0.0, "certificate", "no stable box", "a loop with a guarantee")
     require(promise.late == 0.0, "certificate", f"u up to {promise.late:g} s late", "u in time")
     require(promise.has_exact_lags, "certificate", "a lag in the box", "exact lags")
+    return _text(linear, promise.stable, {**sources, "parts": promise.proof})
+
+
+def limit_certificate(
+    linear: LinearLoop, promise: LimitGuarantee, sources: Mapping[str, str]
+) -> str:
+    """Write the certificate of a guarantee with a limit, as JSON, as `certificate` does."""
+    limit = {"input": promise.input, **promise.multiplier._asdict()}
+    return _text(linear, promise.size, {**sources, "parts": promise.proof, "limit": limit})
+
+
+def _text(linear: LinearLoop, deviation: float, proof: Mapping[str, Any]) -> str:
+    """Write the loop, its box up to a relative deviation, and a proof."""
     box = linear.box
-    assert box is not None and promise.proof  # noqa: S101, PT018 - a guarantee has both
+    assert box is not None  # noqa: S101 - a guarantee has one
     content = {
-        **sources,
+        **proof,
         "states": linear.states,
         "outputs": linear.outputs,
         "inputs": linear.inputs,
@@ -57,9 +71,8 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
         **{name: value for name, value in box._asdict().items() if name != "zeros" or value},
         **linear.loop._asdict(),
         "law": linear.law._asdict(),
-        "loop": promise.loop,
-        "size": promise.stable / box.largest,
-        "parts": promise.proof,
+        "loop": linear.digest,
+        "size": deviation / box.largest,
     }
     text = json.dumps(content, sort_keys=True, default=np.ndarray.tolist)
     digest = hashlib.sha256(text.encode()).hexdigest()

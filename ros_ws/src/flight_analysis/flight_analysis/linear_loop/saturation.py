@@ -1,0 +1,389 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Proof for every aircraft of a box, whatever the limits of one input.
+
+The input acts as a = phi(u), and w = u - a is cut off. phi is a curve that rises by 0 to 1 times
+the rise of u. For any taps h_j >= 0 at ticks j, before and after, whose sum is at most 1,
+
+    sum over ticks of w_k (a_k - sum_j h_j a_k-j) >= 0
+
+(Zames-Falb). The loop has the sensitivity S at this input, and m = 1 - sum_j h_j z^-j. If Re(m S) >
+0 at each frequency, every aircraft settles; if this holds from a lowest frequency on, none
+oscillates faster. docs/theory.md has both theorems.
+
+A linear program finds the taps for some aircraft. The box is then covered by D and G of its
+entries, as without a limit. The inequality is tried at samples between the frequencies of a step:
+what proves it is the check of the certificate.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flight_analysis.linear_loop.branch_and_bound import (
+    DIGITS,
+    Region,
+    effects_of,
+    frequency_in,
+)
+from flight_analysis.linear_loop.guarantee import SLACK
+from flight_analysis.linear_loop.loop_margins import LinearLoop
+from flight_analysis.linear_loop.structured_value import Scaling, tightened_at
+from flight_analysis.linear_loop.uncertain_loop import (
+    Channels,
+    ComplexArray,
+    IntArray,
+    parts_of,
+    uncertain_loop,
+)
+from flight_core.parameters import require
+from flight_core.vectors import FloatArray
+
+# abs(z) of a proof that every motion settles: integrators have a mode at 1, outside
+SETTLING = 1.0 - 1e-5
+# Lowest frequency of a proof that nothing oscillates, rad/s
+SLOWEST = 0.05
+TRIED = (1.0, 0.8, 0.65, 0.5, 0.4, 0.3, 0.2)  # parts of the box that are tried, from the whole
+
+LAGS = np.unique(np.geomspace(1.0, 100.0, 30).round().astype(int))  # ticks
+AIRCRAFT = 12  # random corners of the box in the linear program, and at which climbs start
+SEED = 2
+ROUNDS = 8  # linear programs at most
+CLIMBERS = 3  # corners at which climbs start in each round
+LONGEST_CLIMB = 12  # entries that a climb turns at most
+ENOUGH = 0.5  # part of the room of the program that suffices for the worst corner
+LOWEST = 1e-6  # frequency of the program, as a part of pi / T
+LEAST_ROOM = 1e-3  # least Re(m S) / abs(S), as a part of `_expected`, that is worth a proof
+KNEE = 3.0  # frequency below which less is expected, rad/s
+LEAST_TAP = 1e-9
+WHOLE = 1.0 - 1e-8  # sum of the taps, so that rounding does not bring it above 1
+
+MARGIN = 0.02  # part of the bound 1 that is left for what a check between frequencies loses
+MOST = 2000  # steps of a proof
+NARROWEST = 1e-3  # a half box below this part of the box is not halved again
+STRIDE = 0.1  # part of a frequency by which the next sample of an interval is farther, at most
+TURN = 0.2  # angle by which the farthest tap turns from one sample to the next, at most, rad
+BATCH = 200  # samples on each side of a frequency, at most
+
+
+class LimitGuarantee(NamedTuple):
+    """What holds for every aircraft of a box, whatever the limits of one input."""
+
+    input: str
+    uncertainty: float  # largest relative deviation in the box
+    size: float  # largest relative deviation for which it is found
+    multiplier: "Multiplier"
+    # "entries" and "steps" of each strongly connected part, as in `limit_proof`
+    proof: list[dict[str, Any]]
+
+    @property
+    def settles(self) -> bool:
+        """Whether every motion settles; otherwise no motion is periodic."""
+        return not self.multiplier.slowest
+
+    @property
+    def holds(self) -> bool:
+        """Whether it is found for the whole box."""
+        return self.size >= self.uncertainty
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything except the proof."""
+        return {
+            "input": self.input,
+            "uncertainty": self.uncertainty,
+            "within": self.size,
+            "settles": self.settles,
+            "slowest": self.multiplier.slowest,
+            "holds": self.holds,
+        }
+
+
+class Multiplier(NamedTuple):
+    """The taps h >= 0 at the ticks `lags`, of which none is 0."""
+
+    slowest: float  # lowest frequency of the proof, rad/s
+    lags: IntArray
+    taps: FloatArray
+
+    @property
+    def radius(self) -> float:
+        """abs(z) of the proof."""
+        return 1.0 if self.slowest else SETTLING
+
+    def at(self, turn: FloatArray) -> ComplexArray:
+        """Compute m at the angles `turn` = w T, rad."""
+        turned = np.exp(-1j * np.multiply.outer(turn, self.lags))
+        return np.asarray(1.0 - turned @ self.taps.astype(complex))
+
+
+def guarantee_with_limit(linear: LinearLoop, name: str) -> LimitGuarantee | None:
+    """Find the largest part of the box in which every aircraft settles, or none oscillates.
+
+    Returns None if there is none. Raises ParameterError if the loop has no such input, or no box.
+    """
+    require(name in linear.inputs, "limit", name, f"an input: {', '.join(linear.inputs)}")
+    box = linear.box
+    require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
+    assert box is not None  # noqa: S101 - for mypy
+    place = linear.inputs.index(name)
+    loop = uncertain_loop(linear.nominal, linear.law, linear.loop, box)
+    limited = [_with_limit(part) for part in parts_of(loop, (place,))]
+    require(
+        len(limited) == 1 and bool(limited[0].entries),
+        "limit",
+        name,
+        "an input of a loop with entries",
+    )
+    others = [part for part in parts_of(loop) if part.entries != limited[0].entries]
+    for part_of_box in TRIED:
+        for slowest in (0.0, SLOWEST):
+            multiplier = multiplier_for(limited[0], part_of_box, slowest)
+            if multiplier is None:
+                continue
+            proof = _proof(limited + others, multiplier, (1.0 + SLACK) * part_of_box)
+            if proof is not None:
+                whole = box.largest
+                return LimitGuarantee(name, whole, part_of_box * whole, multiplier, proof)
+    return None
+
+
+def _proof(
+    parts: list[Channels], multiplier: Multiplier, size: float
+) -> list[dict[str, Any]] | None:
+    """Prove each part for a size, of which the first one has the limit, or return None."""
+    proof = []
+    for number, part in enumerate(parts):
+        steps = limit_proof(part, multiplier, size, has_limit=number == 0)
+        if steps is None:
+            return None
+        proof.append({"entries": list(part.entries), "steps": steps})
+    return proof
+
+
+def _with_limit(part: Channels) -> Channels:
+    """Return a part with a disk in one input as one from (w of the entries, w) to (z, a)."""
+    W, D = part.W.copy(), part.D.copy()
+    D[-1, -1] += 0.5
+    W[:, -1] *= -1.0
+    D[:, -1] *= -1.0
+    return part._replace(W=W, D=D)
+
+
+def sensitivity(part: Channels, w: FloatArray, radius: float) -> ComplexArray:
+    """Compute S at the input, at the frequencies w, rad/s, for the aircraft in the middle."""
+    last = np.array([len(part.D) - 1])
+    return np.asarray(-part.some(last).response(w, radius)[:, 0, 0])
+
+
+def multiplier_for(part: Channels, size: float, slowest: float) -> Multiplier | None:
+    """Find taps that serve the middle of a box and its worst corners.
+
+    A linear program finds the taps that leave the most room to some aircraft. A search then adds
+    the corners to which these taps leave least, until that is nearly as much.
+    Returns None if no taps serve all of them.
+    """
+    k = len(part.entries)
+    generator = np.random.default_rng(SEED)
+    few = min(AIRCRAFT, 2**k)
+    aircraft = np.vstack([np.zeros(k), generator.choice([-size, size], (few, k))])
+    parts = np.r_[np.geomspace(1e-4, 1.0, 100), np.linspace(0.0, 0.3, 200)]
+    w = np.unique(np.maximum(np.pi / part.period * parts, slowest))
+    multiplier = None
+    for _ in range(ROUNDS):
+        multiplier, room = _program(part, aircraft, slowest)
+        if multiplier is None:
+            return None
+        starts = generator.choice([-size, size], (few, k))
+        found = _worst_corners(part, multiplier, starts, w)
+        if _rooms(part, multiplier, found, w).min() > ENOUGH * room:
+            break
+        aircraft = np.vstack([aircraft, found])
+    return multiplier
+
+
+def _expected(slowest: float, w: FloatArray) -> FloatArray:
+    """Return the size of Re(m S) / abs(S) that counts as the same room at the frequencies w.
+
+    Towards 0 rad/s an integrator in the loop takes room from S, and m must follow it.
+    """
+    return np.minimum(w / KNEE, 1.0) ** 2 if slowest else np.ones(len(w))
+
+
+def _rooms(part: Channels, multiplier: Multiplier, d: FloatArray, w: FloatArray) -> FloatArray:
+    """Return the least room of aircraft d (N, k) over the frequencies w, (N,)."""
+    S = np.array([sensitivity(part.at(each), w, multiplier.radius) for each in d])
+    phases = (multiplier.at(w * part.period) * S).real / np.abs(S)
+    return np.asarray((phases / _expected(multiplier.slowest, w)).min(axis=1))
+
+
+def _worst_corners(
+    part: Channels, multiplier: Multiplier, starts: FloatArray, w: FloatArray
+) -> FloatArray:
+    """Climb from some corners of a box, (N, k), to those with the least room."""
+    flips = 1.0 - 2.0 * np.eye(len(part.entries))
+    found = []
+    for start in starts[np.argsort(_rooms(part, multiplier, starts, w))[:CLIMBERS]]:
+        d, least = start, np.inf
+        for _ in range(LONGEST_CLIMB):
+            rooms = _rooms(part, multiplier, d * flips, w)
+            if not rooms.min() < least:
+                break
+            least, d = float(rooms.min()), d * flips[int(np.argmin(rooms))]
+        found.append(d)
+    return np.unique(found, axis=0)
+
+
+def _program(
+    part: Channels, aircraft: FloatArray, slowest: float
+) -> tuple[Multiplier | None, float]:
+    """Find the taps that leave the most room to some aircraft (N, k), and how much."""
+    from scipy.optimize import linprog  # noqa: PLC0415 - a flight starts without it
+
+    none = Multiplier(slowest, LAGS, np.zeros(len(LAGS)))
+    parts = np.r_[np.geomspace(LOWEST, 1.0, 200), np.linspace(0.0, 1.0, 800)]
+    w = np.unique(np.maximum(np.pi / part.period * parts, slowest))
+    lags = np.r_[-LAGS[::-1], LAGS]
+    turns = np.exp(-1j * np.outer(w * part.period, lags))
+    rows: list[FloatArray] = []
+    limits: list[FloatArray] = []
+    for d in aircraft:
+        S = sensitivity(part.at(d), w, none.radius)
+        turn = S / np.abs(S)
+        rows.append((turn[:, None] * turns).real)
+        limits.append(turn.real)
+    room = np.tile(_expected(slowest, w), len(rows))
+    A = np.hstack([np.vstack(rows), room[:, None]])
+    whole = np.r_[none.radius ** -np.abs(lags).astype(float), 0.0]
+    found = linprog(
+        np.r_[np.zeros(len(lags)), -1.0],
+        A_ub=np.vstack([A, whole]),
+        b_ub=np.r_[np.concatenate(limits), WHOLE],
+        bounds=[(0.0, None)] * len(lags) + [(None, 1.0)],
+        method="highs",
+    )
+    best = np.zeros(len(lags) + 1) if found.x is None else np.asarray(found.x)
+    if best[-1] < LEAST_ROOM:
+        return None, 0.0
+    taps = np.round(best[:-1], 10)
+    used = taps > LEAST_TAP
+    return none._replace(lags=lags[used], taps=taps[used]), float(best[-1])
+
+
+def inequality(M: ComplexArray, m: ComplexArray | None, step: dict[str, Any]) -> ComplexArray:
+    """Compute diag(1, ..., 1, 0) - N_d* N_d - Y N - N* Y* for M (F, q, q) and m (F,) of a step.
+
+    N = diag(e^t, 1) M diag(e^-t, e^-s), N_d has the rows of t, and Y = diag(j g, e^-s m). Without m
+    the part has no limit, and no last row.
+    """
+    t, g = np.array(step["t"]), np.array(step["g"])
+    one = M.shape[-1] - len(t)
+    N = np.exp(np.r_[t, np.zeros(one)])[:, None] * M
+    N = N * np.exp(-np.r_[t, np.full(one, step.get("s", 0.0))])
+    N_d = N[..., : len(t), :]
+    Y = np.broadcast_to(1j * g, (len(M), len(t)))
+    if m is not None:
+        Y = np.hstack([Y, np.exp(-step["s"]) * m[:, None]])
+    skew = Y[..., None] * N
+    ones = np.diag(np.r_[np.ones(len(t)), np.zeros(one)])
+    gram = np.conj(np.swapaxes(N_d, -1, -2)) @ N_d
+    return np.asarray(ones - gram - skew - np.conj(np.swapaxes(skew, -1, -2)))
+
+
+def limit_proof(
+    part: Channels, multiplier: Multiplier, size: float, *, has_limit: bool
+) -> list[dict[str, Any]] | None:
+    """Find the steps that prove a part for abs(d_i) <= size, or return None.
+
+    The steps are those of `proof_of`, at the radius of the multiplier and from its lowest frequency
+    on. In the part with the limit they have a further scaling "s".
+    """
+    k, highest = len(part.entries), np.pi / part.period
+    whole = Region(np.zeros(k), np.full(k, size), multiplier.slowest, highest)
+    regions = [whole]
+    steps: list[dict[str, Any]] = []
+    while regions and len(steps) < MOST:
+        region = regions.pop()
+        around = part.at(region.centre)
+        w = frequency_in(region, highest)
+        scale = np.r_[region.half[part.parameters], np.ones(int(has_limit))]
+        M = scale[:, None] * around.response(w, multiplier.radius)
+        channel, factor = M, 1.0
+        if has_limit:
+            m = complex(multiplier.at(np.array(w * part.period)))
+            # any positive factor of m proves the same: this one brings m S to the size 1
+            factor = 1.0 / abs(m * M[-1, -1])
+            channel = _as_complex_channel(M, factor * m)
+        bound, scaling = tightened_at(around, w, channel, region.scaling)
+        region = region._replace(scaling=scaling)
+        interval = None
+        if bound < 1.0:
+            step = _step(scaling, -m * M[-1, -1], factor) if has_limit else _plain_step(scaling)
+            interval = _interval(around, multiplier, step, region, w)
+        if interval is None:
+            entry = int(np.argmax(effects_of(part, channel, scaling)))
+            if region.half[entry] < NARROWEST * size:
+                return None
+            steps.append({"halve": entry})
+            regions += region.halves(entry)
+        else:
+            steps.append({"low": interval[0], "high": interval[1]} | step)
+            regions += region.outside(*interval)
+    return None if regions else steps
+
+
+def _as_complex_channel(M: ComplexArray, m: complex) -> ComplexArray:
+    """Return M with m a + w for a and m a - w for w: the limit is a complex channel of size 1."""
+    A, B, C, s = M[:-1, :-1], M[:-1, -1:], m * M[-1:, :-1], m * M[-1, -1]
+    by_z, by_w = -C / (s - 1.0), 1.0 / (s - 1.0)
+    above = np.hstack([A + B @ by_z, B * by_w])
+    return np.vstack([above, np.hstack([C + (s + 1.0) * by_z, [[(s + 1.0) * by_w]]])])
+
+
+def _rounded(values: FloatArray) -> list[float]:
+    return [float(f"{x:.{DIGITS}g}") for x in values]
+
+
+def _plain_step(scaling: Scaling) -> dict[str, Any]:
+    return {"t": _rounded(scaling.t), "g": _rounded(scaling.g)}
+
+
+def _step(scaling: Scaling, mS: complex, factor: float) -> dict[str, Any]:
+    """Return t, g and s of a step. s brings Re(m S) of the middle of the box to 1."""
+    t = scaling.t[:-1] - scaling.t[-1] - np.log(2.0 * factor) / 2.0
+    s = np.log(2.0 * max(mS.real, 1e-300)) / 2.0
+    return {"t": _rounded(t), "g": _rounded(scaling.g[:-1]), "s": _rounded(np.array([s]))[0]}
+
+
+def _interval(
+    around: Channels, multiplier: Multiplier, step: dict[str, Any], region: Region, w: float
+) -> tuple[float, float] | None:
+    """Find the interval around w at whose samples the inequality of a step holds with MARGIN."""
+    has_limit = "s" in step
+    farthest = (
+        TURN / (around.period * float(np.abs(multiplier.lags).max())) if has_limit else np.inf
+    )
+    below = [*_samples(w, region.low, farthest)]
+    points = np.array([*below[::-1], w, *_samples(w, region.high, farthest)])
+    scale = np.r_[region.half[around.parameters], np.ones(int(has_limit))]
+    M = scale[:, None] * around.response(points, multiplier.radius)
+    m = multiplier.at(points * around.period) if has_limit else None
+    fails = np.flatnonzero(np.linalg.eigvalsh(inequality(M, m, step))[:, 0] < MARGIN)
+    place = len(below)
+    if place in fails:
+        return None
+    first = int(np.max(fails[fails < place], initial=-1)) + 1
+    last = int(np.min(fails[fails > place], initial=len(points))) - 1
+    low, high = float(points[first]), float(points[last])
+    return (low, high) if low < high else None
+
+
+def _samples(w: float, end: float, farthest: float) -> Iterator[float]:
+    """Yield frequencies from w to `end`, or BATCH of them, without w."""
+    side = float(np.sign(end - w))
+    for _ in range(BATCH):
+        if w == end:
+            return
+        w += side * max(min(STRIDE * w, farthest), LOWEST)
+        w = end if side * (w - end) > 0.0 else w
+        yield w

@@ -1,0 +1,71 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What `rise-di gains guarantee --saturation INPUT` shows and writes."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from flight_analysis.linear_loop.certificate import limit_certificate
+from flight_analysis.linear_loop.loop_margins import LinearLoop
+from flight_analysis.linear_loop.saturation import LimitGuarantee
+from flight_cli.output import write_text
+from flight_core.parameters import require
+from flight_design.gains.first_scenario import airframe_to_check, scenario_to_check
+from rise_di.c_code import certificate_sources
+
+
+def require_saturation(
+    saturation: str | None,
+    *,
+    scenario: str,
+    late: float,
+    entries: Sequence[str],
+    worst: Path | None,
+) -> None:
+    """Raise ParameterError for an unknown input, or options without a meaning beside it."""
+    if saturation is None:
+        return
+    inputs = scenario_to_check(scenario).controller.inputs
+    require(saturation in inputs, "saturation", saturation, f"an input: {', '.join(inputs)}")
+    require(late == 0.0, "saturation", f"--late {late:g} beside it", "u in time")
+    lags = [text for text in entries if text.startswith("1/")]
+    require(not lags, "saturation", f"{', '.join(lags)} beside it", "exact lags")
+    require(worst is None, "saturation", "--worst beside it", "one of the two")
+
+
+def write_limit_certificate(
+    path: Path | None,
+    loop: LinearLoop,
+    promise: LimitGuarantee | None,
+    airframe: str,
+    scenario: str,
+) -> list[str]:
+    """Write the certificate of a guarantee with a limit, if a path is named.
+
+    Returns a sentence if the law has no C constants from which a checker could compute the loop.
+    """
+    if path is None:
+        return []
+    require(promise is not None, "--certificate", "no box without oscillation", "a guarantee")
+    assert promise is not None  # noqa: S101 - for mypy
+    frame = airframe_to_check(airframe, scenario_to_check(scenario))
+    sources = certificate_sources(frame, scenario)
+    write_text("certificate", path, limit_certificate(loop, promise, sources.texts))
+    return [f"certificate without constants: {sources.without}"] if sources.without else []
+
+
+def limit_text(name: str, promise: LimitGuarantee | None, certificate: str) -> list[str]:
+    """Say a guarantee with a limit of one input in sentences."""
+    if promise is None:
+        return [f"guarantee: none with a limit of {name}, not even for the aircraft of the file"]
+    within = f"for every aircraft within {math.floor(1e3 * promise.size + 1e-6) / 10.0:g} %"
+    proof = f"examples/check_certificate.py proves it ({certificate})"
+    limits = f"with any limits of {name}"
+    if promise.settles:
+        return [f"guarantee: the loop settles {within}, {limits} around where it settles; {proof}"]
+    period = 2.0 * math.pi / promise.multiplier.slowest
+    return [
+        f"guarantee: no motion is periodic up to {period:.0f} s {within}, {limits}; {proof}",
+        "that the loop settles is not proved for this box: a smaller --uncertainty tries less",
+    ]
