@@ -26,7 +26,8 @@ SETTLED = 1e-2  # part of the start by which a state that has settled still chan
 DOUBLINGS = 21  # of ticks until a linear loop rests
 GONE = 1e6  # times the start at which a flight has left
 FALLEN = 0.999  # part of an earlier excess beyond the limits below which it counts as falling
-ENDS = ("settles", "still falls", "does not fall", "leaves")
+TURNS = 3  # in the last third, 200 s, of an oscillation with a period of 126 s or less
+ENDS = ("settles", "falls", "swings more slowly", "oscillates", "leaves")
 
 
 def loop_of(file: dict[str, Any], d: Array) -> tuple[Array, Array, Array]:
@@ -85,28 +86,32 @@ def ends_of(file: dict[str, Any], d: Array, generator: np.random.Generator) -> A
     trim = np.where(generator.random(len(d)) < 0.5, 0.5, generator.uniform(0.0, 1.0, len(d)))
     low, high = -trim * width, (1.0 - trim) * width
     counts = np.zeros(len(ENDS), dtype=int)
-    peaks = np.zeros((len(d), 0))
+    peaks, turns, side = np.zeros((len(d), 0)), np.zeros((len(d), 0)), np.zeros(len(d))
     while len(s):
-        before, peak = s, np.zeros(len(s))
+        before, peak, turned = s, np.zeros(len(s)), np.zeros(len(s))
         for _ in range(int(LOOKED_AT / file["period"])):
             u = s @ K
             w = u - np.clip(u, low, high)
             s = (F @ s[..., None])[..., 0] - W * w[:, None]
             peak = np.maximum(peak, np.abs(w) / width)
-        peaks = np.column_stack([peaks, peak])
+            turned += np.sign(w) * side < 0.0
+            side = np.where(w != 0.0, np.sign(w), side)
+        peaks, turns = np.column_stack([peaks, peak]), np.column_stack([turns, turned])
         far, moved = np.linalg.norm(s, axis=1), np.linalg.norm(s - before, axis=1)
         leaves = ~(far < GONE * start)
         settles = ~leaves & (peak == 0.0) & (moved < SETTLED * start)
         stays = ~leaves & ~settles
-        counts += [settles.sum(), 0, 0, leaves.sum()]
+        counts += [settles.sum(), 0, 0, 0, leaves.sum()]
         if peaks.shape[1] * LOOKED_AT >= LONGEST:
             third = peaks.shape[1] // 3
             earlier, later = peaks[:, third:-third].max(axis=1), peaks[:, -third:].max(axis=1)
             falls = stays & ((later < FALLEN * earlier) | (later == 0.0))
-            counts += [0, falls.sum(), (stays & ~falls).sum(), 0]
+            swings = stays & ~falls & (turns[:, -third:].sum(axis=1) >= TURNS)
+            slow = stays & ~falls & ~swings
+            counts += [0, falls.sum(), slow.sum(), swings.sum(), 0]
             break
-        F, W, s, low, high, width, start, peaks = (
-            value[stays] for value in (F, W, s, low, high, width, start, peaks)
+        F, W, s, low, high, width, start, peaks, turns, side = (
+            value[stays] for value in (F, W, s, low, high, width, start, peaks, turns, side)
         )
     return counts
 

@@ -335,7 +335,7 @@ class Guarantee(Check):
         name = self.saturation or ""
         require_linear(loop)
         promise = guarantee_with_limit(loop, name)
-        lines = limit_text(name, promise, f"certificate {loop.digest[:NAMED]}, {name}")
+        lines = limit_text(name, promise, loop.digest[:NAMED])
         lines += write_limit_certificate(
             self.certificate, loop, promise, self.airframe, self.scenario
         )

@@ -60,12 +60,17 @@ def limit_text(name: str, promise: LimitGuarantee | None, certificate: str) -> l
     if promise is None:
         return [f"guarantee: none with a limit of {name}, not even for the aircraft of the file"]
     within = f"for every aircraft within {math.floor(1e3 * promise.size + 1e-6) / 10.0:g} %"
-    proof = f"examples/check_certificate.py proves it ({certificate})"
     limits = f"with any limits of {name}"
+    sampled = (
+        "found at samples of the frequency: examples/check_certificate.py proves the certificate"
+    )
     if promise.settles:
-        return [f"guarantee: the loop settles {within}, {limits} around where it settles; {proof}"]
+        settles = f"the loop settles {within}, {limits} around where it settles"
+        return [f"guarantee: {settles} (certificate {certificate})", sampled]
     period = 2.0 * math.pi / promise.multiplier.slowest
+    periodic = f"no motion is periodic up to {period:.0f} s {within}, {limits}"
     return [
-        f"guarantee: no motion is periodic up to {period:.0f} s {within}, {limits}; {proof}",
+        f"guarantee: {periodic} (certificate {certificate})",
         "that the loop settles is not proved for this box: a smaller --uncertainty tries less",
+        sampled,
     ]

@@ -122,30 +122,35 @@ def guarantee_with_limit(linear: LinearLoop, name: str) -> LimitGuarantee | None
 
     Returns None if there is none. Raises ParameterError if the loop has no such input, or no box.
     """
+    for part in TRIED:
+        for slowest in (0.0, SLOWEST):
+            promise = limit_guarantee(linear, name, part, slowest)
+            if promise is not None:
+                return promise
+    return None
+
+
+def limit_guarantee(
+    linear: LinearLoop, name: str, part: float, slowest: float
+) -> LimitGuarantee | None:
+    """Try a part of the box of a loop, from a lowest frequency on, as `guarantee_with_limit`."""
     require(name in linear.inputs, "limit", name, f"an input: {', '.join(linear.inputs)}")
     box = linear.box
     require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
     assert box is not None  # noqa: S101 - for mypy
-    place = linear.inputs.index(name)
     loop = uncertain_loop(linear.nominal, linear.law, linear.loop, box)
-    limited = [_with_limit(part) for part in parts_of(loop, (place,))]
-    require(
-        len(limited) == 1 and bool(limited[0].entries),
-        "limit",
-        name,
-        "an input of a loop with entries",
-    )
-    others = [part for part in parts_of(loop) if part.entries != limited[0].entries]
-    for part_of_box in TRIED:
-        for slowest in (0.0, SLOWEST):
-            multiplier = multiplier_for(limited[0], part_of_box, slowest)
-            if multiplier is None:
-                continue
-            proof = _proof(limited + others, multiplier, (1.0 + SLACK) * part_of_box)
-            if proof is not None:
-                whole = box.largest
-                return LimitGuarantee(name, whole, part_of_box * whole, multiplier, proof)
-    return None
+    limited = [_with_limit(each) for each in parts_of(loop, (linear.inputs.index(name),))]
+    has_entries = len(limited) == 1 and bool(limited[0].entries)
+    require(has_entries, "limit", name, "an input of a loop with entries that may deviate")
+    others = [each for each in parts_of(loop) if each.entries != limited[0].entries]
+    multiplier = multiplier_for(limited[0], part, slowest)
+    if multiplier is None:
+        return None
+    proof = _proof(limited + others, multiplier, (1.0 + SLACK) * part)
+    if proof is None:
+        return None
+    whole = box.largest
+    return LimitGuarantee(name, whole, part * whole, multiplier, proof)
 
 
 def _proof(
