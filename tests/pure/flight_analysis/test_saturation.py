@@ -20,7 +20,13 @@ from tests.pure.flight_analysis.test_certificate import Content, _checker
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.certificate import limit_certificate
 from flight_analysis.linear_loop.loop_margins import LinearLoop, scenario_loop
-from flight_analysis.linear_loop.saturation import SETTLING, guarantee_with_limit
+from flight_analysis.linear_loop.saturation import (
+    SETTLING,
+    LimitGuarantee,
+    Multiplier,
+    guarantee_with_limit,
+)
+from flight_cli.gains_saturation import limit_text
 
 Alter = Callable[[Content], object]
 
@@ -220,6 +226,50 @@ def test_aircraft_of_the_box_settle_from_far_beyond_the_limits(rudder: Content) 
     generator = np.random.default_rng(6)
     d = rudder["size"] * generator.choice([-1.0, 1.0], (12, len(rudder["part"])))
     assert dict(zip(ENDS, ends_of(rudder, d, generator), strict=True))["settles"] == 12
+
+
+SPIRAL = {
+    "A[beta,beta]": -1.0, "A[beta,p]": 1.0, "A[beta,r]": 1.0, "A[p,beta]": -1.0, "A[p,p]": -1.0,
+    "A[p,r]": 1.0, "A[r,beta]": 1.0, "A[r,p]": -1.0, "A[r,r]": -1.0, "B[p,aileron]": -1.0,
+    "B[p,rudder]": 1.0, "B[r,aileron]": 1.0, "B[r,rudder]": -1.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("deviation", "grows"), [(0.1, False), (0.112, True)])
+def test_aileron_at_its_limit_lets_the_spiral_of_an_aircraft_grow(
+    deviation: float, *, grows: bool, rudder: Content
+) -> None:
+    """Why no proof with limits of the aileron goes beyond 11.2 %."""
+    held = copy.deepcopy(rudder)
+    held["limit"]["input"] = "aileron"
+    corner = np.array([SPIRAL.get(name, 0.0) for name in held["names"]])
+    F, W, K = flown_loop(held, deviation / np.array(held["part"]) * corner[None])
+    fastest = np.abs(np.linalg.eigvals(F[0] - np.outer(W[0], K))).max()
+    assert (fastest > 1.0 + 1e-6) == grows
+
+
+@pytest.mark.parametrize(
+    ("size", "slowest", "sentence"),
+    [
+        (0.24, 0.0, "the loop settles for every aircraft within 24 %, with any limits of rudder"),
+        (0.3, 0.05, "no motion is periodic up to 126 s for every aircraft within 30 %, with any"),
+    ],
+)
+def test_command_says_what_holds_and_what_proves_it(
+    size: float, slowest: float, sentence: str
+) -> None:
+    multiplier = Multiplier(slowest, np.array([1]), np.array([0.5]))
+    promise = LimitGuarantee("rudder", 0.3, size, multiplier, [])
+    said = limit_text("rudder", promise, "58911e12fa30")
+    assert said[0].startswith(f"guarantee: {sentence}")
+    assert said[0].endswith("(certificate 58911e12fa30)")
+    assert "examples/check_certificate.py proves the certificate" in said[-1]
+    assert promise.holds == (size == 0.3)
+
+
+def test_command_says_that_nothing_holds() -> None:
+    (said,) = limit_text("thrust", None, "58911e12fa30")
+    assert said.startswith("guarantee: none with a limit of thrust")
 
 
 def test_limit_of_an_unknown_input_is_refused() -> None:
