@@ -7,7 +7,7 @@ stack. The limits lie at random around the u at which the loop rests, and each f
 state for which the law asks for up to 300 times as much.
 
     python -m benchmarks.limit_attacks certificate.json --aircraft 2000
-    python -m benchmarks.limit_attacks certificate.json --aircraft 2000 --size 0.4
+    python -m benchmarks.limit_attacks certificate.json --aircraft 2000 --size 0.4 --input thrust
 """
 
 import argparse
@@ -122,9 +122,11 @@ def main() -> None:
     parser.add_argument("certificate", type=Path)
     parser.add_argument("--aircraft", type=int, default=1000)
     parser.add_argument("--size", type=float, help="relative deviation in place of the file's")
+    parser.add_argument("--input", help="limited input in place of the file's")
     parser.add_argument("--seed", type=int, default=7)
     options = parser.parse_args()
     file = json.loads(options.certificate.read_text())
+    file["limit"]["input"] = options.input or file["limit"]["input"]
     generator = np.random.default_rng(options.seed)
     size = options.size / max(file["part"]) if options.size is not None else file["size"]
     counts = np.zeros(len(ENDS), dtype=int)

@@ -251,8 +251,8 @@ def test_aileron_at_its_limit_lets_the_spiral_of_an_aircraft_grow(
 @pytest.mark.parametrize(
     ("size", "slowest", "sentence"),
     [
-        (0.24, 0.0, "the loop settles for every aircraft within 24 %, with any limits of rudder"),
-        (0.3, 0.05, "no motion is periodic up to 126 s for every aircraft within 30 %, with any"),
+        (0.24, 0.0, "the loop settles for every aircraft within 24.0 %, with any limits of rudder"),
+        (0.3, 0.05, "no motion is periodic up to 126 s for every aircraft within 30.0 %, with any"),
     ],
 )
 def test_command_says_what_holds_and_what_proves_it(
@@ -269,7 +269,7 @@ def test_command_says_what_holds_and_what_proves_it(
 
 def test_command_says_that_nothing_holds() -> None:
     (said,) = limit_text("thrust", None, "58911e12fa30")
-    assert said.startswith("guarantee: none with a limit of thrust")
+    assert said.startswith("guarantee: none with any limits of thrust: no taps")
 
 
 def test_limit_of_an_unknown_input_is_refused() -> None:

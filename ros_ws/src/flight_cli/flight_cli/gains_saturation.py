@@ -8,7 +8,8 @@ from pathlib import Path
 
 from flight_analysis.linear_loop.certificate import limit_certificate
 from flight_analysis.linear_loop.loop_margins import LinearLoop
-from flight_analysis.linear_loop.saturation import LimitGuarantee
+from flight_analysis.linear_loop.saturation import TRIED, LimitGuarantee
+from flight_analysis.report.margin_figures import proved_percent
 from flight_cli.output import write_text
 from flight_core.parameters import require
 from flight_design.gains.first_scenario import airframe_to_check, scenario_to_check
@@ -58,8 +59,11 @@ def write_limit_certificate(
 def limit_text(name: str, promise: LimitGuarantee | None, certificate: str) -> list[str]:
     """Say a guarantee with a limit of one input in sentences."""
     if promise is None:
-        return [f"guarantee: none with a limit of {name}, not even for the aircraft of the file"]
-    within = f"for every aircraft within {math.floor(1e3 * promise.size + 1e-6) / 10.0:g} %"
+        least = f"{100.0 * TRIED[-1]:g} % of this box"
+        return [f"guarantee: none with any limits of {name}: no taps prove as much as {least}"]
+    within = f"for every aircraft within {proved_percent(promise.size)}"
+    if promise.zeros:
+        within += f", entries that are 0 within {proved_percent(promise.zeros)} of their rows"
     limits = f"with any limits of {name}"
     sampled = (
         "found at samples of the frequency: examples/check_certificate.py proves the certificate"

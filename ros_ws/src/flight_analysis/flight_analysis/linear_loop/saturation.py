@@ -76,6 +76,7 @@ class LimitGuarantee(NamedTuple):
     multiplier: "Multiplier"
     # "entries" and "steps" of each strongly connected part, as in `limit_proof`
     proof: list[dict[str, Any]]
+    zeros: float = 0.0  # part of its row that an entry becomes that is 0 in the file
 
     @property
     def settles(self) -> bool:
@@ -93,6 +94,7 @@ class LimitGuarantee(NamedTuple):
             "input": self.input,
             "uncertainty": self.uncertainty,
             "within": self.size,
+            "zeros": self.zeros,
             "settles": self.settles,
             "slowest": self.multiplier.slowest,
             "holds": self.holds,
@@ -150,7 +152,8 @@ def limit_guarantee(
     if proof is None:
         return None
     whole = box.largest
-    return LimitGuarantee(name, whole, part * whole, multiplier, proof)
+    zeros = part * box.largest_zero
+    return LimitGuarantee(name, whole, part * whole, multiplier, proof, zeros)
 
 
 def _proof(
