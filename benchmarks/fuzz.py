@@ -6,6 +6,7 @@ python -m benchmarks.fuzz mcap --seconds 60          # or any other target of te
 python -m benchmarks.fuzz all --seconds 60  # every target, a core each; prints statistics as JSON
 python -m benchmarks.fuzz mcap --replay FILE ...
     # each input once, under the same limits, without atheris
+python -m benchmarks.fuzz all --replay      # the corpus of every target
 
 A fuzzer starts from outputs of the stack's own writers and from tests/corpus/<target>/. At an input
 that raises, hangs or takes too much memory it ends with a status other than 0 and keeps the input
@@ -60,7 +61,10 @@ def main() -> None:
     parser.add_argument("target", help=names)
     parser.add_argument("--seconds", type=int, default=60, help="how long to fuzz")
     parser.add_argument(
-        "--replay", type=Path, nargs="*", help="read each of these inputs once instead of fuzzing"
+        "--replay",
+        type=Path,
+        nargs="*",
+        help="read each of these inputs, or the corpus, once instead of fuzzing",
     )
     arguments = parser.parse_args()
     if arguments.replay is not None:
@@ -71,8 +75,11 @@ def main() -> None:
         sys.exit(fuzz(arguments.target, arguments.seconds))
 
 
-def replay(target: str, files: list[Path]) -> None:
-    """Read each input once. Raises the errors of a target, MemoryError and TimeoutError."""
+def replay(name: str, files: list[Path]) -> None:
+    """Read each input once: the files, or the corpus of the target, or of every target.
+
+    Raises the errors of a target, MemoryError and TimeoutError.
+    """
     from tests.fuzz.targets import TARGETS  # noqa: PLC0415 - instrumented when fuzzing
 
     def expire(number: int, frame: FrameType | None) -> None:
@@ -80,16 +87,18 @@ def replay(target: str, files: list[Path]) -> None:
 
     signal.signal(signal.SIGPROF, expire)
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_MB << 20, MEMORY_MB << 20))
-    with tempfile.TemporaryDirectory(prefix="fuzz") as folder:
-        for file in files:
-            signal.setitimer(signal.ITIMER_PROF, TIMEOUT)
-            try:
-                TARGETS[target](file.read_bytes(), Path(folder))
-            except Exception:
-                print(f"{target}: {file}", file=sys.stderr)
-                raise
-            signal.setitimer(signal.ITIMER_PROF, 0)
-    print(f"{target}: {len(files)} inputs read or refused")
+    for target in TARGETS if name == "all" else [name]:
+        inputs = files or sorted((CORPUS / target).iterdir())
+        with tempfile.TemporaryDirectory(prefix="fuzz") as folder:
+            for file in inputs:
+                signal.setitimer(signal.ITIMER_PROF, TIMEOUT)
+                try:
+                    TARGETS[target](file.read_bytes(), Path(folder))
+                except Exception:
+                    print(f"{target}: {file}", file=sys.stderr)
+                    raise
+                signal.setitimer(signal.ITIMER_PROF, 0)
+        print(f"{target}: {len(inputs)} inputs read or refused")
 
 
 def fuzz_all(seconds: int) -> None:
