@@ -184,6 +184,10 @@ def case(request: pytest.FixtureRequest, exported: Callable[[str], Case]) -> Cas
     return exported(str(request.param))
 
 
+each_line = pytest.mark.parametrize("case", ["observer", "schedule and allocation"], indirect=True)
+"""The cases that compile each line of the code between them."""
+
+
 def test_every_bit_is_equal(case: Case) -> None:
     proof = prove(case.code, compilers(), case.sets, case.recordings, float32=False)
     assert proof.holds, proof_report(proof, "the case")
@@ -199,6 +203,7 @@ def test_every_bit_is_equal(case: Case) -> None:
     assert 0.05 < (u != u_free).mean() < 0.95  # limits act in many ticks and not in many
 
 
+@pytest.mark.parametrize("case", [name for name in SCENARIOS if name != "servo"], indirect=True)
 def test_sanitizers_find_nothing(case: Case, tmp_path: Path) -> None:
     flags = [
         *FLAGS,
@@ -212,6 +217,7 @@ def test_sanitizers_find_nothing(case: Case, tmp_path: Path) -> None:
         assert program.compare(recording).differing == 0
 
 
+@each_line
 @pytest.mark.parametrize(
     "flags",
     [
@@ -232,13 +238,14 @@ def test_bits_do_not_depend_on_optimisation(
     assert all(program.compare(recording).differing == 0 for recording in case.recordings[2:6])
 
 
-def test_contraction_does_not_start(case: Case, tmp_path: Path) -> None:
+def test_contraction_does_not_start(exported: Callable[[str], Case], tmp_path: Path) -> None:
     """A fused multiply-add has a single rounding.
 
     Without -ffp-contract=off nothing flies where the processor has it.
     """
     if " fma " not in Path("/proc/cpuinfo").read_text():
         pytest.skip("no fused multiply-add on this processor")
+    case = exported("observer")
     flags = [*FLAGS[:-1], "-mfma", "-ffp-contract=fast"]
     program = Program(case.code, ["gcc"], case.sets, tmp_path, flags=flags)
     with refusing("rise_di_start returns false"):
@@ -275,30 +282,59 @@ def bodies(source: str) -> dict[str, tuple[int, int]]:
     return {match[1]: match.span() for match in FUNCTION.finditer(source)}
 
 
-def test_proof_finds_a_mutant_of_each_function(
-    exported: Callable[[str], Case], tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    cases = [exported(name) for name in ("observer", "schedule and allocation")]
-    source = (SOURCE / "rise_di.c").read_text()
+NUMBERS = {name: number for number, name in enumerate(MUTANTS)}
+SWITCH = """\
+#include <stdlib.h>
+static int mutant;
+__attribute__((constructor)) static void choose(void) { mutant = atoi(getenv("MUTANT")); }
+"""
+
+
+def with_mutants(source: str) -> str:
+    """The code with a mutant of each function beside it: MUTANT is the number of the one in use.
+
+    All are in one program, because it takes longer to compile than to run.
+    """
     places = bodies(source)
     assert set(places) == set(MUTANTS)
-    survivors = []
-    for name, (old, new) in MUTANTS.items():
+    # from the end of the file: the places before stay
+    for name in sorted(MUTANTS, key=places.__getitem__, reverse=True):
         begin, end = places[name]
+        old, new = MUTANTS[name]
         body = source[begin:end]
         assert old in body, name
-        mutant = source[:begin] + body.replace(old, new, 1) + source[end:]
-        if not any(is_found(case, mutant, tmp_path_factory.mktemp("mutant")) for case in cases):
+        mutant = body.replace(old, new, 1).replace(f"{name}(", f"{name}_mutant(", 1)
+        chosen = f"(mutant == {NUMBERS[name]} ? {name}_mutant(__VA_ARGS__) : ({name})(__VA_ARGS__))"
+        source = f"{source[:end]}{mutant}#define {name}(...) {chosen}\n{source[end:]}"
+    return SWITCH + source
+
+
+def test_proof_finds_a_mutant_of_each_function(
+    exported: Callable[[str], Case], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flags = ["-std=c99", "-O0", "-w", "-ffp-contract=off"]
+    source = with_mutants((SOURCE / "rise_di.c").read_text())
+    programs = []
+    for name in ("observer", "schedule and allocation"):
+        case = exported(name)
+        program = Program(
+            case.code, ["gcc"], case.sets, tmp_path / name, flags=flags, source=source
+        )
+        monkeypatch.setenv("MUTANT", "-1")
+        assert not any(program.compare(recording).differing for recording in case.recordings)
+        programs.append((program, case.recordings))
+    survivors = []
+    for name, number in NUMBERS.items():
+        monkeypatch.setenv("MUTANT", str(number))
+        if not any(is_found(*program) for program in programs):
             survivors.append(name)
     assert not survivors
 
 
-def is_found(case: Case, mutant: str, folder: Path) -> bool:
+def is_found(program: Program, recordings: list[Recording]) -> bool:
     """Whether the proof tells a mutant from the code."""
-    flags = ["-std=c99", "-O0", "-w", "-ffp-contract=off"]
-    program = Program(case.code, ["gcc"], case.sets, folder, flags=flags, source=mutant)
     with suppress(ParameterError):  # rise_di_start refuses what is not computed as written
-        return any(program.compare(recording).differing for recording in case.recordings)
+        return any(program.compare(recording).differing for recording in recordings)
     return True
 
 
@@ -385,14 +421,13 @@ def test_drawn_parameters(
 
 
 def test_float32_is_within_its_bound(tmp_path: Path) -> None:
-    for name in ("servo", "observer"):
-        scenario = SCENARIOS[name]()
-        sets = [exportable(scenario.controller)]
-        write_code(sets[0], name, tmp_path / name, float32=True)
-        recordings = flight_recordings(scenario.vary(flight={"duration": 6.0}), sets)
-        proof = prove(tmp_path / name, [["gcc"]], sets, recordings, float32=True)
-        assert proof.holds, proof_report(proof, name)
-        assert all(0.0 < comparison.deviation < FLOAT32_BOUND for comparison in proof.comparisons)
+    scenario = SCENARIOS["observer"]()
+    sets = [exportable(scenario.controller)]
+    write_code(sets[0], "observer", tmp_path, float32=True)
+    recordings = flight_recordings(scenario.vary(flight={"duration": 6.0}), sets)
+    proof = prove(tmp_path, [["gcc"]], sets, recordings, float32=True)
+    assert proof.holds, proof_report(proof, "observer")
+    assert all(0.0 < comparison.deviation < FLOAT32_BOUND for comparison in proof.comparisons)
 
 
 def export(scenario: str, folder: Path, **words: Any) -> None:
