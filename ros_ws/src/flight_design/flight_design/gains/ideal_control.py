@@ -3,7 +3,7 @@
 """The ideal control along a manoeuvre, of the published airframe and of uncertain airframes."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,9 @@ from rise_di_controller.params import ControllerConfig
 STEP = 0.01
 """s, step of the ideal control. It resolves a gust of one second, and hidden modes up to 10 1/s, to
 1e-6 of their size."""
+
+COLUMNS = 10_000
+"""Number of states, of all aircraft and steps, that are evaluated at once: a few megabytes."""
 
 STABLE_STEP = -2.785
 """Least product of a real pole and the step with which Runge-Kutta's fourth-order method is stable.
@@ -244,17 +247,10 @@ class _IdealPlant(NamedTuple):
     P: FloatArray  # (n, m)
     N: FloatArray  # (n, n - m)
 
-    def state(self, y_m: FloatArray, eta: FloatArray) -> FloatArray:
-        """Compute x = P y_m + N eta, (n, N)."""
-        return np.asarray((self.P @ y_m)[:, None] + self.N @ eta)
-
-    def drift(self, t: Any, x: FloatArray) -> FloatArray:
-        """Compute A x + f, (n, N)."""
-        return np.asarray(_times(self.A, x) + dynamics.f(t, x, self.aircraft))
-
 
 def _times(matrices: FloatArray, columns: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("Nij,jN->iN", matrices, columns))
+    """Multiply N matrices with N columns each, (n, ..., N)."""
+    return np.asarray(np.einsum("Nij,j...N->i...N", matrices, columns))
 
 
 def _ideal_plant(
@@ -284,31 +280,82 @@ def _ideal_rates(
 ) -> FloatArray:
     """Compute u*_dot at the steps, (T, N, m)."""
     y_m, y_m_dot, y_m_ddot = references
+    steps = (len(y_m) + 1) // 2
+    count = max(COLUMNS // len(plant.A), 1)
+    eta = np.zeros((plant.N.shape[1], len(plant.A)))
+    u_dot = []
+    for first in range(0, steps, count):
+        last = min(first + count, steps - 1)
+        halves = np.arange(2 * first, 2 * last + 1)
+        path = _zero_dynamics(plant, eta, halves, y_m[halves], y_m_dot[halves])
+        eta = path[:, -1]
+        # each part begins where the one before it ends
+        places = halves[::2][: min(count, steps - first)]
+        wanted = (y_m[places].T, y_m_dot[places].T, y_m_ddot[places].T)
+        u_dot.append(_rates(plant, places, wanted, path[:, : len(places)]))
+    return np.concatenate(u_dot)
 
-    def eta_dot(t: float, eta: Array, _: None, __: None) -> Array:
-        k = round(2.0 * t / STEP)
-        drift = plant.drift(t, plant.state(y_m[k], eta))
-        return _times(plant.project, drift) + (plant.follow @ y_m_dot[k]).T
 
-    steps = (len(y_m) - 1) // 2
-    hidden = plant.N.shape[1]
-    eta = np.zeros((hidden, len(plant.A)))
-    u_dot = np.zeros((steps + 1, len(plant.A), len(plant.C)))
+def _zero_dynamics(
+    plant: _IdealPlant,
+    eta: FloatArray,
+    halves: NDArray[np.int64],
+    y_m: FloatArray,
+    y_m_dot: FloatArray,
+) -> FloatArray:
+    """Integrate eta over the steps that begin and end at every other place, (n - m, steps, N).
+
+    The places count half steps.
+    """
+    t = (STEP / 2.0 * halves)[:, None, None]
+    held = y_m @ plant.P.T
+    forced = dynamics.f_time(t, dynamics.wind(t, plant.aircraft), plant.aircraft)
+    forced = forced + np.einsum("Nij,tj->tiN", plant.A, held)
+    forced = np.einsum("Nhi,tiN->thN", plant.project, forced) + np.einsum(
+        "Nhm,tm->thN", plant.follow, y_m_dot
+    )
+    motion = plant.project @ plant.A @ plant.N
+
+    def eta_dot(k: float, eta: Array, _: None, __: None) -> Array:
+        x = held[round(k)][:, None] + plant.N @ eta
+        of_state = _times(plant.project, dynamics.f_state(x, plant.aircraft))
+        return STEP / 2.0 * (_times(motion, eta) + of_state + forced[round(k)])
+
+    path = [eta]
+    for k in range(0, len(halves) - 1, 2):
+        path.append(rk4(eta_dot, k, path[-1], None, None, 2) if len(eta) else eta)
+    return np.stack(path, axis=1)
+
+
+def _rates(
+    plant: _IdealPlant,
+    halves: NDArray[np.int64],
+    references: tuple[FloatArray, FloatArray, FloatArray],
+    eta: FloatArray,
+) -> FloatArray:
+    """Compute u*_dot at T instants, (T, N, m), that count half steps.
+
+    The references have the shape (m, T), and eta has the shape (n - m, T, N).
+    """
+    y_m, y_m_dot, y_m_ddot = references
+    instants = np.repeat(STEP / 2.0 * halves, eta.shape[-1])
+    gusts = plant.aircraft.gusts
+    gusts = gusts._replace(speed=np.tile(gusts.speed, len(halves)))
+    aircraft = plant.aircraft._replace(gusts=gusts)
+
+    def f(later: float, x: FloatArray) -> FloatArray:
+        columns = x.reshape(len(x), -1)
+        return np.asarray(dynamics.f(instants + later, columns, aircraft)).reshape(x.shape)
+
+    x = (plant.P @ y_m)[..., None] + np.tensordot(plant.N, eta, 1)
+    free = _times(plant.A, x) + f(0.0, x)
+    rate = y_m_dot[..., None] - np.tensordot(plant.C, free, 1)
+    x_dot = free + _times(plant.B, _times(plant.inverse, rate))
     near = 1e-5
-    for k in range(steps + 1):
-        t = k * STEP
-        x = plant.state(y_m[2 * k], eta)
-        free = plant.drift(t, x)
-        rate = np.asarray(y_m_dot[2 * k][:, None] - plant.C @ free, dtype=np.float64)
-        x_dot = free + _times(plant.B, _times(plant.inverse, rate))
-        later, behind = (
-            dynamics.f(t + step, x + step * x_dot, plant.aircraft) for step in (near, -near)
-        )
-        drift_dot: FloatArray = _times(plant.A, x_dot) + (later - behind) / (2.0 * near)
-        u_dot[k] = _times(plant.inverse, y_m_ddot[2 * k][:, None] - plant.C @ drift_dot).T
-        if k < steps and hidden:
-            eta = rk4(eta_dot, t, eta, None, None, STEP)
-    return u_dot
+    later, behind = (f(step, x + step * x_dot) for step in (near, -near))
+    drift_dot = _times(plant.A, x_dot) + (later - behind) / (2.0 * near)
+    u_dot = _times(plant.inverse, y_m_ddot[..., None] - np.tensordot(plant.C, drift_dot, 1))
+    return np.moveaxis(u_dot, 0, -1)
 
 
 def _references(
