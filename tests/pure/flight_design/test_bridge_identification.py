@@ -138,7 +138,7 @@ def test_written_scenario_flies_aircraft_and_tracks(identified: Identified) -> N
 def test_gains_from_log_of_the_board_are_for_the_delay_of_the_link_too(
     identified: Identified,
 ) -> None:
-    link_delay = 0.07
+    link_delay = 0.02
     later = over_link(identified.channels, link_delay)
     slower = flying_scenario(MAP, later, SPEED, str(identified.folder / "over_link.yaml"))
     board = identified.flying
@@ -169,7 +169,7 @@ def of_second_order(tmp_path_factory: pytest.TempPathFactory) -> tuple[Identifie
         Omega=Omega,
         Omega_deviation=none,
         lag=none + 0.02,
-        delay=none + 0.1,
+        delay=none + 0.06,  # with 0.05 the margins lower q's integral
         damping=damping,
         stiffness=stiffness,
         zero=zero,
