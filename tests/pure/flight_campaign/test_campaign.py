@@ -648,9 +648,8 @@ def new(aircraft: int, *more: str) -> tuple[str, ...]:
     )
 
 
-def figures(process: "subprocess.Popen[str]") -> list[object]:
-    output, errors = process.communicate()
-    assert process.returncode == 0, errors
+def figures(output: str) -> list[object]:
+    """The figures of what the command prints."""
     cases = json.loads(output)["cases"]
     for case in cases:
         del case["fly_again"], case["influence"]["command"]  # name the folder
@@ -668,7 +667,8 @@ def wait_for_chunks(runs: Path, count: int, process: "subprocess.Popen[str]") ->
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> list[object]:
     """The figures of an uninterrupted campaign of 10 chunks."""
-    return figures(command(*new(200), cwd=tmp_path_factory.mktemp("whole")))
+    runs = tmp_path_factory.mktemp("whole")
+    return figures(invoke("campaign", *new(200, "--runs", str(runs)), "--json").stdout)
 
 
 def test_killed_campaign_resumes_to_figures_of_uninterrupted_one(
@@ -681,7 +681,7 @@ def test_killed_campaign_resumes_to_figures_of_uninterrupted_one(
     assert 2 <= len(list((folder / CHUNKS).glob("*.parquet"))) < 10, (
         "the campaign ended before the kill"
     )
-    assert figures(command(str(folder), cwd=tmp_path)) == whole
+    assert figures(invoke("campaign", str(folder), "--json").stdout) == whole
 
 
 def test_ctrl_c_prints_the_command_to_resume(tmp_path: Path) -> None:
@@ -831,5 +831,7 @@ def test_two_dask_workers_give_same_figures_and_killed_one_repeats_only_chunks(
     ]
     assert workers, "no worker of dask found"
     workers[0].kill()
-    assert figures(spread) == whole
+    output, errors = spread.communicate()
+    assert spread.returncode == 0, errors
+    assert figures(output) == whole
     assert len(list(tmp_path.glob(f"spread/*/{CHUNKS}/*.parquet"))) == 10
