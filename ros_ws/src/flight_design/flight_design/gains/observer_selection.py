@@ -19,7 +19,7 @@ from aircraft_sim.airframes.airframe import Airframe
 from aircraft_sim.airframes.airspeed import at_speed
 from aircraft_sim.atmosphere.disturbance import AIR_STATE, AXES
 from aircraft_sim.atmosphere.turbulence import MODERATE, dryden, roll_gust
-from aircraft_sim.uncertainty import nominal_and_sampled
+from aircraft_sim.uncertainty import Spread, nominal_and_sampled
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import (
     Names,
@@ -61,6 +61,9 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 # relative deviation of the uncertain aircraft, the least of whose phase margins counts
 WORST_UNCERTAINTY = 0.3
+# Part of its row that each entry of these aircraft may be that is 0 in the file. With 0.05, K of q
+# would be a tenth smaller, and the gains with vanes would change as well.
+WORST_ZEROS = 0.02
 # 1/s. An aircraft with a zero to the right of this diverges while its outputs are held.
 FASTEST = 1e-3
 WORST_SEED = 1
@@ -269,7 +272,8 @@ class _AircraftDesigns(NamedTuple):
 
         In C, the rows of the vanes come below those of the outputs.
         """
-        A, B = nominal_and_sampled(self.airframe, WORST_UNCERTAINTY, count, WORST_SEED)
+        spread = Spread(zeros=WORST_ZEROS)
+        A, B = nominal_and_sampled(self.airframe, WORST_UNCERTAINTY, count, WORST_SEED, spread)
         _, columns = law_order(self.airframe, self.base)
         states = np.array(list(self.airframe.states))
         vane_rows = [(states == name).astype(np.float64) for name in vanes]
