@@ -45,7 +45,7 @@ from flight_design.identification.model_refusals import reason_against_airframe
 from flight_design.learning import learner as design_learner
 from flight_design.learning import part_checks
 from flight_design.learning.change_test import Change
-from flight_design.learning.designs import Goal, goal
+from flight_design.learning.designs import Goal, by_law_of_start, goal
 from flight_design.learning.learner import Known, Learner
 from flight_design.learning.scenario_learner import learn_again, learner, with_last_model
 from flight_log.stored_messages import parameter_changes
@@ -491,7 +491,7 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(
     none_left = without_models(start, fresh, ["p", "r"]).digest()
     sentences = [restarted.propose(none_left, NAMES).sentence for _ in range(2)]
     assert sentences == [
-        "each part flies the law of the start from now on: no part is left to learn",
+        "no part is left to learn: each lacks an input or flies the law of the start",
         None,
     ]
 
@@ -526,10 +526,34 @@ def test_part_flies_without_a_dead_input_at_once(monkeypatch: pytest.MonkeyPatch
     assert made.model is None
 
 
+def test_output_with_a_whole_input_keeps_the_design_for_the_file(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made, flown = learned_part(monkeypatch, DEAD_RUDDER)
+    file = find_scenario("osprey_observer").rise_di()
+    made._design_of_rough = Mock(return_value=Mock(controller=file))
+    proposal = made.propose(flown)
+    assert proposal.sentence == (
+        "rudder has no effect: p and r without it, r by the law of the start"
+    )
+    assert proposal.controller is not None
+    assert acting_inputs(proposal.controller) == ("elevator", "aileron", "thrust")
+
+
+def test_part_without_elevator_or_without_the_file_flies_by_the_law() -> None:
+    """The observer of V presupposes the pitch; a design for the file flies only if it is one."""
+    start = scenario().rise_di()
+    dead: dict[tuple[str, ...], str] = {("q", "V"): "elevator", ("p", "r"): "aileron"}
+    assert by_law_of_start(start, dead, has_file=True) == {"q", "V", "p"}
+    assert by_law_of_start(start, dead, has_file=False) == {"q", "V", "p", "r"}
+    assert by_law_of_start(start, {("q", "V"): "thrust"}, has_file=True) == {"V"}
+    assert by_law_of_start(start, {("p", "r"): ""}, has_file=True) == {"p", "r"}
+
+
 def test_part_without_an_input_states_the_margin_of_its_own_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """P and r fly by the law of the start, which keeps another delay margin than the design."""
+    """Output r flies by the law of the start, with another delay margin than the design has."""
     made, flown = learned_part(monkeypatch, DEAD_RUDDER)
     proposed = made.propose(flown).controller
     assert proposed is not None

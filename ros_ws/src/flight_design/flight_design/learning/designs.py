@@ -16,6 +16,7 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.observer_search import RESOLUTION, SelectedObserver
 from flight_design.gains.requirement import OBSERVER_REQUIREMENT, Requirement
 from flight_design.identification.likelihood import PRIOR
+from rise_di_controller.learning.learned_channels import with_channels_of
 from rise_di_controller.rise_di_config import LEAST_MARGIN, RiseDiConfig
 
 # s, delay margin beyond the latest delay. A loop with 30 ms flew well while u was 20 ms late.
@@ -24,6 +25,7 @@ DELAY_LEFT = 0.01
 # it is 1. With 1 for learned models, the loops had 5 ms more delay margin than the loop of the
 # file, and 2 % more error. 0 was no better than 0.5.
 ACTIVITY = 0.5
+SPEED = "V"  # the output whose observer presupposes the others
 ROUNDED = 1.001  # factor on the margins of a loop, so that the loop keeps them despite rounding
 
 
@@ -120,6 +122,44 @@ def goal(
     # 0.1 ms, as few digits as the file of a scenario has
     late = [round(latest[name] + DELAY_LEFT, 4) if name in latest else 0.0 for name in start.inputs]
     return Goal(np.maximum(margin, late), needed, file, is_free)
+
+
+def by_law_of_start(
+    start: RiseDiConfig, dead: Mapping[tuple[str, ...], str], *, has_file: bool
+) -> set[str]:
+    """Return the outputs that fly by the law of the start, given the dead input of each part.
+
+    A part without a dead input, "", has been given up. If the design for the file flies, a part
+    with a dead input gives up the output of this input, and V: in flights without an elevator the
+    observer of V erred four times as much as the law. Its other outputs keep the design, whose
+    inputs are whole: without a rudder p then erred half as much as by the law.
+    """
+    own = dict(zip(start.inputs, start.outputs, strict=True))
+    return {
+        output
+        for part, name in dead.items()
+        for output in part
+        if not (has_file and name) or output in {own.get(name), SPEED}
+    }
+
+
+def with_flown_channels(
+    start: RiseDiConfig,
+    designed: RiseDiConfig,
+    model: Airframe,
+    flying: Collection[str],
+    dead: Mapping[tuple[str, ...], str],
+) -> RiseDiConfig:
+    """Let the outputs `flying` fly a design, and the others the law of the start.
+
+    Dead inputs are held. If a part has given up or has a dead input, the loop has its own margin.
+    """
+    bare = [output not in flying for output in start.outputs]
+    mixed = with_channels_of(
+        start, designed, bare, [name in dead.values() for name in start.inputs]
+    )
+    has_own = bool(dead) and mixed.observer is not None
+    return with_own_margin(mixed, model, margin_of(start)) if has_own else mixed
 
 
 def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> RiseDiConfig:

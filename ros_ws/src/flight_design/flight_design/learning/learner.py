@@ -34,12 +34,12 @@ from flight_design.identification.model_identification import (
 from flight_design.learning.change_test import ANGLE, RECORD, Change, change_test
 from flight_design.learning.designs import (
     Goal,
+    by_law_of_start,
     goal,
     is_late,
-    margin_of,
     price,
     with_deviations,
-    with_own_margin,
+    with_flown_channels,
 )
 from flight_design.learning.flight_record import (
     SPREAD,
@@ -67,7 +67,6 @@ from flight_design.learning.part_checks import (
 )
 from rise_di_controller.learning.learned_channels import (
     outputs_without,
-    with_channels_of,
     without_models,
 )
 from rise_di_controller.learning.proposals import UNVERIFIED
@@ -235,7 +234,9 @@ class Learner:
         self._distrust(lost=lost)
         if is_within(self._controller.outputs, chain.from_iterable(self._dead)) and not lost:
             ended, self._has_ended = self._has_ended, True
-            none_left = "each part flies the law of the start from now on: no part is left to learn"
+            none_left = (
+                "no part is left to learn: each lacks an input or flies the law of the start"
+            )
             return LearnerResult(None, None if ended else none_left)
         if changes := self._changes(end_ns):
             return self._damaged(changes, end_ns)
@@ -261,7 +262,7 @@ class Learner:
         if verdict.model is self._model and not leaves_out_again:
             nothing = Refusal("each part flies the law of the start from before on")
             return LearnerResult(None, str(joined(verdict.refusals) or nothing))
-        left_out = without_effect(self._dead) if lost else []
+        left_out = without_effect(self._dead, self._by_law(self._dead)) if lost else []
         price_text = self._adopt(verdict.model, verdict.known, self._dead)
         refused = [f"refused: {refusal}" for refusal in verdict.refusals]
         told = sentences(*left_out, *verdict.sentences, price_text, *refused)
@@ -289,7 +290,7 @@ class Learner:
             self._changed |= set(dead)
             losses = [f"{name} has no effect" for name in dead.values()]
             return LearnerResult(None, "; ".join([*losses, *weaker_parts, f"refused: {error}"]))
-        told = sentences(*without_effect(dead), *weaker_parts, price_text)
+        told = sentences(*without_effect(dead, self._by_law(dead)), *weaker_parts, price_text)
         return LearnerResult(self._last, told)
 
     def _verdict(self, identified: Identification, *, lost: bool) -> Verdict:
@@ -527,6 +528,10 @@ class Learner:
                 found.append(change)
         return found
 
+    def _by_law(self, dead: Mapping[PartName, str]) -> set[str]:
+        """Return the outputs that fly by the law of the start, given the dead inputs."""
+        return by_law_of_start(self._controller, dead, has_file=self._design_of_rough is not None)
+
     def _designed(
         self, model: Airframe, known: Mapping[PartName, Known], dead: Mapping[PartName, str]
     ) -> tuple[RiseDiConfig, str | None]:
@@ -539,16 +544,16 @@ class Learner:
         without_learning = start.model_copy(update={"learn": None})
         flying = set(chain.from_iterable(known))
         file = None
+        without = self._by_law(dead)
         if self._design_of_rough is not None:
             file = self._design_of_rough(without_learning)
-            flying = set(start.outputs) - set(chain.from_iterable(dead))
+            flying = set(start.outputs) - without
         designed = without_learning
         price_text = None
         if file is not None and not known:
             designed = file.controller
         elif flying:
             latest = dict(chain.from_iterable(value.latest.items() for value in known.values()))
-            without = set(chain.from_iterable(dead))
             aim = goal(start, file, model, list(known), latest, without)
             try:
                 selected = self._design(without_learning, model, aim)
@@ -562,15 +567,7 @@ class Learner:
         if flying:
             deviation = chain.from_iterable(part.deviation.items() for part in known.values())
             designed = with_deviations(designed, dict(deviation))
-        proposed = with_channels_of(
-            start,
-            designed,
-            [output not in flying for output in start.outputs],
-            [name in dead.values() for name in start.inputs],
-        )
-        if dead and proposed.observer is not None:
-            # Parts that fly the law of the start have a margin of their own.
-            proposed = with_own_margin(proposed, model, margin_of(start))
+        proposed = with_flown_channels(start, designed, model, flying, dead)
         checked = RiseDiConfig.validate_mapping(
             proposed.model_dump() | {"learn": self._start.model_dump()["learn"]}, "proposal"
         )

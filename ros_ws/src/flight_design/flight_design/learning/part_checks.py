@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks of a part's model against the model that flies, and sentences about the part."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 
@@ -163,10 +163,13 @@ def effect_sentence(part: Part) -> str:
     return text if all(entry.nominal for entry in part.entries) else f"{text}, with coupling"
 
 
-def without_effect(dead: Mapping[tuple[str, ...], str]) -> list[str]:
-    """Say which parts fly without an input."""
-    return [
-        f"{name} has no effect: {' and '.join(part)} without it, by the law of the start"
-        for part, name in dead.items()
-        if name
-    ]
+def without_effect(dead: Mapping[tuple[str, ...], str], by_law: Collection[str]) -> list[str]:
+    """Say which parts fly without an input, and which outputs fly `by_law` of the start."""
+    told = []
+    for part, name in dead.items():
+        outputs = [output for output in part if output in by_law]
+        which = "" if len(outputs) == len(part) else f"{' and '.join(outputs)} "
+        if name:
+            flown = f"{' and '.join(part)} without it, {which}by the law of the start"
+            told.append(f"{name} has no effect: {flown}")
+    return told
