@@ -55,6 +55,7 @@ SETTLING = 1.0 - 1e-5  # with a limit, a motion that settles falls by a part of 
 ROUNDING = 1e-6  # left of the bound 1 for sums of 100 products whose sizes are up to 1e6
 EPS = np.finfo(float).eps
 TERMS = 4
+ROUNDS = 4  # of the balance of coefficients
 BASIS = [Legendre.basis(i, [0, 1]) * (2 * i + 1) ** 0.5 for i in range(TERMS)]
 # exact to degree 23: for exponentials over a period, beyond rounding
 GAUSS, WEIGHTS = leggauss(12)
@@ -558,6 +559,12 @@ def system_of(
     for i in range(known, p, k):
         to = (np.exp(t[:i]) * (1.0 + np.abs(g[:i]))) ** 2 @ sizes[:i, i : i + k]
         t[i : i + k] = np.log(to / (sizes[i : i + k, :i] @ np.exp(-2.0 * t[:i]))) / 4.0
+    # Balance the coefficients that t lacks against all others, channel by channel (Osborne).
+    np.fill_diagonal(sizes, 1e-30)
+    weight = (1.0 + np.abs(g)) ** 2
+    for i in np.tile(np.arange(known, p), ROUNDS):
+        into = (weight * np.exp(2.0 * t)) @ sizes[:, i]
+        t[i] = np.log(into / (sizes[i] @ np.exp(-2.0 * t))) / 4.0
     # v of an entry is scaled as its last coefficient, and is at most `most` times the rest of z.
     most, last = np.abs(middle) + half, np.exp(t[-k:])
     s = np.full(one, step.get("s", 0.0))
@@ -629,7 +636,9 @@ def is_proved(system: System, part: Loop, w: float, x: float) -> bool:
 
     # The rest: v is at most `rest`, and adds `added` to y.
     x_by_v = inverse * (norm(R @ V) + 2.0 * inverse * error * norm(R) * norm(V))
-    loop_gain = rest_by_v + norm(S) * x_by_v
+    # With X = Y - slip, S R (I + X)^-1 V = S R V - S R (I + X)^-1 X V.
+    through_R = inverse * norm(S @ R) * (delta * norm(R @ V) + error * norm(V))
+    loop_gain = rest_by_v + min(norm(S) * x_by_v, norm(S @ R @ V) + through_R)
     if not loop_gain < 0.9:
         return False
     square = norm(S @ right) ** 2 + 2.0 * float((S_w * right.real).sum()) + rest_by_w**2
@@ -712,6 +721,50 @@ def is_equal(found: Array, expected: Array, part: float = EQUAL) -> bool:
     return bool(apart <= part * largest)
 
 
+def without_actuators(file: dict[str, Any]) -> dict[str, Any]:
+    """Return the file with lags in place of the actuators that are states, u[INPUT], last.
+
+    Raises ValueError unless such a state follows its input by one lag, 1/lag[INPUT] changes this
+    lag alone by `part` of itself, and nothing else depends on both.
+    """
+    inputs, names = file["inputs"], file["names"]
+    A, B, F, G, lag = (file[key].copy() for key in ["A", "B", "F", "G", "lag"])
+    columns = {f"u[{name}]": j for j, name in enumerate(inputs)}
+    n = sum(state not in columns for state in file["states"])
+    found = set()
+    for i, state in enumerate(file["states"][n:], n):
+        require(state in columns, "states", file["states"], "actuators behind the others")
+        j = columns[state]
+        rate, entry = file["B"][i, j], f"1/lag[{inputs[j]}]"
+        found.add(entry)
+        own = {"A": -rate * np.eye(len(A))[i], "B": rate * np.eye(len(inputs))[j]}
+        follows = rate > 0.0 and lag[j] == 0.0 and not file["B"][:n, j].any()
+        follows = follows and all(np.array_equal(file[key][i], own[key]) for key in "AB")
+        for k, name in enumerate(names):
+            changes, part = file["E"][i, k] != 0.0, file["part"][k]
+            follows = follows and changes == (name == entry)
+            if not changes:
+                follows = follows and not file["G"][k, j]
+                continue
+            follows = follows and np.array_equal(file["E"][:, k], np.eye(len(A))[i])
+            follows = follows and is_equal(file["F"][k], part * own["A"])
+            follows = follows and is_equal(file["G"][k], part * own["B"])
+        require(bool(follows), state, file["A"][i].tolist(), f"the lag of {inputs[j]} alone")
+        B[:, j], G[:, j], lag[j] = A[:, i], F[:, i], 1.0 / rate
+    kept = [k for k, name in enumerate(names) if name not in found]
+    return file | {
+        "states": file["states"][:n],
+        "names": [names[k] for k in kept],
+        "part": file["part"][kept],
+        "A": A[:n, :n],
+        "B": B[:n],
+        "E": file["E"][:n, kept],
+        "F": F[kept, :n],
+        "G": G[kept],
+        "lag": lag,
+    }
+
+
 def exact_entries(file: dict[str, Any]) -> list[str]:
     """Return the entries of A and B that are the same number in every aircraft.
 
@@ -719,6 +772,7 @@ def exact_entries(file: dict[str, Any]) -> list[str]:
     off by `part` of itself, or B[i,j] of an effector, whose row of T multiplies it. One of `zeros`
     is 0, and off by any number.
     """
+    file = without_actuators(file)
     states, effectors, T = file["states"], file["effectors"], file["T"]
     zeros, own = file.get("zeros", []), effectors == file["inputs"]
     require({*zeros} <= {*file["names"]}, "zeros", zeros, "some of the names")
@@ -953,6 +1007,11 @@ def claim_of(file: dict[str, Any]) -> str:
 def report_of(file: dict[str, Any], count: int) -> str:
     """Return what a proved certificate says."""
     lines = [f"PROVED by {count} bounds: {claim_of(file)} for each deviation within"]
+    for k in [k for k, name in enumerate(file["names"]) if name.startswith("1/lag")]:
+        percent = np.floor(1e3 * file["size"] * file["part"][k] + 1e-6) / 10.0
+        lines.append(f"  {file['names'][k]} {percent:g} %")
+    exact = ", ".join(exact_entries(file)) or "no entry"
+    file = without_actuators(file)
     for k, name in enumerate(file["names"]):
         if file["part"][k]:
             # a position beside the name: row and column from 0
@@ -965,7 +1024,6 @@ def report_of(file: dict[str, Any], count: int) -> str:
                 change = file["F" if letter == "A" else "G"][k] @ along / (along @ along)
                 within = f"0 +- {rounded_down(abs(change) * file['size'])}"
             lines.append(f"  {name} ({letter} {i}, {j}) {within}")
-    exact = ", ".join(exact_entries(file)) or "no entry"
     lines.append(f"exact in every aircraft: {exact}, and each other 0")
     lines.append(f"certificate {file['loop'][:12]}")
     law = "of the constants in the file" if "constants" in file else "of no exported constants"

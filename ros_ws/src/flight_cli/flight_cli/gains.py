@@ -304,7 +304,6 @@ class Guarantee(Check):
             airframe=self.airframe,
             scenario=self.scenario,
             late=self.late,
-            entries=self.entry or (),
             worst=self.worst,
             certificate=self.certificate,
         )

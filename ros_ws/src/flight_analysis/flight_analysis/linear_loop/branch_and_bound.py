@@ -57,13 +57,16 @@ class Region(NamedTuple):
         return [side for side in (below, above) if side.high > side.low]
 
 
-def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[str, Any]] | None:
+def proof_of(
+    part: Channels, size: float, disk: float, most: int, reserve: float = 0.0
+) -> list[dict[str, Any]] | None:
     """Find the steps that prove the loop stable, or return None if `most` steps are too few.
 
     The proof holds for all abs(d_i) <= size, for delays that change from tick to tick within their
     range, and for complex disks of size `disk` in the channels of disks. It starts from d = 0,
     where the loop is stable, and shows that no aircraft of the box has a mode on abs(z) = RADIUS.
-    The eigenvalues move continuously over the box, so none of them can leave the circle.
+    The eigenvalues move continuously over the box, so none of them can leave the circle. Each
+    region is proved for half widths that are larger by the fraction `reserve`.
 
     Each step takes the last region of a list, which at first holds the whole box from 0 to pi / T.
     A step {"halve": i} halves this region along entry i and appends both halves to the list. Every
@@ -84,7 +87,7 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
         w = frequency_in(region, highest)
         around = part.at(region.centre)
         # Bound mu of the deviations of this region, scaled to 1, at one frequency.
-        scale = np.r_[region.half[part.parameters], others]
+        scale = np.r_[(1.0 + reserve) * region.half[part.parameters], others]
         M = scale[:, None] * around.response(w, RADIUS)
         bound, scaling = tightened_at(around, w, M, region.scaling)
         interval = interval_at(around, w, scaling, scale) if bound < 1.0 else None

@@ -41,12 +41,11 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
             the text of the exported constants.
 
     Raises:
-        ParameterError: Nothing is proved, a lag is in the box, or u can be late. For a late u, the
-            checker has no bound for the coefficients that are left out.
+        ParameterError: Nothing is proved, or u can be late. For a late u, the checker has no bound
+            for the coefficients that are left out.
     """
     require(promise.stable > 0.0, "certificate", "no stable box", "a loop with a guarantee")
     require(promise.late == 0.0, "certificate", f"u up to {promise.late:g} s late", "u in time")
-    require(promise.has_exact_lags, "certificate", "a lag in the box", "exact lags")
     return _text(linear, promise.stable, {**sources, "parts": promise.proof})
 
 
@@ -64,7 +63,7 @@ def _text(linear: LinearLoop, deviation: float, proof: Mapping[str, Any]) -> str
     assert box is not None  # noqa: S101 - a guarantee has one
     content = {
         **proof,
-        "states": linear.states,
+        "states": linear.plant_states,
         "outputs": linear.outputs,
         "inputs": linear.inputs,
         **linear.nominal._asdict(),

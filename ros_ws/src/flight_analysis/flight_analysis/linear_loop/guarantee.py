@@ -42,6 +42,9 @@ FEWER_BOXES = 300  # the same for the other gaps, and for disks
 # The proved deviations are larger than the stated ones by this fraction. It covers the coefficients
 # that are left out, and the width that a check by interval arithmetic loses.
 SLACK = 2e-3
+# The same if a lag deviates, as a fraction of the half widths of each region: the actuator leaves
+# out more, and a slack of the whole box moves small regions by more than their half widths.
+LAG_SLACK = 5e-3
 NAMED = 12  # number of digits of the digest that name a certificate
 
 
@@ -89,8 +92,8 @@ class Guarantee(NamedTuple):
 
     @property
     def certificate(self) -> str:
-        """Name of the certificate, or "" if u is late, a lag is uncertain or nothing is proved."""
-        return self.loop[:NAMED] if self.stable and not self.late and self.has_exact_lags else ""
+        """Name of the certificate, or "" if u is late or nothing is proved."""
+        return self.loop[:NAMED] if self.stable and not self.late else ""
 
     def as_json(self) -> dict[str, Any]:
         """Return everything except the proof."""
@@ -135,7 +138,9 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     # beyond MOST_OF_LAG nothing can be proved for a lag
     most = MOST_OF_LAG / float(box.part[is_lag].max()) if is_lag.any() else np.inf
     exact = first is None or most < size
-    proved, proof = _proved(parts_of(uncertain), min(size, most), disks=False, exact=exact)
+    reserve = LAG_SLACK if is_lag.any() else 0.0
+    parts = parts_of(uncertain)
+    proved, proof = _proved(parts, min(size, most), disks=False, exact=exact, reserve=reserve)
     promise = none._replace(
         stable=largest * proved, unstable=first, proof=proof, zeros=box.largest_zero * proved
     )
@@ -217,6 +222,7 @@ def _proved(
     disks: bool,
     exact: bool = False,
     finer_gaps: Sequence[float] = FINER_GAPS,
+    reserve: float = 0.0,
 ) -> tuple[float, list[dict[str, Any]]]:
     """Prove the largest size possible below `least`, and return this size and the proof.
 
@@ -226,7 +232,7 @@ def _proved(
     """
     for proved in (*(0.0,) * exact, *GAPS):
         most = FEWER_BOXES if disks or proved > GAPS[0] else BOXES
-        proof = _proof(parts, least / (1.0 + proved), most, disks=disks)
+        proof = _proof(parts, least / (1.0 + proved), most, disks=disks, reserve=reserve)
         if proof is not None:
             break
     else:
@@ -234,7 +240,8 @@ def _proved(
     for finer in finer_gaps if proved == GAPS[0] else ():
         if sum(len(part["steps"]) for part in proof) > FEWER_BOXES:
             break
-        tighter = _proof(parts, least / (1.0 + finer), FEWER_BOXES, disks=disks)
+        size = least / (1.0 + finer)
+        tighter = _proof(parts, size, FEWER_BOXES, disks=disks, reserve=reserve)
         if tighter is None:
             break
         proof, proved = tighter, finer
@@ -242,16 +249,18 @@ def _proved(
 
 
 def _proof(
-    parts: list[Channels], size: float, most: int, *, disks: bool
+    parts: list[Channels], size: float, most: int, *, disks: bool, reserve: float
 ) -> list[dict[str, Any]] | None:
     """Prove each part for a size, or return None if `most` steps are not enough.
 
-    The proved deviations exceed the size by the fraction SLACK.
+    The proved deviations exceed the size by the fraction SLACK, or those of each region by the
+    fraction `reserve` of its half widths.
     """
     proof = []
+    whole = size if reserve else (1.0 + SLACK) * size
     for part in parts:
-        deviation, disk = (1.0, size) if disks else ((1.0 + SLACK) * size, 0.0)
-        steps = proof_of(part, deviation, disk, most)
+        deviation, disk = (1.0, size) if disks else (whole, 0.0)
+        steps = proof_of(part, deviation, disk, most, reserve)
         if steps is None:
             return None
         most -= len(steps)

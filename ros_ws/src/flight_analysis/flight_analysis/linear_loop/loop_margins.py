@@ -49,9 +49,8 @@ LAG_ENTRY = "1/lag"  # beginning of the name of an uncertain entry that is the l
 LEAST_LAG = 2.0  # least lag of an actuator that can be uncertain, periods
 MOST_OF_LAG = 0.8
 """The largest deviation d of 1 / lag for which a proof holds. With a lag of LEAST_LAG, the two
-Legendre coefficients of a period leave out less than a thousandth of the deviation. This is half of
-the fraction by which the proved deviations exceed the stated ones. For a larger d they leave out
-more."""
+Legendre coefficients of a period leave out less than a thousandth of the deviation, a fifth of
+what each region of a proof has in reserve. For a larger d they leave out more."""
 
 BARE = (
     "; each output integrates its inputs, without drag and phugoid: the margins cover Omega alone"
@@ -89,6 +88,13 @@ class LinearLoop(NamedTuple):
         return LinearPlant(self.plant.A[0], self.plant.B[0], self.plant.C)
 
     @property
+    def plant_states(self) -> tuple[str, ...]:
+        """States of the aircraft, and u[INPUT] for each actuator whose lag deviates."""
+        entries = () if self.box is None else self.box.names
+        lags = [name for name in entries if name.startswith(LAG_ENTRY)]
+        return (*self.states, *(f"u{name.removeprefix(LAG_ENTRY)}" for name in lags))
+
+    @property
     def digest(self) -> str:
         """SHA-256 of the loop and its box: of their names, and of their numbers to DIGITS digits.
 
@@ -96,7 +102,7 @@ class LinearLoop(NamedTuple):
         """
         loop = self.loop
         arrays = [*self.nominal, *self.law, loop.lag, loop.delay, loop.period]
-        names = [self.states, self.outputs, self.inputs]
+        names = [self.plant_states, self.outputs, self.inputs]
         if self.box is not None:
             size = self.box.part.max()
             arrays += [self.box.part / size, self.box.E, self.box.F / size, self.box.G / size]
