@@ -70,9 +70,14 @@ def test_aircraft_whose_sideslip_diverges_has_gains(monkeypatch: pytest.MonkeyPa
         return {"calm": manoeuvre_result(simulate(scenario.vary(aircraft={"gusts": {}})))}
 
     monkeypatch.setattr(jsbsim_identification, "fly_all", calm)
+    # JSBSim searches for the trims that do not exist for 45 s of processor
+    monkeypatch.setattr(jsbsim_identification, "slowest_trim", lambda _: 82.125)
     aircraft = identify_jsbsim("f15", 180.0, 3000.0, guided=True)
     assert aircraft.sideslip_zero > 0.0
     assert aircraft.flights["calm"].outcome == "completed"
+    guidance = aircraft.scenario().guidance
+    assert guidance is not None
+    assert guidance.stall_speed == 82.125
 
 
 def test_zero_of_sideslip_is_that_of_its_equations() -> None:
