@@ -770,11 +770,17 @@ def exact_entries(file: dict[str, Any]) -> list[str]:
 
     Raises ValueError unless an entry NAME of `names` is one number of the aircraft: A[i,j] that is
     off by `part` of itself, or B[i,j] of an effector, whose row of T multiplies it. One of `zeros`
-    is 0, and off by any number.
+    is 0, and off by any number. Two names for one thing, or one for two, would make the lines that
+    are printed false: an effector with the name of an input is moved by this input alone.
     """
     file = without_actuators(file)
     states, effectors, T = file["states"], file["effectors"], file["T"]
     zeros, own = file.get("zeros", []), effectors == file["inputs"]
+    for name, row in zip(effectors, T, strict=True):
+        if name in file["inputs"]:
+            is_of_input = np.arange(len(row)) == file["inputs"].index(name)
+            fits = np.array_equal(row != 0.0, is_of_input)
+            require(fits, f"T of {name}", row.tolist(), "the input of this name alone")
     require({*zeros} <= {*file["names"]}, "zeros", zeros, "some of the names")
     rest = {"A": file["A"].copy(), "B": file["B"].copy()}
     places: dict[str, tuple[str, int, int]] = {}

@@ -220,6 +220,19 @@ def exchanged(pattern: str) -> Alter:
     )
 
 
+def exchanged_in_names(one: str, other: str) -> Alter:
+    """Exchange two words in the names of the entries."""
+    words = {one: other, other: one}
+
+    def alter(content: Content) -> None:
+        pattern = f"{one}|{other}"
+        content["names"] = [
+            re.sub(pattern, lambda match: words[match[0]], name) for name in content["names"]
+        ]
+
+    return alter
+
+
 def only_the_first(name: str) -> Alter:
     """Leave out all but the first value of a row of the constants."""
     pattern = rf"(/\* {name} \*/ \{{[\d.]+)[^}}]*"
@@ -289,6 +302,14 @@ REFUSED: dict[str, tuple[Alter, str]] = {
     "outputs renamed": (put("w", "outputs", 0), "law is not that of the constants"),
     "inputs exchanged": (swap("inputs", places=(0, 1)), "law is not that of the constants"),
     "effectors exchanged": (swap("effectors", places=(0, 1)), "expected"),
+    "inputs exchanged where C has no constants": (
+        both(drop("constants"), swap("inputs", places=(1, 2))),
+        "T of aileron: .* the input of this name alone",
+    ),
+    "effectors and their entries exchanged": (
+        both(swap("effectors", places=(1, 2)), exchanged_in_names("aileron", "rudder")),
+        "T of rudder: .* the input of this name alone",
+    ),
     "an allocation of zeros": (times(0.0, "T"), "expected"),
     "an allocation twice as large": (times(2.0, "T"), "expected"),
     # types and ranges
