@@ -45,6 +45,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+# OpenBLAS reads it with the next import. On matrices as small as these its threads wait for each
+# other: beside other work two of them take seven times as long as one.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import numpy as np
 from numpy.polynomial.legendre import Legendre, leggauss
 from numpy.typing import NDArray
