@@ -376,7 +376,9 @@ def _interval(
     scale = np.r_[region.half[around.parameters], np.ones(int(has_limit))]
     M = scale[:, None] * around.response(points, multiplier.radius)
     m = multiplier.at(points * around.period) if has_limit else None
-    fails = np.flatnonzero(np.linalg.eigvalsh(inequality(M, m, step))[:, 0] < MARGIN)
+    least = np.linalg.eigvalsh(inequality(M, m, step))[:, 0]
+    # A NaN is not at least MARGIN either.
+    fails = np.flatnonzero(~(least >= MARGIN))
     place = len(below)
     if place in fails:
         return None
