@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a flight, each of which is a pure function of the tape of the flight.
+"""Compute metrics of a flight, each as a pure function of the tape of the flight.
 
 They are the error, the noise floor, the ultimate bound, settling, control effort, saturation and
-switches of the sign.
+how often the sign term switches.
 """
 
 import math
@@ -60,7 +60,7 @@ engagement has the name of its air. UNKNOWN_AIR means that no simulated aircraft
 
 @dataclass(frozen=True, kw_only=True)
 class Transient:
-    """An engagement, a command, a gust, a turn or a capture.
+    """A disturbance in a flight: an engagement, a command, a gust, a turn or a capture.
 
     `start` and `stop` are its first and its last instant, in s of flight time.
     """
@@ -73,7 +73,8 @@ class Transient:
     def excites(self, channel: str) -> bool:
         """Return whether the transient excites a channel.
 
-        A command excites its own channel; every other transient excites all channels.
+        A command excites only the channel that it commands. Every other transient excites all
+        channels.
         """
         return self.kind != "command" or self.name == channel
 
@@ -112,10 +113,11 @@ def best_pose(tape: Tape) -> Signal | None:
 
 
 def tracking_error(tape: Tape) -> Signal:
-    """Return the measured error e = y - y_m at every y within the time of y_m, (N, m).
+    """Return the measured error e = y - y_m, (N, m).
 
-    Channels that y_m lacks are left out. y_m is interpolated linearly. This is the error that the
-    law sees, with the noise of the sensors.
+    It has a row for each sample of y within the time of y_m. Channels that y_m lacks are left out.
+    y_m is interpolated linearly. This is the error that the law sees, with the noise of the
+    sensors.
     """
     names = _controlled(tape)
     return _minus_reference(
@@ -139,11 +141,12 @@ def _controlled(tape: Tape) -> tuple[str, ...]:
 
 
 def true_error(tape: Tape) -> Signal | None:
-    """Return the true error C x - y_m at every sample of `truth`, (N, m), within the time of y_m.
+    """Return the true error C x - y_m, (N, m).
 
-    The channels are those of `tracking_error`. The noise and bias of the sensors do not enter this
-    error, except through their effect on the flight. Returns None unless `truth` has "x.output" for
-    every channel, as in a simulation.
+    It has a row for each sample of `truth` within the time of y_m. The channels are those of
+    `tracking_error`. The noise and bias of the sensors do not enter this error, except through
+    their effect on the flight. Returns None if `truth` lacks "x.output" for a channel. Only a
+    simulation logs this.
     """
     if "truth" not in tape:
         return None
@@ -248,9 +251,11 @@ def live_commands(tape: Tape) -> list[Transient]:
 
 
 def guided_transients(tape: Tape) -> list[Transient]:
-    """Return the turns and captures of a guided flight, from `guidance`, as the glossary says.
+    """Return the turns and captures of a guided flight, as the glossary defines them.
 
-    In such a flight `u_m` changes all the time, so that it shows no transients. Transients of the
+    They are found in the topic `guidance`.
+
+    In a guided flight `u_m` changes all the time, so that it shows no transients. Transients of the
     same kind that are less than SETTLING_DWELL apart count as one.
     """
     if "guidance" not in tape:
@@ -315,8 +320,9 @@ def part_masks(
     """Return masks of the instants t, (N,), by part of the flight.
 
     The parts are "whole", `air`, "command" and "gust". In a guided flight, "capture" and "turn"
-    replace "command". Every instant is in "whole". If transients overlap, an instant also belongs
-    to the last of their parts in this order. If there is no transient, it belongs to `air`.
+    replace "command". Every instant is in "whole" and in one more part. During a transient this is
+    the part of the transient, or the last one in the order above if transients overlap. Otherwise
+    it is `air`.
     """
     kinds = {transient.kind for transient in transients}
     commands = ["capture", "turn"] if kinds & {"capture", "turn"} else ["command"]

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A scenario, the closed loop in one process, and the replay of a recorded flight."""
+"""Read a scenario, fly it as a closed loop in one process, and replay a recorded flight."""

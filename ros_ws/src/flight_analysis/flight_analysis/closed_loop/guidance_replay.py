@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of guidance from the log: every step is computed again.
+"""Compute every step of guidance in a log again, to check that the log is complete.
 
-A step starts from the logged inputs and the state of the sample before it.
+The inputs of a step come from its own sample in the log, and its initial state from the sample
+before.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,7 +26,7 @@ from flight_guidance.steering.path import Route
 
 
 class GuidanceReplay(NamedTuple):
-    """Comparison of the recorded steps of `guidance` and of u_m with the computed ones."""
+    """The result of comparing the recorded steps of guidance and their u_m with computed ones."""
 
     steps: int
     checked: int
@@ -44,9 +45,10 @@ def _waypoints(rows: FloatArray) -> list[Waypoint]:
 
 
 def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
-    """Return the routes of the section and of the topic `route`.
+    """Return the routes that guidance could fly in this flight, by digest.
 
-    Their keys are digests, as in the log of guidance.
+    They come from the section `guidance` of the scenario and from the topic `route`. The log of
+    guidance names a route by the same digest.
     """
     lists = [list(parameters.waypoints())]
     if "route" in tape:
@@ -55,18 +57,18 @@ def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
         lists += [_waypoints(rows) for rows in np.split(received.values, starts)]
     routes = []
     for waypoints in filter(None, lists):
-        with suppress(ParameterError):  # guidance refused it, too
+        with suppress(ParameterError):  # guidance refused this route, too
             routes.append(parameters.plan(waypoints))
     return {guidance.digest(route): route for route in routes}
 
 
 def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceReplay:
-    """Compute every step of the topic `guidance` again, and the u_m published at its instant.
+    """Compute every step of the topic `guidance` again, and the u_m published at the same instant.
 
-    If a step failed, the state must stay as it was and the last u_m must go on. This is checked,
-    too. A step is not checked if its route is not in the log. If the log has other channels than
-    this version records, no step is checked. Raises ParameterError if the log lacks the scenario's
-    section of guidance.
+    If a step failed in flight, the replay checks that the state stayed as it was and that the last
+    u_m was published again. A step is not checked if the log lacks its route or the state before
+    it. If the log has other channels than this version records, no step is checked. Raises
+    ParameterError if the log lacks the scenario's section of guidance.
     """
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")
@@ -115,7 +117,7 @@ class _Comparison:
         )
 
     def differences(self) -> Iterator[ReplayDifference]:
-        """Yield the first channel that differs in each step, in the order of the steps."""
+        """Yield the first channel that differs, for each step with a difference, in order."""
         previous: GuidanceState | None = None
         failed_before = 0.0
         rows = zip(self._signal.stamp_ns.tolist(), self._signal.values, strict=True)
@@ -123,7 +125,8 @@ class _Comparison:
             channels = dict(zip(self._names, row.tolist(), strict=True))
             inputs, recorded = guidance_log.restored(stamp_ns, channels, self._outputs)
             begins = previous is not None or inputs.begin is Begin.HOLD
-            # The filters begin again after a failed step that has no sample in the log.
+            # If a failed step has no sample in the log, the count of failures rises with the next
+            # step. That step did not fail, and its filters begin again.
             failed = channels[FAILED]
             goes_on = failed > failed_before and inputs.begin is Begin.NO
             failed_before = failed
@@ -144,7 +147,7 @@ class _Comparison:
         *,
         goes_on: bool,
     ) -> FloatArray:
-        """Compute the channels of the step that follows the state `previous`, then u_m.
+        """Compute the channels of the step after the state `previous`, and append its u_m.
 
         `goes_on` says that the step failed, so that guidance went on with the last u_m.
         """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a learner is, and its stations in a flight in one process."""
+"""The interface of a learner, and the stations that run it in a flight in one process."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
@@ -25,11 +25,14 @@ class LearnerResult(NamedTuple):
     """The result of an identification in flight: parameters to fly, or why there are none."""
 
     controller: RiseDiConfig | None
-    sentence: str | None  # None if nothing was due
+    sentence: str | None  # None if no identification was due
 
 
 class Learner(Protocol):
-    """A learner of a flight. Its channels are in the order of the control law."""
+    """A learner, which identifies the model of the control law during a flight.
+
+    Its channels are in the order of the control law.
+    """
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
         """Take y, u and the digest of the parameters of one tick of the engaged law.
@@ -40,8 +43,8 @@ class Learner(Protocol):
     def propose(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
         """Propose parameters from the record so far.
 
-        `flown` is the digest of the parameters at the end of the record. `given_up` are the outputs
-        that have no model until the engagement ends.
+        `flown` is the digest of the parameters at the end of the record. `given_up` has the outputs
+        that the law controls without a model until the engagement ends.
         """
 
 
@@ -49,10 +52,11 @@ Learn = Callable[[RiseDiConfig], Learner]
 
 
 class Entry(NamedTuple):
-    """An entry of A or B, and how far the flight shows it to be off.
+    """An entry of A or B, and the error of its nominal value that was found in flight.
 
-    The nominal value is in SI. `error` and `deviation`, the standard deviation of the error after
-    the flight, are fractions of `unit`. This is the nominal value, unless the nominal value is 0.
+    The nominal value is in SI. `deviation` is the standard deviation of the error after the flight.
+    `error` and `deviation` are fractions of `unit`, which is the nominal value, or another value if
+    the nominal value is 0.
     """
 
     matrix: str
@@ -154,7 +158,7 @@ def proposed(
 class ProposalStation:
     """Puts proposals in force when they are due, and publishes `authority`.
 
-    If the law diverges, the station falls back to the law of the start.
+    If the law diverges, the station falls back to the law with which the flight started.
     """
 
     def __init__(self, controller: Controller, learning: Learning, topics: Topics) -> None:
@@ -165,7 +169,7 @@ class ProposalStation:
         topics.advertise("authority", authority_names(controller.parameters.outputs))
 
     def step(self, t_ns: int) -> None:
-        """See Station."""
+        """Put a proposal in force if it is due, and publish `authority` at its lower rate."""
         self._learning.step(self._controller, t_ns)
         if t_ns % (AUTHORITY_TICKS * self.period_ns) == 0:
             self._topics.publish(
@@ -190,7 +194,7 @@ class LearnerStation:
         self._identifications = Identifications(learner, learning.start.outputs)
 
     def step(self, t_ns: int) -> None:
-        """See Station."""
+        """Record the tick for the learner, and ask for a proposal if an identification is due."""
         controller = self._station.controller
         output = self._station.output
         if output is None or not controller.has_internals:

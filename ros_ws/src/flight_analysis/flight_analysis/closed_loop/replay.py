@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of a recorded flight: every tick of the controller is computed again.
+"""Replay a recorded flight by computing every tick of the controller again.
 
-The inputs of a tick come from the log, and its results are compared with the log bit by bit.
+The inputs of a tick come from the log, and the results are compared with the log bit by bit.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -45,21 +45,21 @@ class ReplayDifference:
     """A channel of a tick whose recorded and computed values differ."""
 
     number: int  # number of the tick's sample in `internals`
-    t: float  # flight time of its stamp, s
+    t: float  # flight time at the stamp of the tick, s
     channel: str
     recorded: float
     computed: float  # NaN if the tick computes no value
 
     @property
     def ulps(self) -> int | None:
-        """Distance of the values in units in the last place (ULP), or None for a NaN."""
+        """Distance of the two values in units in the last place (ULP), or None if one is NaN."""
         if np.isnan(self.recorded) or np.isnan(self.computed):
             return None
         return abs(_ordinal(self.computed) - _ordinal(self.recorded))
 
 
 class ReplayResult(NamedTuple):
-    """The N ticks of a log as recorded and as computed, in k channels.
+    """The k channels of the N ticks of a log, as recorded and as computed.
 
     The channels of `internals` come first, then those of u.
     """
@@ -82,20 +82,20 @@ class ReplayResult(NamedTuple):
         return self.checked if self.published is None else self.checked & self.published
 
     def different(self) -> NDArray[np.bool_]:
-        """Mask of the values with a different bit, shape (N, k)."""
+        """Return the mask of the values that differ in a bit from the log, shape (N, k)."""
         different: NDArray[np.bool_] = self.checked[:, None] & (
             _bits(self.recorded) != _bits(self.computed)
         )
         return different
 
     def equal(self) -> bool:
-        """Return whether every checked bit is equal, and recorded with these parameters."""
+        """Return whether all checked bits are equal and were recorded with these parameters."""
         return not self.different().any() and not self.other_parameters.any()
 
     def first(self) -> ReplayDifference | None:
         """Return the first difference in the first tick that differs, or None without a difference.
 
-        A channel of u goes before a channel of `internals`.
+        If several channels of this tick differ, a channel of u comes before all others.
         """
         different = self.different()
         rows = np.flatnonzero(different.any(axis=1))
@@ -134,14 +134,14 @@ class ReplayResult(NamedTuple):
 def recorded_parameters(scenario: StoredFile, namespace: str | None = None) -> ControllerConfig:
     """Read the controller's parameters from the scenario of a log, or from a parameter file.
 
-    A file for nothing but the controller in this namespace is enough, because no other section is
-    read. Raises ParameterError.
+    No other section is read, so the file needs only the section of the controller in this
+    namespace. Raises ParameterError.
     """
     path = Path(scenario.name)
     needed = {"controller": AnyLaw}
     try:
         sections = parse_sections(scenario.content, path, needed, (), namespace)
-    except ParameterError:  # the namespace of the log is not that of the file
+    except ParameterError:  # the file has another namespace than the log
         sections = parse_sections(scenario.content, path, needed)
     return AnyLaw.validate_mapping(sections["controller"], "controller")
 
@@ -158,7 +158,7 @@ def is_controller_alone(scenario: StoredFile) -> bool:
 
 
 def recorded_scenario(run: RecordedRun | StoredFile | FilePath) -> Scenario:
-    """Return the scenario of a run, given as read, as its folder, or as the stored scenario.
+    """Return the scenario of a recorded flight.
 
     Args:
         run: Folder or file of a run, a run as read, or a scenario as stored.
@@ -188,30 +188,30 @@ def replay(
     others: ControllerConfig | None = None,
     changes: Sequence[Change] | None = None,
 ) -> ReplayResult:
-    """Compute every tick of `internals` again: (state, now, y, y_m) -> (state, u) by `guard.tick`.
+    """Compute every tick of `internals` again, and return the recorded and the computed values.
 
-    A tick takes y from the topic `y` at its stamp. y_m, the instant of y_m, and whether the
-    controller was active come from `internals`. The results are dt, mode, e, the integrals, Pi and
-    u.
+    A tick is (state, now, y, y_m) -> (state, u) by `guard.tick`. It takes y from the topic `y` at
+    its stamp. y_m, the instant of y_m, and whether the controller was active come from `internals`.
+    The results are dt, mode, e, the integrals, Pi and u.
 
     The state comes from the computation of the tick before. If that tick differs from the log, the
-    state comes from the log, so that each tick is judged by itself. After a gap, the state is the
-    logged state of the first engaged tick. The ticks up to that one are not checked, and u_ff is
-    not checked until the next engagement.
+    state comes from the log, so that each tick is judged by itself. After a gap in the log, the
+    state is the logged state of the first engaged tick. The ticks up to this one are not checked,
+    and u_ff is not checked until the next engagement.
 
     Args:
         run: Folder or file of a run, a run as read, or a tape.
         parameters: Parameters of the recorded controller. If None, they come from the log, or from
             the scenario of a simulated tape.
-        others: Parameters of an open loop. The inputs are the same, and the state is the computed
-            one throughout. If the log does not begin with the flight, the law engages in the first
-            tick, at the recorded u.
-        changes: Parameter changes in flight, in order. If None, they come from the log; with
-            `others` there are none. A tick applies the changes up to the parameters of the channel
-            "parameters".
+        others: Parameters of another controller, which is computed in an open loop. It gets the
+            recorded inputs, and its state is the computed one throughout. If the log begins later
+            than the flight, the law engages in the first tick, at the recorded u.
+        changes: Parameter changes in flight, in order. If None, they come from the log, but there
+            are none if `others` is given. Before a tick, changes are applied until the digest of
+            the parameters is that of the channel "parameters".
 
     Returns:
-        N ticks of k channels, as recorded and as computed, shape (N, k), SI.
+        The recorded and the computed values of N ticks in k channels, shape (N, k), SI.
 
     Raises:
         ParameterError: `internals` has other channels or comes from a version with fewer channels,
@@ -264,8 +264,8 @@ def _replay(
     steps.compute()
     opened = () if others is None else (OPEN_LOOP,)
     notes = (*opened, *in_force.notes(), *_coverage_notes(ticks, steps.checked))
-    # If the y of a tick is not on the topic, it comes from `internals`. If its u is not on the
-    # topic, it is not compared.
+    # If the topic `y` lacks the y of a tick, this y comes from `internals`. If the topic `u` lacks
+    # the u of a tick, this u is not compared.
     missing = np.flatnonzero(~ticks.u_found)
     steps.computed[missing, -ticks.p :] = ticks.values[missing, -ticks.p :]
     return ReplayResult(
@@ -282,7 +282,7 @@ def _replay(
 
 
 def _require_same_channels(recorded: ControllerConfig, others: ControllerConfig) -> None:
-    """Raise ParameterError if parameters have other channels than the recorded ones."""
+    """Raise ParameterError if `others` have other channels than the recorded parameters."""
     for key, names in (("outputs", "measured"), ("inputs", "inputs"), ("effectors", "effectors")):
         before = getattr(recorded, names)
         after = getattr(others, names)
@@ -295,7 +295,7 @@ def _require_same_channels(recorded: ControllerConfig, others: ControllerConfig)
 
 
 class _Steps:
-    """The computation of all ticks, row by row, with the parameters in force."""
+    """Computes all ticks in order, each with the parameters that were in force."""
 
     def __init__(self, ticks: Ticks, in_force: ParametersInForce, *, open_loop: bool) -> None:
         self._ticks = ticks
@@ -328,9 +328,10 @@ class _Steps:
                 state = ticks.state(k, in_force.limits, in_force.law, state)
 
     def _state_after_gap(self, k: int) -> ControllerState | None:
-        """Return the recorded state at a tick, or None if the controller is not engaged there.
+        """Return the state at tick k, with which the computation goes on after a gap.
 
-        In an open loop, return the state of a law that engages at this tick.
+        It is the recorded state after the tick or, in an open loop, the state of a law that engages
+        at this tick. Returns None if the recorded controller is not engaged at this tick.
         """
         if not self._ticks.flies[k]:
             return None
@@ -341,7 +342,7 @@ class _Steps:
 def _recorded(
     run: Tape | RecordedRun, parameters: ControllerConfig | None, changes: Sequence[Change] | None
 ) -> tuple[Tape, ControllerConfig, Sequence[Change]]:
-    """Return the tape of a run; parameters and changes that are None come from the run.
+    """Return the tape of a run, and the parameters and changes, from the run if they are None.
 
     Raises ParameterError.
     """
@@ -363,7 +364,7 @@ def _recorded(
 def recorded_changes(run: RecordedRun, parameters: ControllerConfig) -> Sequence[Change]:
     """Return the changes in flight of the recorded controller's parameters, in order.
 
-    If the run has no log, they are the changes of the tape.
+    If the run has no log file, the changes come from its tape.
     """
     if run.path is None:
         return run.tape.changes
@@ -374,7 +375,7 @@ def recorded_changes(run: RecordedRun, parameters: ControllerConfig) -> Sequence
 
 
 def later_aircraft(run: RecordedRun, scenario: Scenario) -> tuple[AircraftConfig, ...]:
-    """Return the simulated aircraft after each change of its parameters in flight, in order."""
+    """Return the parameters of the simulated aircraft after each change in flight, in order."""
     node = f"{run.namespace}/aircraft"
     is_changed = any(
         each.kind == PARAMETER and each.text.startswith("aircraft:") for each in run.messages
@@ -394,7 +395,7 @@ def later_aircraft(run: RecordedRun, scenario: Scenario) -> tuple[AircraftConfig
 
 
 def _coverage_notes(ticks: Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
-    """Note what the log does not hold, and what was therefore not checked."""
+    """Yield a note on each thing that the log lacks and that was therefore not checked."""
     if len(ticks.number) and not ticks.begins[0]:
         yield f"the log begins with sample {ticks.number[0]} of internals: earlier ones are missing"
     for start in ticks.starts:
@@ -418,9 +419,9 @@ def _coverage_notes(ticks: Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
 
 
 def _controller_at(processes: Mapping[str, Process], stamp_ns: int) -> str:
-    """Name the last controller that began before an instant, after a comma.
+    """Return the name of the controller that runs at an instant, between commas for a note.
 
-    Returns "" if the log has no name.
+    This is the last controller that began before the instant. Returns "" if the log has no name.
     """
     begins = [
         (process.first_ns, name)

@@ -31,9 +31,10 @@ Change = Mapping[str, Any]
 
 
 def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> ControllerConfig:
-    """Return the parameters with changes by dotted name, validated.
+    """Return the parameters with some values changed, validated.
 
-    The value None removes a parameter. Raises ParameterError if a changed value is invalid.
+    `changes` has the new values by dotted name. The value None removes a parameter. Raises
+    ParameterError if a changed value is invalid.
     """
     return AnyLaw.validate_mapping(parameters.changed(changes), "controller")
 
@@ -42,7 +43,9 @@ class ParametersInForce:
     """The parameters in force at a tick, and the changes that are still to come."""
 
     def __init__(self, parameters: ControllerConfig, changes: Sequence[Change]) -> None:
-        self._changed: dict[str, list[int]] = {}  # ticks by names of the parameters
+        self._changed: dict[
+            str, list[int]
+        ] = {}  # numbers of ticks, by the names of the changed values
         self._first = parameters
         self._changes = list(changes)
         self.begin()
@@ -70,9 +73,9 @@ class ParametersInForce:
     def change(
         self, digest: int, number: int, state: ControllerState | None
     ) -> ControllerState | None:
-        """Apply the changes that lead to the parameters with a digest, and return the state then.
+        """Apply the changes up to the parameters with a digest, and return the retuned state.
 
-        If no sequence of changes leads to this digest, nothing changes.
+        If no sequence of changes leads to this digest, no change is applied.
         """
         if digest == self.digest or digest in self._unmatched:
             return state
@@ -103,7 +106,7 @@ class ParametersInForce:
 
 
 class Ticks:
-    """`internals` of a log in the order of the controller's ticks, and the inputs of the ticks."""
+    """The samples of `internals` in the order of the controller's ticks, and their inputs."""
 
     def __init__(self, tape: Tape, parameters: ControllerConfig) -> None:
         groups = parameters.logged_groups()
@@ -112,8 +115,8 @@ class Ticks:
         self.m = len(parameters.inputs)
         self.p = len(parameters.effectors)
         self._allocation = parameters.guard().allocation
-        # In logs of an earlier version stamps may decrease: a late y was older than the failsafe u
-        # before it.
+        # In logs of an earlier version stamps can decrease, because a late y was older than the
+        # failsafe u that was published before it.
         now_ns = signal.stamp_ns + np.round(signal["age"] * NANOSECONDS).astype(np.int64)
         order, self.starts = _tick_order(now_ns, signal["number"])
         self.stamp_ns = signal.stamp_ns[order]
@@ -142,7 +145,7 @@ class Ticks:
         self._copied = [names.index(name) for name in COPIED_CHANNELS]
 
     def begin(self, before: ControllerState | None = None) -> ControllerState:
-        """Return the state of a configured controller, with the u of an earlier state, if any."""
+        """Return the initial state of a controller, with the u of the state `before`, if given."""
         state = guard.initial_state(self.m, self._allocation)
         return state if before is None else state._replace(u=before.u, effectors=before.effectors)
 
@@ -202,7 +205,8 @@ class Ticks:
         y = None
         y_m = []
         if not self.flies[k] and stamp_ns == state.stamp_ns:
-            # If the stamp stays the same, the last y is older than the stamp and engaged nothing.
+            # The stamp stayed the same, so the last y is older than the stamp and did not engage
+            # the law.
             y = StampedVector(stamp_ns - 1, self._y[k])
             y_m = [StampedVector(stamp_ns - 1, self._groups["y_m"][k])]
         elif self.flies[k]:
@@ -211,8 +215,7 @@ class Ticks:
             if (offset_ns := int(self._offset_ns[k])) > 0:
                 y_m.append(y_m[0]._replace(stamp_ns=stamp_ns + offset_ns))
         if self._engages[k] and state.mode is Mode.ENGAGED:
-            # As in `Controller.restart`, only the law has engaged again. The state of the guard
-            # goes on.
+            # Only the law has engaged again, as in `Controller.restart`. The guard keeps its state.
             state = state._replace(mode=Mode.WAITING)
         # After a gap, the log has the output of the feedforward but not its state, so that only
         # the law is computed.
@@ -273,7 +276,7 @@ def _tick_order(
 ) -> tuple[NDArray[np.int64], list[int]]:
     """Order the ticks by their instants, and return the order and where each controller starts.
 
-    The starts are places in this order. The ticks of one controller are in the order of their
+    The starts are indices into this order. The ticks of one controller are in the order of their
     numbers, whichever of them was stored first.
     """
     order = np.argsort(now_ns, kind="stable")
@@ -286,7 +289,7 @@ def _tick_order(
 def _as_published(
     tape: Tape, topic: str, names: Sequence[str], stamp_ns: NDArray[np.int64], otherwise: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return the samples of a topic at N stamps, (N, m), and a mask of the stamps that have one.
+    """Return the samples of a topic at N stamps, (N, m), and a mask of the stamps with a sample.
 
     A stamp without a sample has the values of `otherwise`.
     """

@@ -165,7 +165,7 @@ class Scenario:
     def rise_di(self) -> RiseDiConfig:
         """Return the parameters of a controller with RISE-DI.
 
-        Raises ParameterError if the law is another one.
+        Raises ParameterError if the controller has another law.
         """
         if not isinstance(self.controller, RiseDiConfig):
             expected = "rise_di, which has the gains of (20) to (22)"
@@ -179,7 +179,7 @@ class Scenario:
         return isinstance(self.controller, RiseDiConfig) and self.controller.learn is not None
 
     def air(self) -> str:
-        """Name the most violent disturbance of the air except gusts: one of metrics.AIRS."""
+        """Return the name of the most violent motion of the air except gusts, from AIRS."""
         aircraft = self.aircraft
         if aircraft.microburst is not None:
             return "microburst"
@@ -230,7 +230,7 @@ If `recorder` is missing, the recorder has its defaults. If `guidance` is missin
 
 
 def load_scenario(path: FilePath, *, with_route: bool = True) -> Scenario:
-    """Read and validate a scenario file. Raises ParameterError with a sentence.
+    """Read and validate a scenario file. Raises ParameterError if it is invalid.
 
     If `with_route` is False, the route and the program of guidance are left out before the check,
     because the flight will take another route.
@@ -264,7 +264,7 @@ def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]
     }
     scenario = Scenario(name=name, path=path, **parameters)
     check_together(scenario)
-    # The numbers of guidance by rule follow from the other sections.
+    # If guidance is by rule, its numbers follow from the other sections.
     return scenario.vary(guidance=sections["guidance"]) if "guidance" in sections else scenario
 
 
@@ -302,10 +302,10 @@ def guidance_by_rule(
 ) -> dict[str, Any]:
     """Compute the parameters of guidance that follow from the other sections.
 
-    For RISE-DI, the authorities of throttle and aileron are abs(Omega_ii) u, with Omega_ii = omega
-    / input_scale and u at its limits, as deviations from trim. If a controller lacks these numbers,
-    the result has no authorities. Raises ParameterError if the model or the aircraft does not suit
-    guidance.
+    For RISE-DI, the authority of throttle and of aileron is abs(Omega_ii) u. Here Omega_ii = omega
+    / input_scale, and u is the limit of this input as a deviation from trim. For a controller
+    without these numbers, the result has no authorities. Raises ParameterError if the model or the
+    aircraft does not suit guidance.
     """
     key = "reference_model.second_order"
     channels = aircraft.channels()
@@ -549,7 +549,7 @@ def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
 
 
 def opposite_signs(scenario: Scenario) -> tuple[str, ...]:
-    """Warn, in a sentence, if D contradicts the signs of C B of the airframe file.
+    """Return a warning if D contradicts the signs of C B in the airframe file.
 
     With wrong signs the law drives y away from y_m. If there is an allocation, or no airframe file,
     nothing is compared.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The scenarios that ship, the files that their names stand for, and scenarios with a route."""
+"""Find the scenarios that ship with the stack, give them a route, and save them."""
 
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
@@ -103,12 +103,13 @@ def with_route(
 
 
 def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
-    """Return the scenario with a file from which the nodes in a namespace read the same.
+    """Return the scenario with a file from which nodes in a namespace read the same values.
 
-    The scenario keeps its own file, unless this has recorded commands or sections for another
-    namespace, such as /uav7/controller. In these cases a new file is written into the folder `run`.
-    It has sections for any namespace and holds the values of the recorded commands, so that the log
-    can be flown again without another file. Raises ParameterError if the file cannot be written.
+    The scenario keeps its own file if the nodes can read it. If this file names recorded commands,
+    or has sections for another namespace, such as /uav7/controller, a new file is written into the
+    folder `run`. The new file has sections for any namespace and holds the values of the recorded
+    commands, so that the log can be flown again without another file. Raises ParameterError if the
+    file cannot be written.
     """
     if not scenario.reference_model.recorded and _reaches_nodes(scenario.path, namespace):
         return scenario
@@ -118,8 +119,8 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
 def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
     """Return the scenario with the values that a parameter file gives the nodes in a namespace.
 
-    They replace the scenario's values of the same names. An error must be in the parameter file,
-    because the scenario alone is valid. ParameterError therefore names the parameter file.
+    The values replace those of the same names in the scenario. An error must be in the parameter
+    file, because the scenario alone is valid. ParameterError therefore names the parameter file.
     """
     content = read_file(path, str(path), "a ROS parameter file")
     further = parse_sections(content, path, SCHEMAS, tuple(SCHEMAS), namespace, with_general=True)
@@ -148,8 +149,9 @@ def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
 def _reaches_nodes(path: Path, namespace: str) -> bool:
     """Return whether the nodes in a namespace get every section of a scenario file, and no other.
 
-    If the file has a section for all nodes, the result is False. rcl would put the overrides of a
-    node into this section, and a section of the node itself would replace them.
+    If the file has a section for all nodes, the result is False. In such a file, rcl would put the
+    overrides of a node into the section for all nodes, and the node's own section would then
+    replace them.
     """
     content = read_file(path, str(path), A_SCENARIO)
     if has_general(content, path):
@@ -163,9 +165,9 @@ def _reaches_nodes(path: Path, namespace: str) -> bool:
 
 
 def save_scenario(scenario: Scenario, path: Path) -> Scenario:
-    """Save a scenario that differs from its file as a file of its own.
+    """Save a scenario as a new file, and return the scenario that is read from this file.
 
-    Raises ParameterError if it cannot be written.
+    Raises ParameterError if the file cannot be written.
     """
     with writing("", path, "a folder that can"):
         write_file(path, scenario_yaml(scenario))

@@ -37,7 +37,7 @@ Record = Callable[[Mapping[str, Signal]], None]
 
 
 class _Recorder:
-    """Hands the samples on once per simulated second, then tells the flight time."""
+    """Hands the samples on once per simulated second, and then reports the flight time."""
 
     period_ns = NANOSECONDS
 
@@ -49,7 +49,7 @@ class _Recorder:
         self._progress = progress
 
     def step(self, t_ns: int) -> None:
-        """See Station."""
+        """Hand on the samples since the last call, then report the flight time."""
         self._record(self._topics.pop_signals())
         if self._progress is not None:
             self._progress(seconds(t_ns))
@@ -147,7 +147,7 @@ def fly(
         outcome = INTERRUPTED
     except FlightEnded as error:
         outcome = error.outcome
-    except ChannelError as error:  # commands or noise overflow
+    except ChannelError as error:  # a command or the noise overflowed
         outcome = ended_early(f"ended at t = {seconds(loop.t_ns):.2f} s: {error}")
     record(topics.pop_signals())
     return outcome

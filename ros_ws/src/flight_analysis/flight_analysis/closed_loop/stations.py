@@ -36,7 +36,7 @@ class Station(Protocol):
 
     @property
     def period_ns(self) -> int:
-        """The period."""
+        """The period, ns."""
 
     def step(self, t_ns: int) -> None:
         """Act at flight time t. Raises FlightEnded or ChannelError if the flight ends."""
@@ -63,7 +63,7 @@ class FlightLoop:
 
 
 class Topics:
-    """The samples of the topics, which are handed to subscribers and kept if `recorded`."""
+    """Hands the samples of each topic to its subscribers, and keeps them if `recorded`."""
 
     def __init__(self, *, recorded: bool = True) -> None:
         self._recorded = recorded
@@ -83,7 +83,7 @@ class Topics:
     def subscribe(self, topic: str, take: Take, channels: Sequence[str] | None = None) -> None:
         """Hand each sample of a topic to `take`.
 
-        A sample has only these `channels`, in this order. If None, it has all channels.
+        `take` gets the values of these `channels`, in this order. If None, it gets all channels.
         """
         self._subscriptions[topic].append((channels, take))
 
@@ -119,7 +119,7 @@ class Topics:
 
 
 def _or_refuse(take: Take) -> Take:
-    """Return a `take` that ignores a sample if it raises ChannelError, as a node does."""
+    """Wrap `take` so that it ignores a sample that raises ChannelError, as a node does."""
 
     def take_or_refuse(sample: StampedVector, t_ns: int) -> None:
         with suppress(ChannelError):
@@ -129,7 +129,7 @@ def _or_refuse(take: Take) -> Take:
 
 
 class AircraftStation:
-    """The simulated aircraft: it publishes y, pose and truth, and holds the last u.
+    """The simulated aircraft, which publishes y, pose and truth, and holds the last u.
 
     A lost sample of y is not published, and a delayed sample keeps its stamp. `every_ns` replaces
     the period of the sensors by a longer one.
@@ -158,7 +158,7 @@ class AircraftStation:
         return simulator
 
     def step(self, t_ns: int) -> None:
-        """See Station."""
+        """Simulate up to flight time t, and publish y, and pose and truth if they are taken."""
         simulator = self._simulator
         for sample in simulator.sample(t_ns // simulator.period_ns, self._u):
             self._topics.publish("y", sample, t_ns)
@@ -170,7 +170,7 @@ class AircraftStation:
 
 
 class ReferenceStation:
-    """The reference model: it publishes y_m. A u_m acts from the next step on."""
+    """The reference model, which publishes y_m. A new u_m acts from the next step on."""
 
     def __init__(
         self, parameters: ReferenceModelConfig, topics: Topics, every_ns: int | None = None
@@ -186,13 +186,13 @@ class ReferenceStation:
         self._reference.take(t_ns, u_m, attitude)
 
     def step(self, t_ns: int) -> None:
-        """See Station."""
+        """Compute y_m at flight time t, and publish it."""
         y_m = self._reference.sample(t_ns // self._reference.period_ns)
         self._topics.publish("y_m", StampedVector(t_ns, y_m), t_ns)
 
 
 class GuidanceStation:
-    """Guidance: it publishes u_m and the log of its steps."""
+    """Guidance, which publishes u_m and the log of its steps."""
 
     def __init__(self, guidance: Guidance, parameters: GuidanceConfig, topics: Topics) -> None:
         self._guidance = guidance
@@ -209,7 +209,7 @@ class GuidanceStation:
         self._guidance.take_authority(dict(zip(names, sample.value.tolist(), strict=True)))
 
     def step(self, t_ns: int) -> None:
-        """See Station."""
+        """Take a step of guidance, and publish u_m. Raises FlightEnded if guidance must wait."""
         if reason := self._guidance.reason_to_wait(t_ns):
             raise FlightEnded(f"ended at t = {seconds(t_ns):.2f} s: {reason}")
         if (guided := self._guidance.step(t_ns, t_ns)) is not None:
@@ -218,7 +218,7 @@ class GuidanceStation:
 
 
 class ControllerStation:
-    """The controller: it publishes u and the log of its ticks.
+    """The controller, which publishes u and the log of its ticks.
 
     `output` is the output of the last tick, or None if that tick had none.
     """
@@ -237,7 +237,7 @@ class ControllerStation:
         topics.subscribe("y_m", controller.take_y_m, parameters.outputs)
 
     def step(self, t_ns: int) -> None:
-        """See Station."""
+        """Take a tick of the controller, and publish u and the log if the tick has an output."""
         self.output = self.controller.tick(t_ns)
         if self.output is not None:
             self._topics.publish("u", StampedVector(self.output.stamp_ns, self.output.u), t_ns)

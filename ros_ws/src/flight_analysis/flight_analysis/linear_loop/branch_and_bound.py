@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Proof of stability for every aircraft of a box, if one bound for the whole box is too large.
+"""Prove stability for every aircraft of a box, if one bound for the whole box is too large.
 
 The box is halved along one parameter, and each half again, over the frequencies at which nothing is
 proved yet.
@@ -24,14 +24,15 @@ from flight_analysis.linear_loop.structured_value import (
 from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
 from flight_core.vectors import FloatArray
 
-LEVELLED = 8  # frequencies at which the ratios of X for the channels of a late u are sought
+LEVELLED = 8  # number of frequencies at which the ratios of X for a late u are sought
 DIGITS = 5  # significant digits of X and G in a step of a proof
 
 
 class Region(NamedTuple):
-    """The aircraft with abs(d - centre) <= half, at the frequencies from low to high.
+    """A part of a box and of the frequencies that a step of a proof covers.
 
-    d, `centre` and `half` have the shape (r,).
+    It has the aircraft with abs(d - centre) <= half, where d holds the r deviations, at the
+    frequencies from `low` to `high`. d, `centre` and `half` have the shape (r,).
     """
 
     centre: FloatArray
@@ -70,8 +71,8 @@ def proof_of(
 
     Each step takes the last region of a list, which at first holds the whole box from 0 to pi / T.
     A step {"halve": i} halves this region along entry i and appends both halves to the list. Every
-    other step proves the region from "low" to "high", rad/s, by "t" and "g", and appends the
-    regions that are left below and above.
+    other step proves the region from "low" to "high", rad/s, by the scalings "t" and "g". It then
+    appends the regions that are left below and above.
     """
     highest = np.pi / part.period
     narrowest = NARROWEST * highest
@@ -109,10 +110,10 @@ def proof_of(
 
 
 def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
-    """Round X and G, and return them as `t` and `g` of a step.
+    """Round the scalings X and G, and return them as `t` and `g` of a step.
 
-    Rounding is safe, because any X and G prove a bound. The step has only the X and G of the means
-    over a period if the others follow from these, as in `tightened_at`.
+    Rounding is safe, because any X and G prove a bound. The step needs only the X and G of the
+    means over a period, if those of the second coefficients follow from them as in `tightened_at`.
     """
     count = len(scaling.t) if scaling.g[entries:].any() else entries
     t, g = ([float(f"{x:.{DIGITS}g}") for x in values[:count]] for values in (scaling.t, scaling.g))
@@ -120,7 +121,10 @@ def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
 
 
 def frequency_in(region: Region, highest: float) -> float:
-    """Choose the frequency at which a region is bounded, first 0 and pi / T, where M is real."""
+    """Choose the frequency, rad/s, at which the bound of a region is computed.
+
+    The ends 0 and pi / T come first, because M is real there.
+    """
     if region.low == 0.0:
         return 0.0
     return highest if region.high == highest else float(np.sqrt(region.low * region.high))
@@ -150,7 +154,7 @@ def _levelled(part: Channels, scale: FloatArray) -> Channels:
 
 
 def effects_of(part: Channels, M: ComplexArray, scaling: Scaling) -> FloatArray:
-    """Estimate how the bound of M falls with the half width of each parameter, up to a factor."""
+    """Estimate, up to a common factor, how much the bound of M falls with each half width."""
     scale = np.exp(scaling.t)
     N = scale[:, None] * M / scale
     centre = Centre(np.ones(len(N)), scaling.g[: part.uncertain], np.eye(len(N)))

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A guarantee as a file: for a check without this stack, and for the pages of later flights.
+"""Write a guarantee to a file that can be checked without this stack, and keep guarantees.
 
 examples/check_certificate.py reads a certificate, which contains the sampled loop in numbers, the
 box of its entries, and the steps of the proof. The checker computes the motion over a period again,
 and bounds the error of the Legendre coefficients that are left out.
 
-A report shows the guarantee that was computed for its loop, but computes none itself. Guarantees
-are kept in the folder rise-di/guarantees in $XDG_CACHE_HOME, or in ~/.cache, by the digest of the
-loop.
+The report of a flight shows the guarantee that was kept for its loop, but computes none itself.
+Guarantees are kept in the folder rise-di/guarantees in $XDG_CACHE_HOME, or in ~/.cache, by the
+digest of the loop.
 """
 
 import hashlib
@@ -32,13 +32,13 @@ BOUND = 5  # version of the method by which this stack bounds a loop
 
 
 def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, str]) -> str:
-    """Write the certificate of a guarantee, as JSON.
+    """Return the certificate of a guarantee as JSON.
 
     Args:
-        linear: The loop, with the box of the guarantee, of any size.
-        promise: The guarantee of this loop, computed for u in time.
-        sources: What the loop belongs to, by name: SHA-256 of the airframe and of the scenario, and
-            the text of the exported constants.
+        linear: The loop, with the box of the guarantee. The size of this box does not matter.
+        promise: The guarantee of this loop, computed for a u that is never late.
+        sources: The files from which the loop was built, by name: SHA-256 of the airframe and of
+            the scenario, and the text of the exported constants.
 
     Raises:
         ParameterError: Nothing is proved, or u can be late. For a late u, the checker has no bound
@@ -52,15 +52,15 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
 def limit_certificate(
     linear: LinearLoop, promise: LimitGuarantee, sources: Mapping[str, str]
 ) -> str:
-    """Write the certificate of a guarantee with a limit, as JSON, as `certificate` does."""
+    """Return the certificate of a guarantee with a limit of one input, as JSON."""
     limit = {"input": promise.input, **promise.multiplier._asdict()}
     return _text(linear, promise.size, {**sources, "parts": promise.proof, "limit": limit})
 
 
 def _text(linear: LinearLoop, deviation: float, proof: Mapping[str, Any]) -> str:
-    """Write the loop, its box up to a relative deviation, and a proof."""
+    """Return the loop, its box up to a relative deviation, and a proof as JSON."""
     box = linear.box
-    assert box is not None  # noqa: S101 - a guarantee has one
+    assert box is not None  # noqa: S101 - a guarantee has a box
     content = {
         **proof,
         "states": linear.plant_states,
@@ -79,7 +79,10 @@ def _text(linear: LinearLoop, deviation: float, proof: Mapping[str, Any]) -> str
 
 
 def keep(promise: Guarantee) -> None:
-    """Keep a guarantee for u in time. If its folder cannot be written, do nothing."""
+    """Store a guarantee in the folder of guarantees, for the pages of later flights.
+
+    Nothing is stored if u can be late, or if the folder cannot be written.
+    """
     if promise.late:
         return
     path = _path(promise.loop)
@@ -102,15 +105,15 @@ def kept_guarantee(linear: LinearLoop) -> Guarantee | None:
 def unstated(linear: LinearLoop, promise: Guarantee) -> tuple[str, ...]:
     """Return the reasons why a guarantee cannot be stated for the aircraft that flies.
 
-    There are none if it can be stated. A guarantee holds for a linear loop and for the aircraft
-    within its box, so it says nothing about what the loop leaves out.
+    The result is empty if the guarantee can be stated. A guarantee holds for a linear loop and for
+    the aircraft within its box, so it says nothing about what the loop leaves out.
     """
     reasons = [each.sentence for each in linear.differences if each.standing is not Standing.TAKEN]
     return (*reasons, *_beyond_box(linear, promise))
 
 
 def beyond_kept(linear: LinearLoop) -> tuple[str, ...]:
-    """Return the sentence about an aircraft beyond the guarantee that was computed for its loop."""
+    """Return a sentence if the aircraft lies beyond the guarantee kept for its loop, else ()."""
     promise = _kept(linear)
     return () if promise is None else _beyond_box(linear, promise)
 
@@ -139,6 +142,6 @@ def _kept(linear: LinearLoop) -> Guarantee | None:
 
 
 def _path(loop: str) -> Path:
-    """Return the file of the guarantee of a loop, by the digest of the loop."""
+    """Return the path of the kept guarantee of a loop, given the digest of the loop."""
     caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(caches) / "rise-di" / "guarantees" / f"{loop}.{BOUND}.json"

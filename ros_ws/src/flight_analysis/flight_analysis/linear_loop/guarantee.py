@@ -38,30 +38,30 @@ CONFIRMED = 10  # number of such steps that are tried
 GAPS = (0.08, 0.16, 0.32, 0.64, 1.28, 2.56)
 FINER_GAPS = (0.04, 0.02, 0.01, 0.005)
 BOXES = 1500  # largest number of steps of a proof for the first gap
-FEWER_BOXES = 300  # the same for the other gaps, and for disks
+FEWER_BOXES = 300  # largest number of steps for the other gaps, and for disks
 # The proved deviations are larger than the stated ones by this fraction. It covers the coefficients
 # that are left out, and the width that a check by interval arithmetic loses.
 SLACK = 2e-3
-# The same if a lag deviates, as a fraction of the half widths of each region: the actuator leaves
-# out more, and a slack of the whole box moves small regions by more than their half widths.
+# The slack if a lag deviates, as a fraction of the half widths of each region. The actuator leaves
+# out more, and a slack of the whole box would move small regions by more than their half widths.
 LAG_SLACK = 5e-3
 NAMED = 12  # number of digits of the digest that name a certificate
 
 
 class Unstable(NamedTuple):
-    """An unstable aircraft."""
+    """An unstable aircraft that a search has found."""
 
-    deviation: float  # relative deviation of the entries with the largest one in the box
+    deviation: float  # relative deviation of the entry that deviates most in the box
     frequency: float  # rad/s
-    # relative deviation by entry; for one that is 0 in the file the part of its row
+    # relative deviation of each entry; an entry that is 0 in the file is given as a part of its row
     entries: dict[str, float]
 
 
 class Zeros(NamedTuple):
-    """How far the entries may go that are 0 in the file, while all others are as in the file."""
+    """How far the entries that are 0 in the file may deviate, if all others are exact."""
 
-    stable: float  # every aircraft is stable whose zeros are within this part of their rows
-    unstable: Unstable | None  # the least one found; None if none was found up to LARGEST
+    stable: float  # largest part of its row that every zero may become in a stable aircraft
+    unstable: Unstable | None  # the one that deviates least; None if none was found up to LARGEST
 
 
 class Guarantee(NamedTuple):
@@ -69,7 +69,7 @@ class Guarantee(NamedTuple):
 
     uncertainty: float  # largest relative deviation in the box
     stable: float  # every aircraft within this deviation is stable, at most 1
-    unstable: Unstable | None  # the least one found; None if none was found up to LARGEST
+    unstable: Unstable | None  # the one that deviates least; None if none was found up to LARGEST
     # balanced disk margin that every aircraft of the box has at an input, with other loops closed
     disk: dict[str, float]
     disk_all: float  # disk margin with independent disks in all inputs at once
@@ -78,16 +78,16 @@ class Guarantee(NamedTuple):
     late: float = 0.0
     has_exact_lags: bool = True  # whether no lag of an actuator is in the box
     exact: tuple[str, ...] = ()  # nonzero entries of A and B that are not part of the box
-    # part of its row that each entry becomes that is 0 in the file, while the others are within
-    # `stable`; 0 if it stays 0
+    # part of its row up to which each entry that is 0 in the file may deviate, while the others are
+    # within `stable`; 0 if such entries stay 0
     zeros: float = 0.0
-    zeros_alone: Zeros | None = None  # how far these go beside exact others; None: not computed
+    zeros_alone: Zeros | None = None  # how far zeros go if the others are exact; None: not computed
     # "entries" and "steps" of each strongly connected part of the loop, as in `proof_of`
     proof: Sequence[dict[str, Any]] = ()
 
     @property
     def holds(self) -> bool:
-        """Whether every aircraft of the box is stable."""
+        """Whether every aircraft of the box is proved stable."""
         return self.stable >= self.uncertainty
 
     @property
@@ -111,8 +111,8 @@ class Guarantee(NamedTuple):
 def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     """Compute the guarantee for the box of a loop.
 
-    Each input is late by an unknown time from 0 to `late`, s, which changes from tick to tick.
-    Raises ParameterError if the loop has no box.
+    The guarantee holds although each input is late by an unknown time from 0 to `late`, s, which
+    changes from tick to tick. Raises ParameterError if the loop has no box.
     """
     box = linear.box
     require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
@@ -159,10 +159,11 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
 
 
 def zeros_alone(linear: LinearLoop, late: float = 0.0) -> Zeros | None:
-    """Compute how far the entries may go that are 0 in the file, while the others are exact.
+    """Compute how far the entries that are 0 in the file may deviate, if the others are exact.
 
-    They are the box of the loop. Search and proof are quick: a gap of GAPS[0] is enough, because
-    these boxes have the most entries. Returns None if the box is empty, or if the loop is unstable.
+    The box of the loop has only these entries. Search and proof stop early, at a gap of GAPS[0],
+    because such a box has the most entries of all. Returns None if the box is empty, or if the loop
+    is unstable.
     """
     box = linear.box
     still = np.zeros(len(linear.inputs))
@@ -226,9 +227,9 @@ def _proved(
 ) -> tuple[float, list[dict[str, Any]]]:
     """Prove the largest size possible below `least`, and return this size and the proof.
 
-    The size is that of the deviations, or with `disks` that of the disks over the whole box. It is
-    0 if none is proved. A search has found that `least` is too large, unless `exact`, in which case
-    `least` itself is tried first.
+    The size belongs to the deviations. If `disks` is True, it belongs to the disks, and the
+    deviations cover the whole box. The size is 0 if none is proved. `least` is a size that a search
+    found too large. If `exact` is True, it may be provable, and is tried first.
     """
     for proved in (*(0.0,) * exact, *GAPS):
         most = FEWER_BOXES if disks or proved > GAPS[0] else BOXES
@@ -253,8 +254,8 @@ def _proof(
 ) -> list[dict[str, Any]] | None:
     """Prove each part for a size, or return None if `most` steps are not enough.
 
-    The proved deviations exceed the size by the fraction SLACK, or those of each region by the
-    fraction `reserve` of its half widths.
+    The proof covers deviations that exceed the size by the fraction SLACK. If `reserve` is not 0,
+    it covers instead, for each region, half widths that are larger by the fraction `reserve`.
     """
     proof = []
     whole = size if reserve else (1.0 + SLACK) * size

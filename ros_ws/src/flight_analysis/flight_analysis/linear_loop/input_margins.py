@@ -92,8 +92,8 @@ class Margins(NamedTuple):
     def worst(self) -> "Margins":
         """Return the worst value of each margin among N aircraft.
 
-        The margins have the shapes (N, m) and (N,) before, and (m,) and () after. `crossover` is
-        that of the aircraft with the smallest phase margin.
+        The margins of N aircraft have the shapes (N, m) and (N,), and the worst ones (m,) and ().
+        `crossover` is that of the aircraft with the smallest phase margin.
         """
         least = {name: np.asarray(value.min(axis=0)) for name, value in self._asdict().items()}
         most = {
@@ -120,7 +120,7 @@ def disk_phase(disk: FloatArray) -> FloatArray:
 
 
 class SlowModes(NamedTuple):
-    """Oscillating modes of a closed loop with at least four ticks a cycle, the slowest first."""
+    """Oscillating modes of a closed loop that take at least four ticks a cycle, slowest first."""
 
     frequency: FloatArray  # (k,) natural, rad/s
     damping: FloatArray  # (k,) ratio
@@ -262,7 +262,8 @@ def _modal_form(
 ) -> tuple[SchurForm, NDArray[np.bool_]]:
     """Return a form with a diagonal T, and whether the modes of each loop are independent.
 
-    They count as independent if the condition of their eigenvectors is at most MOST_CONDITION.
+    The modes count as independent if the condition number of their eigenvectors is at most
+    MOST_CONDITION.
     """
     A, B, K = _from_inputs_to_inputs(plant, law, loop)
     eigenvalues, modes = (part.astype(np.complex128) for part in np.linalg.eig(A))
@@ -293,9 +294,10 @@ def _from_inputs_to_inputs(
 
 
 def _sensitivity(form: SchurForm, z: ComplexArray) -> ComplexArray:
-    """Compute S at the points z (N, F), shape (N, F, m, m), by back substitution.
+    """Compute S at the points z by back substitution.
 
-    Points are solved many at a time. If T is diagonal, S is a sum over the modes.
+    z has the shape (N, F), and S has (N, F, m, m). Points are solved many at a time. If T is
+    diagonal, S is a sum over the modes.
     """
     (N, k, m), F = form.R.shape, z.shape[1]
     if form.T.ndim == z.ndim:
@@ -523,9 +525,9 @@ def _narrow(decrease: FloatArray, increase: FloatArray, place: tuple[int, int], 
 
 
 def _balanced(matrices: ComplexArray) -> ComplexArray:
-    """Return D M D^-1, (..., m, m), with D such that row i and column i have similar norms.
+    """Return D M D^-1 with a diagonal D that makes the norms of row i and column i similar.
 
-    The method is Osborne's iteration.
+    The matrices have the shape (..., m, m). The method is Osborne's iteration.
     """
     M = matrices.copy()
     off_diagonal = ~np.eye(matrices.shape[-1], dtype=bool)
@@ -543,18 +545,18 @@ def _balanced(matrices: ComplexArray) -> ComplexArray:
 
 
 def norm_bound(matrices: ComplexArray) -> FloatArray:
-    """Compute sqrt(norm(M, 1) norm(M, inf)) >= norm(M, 2), over the last two axes."""
+    """Compute the bound sqrt(norm(M, 1) norm(M, inf)) of norm(M, 2), over the last two axes."""
     sizes = np.abs(matrices)
     return np.asarray(np.sqrt(sizes.sum(axis=-1).max(axis=-1) * sizes.sum(axis=-2).max(axis=-1)))
 
 
 def scaled_norm(matrices: ComplexArray) -> FloatArray:
-    """Compute min_D norm(D M D^-1, 2) over diagonal D > 0, for P matrices M (m, m). Shape (P,).
+    """Compute min_D norm(D M D^-1, 2) over diagonal D > 0, for each of P matrices M.
 
-    The result bounds the structured singular value. Osborne's iteration comes first, then a descent
-    along d log norm / d log D_i = abs(u_i)^2 - abs(v_i)^2 with the singular vectors u and v. Any D
-    gives an upper bound, so ending early is conservative. Source: A. Packard, J. Doyle, Automatica
-    29(1), 1993.
+    `matrices` has the shape (P, m, m), and the result (P,). The result bounds the structured
+    singular value. Osborne's iteration comes first, then a descent along d log norm / d log D_i =
+    abs(u_i)^2 - abs(v_i)^2 with the singular vectors u and v. Any D gives an upper bound, so ending
+    early is conservative. Source: A. Packard, J. Doyle, Automatica 29(1), 1993.
     """
     M = _balanced(matrices)
     best = np.full(len(M), np.inf)
@@ -569,12 +571,12 @@ def scaled_norm(matrices: ComplexArray) -> FloatArray:
 def _largest_norm(balanced: ComplexArray) -> FloatArray:
     """Return the largest `scaled_norm` over the second axis of (N, F, m, m), shape (N,).
 
-    Every matrix has an upper bound. Only the largest bound of each aircraft is refined to the
-    scaled norm, and this is repeated until the largest one is refined already.
+    `norm_bound` first bounds the norm of every matrix. The largest bound of each aircraft is then
+    refined to the scaled norm, until the largest value of every aircraft is a refined one.
     """
     bounds = norm_bound(balanced)
     rows = np.arange(len(balanced))
-    # D does not change a diagonal entry, so the largest one is a lower bound.
+    # D does not change the diagonal entries, so the largest diagonal entry is a lower bound.
     least = np.abs(np.einsum("NFii->NFi", balanced)).max(axis=(1, 2))
     near = bounds > least[:, None]
     bounds[near] = np.linalg.norm(balanced[near], ord=2, axis=(1, 2))

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of the linear loop of a scenario under the law of the controller.
-
-They are computed for the nominal and for uncertain aircraft.
-"""
+"""Compute the margins of a scenario's linear loop, for the nominal and for uncertain aircraft."""
 
 import hashlib
 import json
@@ -96,7 +93,7 @@ class LinearLoop(NamedTuple):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the loop and its box: of their names, and of their numbers to DIGITS digits.
+        """SHA-256 of the names in the loop and its box, and of their numbers to DIGITS digits.
 
         The box is scaled to the size 1 first, because its size is a result of a guarantee.
         """
@@ -121,7 +118,7 @@ class LoopMargins(NamedTuple):
     modes: SlowModes  # slow modes of the nominal aircraft
     delay: float  # delay margin of the nominal aircraft if u is late in all inputs, s
     channel_delay: tuple[float, ...]  # delay margin if u is late in this input only, s
-    # least margins of the uncertain aircraft, figure by figure; None if there are none
+    # least value of each margin among the uncertain aircraft; None if there are none
     worst: Margins | None = None
     worst_delay: float | None = None  # least delay margin of the uncertain aircraft, s
     aircraft: int = 0  # number of uncertain aircraft that were drawn
@@ -138,14 +135,15 @@ def margins(
 ) -> LoopMargins:
     """Compute the margins of a scenario's loop, and the least margins among uncertain aircraft.
 
-    A search finds the least margins. Every entry of A and B of an uncertain aircraft is off by up
-    to `uncertainty`, or as `spread` says, except in the rows of angles. Drawn samples only serve to
-    count the stable aircraft, because the least margins lie at corners, where no sample falls. Lags
-    and delay are those of the aircraft, even if the controller was told others. A lag is exact
-    unless `spread` has an entry 1/lag[INPUT]. The uncertainty of the scenario itself is left out.
+    A search finds the least margins. In an uncertain aircraft, every entry of A and B deviates by
+    up to `uncertainty`, or by the deviation that `spread` has for this entry. The rows of angles
+    are exact. Drawn samples only serve to count the stable aircraft, because the least margins lie
+    at corners of the box, where no sample falls. Lags and delay are those of the aircraft that
+    flies, even if the controller was told others. A lag deviates only if `spread` has an entry
+    1/lag[INPUT]. The uncertainty in the scenario itself is ignored.
 
     Args:
-        scenario: The flight: aircraft and controller.
+        scenario: Scenario with the aircraft and the controller.
         aircraft: Number of uncertain aircraft that are drawn. 0 is the nominal aircraft alone.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
         seed: Seed of the uncertain aircraft.
@@ -155,8 +153,8 @@ def margins(
         Margins of the nominal aircraft, and the least margins that were found. Delays are in s.
 
     Raises:
-        ParameterError: The law has the literal sign, the controller of an aircraft of JSBSim has no
-            model, or an entry is unknown.
+        ParameterError: The law has the literal sign, the aircraft is one of JSBSim and its
+            controller has no model of it, or `spread` has an unknown entry.
 
     Examples:
         >>> rise_di.margins(rise_di.find_scenario("osprey_servo")).delay > 0.03
@@ -172,7 +170,7 @@ def margins(
 
 
 def loop_margins(linear: LinearLoop) -> LoopMargins:
-    """Compute the margins of the nominal aircraft, and the worst of the uncertain ones."""
+    """Compute the margins of the nominal aircraft, and the worst margins of the uncertain ones."""
     if linear.box is not None and len(linear.plant.A) > 1:
         return _assessed_by_search(linear, linear.box)
     together = input_margins(linear.plant, linear.law, linear.loop)
@@ -203,7 +201,7 @@ def loop_margins(linear: LinearLoop) -> LoopMargins:
 
 
 def _assessed_by_search(linear: LinearLoop, box: Box) -> LoopMargins:
-    """Search the box for the worst margins, and use the samples only to count the stable ones."""
+    """Search the box for the worst margins, and use the samples only to count stable aircraft."""
     nominal = loop_margins(linear._replace(plant=_some(linear.plant, slice(1)), box=None))
     samples = closed_loop(
         _some(linear.plant, slice(1, None)), linear.law, linear.loop, np.zeros(len(linear.inputs))
@@ -259,8 +257,8 @@ def scenario_loop(
 ) -> LinearLoop:
     """Build the loop of a controller around the nominal and uncertain aircraft of a scenario.
 
-    Lags and delay are those of the aircraft that flies, as the scenario or the `flight` tells them.
-    Raises ParameterError as `margins` does.
+    Lags and delay are those of the aircraft that flies. They come from the scenario or from
+    `flight`. Raises ParameterError as `margins` does.
     """
     airframe = scenario_model(scenario, controller)
     comparison = compare(scenario, controller, flight)
@@ -276,15 +274,15 @@ def scenario_loop(
 
 
 def as_compared(linear: LinearLoop, scenario: Scenario, comparison: Comparison) -> LinearLoop:
-    """Return the loop with the differences of a comparison and the deviation of the aircraft."""
+    """Add to a loop the differences that a comparison found, and the deviation of the aircraft."""
     return _with_deviation(linear._replace(differences=comparison.differences), scenario)
 
 
 def _with_deviation(linear: LinearLoop, scenario: Scenario) -> LinearLoop:
     """Return the loop with the deviation of the aircraft that the scenario draws.
 
-    The deviation is 0 if the airframe is as in its file. It is infinite if the scenario moves an
-    entry that is exact in the box.
+    The deviation is 0 if the airframe flies as in its file. It is infinite if the scenario changes
+    an entry that is exact in the box.
     """
     if linear.box is None or scenario.aircraft.is_jsbsim:
         return linear
@@ -343,7 +341,7 @@ def with_box(
     seed: int,
     spread: Spread,
 ) -> LinearLoop:
-    """Return the loop with the box around its aircraft, which are the nominal and the drawn ones.
+    """Return the loop with the box that contains its nominal and its drawn aircraft.
 
     The box is None if nothing deviates. If a lag deviates, its actuator becomes a state of the
     plant, and the lag becomes 0 in the timing of the loop:
@@ -364,9 +362,9 @@ def of_matrices_and_lags(
 ) -> tuple[Spread, dict[int, float]]:
     """Separate the entries of A and B in `spread` from the entries of lags.
 
-    The entry of a lag is named 1/lag[INPUT]. It becomes a relative deviation of 1 / lag, by the
-    index of the input of the law. Raises ParameterError for an unknown entry, a lag below LEAST_LAG
-    periods, and a deviation outside [0, 1).
+    The entry of a lag is named 1/lag[INPUT]. It is returned as a relative deviation of 1 / lag, in
+    a dict by the index of the law's input. Raises ParameterError for an unknown entry, a lag below
+    LEAST_LAG periods, and a deviation outside [0, 1).
     """
     least = LEAST_LAG * timing.period
     known = {
@@ -481,7 +479,7 @@ def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airf
 
 
 def distribution(airframe: Airframe, controller: ControllerConfig) -> FloatArray:
-    """Return T (p, m) with its rows in the order of the inputs of an airframe.
+    """Return the allocation matrix T, (p, m), with a row for each input of an airframe, in order.
 
     T is the identity if no allocation drives these inputs.
     """
@@ -545,8 +543,9 @@ def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[in
 def scenario_model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
     """Return the airframe of a scenario, or y_dot = Omega u for an aircraft of JSBSim.
 
-    This model has the inputs of the law. Its Omega comes from the controller: it is that of the
-    feedforward, or abs(Omega_ii) = omega / input_scale of RISE-DI, which is an upper bound.
+    The model y_dot = Omega u has the inputs of the law. Its Omega comes from the feedforward of the
+    controller. Without a feedforward, it is abs(Omega_ii) = omega / input_scale of RISE-DI, which
+    is an upper bound.
     """
     aircraft = scenario.aircraft
     if not aircraft.is_jsbsim:

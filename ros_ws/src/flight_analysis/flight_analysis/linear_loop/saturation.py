@@ -1,19 +1,20 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Proof for every aircraft of a box, whatever the limits of one input.
+"""Prove that every aircraft of a box settles, whatever the limits of one input.
 
-The input acts as a = phi(u), and w = u - a is cut off. phi is a curve that rises by 0 to 1 times
-the rise of u. For any taps h_j >= 0 at ticks j, before and after, whose sum is at most 1,
+The aircraft gets a = phi(u) instead of u, so that w = u - a is cut off. phi can be any curve whose
+slope lies between 0 and 1. Take any taps h_j >= 0 at earlier and later ticks j, whose sum is at
+most 1. Then
 
     sum over ticks of w_k (a_k - sum_j h_j a_k-j) >= 0
 
 (Zames-Falb). The loop has the sensitivity S at this input, and m = 1 - sum_j h_j z^-j. If Re(m S) >
-0 at each frequency, every aircraft settles; if this holds from a lowest frequency on, none
-oscillates faster. docs/theory.md has both theorems.
+0 at each frequency, every aircraft settles. If this holds only above a lowest frequency, no
+aircraft oscillates faster than that. docs/theory.md has both theorems.
 
-A linear program finds the taps for some aircraft. The box is then covered by D and G of its
-entries, as without a limit. The inequality is tried at samples between the frequencies of a step:
-what proves it is the check of the certificate.
+A linear program finds the taps for some aircraft. The box is then covered by regions with scalings
+D and G of the entries, as in a proof without a limit. Within the frequencies of a step, the
+inequality is only tried at samples. The check of the certificate proves it for all frequencies.
 """
 
 from collections.abc import Iterator
@@ -44,7 +45,7 @@ from flight_core.vectors import FloatArray
 SETTLING = 1.0 - 1e-5
 # Lowest frequency of a proof that nothing oscillates, rad/s
 SLOWEST = 0.05
-TRIED = (1.0, 0.8, 0.65, 0.5, 0.4, 0.3, 0.2)  # parts of the box that are tried, from the whole
+TRIED = (1.0, 0.8, 0.65, 0.5, 0.4, 0.3, 0.2)  # parts of the box that are tried, the whole box first
 
 LAGS = np.unique(np.geomspace(1.0, 100.0, 30).round().astype(int))  # ticks
 AIRCRAFT = 12  # random corners of the box in the linear program, and at which climbs start
@@ -52,10 +53,10 @@ SEED = 2
 ROUNDS = 8  # linear programs at most
 CLIMBERS = 3  # corners at which climbs start in each round
 LONGEST_CLIMB = 12  # entries that a climb turns at most
-ENOUGH = 0.5  # part of the room of the program that suffices for the worst corner
-LOWEST = 1e-6  # frequency of the program, as a part of pi / T
+ENOUGH = 0.5  # part of the program's room that suffices for the worst corner to end the search
+LOWEST = 1e-6  # lowest frequency of the program, as a part of pi / T
 LEAST_ROOM = 1e-3  # least Re(m S) / abs(S), as a part of `_expected`, that is worth a proof
-KNEE = 3.0  # frequency below which less is expected, rad/s
+KNEE = 3.0  # frequency below which less room is expected, rad/s
 LEAST_TAP = 1e-9
 WHOLE = 1.0 - 1e-8  # sum of the taps, so that rounding does not bring it above 1
 
@@ -68,24 +69,24 @@ BATCH = 200  # samples on each side of a frequency, at most
 
 
 class LimitGuarantee(NamedTuple):
-    """What holds for every aircraft of a box, whatever the limits of one input."""
+    """A guarantee for every aircraft of a box, whatever the limits of one input."""
 
     input: str
     uncertainty: float  # largest relative deviation in the box
-    size: float  # largest relative deviation for which it is found
+    size: float  # largest relative deviation for which the guarantee was found
     multiplier: "Multiplier"
     # "entries" and "steps" of each strongly connected part, as in `limit_proof`
     proof: list[dict[str, Any]]
-    zeros: float = 0.0  # part of its row that an entry becomes that is 0 in the file
+    zeros: float = 0.0  # part of its row up to which an entry that is 0 in the file deviates
 
     @property
     def settles(self) -> bool:
-        """Whether every motion settles; otherwise no motion is periodic."""
+        """Whether every motion settles. Otherwise the guarantee only excludes oscillations."""
         return not self.multiplier.slowest
 
     @property
     def holds(self) -> bool:
-        """Whether it is found for the whole box."""
+        """Whether the guarantee was found for the whole box."""
         return self.size >= self.uncertainty
 
     def as_json(self) -> dict[str, Any]:
@@ -102,7 +103,7 @@ class LimitGuarantee(NamedTuple):
 
 
 class Multiplier(NamedTuple):
-    """The taps h >= 0 at the ticks `lags`, of which none is 0."""
+    """The multiplier m = 1 - sum_j h_j z^-j of a proof, with taps h_j >= 0 at nonzero lags j."""
 
     slowest: float  # lowest frequency of the proof, rad/s
     lags: IntArray
@@ -110,11 +111,11 @@ class Multiplier(NamedTuple):
 
     @property
     def radius(self) -> float:
-        """abs(z) of the proof."""
+        """Radius abs(z) at which the inequality of the proof is checked."""
         return 1.0 if self.slowest else SETTLING
 
     def at(self, turn: FloatArray) -> ComplexArray:
-        """Compute m at the angles `turn` = w T, rad."""
+        """Compute m at the angles `turn` = w T of z, rad."""
         turned = np.exp(-1j * np.multiply.outer(turn, self.lags))
         return np.asarray(1.0 - turned @ self.taps.astype(complex))
 
@@ -122,7 +123,8 @@ class Multiplier(NamedTuple):
 def guarantee_with_limit(linear: LinearLoop, name: str) -> LimitGuarantee | None:
     """Find the largest part of the box in which every aircraft settles, or none oscillates.
 
-    Returns None if there is none. Raises ParameterError if the loop has no such input, or no box.
+    `name` is the input with the limits. Returns None if there is no such part. Raises
+    ParameterError if the loop has no such input, or no box.
     """
     for part in TRIED:
         for slowest in (0.0, SLOWEST):
@@ -135,7 +137,11 @@ def guarantee_with_limit(linear: LinearLoop, name: str) -> LimitGuarantee | None
 def limit_guarantee(
     linear: LinearLoop, name: str, part: float, slowest: float
 ) -> LimitGuarantee | None:
-    """Try a part of the box of a loop, from a lowest frequency on, as `guarantee_with_limit`."""
+    """Prove a part of the box from the lowest frequency `slowest`, rad/s, or return None.
+
+    If `slowest` is 0, the proof shows that every aircraft settles. Raises ParameterError as
+    `guarantee_with_limit` does.
+    """
     require(name in linear.inputs, "limit", name, f"an input: {', '.join(linear.inputs)}")
     box = linear.box
     require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
@@ -159,7 +165,7 @@ def limit_guarantee(
 def _proof(
     parts: list[Channels], multiplier: Multiplier, size: float
 ) -> list[dict[str, Any]] | None:
-    """Prove each part for a size, of which the first one has the limit, or return None."""
+    """Prove each part of the loop for a size, or return None. Only the first part has the limit."""
     proof = []
     for number, part in enumerate(parts):
         steps = limit_proof(part, multiplier, size, has_limit=number == 0)
@@ -170,7 +176,10 @@ def _proof(
 
 
 def _with_limit(part: Channels) -> Channels:
-    """Return a part with a disk in one input as one from (w of the entries, w) to (z, a)."""
+    """Turn a part with a disk in one input into a part with a limit of that input.
+
+    The result leads from the w of the entries and the cut-off w to the z of the entries and a.
+    """
     W, D = part.W.copy(), part.D.copy()
     D[-1, -1] += 0.5
     W[:, -1] *= -1.0
@@ -179,7 +188,10 @@ def _with_limit(part: Channels) -> Channels:
 
 
 def sensitivity(part: Channels, w: FloatArray, radius: float) -> ComplexArray:
-    """Compute S at the input, at the frequencies w, rad/s, for the aircraft in the middle."""
+    """Compute S at the input with the limit, for the aircraft in the middle.
+
+    w has the frequencies, rad/s, and `radius` is abs(z).
+    """
     last = np.array([len(part.D) - 1])
     return np.asarray(-part.some(last).response(w, radius)[:, 0, 0])
 
@@ -187,9 +199,10 @@ def sensitivity(part: Channels, w: FloatArray, radius: float) -> ComplexArray:
 def multiplier_for(part: Channels, size: float, slowest: float) -> Multiplier | None:
     """Find taps that serve the middle of a box and its worst corners.
 
-    A linear program finds the taps that leave the most room to some aircraft. A search then adds
-    the corners to which these taps leave least, until that is nearly as much.
-    Returns None if no taps serve all of them.
+    The room of an aircraft is its least Re(m S) / abs(S) over the frequencies. A linear program
+    finds the taps that leave the most room to some aircraft. A search then adds the corners with
+    the least room, until these have at least ENOUGH of the room in the program. Returns None if no
+    taps serve all of them.
     """
     k = len(part.entries)
     generator = np.random.default_rng(SEED)
@@ -211,15 +224,19 @@ def multiplier_for(part: Channels, size: float, slowest: float) -> Multiplier | 
 
 
 def _expected(slowest: float, w: FloatArray) -> FloatArray:
-    """Return the size of Re(m S) / abs(S) that counts as the same room at the frequencies w.
+    """Return the Re(m S) / abs(S) that counts as a room of 1 at the frequencies w, rad/s.
 
-    Towards 0 rad/s an integrator in the loop takes room from S, and m must follow it.
+    Towards 0 rad/s an integrator in the loop takes room from S, so that less room is expected of m
+    there.
     """
     return np.minimum(w / KNEE, 1.0) ** 2 if slowest else np.ones(len(w))
 
 
 def _rooms(part: Channels, multiplier: Multiplier, d: FloatArray, w: FloatArray) -> FloatArray:
-    """Return the least room of aircraft d (N, k) over the frequencies w, (N,)."""
+    """Return the least room of N aircraft over the frequencies w, rad/s, shape (N,).
+
+    d has the k deviations of each aircraft, (N, k).
+    """
     S = np.array([sensitivity(part.at(each), w, multiplier.radius) for each in d])
     phases = (multiplier.at(w * part.period) * S).real / np.abs(S)
     return np.asarray((phases / _expected(multiplier.slowest, w)).min(axis=1))
@@ -228,7 +245,7 @@ def _rooms(part: Channels, multiplier: Multiplier, d: FloatArray, w: FloatArray)
 def _worst_corners(
     part: Channels, multiplier: Multiplier, starts: FloatArray, w: FloatArray
 ) -> FloatArray:
-    """Climb from some corners of a box, (N, k), to those with the least room."""
+    """Climb from N corners of a box, (N, k), to corners with the least room."""
     flips = 1.0 - 2.0 * np.eye(len(part.entries))
     found = []
     for start in starts[np.argsort(_rooms(part, multiplier, starts, w))[:CLIMBERS]]:
@@ -245,7 +262,10 @@ def _worst_corners(
 def _program(
     part: Channels, aircraft: FloatArray, slowest: float
 ) -> tuple[Multiplier | None, float]:
-    """Find the taps that leave the most room to some aircraft (N, k), and how much."""
+    """Find the taps that leave the most room to N aircraft, and return them and this room.
+
+    `aircraft` has the deviations of each aircraft, (N, k).
+    """
     from scipy.optimize import linprog  # noqa: PLC0415 - a flight starts without it
 
     none = Multiplier(slowest, LAGS, np.zeros(len(LAGS)))
@@ -279,10 +299,11 @@ def _program(
 
 
 def inequality(M: ComplexArray, m: ComplexArray | None, step: dict[str, Any]) -> ComplexArray:
-    """Compute diag(1, ..., 1, 0) - N_d* N_d - Y N - N* Y* for M (F, q, q) and m (F,) of a step.
+    """Compute the matrices of a step that must be positive definite, at F frequencies.
 
-    N = diag(e^t, 1) M diag(e^-t, e^-s), N_d has the rows of t, and Y = diag(j g, e^-s m). Without m
-    the part has no limit, and no last row.
+    They are diag(1, ..., 1, 0) - N_d* N_d - Y N - N* Y*, with M (F, q, q) and m (F,). N = diag(e^t,
+    1) M diag(e^-t, e^-s), N_d has the rows of t, and Y = diag(j g, e^-s m). If m is None, the part
+    has no limit, and the matrices lack the last row and column.
     """
     t, g = np.array(step["t"]), np.array(step["g"])
     one = M.shape[-1] - len(t)
@@ -301,10 +322,10 @@ def inequality(M: ComplexArray, m: ComplexArray | None, step: dict[str, Any]) ->
 def limit_proof(
     part: Channels, multiplier: Multiplier, size: float, *, has_limit: bool
 ) -> list[dict[str, Any]] | None:
-    """Find the steps that prove a part for abs(d_i) <= size, or return None.
+    """Find the steps that prove a part of the loop for abs(d_i) <= size, or return None.
 
     The steps are those of `proof_of`, at the radius of the multiplier and from its lowest frequency
-    on. In the part with the limit they have a further scaling "s".
+    on. In the part with the limit, each step has a further scaling "s".
     """
     k, highest = len(part.entries), np.pi / part.period
     whole = Region(np.zeros(k), np.full(k, size), multiplier.slowest, highest)
@@ -319,7 +340,7 @@ def limit_proof(
         channel, factor = M, 1.0
         if has_limit:
             m = complex(multiplier.at(np.array(w * part.period)))
-            # any positive factor of m proves the same: this one brings m S to the size 1
+            # any positive factor of m proves the same, and this one brings m S to the size 1
             factor = 1.0 / abs(m * M[-1, -1])
             channel = _as_complex_channel(M, factor * m)
         bound, scaling = tightened_at(around, w, channel, region.scaling)
@@ -341,7 +362,10 @@ def limit_proof(
 
 
 def _as_complex_channel(M: ComplexArray, m: complex) -> ComplexArray:
-    """Return M with m a + w for a and m a - w for w: the limit is a complex channel of size 1."""
+    """Return M with m a + w in place of a, and m a - w in place of w.
+
+    In these signals the limit is a complex channel of size 1.
+    """
     A, B, C, s = M[:-1, :-1], M[:-1, -1:], m * M[-1:, :-1], m * M[-1, -1]
     by_z, by_w = -C / (s - 1.0), 1.0 / (s - 1.0)
     above = np.hstack([A + B @ by_z, B * by_w])
@@ -357,7 +381,7 @@ def _plain_step(scaling: Scaling) -> dict[str, Any]:
 
 
 def _step(scaling: Scaling, mS: complex, factor: float) -> dict[str, Any]:
-    """Return t, g and s of a step. s brings Re(m S) of the middle of the box to 1."""
+    """Return t, g and s of a step, with the s that brings Re(m S) in the middle of the box to 1."""
     t = scaling.t[:-1] - scaling.t[-1] - np.log(2.0 * factor) / 2.0
     s = np.log(2.0 * max(mS.real, 1e-300)) / 2.0
     return {"t": _rounded(t), "g": _rounded(scaling.g[:-1]), "s": _rounded(np.array([s]))[0]}
@@ -366,7 +390,10 @@ def _step(scaling: Scaling, mS: complex, factor: float) -> dict[str, Any]:
 def _interval(
     around: Channels, multiplier: Multiplier, step: dict[str, Any], region: Region, w: float
 ) -> tuple[float, float] | None:
-    """Find the interval around w at whose samples the inequality of a step holds with MARGIN."""
+    """Find the interval around w, rad/s, at whose samples a step's inequality holds with MARGIN.
+
+    Returns None if it fails at w itself, or at all neighbours.
+    """
     has_limit = "s" in step
     farthest = (
         TURN / (around.period * float(np.abs(multiplier.lags).max())) if has_limit else np.inf

@@ -54,9 +54,9 @@ class Scaling(NamedTuple):
 
 
 def balanced(M: ComplexArray) -> FloatArray:
-    """Find t = log(X) / 2, (p,), that makes row and column of each channel about equally large.
+    """Find the t = log(X) / 2 that makes row and column of each channel about equally large.
 
-    The method is Osborne's iteration.
+    t has the shape (p,). The method is Osborne's iteration.
     """
     t = np.zeros(len(M))
     sizes = np.abs(M) ** 2
@@ -83,7 +83,7 @@ def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
 def tightened(
     M: ComplexArray, real: int, target: float, alike: int = 0, near: Scaling | None = None
 ) -> tuple[float, Scaling]:
-    """Search for the X and G with the least bound of M, (p, p), and return the bound and both.
+    """Search for the X and G with the least bound of M, (p, p), and return the bound, X and G.
 
     The first `real` channels are real, and the next `alike` channels share one factor of X. The
     search begins at the balanced X, or at `near` if its bound is smaller. `near` has the X and G of
@@ -131,7 +131,8 @@ def tightened_at(
     """Bound a scaled M(w) of a part of the loop, as `tightened` does for the target 1.
 
     At first X and G are found for the means over a period alone, and the X of the second
-    coefficients balances rows and columns. If this bound is below 1, or w is low, it is returned.
+    coefficients only balances rows and columns. If the resulting bound is below 1, or w is low, it
+    is returned. Otherwise X and G are found for all channels.
     """
     k = len(part.entries)
     rows = np.r_[0:k, part.uncertain : len(scaled)]
@@ -159,7 +160,7 @@ class Centre(NamedTuple):
     free: FloatArray  # (p, f) map from f free factors to d: channels with one factor share a column
 
     def inequality(self, N: ComplexArray, level: float) -> ComplexArray:
-        """Compute F, (p, p)."""
+        """Compute the matrix F of the inequality, (p, p)."""
         skew = 1j * np.r_[self.g, np.zeros(len(N) - len(self.g))][:, None] * N
         right = (N.conj().T * self.d) @ N + skew + skew.conj().T
         return np.asarray(level * np.diag(self.d) - right)

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the controller was told of its aircraft, compared with the aircraft that flies.
+"""Compare what the controller was told of its aircraft with the aircraft that flies.
 
 The section `controller` of a scenario has the lags and the delay that the controller was told. The
-section `aircraft` has the true ones, and a log the measured ones. `compare` says where they differ,
-and gives the timing of the loop that flies. Margins and guarantees refer to this timing. If
-something acts that no linear loop contains, such as a fault, no guarantee is stated.
+section `aircraft` has the true ones, and a log the measured ones. `compare` finds the differences,
+and the timing of the loop that flies. Margins and guarantees refer to this timing. If something
+acts that no linear loop contains, such as a fault, no guarantee is stated.
 """
 
 from dataclasses import replace
@@ -101,7 +101,7 @@ class Difference(NamedTuple):
 
 
 class FlightFacts(NamedTuple):
-    """Facts about a flight that its scenario does not tell. None if the log does not, either."""
+    """Facts about a flight that only its log contains. A fact is None if the log lacks it."""
 
     is_simulated: bool = True  # whether the aircraft of the scenario flew
     tick: float | None = None  # s, median period of the ticks
@@ -211,8 +211,8 @@ def _compare_delays(
     In simulation, y waits for the next tick and u for the next step of the aircraft, each up to a
     period of the aircraft. The controller can be told any delay in this range. If it is told
     another one, the longest delay of the range is assumed. If you fly an aircraft of your own, its
-    transport delay is unknown. The law steps with each y. If y comes less often than the ticks, it
-    is late by one and a half of its own periods instead of one and a half ticks.
+    transport delay is unknown. The law steps with each y. If y comes less often than the ticks, the
+    delay of one and a half ticks becomes one and a half periods of y.
     """
     aircraft = scenario.aircraft
     told_delay = controller.delay
@@ -285,7 +285,7 @@ def _beyond_loop(scenario: Scenario, controller: ControllerConfig) -> list[Diffe
 
 
 def _other_effect(scenario: Scenario) -> list[str]:
-    """Return a sentence for each output for which allocation.effect and C B have different rows.
+    """Return a sentence for each output whose row in allocation.effect differs from that in C B.
 
     Rows are compared up to a positive factor, because input_scale contains this factor.
     """

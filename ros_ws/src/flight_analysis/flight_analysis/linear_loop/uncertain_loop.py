@@ -55,7 +55,7 @@ class Box(NamedTuple):
     """
 
     names: tuple[str, ...]
-    # (k,) relative deviation of the entry at d_i = 1; of an entry that is 0, the part of its row
+    # relative deviation of each entry at d_i = 1, (k,); a part of its row if it is 0 in the file
     part: FloatArray
     E: FloatArray  # (n, k)
     F: FloatArray  # (k, n)
@@ -72,7 +72,7 @@ class Box(NamedTuple):
 
     @property
     def largest_zero(self) -> float:
-        """Largest part of its row that an entry becomes that is 0 in the file."""
+        """Largest deviation of the entries that are 0 in the file, as a part of their rows."""
         return float(np.max(self.part[np.isin(self.names, self.zeros)], initial=0.0))
 
 
@@ -112,18 +112,18 @@ class Channels(NamedTuple):
 
     @property
     def disks(self) -> slice:
-        """Channels of disks."""
+        """Places of the channels that belong to disks."""
         return slice(self.uncertain + self.late, None)
 
     def some(self, channels: IntArray) -> "Channels":
-        """Select some channels of the same loop."""
+        """Return the same loop with only some of its channels."""
         D = self.D[np.ix_(channels, channels)]
         return self._replace(W=self.W[:, channels], Z=self.Z[channels], D=D)
 
     def response(self, w: FloatArray | float, radius: float) -> ComplexArray:
-        """Compute M(z), (F, p, p) or (p, p), at abs(z) = radius and frequencies w, (F,) or ().
+        """Compute M(z) at abs(z) = radius and at the frequencies w, rad/s.
 
-        w is in rad/s.
+        w has the shape (F,) or (), and M has (F, p, p) or (p, p).
         """
         z = radius * np.exp(1j * np.asarray(w) * self.period)
         motion = z[..., None, None] * np.eye(len(self.A)) - self.A
@@ -230,8 +230,8 @@ def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int
     """Add the channels of a delay to a loop with n states of the aircraft and k entries.
 
     The nominal delay of the loop becomes the middle of the range of each coefficient. `ramps` is
-    the motion that w_1 causes. To the states of the loop are appended the c states that the w_1 of
-    earlier ticks need, and then u of earlier ticks.
+    the motion that w_1 causes. The states of the loop are followed by the c states that the w_1 of
+    earlier ticks need, and then by u of earlier ticks.
     """
     E, U, K = exact.W[:, : exact.uncertain], exact.W[:, exact.disks], exact.Z[exact.disks]
     m, q = K.shape
@@ -284,10 +284,10 @@ def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int
 def sensitivity_slopes(
     loop: Channels, d: FloatArray, w: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Compute S, (F, m, m), and its slopes along d, (F, k, m, m), at the frequencies w, (F,).
+    """Compute S and its slopes along d at the frequencies w, rad/s.
 
-    S is that of the aircraft with the deviations d, (k,), and w is in rad/s. The loop must have
-    disks in all inputs, and no late u.
+    They are those of the aircraft with the deviations d, (k,). w has the shape (F,), S has (F, m,
+    m), and the slopes have (F, k, m, m). The loop must have disks in all inputs, and no late u.
     """
     around = loop.at(d)
     p, k = loop.uncertain, len(d)
@@ -305,9 +305,9 @@ def sensitivity_slopes(
 def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
     """Split the loop into its strongly connected parts, and reduce each part.
 
-    If `inputs` are given, the loop has disks in these, and only parts with a disk are returned. To
-    bound the parts is enough, because the structured singular value of a block triangular matrix is
-    the largest one of its blocks.
+    If `inputs` are given, the loop keeps the disks in these inputs, and only parts with a disk are
+    returned. To bound the parts is enough, because the structured singular value of a block
+    triangular matrix is the largest one of its blocks.
     """
     from scipy.sparse import csr_array  # noqa: PLC0415 - a flight starts without it
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
@@ -342,7 +342,7 @@ def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
 def _reduced(every: Channels, channels: IntArray) -> Channels:
     """Keep some channels, and the states that are both moved by their w and seen in their z.
 
-    The other states are left out. They are constants, integrals, and states of other parts.
+    The other states, which are constants, integrals and states of other parts, are left out.
     """
     part = every.some(channels)
     coupled = np.abs(part.A) > NO_COUPLING

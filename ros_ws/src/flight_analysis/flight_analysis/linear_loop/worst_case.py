@@ -41,7 +41,7 @@ from rise_di_controller.law.linear_loop import (
 
 SEED = 1  # seed of the random corners at which a search starts
 STARTS = 24  # number of these corners
-FEW_STARTS = 8  # the same for a quick search
+FEW_STARTS = 8  # number of random corners for a quick search
 ROUNDS = 12  # largest number of moves to other corners
 POLISHED = 4  # number of corners from which each flip of an entry is tried
 CLIMBERS = 24  # number of further corners at which climbs start
@@ -49,7 +49,7 @@ LONGEST_CLIMB = 40  # largest number of flips in a climb
 FALL = 0.005  # the next size to try is smaller than the least one found by this fraction
 RESOLUTION = 1e-4  # resolution of the size of an unstable deviation
 NEAR = 2.5  # a mode counts as near a frequency if the two differ by at most this factor
-SLOWEST = 0.05  # a mode below this frequency counts as one at 0 rad/s, rad/s
+SLOWEST = 0.05  # frequency, rad/s, below which a mode counts as one at 0 rad/s
 REAL = 1e-9  # fraction of an eigenvalue up to which its imaginary part counts as rounding
 
 
@@ -59,8 +59,8 @@ def first_unstable(
     """Find unstable aircraft of a part of the loop, with deviations up to a largest size.
 
     The search looks for a divergence at 0 rad/s, and then for modes near one frequency after the
-    other, up to pi / T. A `quick` search has FEW_STARTS and no climbs. Deviations have the shape
-    (entries,), and each one is smaller than the one before.
+    other, up to pi / T. A `quick` search has FEW_STARTS and no climbs. The deviations of an
+    aircraft have the shape (entries,). Each aircraft deviates less than the one before it.
     """
     highest = np.pi / part.period
     count = int(np.ceil(np.log(highest / SLOWEST) / (2.0 * np.log(NEAR))))
@@ -115,9 +115,9 @@ def _oscillation(
 
     The size is infinite if none is found. From each of STARTS corners, the search grows the size
     until a mode near the frequency leaves abs(z) < 1. Then it moves to the corner at which abs(z)
-    is larger, and repeats this until it knows every such corner. At last, unless it is `quick`, it
-    climbs from further corners at a smaller size, as long as one of the climbs ends at an unstable
-    aircraft.
+    is larger, and repeats this until it knows every such corner. If the search is not `quick`, it
+    finally climbs from further corners at a smaller size, as long as one of the climbs ends at an
+    unstable aircraft.
     """
     rng = np.random.default_rng(SEED)
     k = len(part.entries)
@@ -259,7 +259,7 @@ WALKED = 6  # largest number of rounds of the walk over the corners
 
 
 class WorstCase(NamedTuple):
-    """The least margins that were found in a box. Each is the least one of its kind."""
+    """The least margins that were found in a box. Each margin can belong to another aircraft."""
 
     worst: Margins
     corners: FloatArray  # (N, k) deviations of all aircraft that were tried
@@ -309,7 +309,10 @@ def _corners(slopes: FloatArray) -> FloatArray:
 
 
 def _figures(margins: Margins) -> FloatArray:
-    """Stack the figures of N aircraft, (N, 4 m + 3), ordered as in `_slopes`. Smaller is worse."""
+    """Stack the margins of N aircraft as figures, (N, 4 m + 3), of which a smaller one is worse.
+
+    The order is that of `_slopes`.
+    """
     all_inputs = (1.0 / margins.sensitivity_all, margins.disk_all, margins.damping)
     return np.concatenate(
         [
@@ -332,11 +335,12 @@ def _slopes(
     uncertain: Channels,
     d: FloatArray,
 ) -> FloatArray:
-    """Compute the slopes of `_figures` along the deviations, (4 m + 3, k), at d, up to a factor.
+    """Compute the slopes of `_figures` along the deviations at d, up to a positive factor.
 
-    With a = d log L / d d_i and b = d log L / d w, the slope of the phase at abs(L) = 1 is Im a -
-    Im b Re a / Re b, and the slope of the log of the gain at real L is Re a - Re b Im a / Im b. The
-    slope of a peak of abs(S - c) is its slope at constant frequency.
+    The result has the shape (4 m + 3, k). With a = d log L / d d_i and b = d log L / d w, the slope
+    of the phase at abs(L) = 1 is Im a - Im b Re a / Re b, and the slope of the log of the gain at
+    real L is Re a - Re b Im a / Im b. The slope of a peak of abs(S - c) is its slope at constant
+    frequency.
     """
     at = plants_at(plant, box, d[None])
     form = schur_form(at, law, loop)
@@ -403,9 +407,10 @@ def _crossed(
 
 
 def _damping_slope(uncertain: Channels, d: FloatArray) -> FloatArray:
-    """Compute the slope of the least damping ratio of a slow mode along the deviations, (k,), at d.
+    """Compute the slope of the least damping ratio of a slow mode along the deviations.
 
-    The damping ratio is zeta = -cos(angle(log z)). The slope is known only up to a factor.
+    The slope is taken at d, and has the shape (k,). The damping ratio is zeta = -cos(angle(log z)).
+    The slope is known only up to a factor.
     """
     around = uncertain.at(d)
     z, X = np.linalg.eig(around.A)

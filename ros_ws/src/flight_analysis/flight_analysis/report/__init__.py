@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a recorded flight to summary, figures, tables and report page."""
+"""Turn a recorded flight into a summary, figures, tables and a report page."""

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Account for a flight: what its log lacks, its processes, its commands and its legs."""
+"""Find what the log of a flight holds and lacks, with its processes, commands and legs."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -28,17 +28,17 @@ from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Recording, Signal, Tape
 from flight_log.clock import SINCE_EPOCH_NS
 
-REPEATS = 0.01  # share of repeated stamps in a topic, up to which we do not name them
+REPEATS = 0.01  # share of repeated stamps in a topic up to which they are not mentioned
 STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight interrupts
 
 
 class ProcessAccount(NamedTuple):
-    """A process of the flight, in flight times, s.
+    """When a process of the flight began, and what it sent.
 
-    A time is None if it is unknown, or if the process sent nothing.
+    Times are flight times in s. A time is None if it is unknown, or if the process sent nothing.
     """
 
-    ready: float | None  # its event loop began
+    ready: float | None  # when its event loop began
     first: float | None  # stamps of its first and last output
     last: float | None
     samples: int | None = None  # on the topics of the aircraft
@@ -49,7 +49,7 @@ class Commands:
     """The commands of a flight, without the legs of a route."""
 
     given: int  # edges of the scenario's commands and of u_m
-    flown: int  # those that began before the end of the flight
+    flown: int  # edges that began before the end of the flight
     targets: int  # messages of targets and routes in the log
     taken: int  # steps of guidance with a new command: of a target, a route or a service
 
@@ -60,23 +60,23 @@ class Account(NamedTuple):
     end: float  # s, flight time of the end
     topics: dict[str, TopicAccount]
     lacks: tuple[str, ...]
-    busy: str = ""  # the sentence on a host that left out samples and ticks
-    unguided: bool = False  # the controller was engaged, and guidance took no step
+    busy: str = ""  # sentence that is not empty if a busy host left out samples and ticks
+    unguided: bool = False  # whether the controller was engaged but guidance took no step
     processes: Mapping[str, ProcessAccount] = {}
     commands: Commands | None = None
-    # s, flight time of the first u of a flight that flew less than half of its time
+    # flight time of the first u, s, if the law flew less than half of the flight; else None
     late: float | None = None
     starved: tuple[tuple[float, float], ...] = ()  # s, spans in which the host starved the nodes
-    host_lacks: tuple[str, ...] = ()  # those of `lacks` that are the host's
-    lost_parts: tuple[str, ...] = ()  # those of `lacks` that the notes of the tape tell
+    host_lacks: tuple[str, ...] = ()  # sentences of `lacks` whose cause is the host
+    lost_parts: tuple[str, ...] = ()  # sentences of `lacks` that are also notes of the tape
 
     @property
     def starvation(self) -> Starvation:
-        """Return the spans in which the host starved the nodes."""
+        """The spans in which the host was too busy to run the nodes in time."""
         return Starvation(self.starved)
 
     def over(self, *topics: str) -> str:
-        """Return how much of these topics a figure is taken over; empty if all of them."""
+        """Return how much of these topics a figure is based on, or "" if it is all of them."""
         accounts = {name: self.topics[name] for name in topics if name in self.topics}
         parts = [
             f"{math.floor(100.0 * topic.share)} % of {name}"
@@ -92,9 +92,9 @@ class Account(NamedTuple):
         return (*busy, *(f"the log lacks {lack}" for lack in lacks))
 
     def as_json(self) -> dict[str, Any]:
-        """Return the account as `summary.json` holds it."""
+        """Return the account as a dict for `summary.json`."""
         content = self._asdict()
-        del content["lost_parts"]  # they are among the lacks
+        del content["lost_parts"]  # these sentences are in "lacks" as well
         content["topics"] = {
             name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()
         }
@@ -104,7 +104,7 @@ class Account(NamedTuple):
 
 
 def best_error_over(tape: Tape) -> tuple[str, Signal]:
-    """Return name and signal of the best error on a tape.
+    """Return the name and the signal of the best error on a tape.
 
     This is the true error if the tape has it, else the measured error.
 
@@ -133,7 +133,7 @@ def best_error_over(tape: Tape) -> tuple[str, Signal]:
 
 
 def planned_end_ns(tape: Tape) -> int | None:
-    """Return the stamp of the planned end, or None if the log does not tell it."""
+    """Return the stamp at which the flight was to end, or None if the log does not have it."""
     duration = tape.duration
     if isinstance(tape.scenario, Scenario):
         duration = tape.scenario.flight.duration
@@ -143,11 +143,11 @@ def planned_end_ns(tape: Tape) -> int | None:
 def account(
     tape: Tape, scenario: Scenario | None, outcome: Outcome = COMPLETED, *, simulated: bool = True
 ) -> Account:
-    """Account for a flight.
+    """Find what the log of a flight holds, and what it lacks.
 
-    If the log tells both t = 0 and the planned end, the account covers the time between them. If
-    not, it begins with the first sample of a topic and ends with the last sample of any.
-    `simulated` says that the aircraft of the scenario flew, and no autopilot.
+    If the log has both t = 0 and the planned end, the account covers the time between them.
+    Otherwise each topic counts from its first sample to the last sample of any topic. `simulated`
+    is False if an autopilot flew an aircraft other than that of the scenario.
     """
     planned_ns = planned_end_ns(tape)
     span = _span(tape, planned_ns, outcome, simulated=simulated)
@@ -176,7 +176,7 @@ def account(
         and topic.is_of_stack
         and not topic.holds(topic.expected - topic.unsent)
     ]
-    # A planned end shows a truncated end too.
+    # Given a planned end, a log that was cut off at its end is noticed as well.
     parts = [lost.sentence for lost in tape.lost_parts if planned_ns is None or not lost.is_end]
     return Account(
         end=end,
@@ -193,7 +193,7 @@ def account(
 
 
 def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bool) -> Span:
-    """Return the part of the flight that the account covers."""
+    """Return the time span of the flight that the account covers."""
     lasts = [
         int(signal.stamp_ns.max())
         for name, signal in tape.signals.items()
@@ -207,10 +207,10 @@ def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bo
 
 
 def _processes(tape: Tape) -> dict[str, ProcessAccount]:
-    """Return the processes, in flight time.
+    """Return what is known of the processes of a flight, by name, with times in flight time.
 
-    In lockstep the stamps are no times of day, so we do not know when a process was ready. A
-    process that sent nothing either, like the recorder, is left out.
+    In lockstep the stamps are no times of day, so the time at which a process was ready is unknown.
+    A process of which no time is known, such as a recorder in lockstep, is left out.
     """
 
     def flight_time(stamp_ns: int | None) -> float | None:
@@ -235,7 +235,7 @@ def _too_busy(parts: Sequence[str]) -> str:
 
 
 def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
-    """Return the channels of the scenario that y, y_m and u lack, a sentence for each topic."""
+    """Return a sentence for each of y, y_m and u that lacks channels of the scenario."""
     if scenario is None:
         return []
     outputs = scenario.controller.outputs
@@ -251,10 +251,10 @@ def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
 def _late_first_u(
     tape: Tape, topics: Mapping[str, TopicAccount], scenario: Scenario | None
 ) -> float | None:
-    """Return when the first u came, s, if that was more than SILENCE after the first y could.
+    """Return the time of the first u, s, if it is more than SILENCE after the first possible y.
 
-    Returns None if u came in time. The numbers of the ticks tell whether there was a u before the
-    log began. If a user activates the controller, no time is too late.
+    Returns None if u came in time. If the log begins later than u, the first u follows from the
+    number of the first tick. If a user activates the controller, no time is too late.
     """
     if scenario is None or not (scenario.controller.autostart and scenario.controller.start_active):
         return None
@@ -271,10 +271,10 @@ def _late_first_u(
 
 
 def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bool) -> str | None:
-    """Return what a topic lacks, as a sentence without a verb; None if it lacks nothing.
+    """Return what a topic lacks, as the object of "the log lacks", or None if it lacks nothing.
 
-    `late` is how long before the end the last sample may be stamped, s; the first may be as late.
-    `late_u` says that the first u of the flight was late.
+    `late` is a tolerance, s. The first sample may come so long after the start, and the last sample
+    so long before the end. `late_u` says that the first u of the flight was late.
     """
     facts = []
     missing = not topic.holds(topic.found + topic.unsent) or (
@@ -296,7 +296,7 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bo
         if tail > min((1.0 - WHOLE) * end, SILENCE) + late:
             facts.append(f"ends at t = {topic.last:.3f} of {end:.3f} s")
         silence = end * (1.0 - topic.share) if missing and topic.share is not None else math.inf
-        least = min(SILENCE, silence / 2.0)  # a shorter gap is named where it is most of the lack
+        least = min(SILENCE, silence / 2.0)  # a shorter gap is named if it is most of the lack
         if topic.gap is not None and topic.gap_at is not None and topic.gap > least:
             facts.append(
                 f"no sample from t = {topic.gap_at:.3f} to {topic.gap_at + topic.gap:.3f} s"
@@ -315,8 +315,9 @@ def _is_of_host(
 ) -> bool:
     """Return whether the host alone is the cause of what a topic lacks.
 
-    That is so if no message was lost and no stamp is wrong, so that what is missing was never sent;
-    if the topic goes on to the `end`, s; and if it began in time, or late in a starved span.
+    This needs three things. No message was lost and no stamp is wrong, so that what is missing was
+    never sent. The topic goes on to the `end`, s. It began in time, or so late because the host
+    starved the nodes.
     """
     is_whole = tape.recording.get(name, Recording(0)).lost == 0
     has_stamps = not (topic.step or topic.unset or topic.left_out or topic.repeated)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Build the cards of a flight: a claim each, in plain words, and the command that checks it."""
+"""Build the cards of a flight. Each has a claim in plain words, and a command to check it."""
 
 import math
 
@@ -49,7 +49,7 @@ def claims(flight: RecordedFlight, scenario: Scenario, flown: FlownLoops) -> lis
 
 
 def _margin_card(margins: LoopMargins, command: str) -> Card:
-    """Return how far the loop is from instability, at the input where it is nearest."""
+    """Return the card on the distance of the loop from instability, at the worst input."""
     step = Step(sentence="Compute them again:", command=command)
     nominal = margins.nominal
     if not nominal.stable:
@@ -79,7 +79,7 @@ def _margin_card(margins: LoopMargins, command: str) -> Card:
 
 
 def _guarantee_card(promise: Guarantee | None, command: str) -> Card:
-    """Return what is guaranteed for aircraft other than that of the file."""
+    """Return the card on what is guaranteed for aircraft that differ from the file."""
     title = "Guarantee"
     if promise is None:
         return Card(
@@ -130,7 +130,7 @@ def _guarantee_card(promise: Guarantee | None, command: str) -> Card:
 
 
 def _changed_card(flown: FlownLoops) -> Card:
-    """Return the card of a flight with several parameter sets, or with a true aircraft."""
+    """Return the card of a flight with several parameter sets, or whose true aircraft is known."""
     is_stable = [bool(each.margins.nominal.stable) for each in flown.loops]
     count = len(flown.loops)
     sentence = (
@@ -149,7 +149,7 @@ def _changed_card(flown: FlownLoops) -> Card:
 
 
 def _learned_card(flight: RecordedFlight) -> Card:
-    """Return which learned models flew, and what became of the error."""
+    """Return the card on which learned models flew, and how the error changed."""
     spans = flight.summary["models"]
     learned = learned_spans(flight)
     if not learned:
@@ -179,7 +179,7 @@ def _learned_card(flight: RecordedFlight) -> Card:
 
 
 def _replay_card(flight: RecordedFlight) -> Card:
-    """Return how to check that the log holds all that the controller computed with."""
+    """Return the card on how to check that the log has every input of the controller."""
     ticks = len(flight.tape["internals"].stamp_ns)
     return Card(
         title="Replay",

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compare several flights, with their channels matched by name.
 
-We compute ratios of metrics to the first flight, and list the conditions that differ.
+This gives the ratios of metrics to the first flight, and a list of the conditions that differ.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ from flight_core.parameters import flatten
 from flight_core.tape import Tape
 from flight_log.clock import SINCE_EPOCH_NS
 
-EQUAL_RATIO_TOLERANCE = 0.05  # if a ratio is closer to 1, the metrics count as equal
+EQUAL_RATIO_TOLERANCE = 0.05  # metrics count as equal if their ratio is closer to 1
 
 
 class ComparisonRow(NamedTuple):
@@ -40,7 +40,7 @@ class ComparisonRow(NamedTuple):
     texts: tuple[str, ...]
     ratios: tuple[float | None, ...]
     lower_is_better: bool = True
-    # whether each flight had the conditions of the first, so that the ratio says better or worse
+    # whether each flight had the conditions of the first, so that its ratio is a verdict
     alike: tuple[bool, ...] = ()
 
     def verdict(self, flight: int) -> str:
@@ -68,22 +68,22 @@ class ComparisonTable(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """A parameter that differs, with its value in each flight."""
+    """A parameter that differs between the flights, with its value in each of them."""
 
     key: str
     texts: tuple[str, ...]
 
 
 WINDS = tuple(f"aircraft.{key}" for key in ("gusts", "turbulence", "wind", "shear", "microburst"))
-COMPARED = ("controller.",)  # if only this differs, it is what we compare, and ratios have colours
+COMPARED = ("controller.",)  # if only these keys differ, ratios have colours
 NO_CONDITION = ("recorder.",)
 PACE = "flown"
-LONG = 40  # characters of a value, as of a matrix
+LONG = 40  # a text with more characters, such as a matrix, is shortened
 UNLIKE = "the conditions differ: a ratio between unlike flights says nothing of the law"
 
 
 def conditions(flights: Sequence[RecordedFlight]) -> list[Condition]:
-    """Return the parameters that differ, wind first, and whether each flight was in real time."""
+    """Return the conditions that differ: the parameters, wind first, and the pace."""
     values = [_parameters(flight) for flight in flights]
     keys = sorted(
         {key for key in chain.from_iterable(values) if not key.startswith(NO_CONDITION)},
@@ -106,7 +106,7 @@ def _parameters(flight: RecordedFlight) -> dict[str, str]:
 
 
 def _shortened(texts: Sequence[str]) -> tuple[str, ...]:
-    """Shorten a long list of numbers to its count, and say whether the numbers differ."""
+    """Shorten each long list of numbers to its count, and tell different lists apart."""
     counts = [f"{text.count(',') + 1} values" if len(text) > LONG else text for text in texts]
     return tuple(
         f"{count}, others" if texts.index(text) and count in counts[: texts.index(text)] else count
@@ -131,7 +131,7 @@ def has_same_conditions(
 ) -> tuple[bool, ...]:
     """Return whether each flight had the conditions of the first, except for the controller.
 
-    If `timed`, it must have kept the same time too, real or not.
+    If `timed`, the flights must also have the same pace, such as real time.
     """
     rows = [
         row
@@ -152,9 +152,10 @@ def comparison_tables(
     lower_is_better: bool,
     units: Mapping[str, DisplayUnit] | None = None,
 ) -> list[ComparisonTable]:
-    """Return metrics of "errors" or "inputs" of the summaries, a table for each channel.
+    """Return a table for each channel, with metrics from "errors" or "inputs" of the summaries.
 
-    A table has a row for each column that has a value. `units` are those of the flights by default.
+    `key` is "errors" or "inputs". A table has a row for each metric of `columns` that has a value.
+    By default `units` are those of the flights.
     """
     display = common_units(flights) if units is None else units
     same = has_same_conditions(flights)
@@ -174,7 +175,7 @@ def comparison_tables(
 def error_tables(
     flights: Sequence[RecordedFlight], units: Mapping[str, DisplayUnit] | None = None
 ) -> list[ComparisonTable]:
-    """Return metrics of the error and settling times by channel, as `comparison_tables` does."""
+    """Return a table for each channel, with the metrics of its error and its settling times."""
     return [
         table._replace(rows=(*table.rows, *_settling_rows(flights, table.channel)))
         for table in comparison_tables(
@@ -198,7 +199,7 @@ def _settling_rows(flights: Sequence[RecordedFlight], channel: str) -> list[Comp
 
 
 def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
-    """Return the timing of the controllers as a table, or none if all times are 0."""
+    """Return a table of the controllers' timing in a list, which is empty if all times are 0."""
     same = has_same_conditions(flights, timed=True)
     summaries = [flight.summary for flight in flights]
     rows = []

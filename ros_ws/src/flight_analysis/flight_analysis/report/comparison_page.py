@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Build the page that compares several flights, or lays any logs over each other."""
+"""Build the page that compares several flights, or draws several logs over each other."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -25,10 +25,10 @@ from flight_analysis.report.tables import TIMES, MetricTable
 
 
 def comparison_page(flights: Sequence[RecordedFlight], tolerances: Mapping[str, float]) -> Page:
-    """Return the page of several flights, each in its own colour and compared with the first.
+    """Return the page of several flights, each with a colour and compared with the first.
 
-    If one of them is an imported log, the signals that have a name in common are laid over each
-    other. `tolerances` are those of differences by channel, SI.
+    If one of them is an imported log, signals of the same name are drawn over each other.
+    `tolerances` has the allowed difference of each channel, SI.
     """
     context = figures.plot_context(flights)
     colours = {label: run.colour for label, run in context.runs.items()}
@@ -75,7 +75,7 @@ def comparison_page(flights: Sequence[RecordedFlight], tolerances: Mapping[str, 
 
 
 def _verdict(flight: RecordedFlight, label: str, colour: str) -> Verdict:
-    """Return what came of a flight, under its label and in its colour."""
+    """Return the verdict on a flight, with the label and the colour of this flight."""
     if flight.scenario is None:
         source = flight.summary["source"]
         headline = f"{title_of(flight)}, {source['kind']}."
@@ -88,7 +88,7 @@ def _verdict(flight: RecordedFlight, label: str, colour: str) -> Verdict:
 
 
 def _common_trim(scenarios: Sequence[Scenario]) -> dict[str, str]:
-    """Return the labels of axes that say which trim is subtracted, if all have the same."""
+    """Return the axis label of V, which states the trim speed if all flights share it."""
     trims = [about_trim(scenario) for scenario in scenarios]
     return trims[0] if all(each == trims[0] for each in trims) else {"V": "V about trim (m/s)"}
 
@@ -112,7 +112,7 @@ def _tracks(flights: Sequence[RecordedFlight], colours: Mapping[str, str]) -> li
 def _metrics(
     flights: Sequence[RecordedFlight], context: PlotContext, palette: Sequence[str]
 ) -> Figures:
-    """Return the tables of a comparison; `palette` has the colours of the flights."""
+    """Return the tables of a comparison. `palette` has the colours of the flights."""
     units = (context.units, display_units.in_radians(context.units))
     errors, errors_in_radians = (comparison.error_tables(flights, each) for each in units)
     inputs, inputs_in_radians = (
@@ -152,7 +152,7 @@ def _overlay_page(
     verdicts: Sequence[Verdict],
     differences: TableGroup,
 ) -> Page:
-    """Return the page of logs laid over each other, with the differences from the first."""
+    """Return the page of logs drawn over each other, with the differences from the first."""
     has_references = all("y_m" in flight.tape for flight in flights)
     return Page(
         title=f"{len(flights)} logs over each other",

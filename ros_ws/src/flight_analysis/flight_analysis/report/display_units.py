@@ -22,7 +22,7 @@ class DisplayUnit:
     factor: float
 
 
-NO_UNIT = DisplayUnit(unit="", factor=1.0)  # for a channel whose unit is unknown: it stays in SI
+NO_UNIT = DisplayUnit(unit="", factor=1.0)  # for a channel with an unknown unit, which stays in SI
 UNITLESS = DisplayUnit(unit="no unit", factor=1.0)  # an input of an imported log
 
 
@@ -55,7 +55,7 @@ def display_unit(unit: str) -> DisplayUnit:
 
 
 def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
-    """Return units by channel of y and u, in the order of the controller."""
+    """Return the display unit of each channel of y and u, in the order of the controller."""
     channels = scenario.aircraft.channels()
     units = {
         name: display_unit(unit) for name, unit in {**channels.outputs, **channels.inputs}.items()
@@ -65,13 +65,13 @@ def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
 
 
 def about_trim(scenario: Scenario) -> dict[str, str]:
-    """Return what stands in place of V in a figure of y: the airspeed less that of trim."""
+    """Return the axis label of V in a figure of y, which says that the trim speed is subtracted."""
     channels = scenario.aircraft.channels()
     return {"V": f"V - {channels.speed:g} (m/s)"} if "V" in channels.outputs else {}
 
 
 def in_radians(units: Mapping[str, DisplayUnit]) -> dict[str, DisplayUnit]:
-    """Return the units with rad in place of deg, also in deg/s."""
+    """Return the units with deg replaced by rad, and deg/s by rad/s."""
     return {
         name: DisplayUnit(unit=shown.unit.replace("deg", "rad"), factor=1.0)
         if shown.unit.startswith("deg")
@@ -81,7 +81,7 @@ def in_radians(units: Mapping[str, DisplayUnit]) -> dict[str, DisplayUnit]:
 
 
 def plain_number(value: float, digits: int = 2) -> str:
-    """Return a number with so many significant digits, and never with an exponent.
+    """Return a number as text, with at most `digits` significant digits and without an exponent.
 
     Examples:
         >>> plain_number(123.4), plain_number(0.0123, 1), plain_number(2.0)
@@ -95,7 +95,7 @@ def plain_number(value: float, digits: int = 2) -> str:
 
 
 def unlike_numbers(first: float, second: float) -> tuple[str, str]:
-    """Return two numbers with as many digits as it takes to tell them apart, from 2 to 6."""
+    """Return two numbers as texts, with the fewest digits, from 2 to 6, that tell them apart."""
     for digits in range(2, 7):
         texts = (plain_number(first, digits), plain_number(second, digits))
         if texts[0] != texts[1]:
@@ -104,7 +104,9 @@ def unlike_numbers(first: float, second: float) -> tuple[str, str]:
 
 
 def aligned_numbers(first: float, second: float) -> tuple[str, str]:
-    """Return two numbers with the same decimals: two digits, or what tells them apart, up to 6.
+    """Return two numbers as texts with the same number of decimals.
+
+    The smaller number has two digits, or up to 6 if it takes more to tell the numbers apart.
 
     Examples:
         >>> aligned_numbers(1.0, 3.21), aligned_numbers(0.3012, 0.3021), aligned_numbers(9.0, 123.4)
@@ -136,23 +138,23 @@ POSE_UNITS = {
 
 
 def state_units(scenario: Scenario) -> dict[str, DisplayUnit]:
-    """Return the units of the states of a simulated aircraft."""
+    """Return the display units of the states of a simulated aircraft."""
     aircraft = scenario.aircraft
     states = STATES if aircraft.is_jsbsim else load_airframe(aircraft.airframe).states
     return {name: display_unit(unit) for name, unit in states.items()}
 
 
 def in_order(names: Iterable[str], units: Mapping[str, DisplayUnit]) -> list[str]:
-    """Sort channels as their units are; those without a known unit follow as they come."""
+    """Sort channels in the order of `units`. Channels without a known unit come last."""
     places = {name: place for place, name in enumerate(units)}
     return sorted(names, key=lambda name: places.get(name, len(places)))
 
 
 def format_value(value: float | None, factor: float = 1.0) -> str:
-    """Write a value with three digits, or NO_VALUE."""
+    """Write a value with three digits, or NO_VALUE for None."""
     return NO_VALUE if value is None else f"{value * factor:#.3g}".rstrip(".")
 
 
 def format_seconds(time: float | None) -> str:
-    """Write a time in s with one digit after the point, or that it is not known."""
+    """Write a time, s, with one digit after the point, or "an unknown time" for None."""
     return "an unknown time" if time is None else f"{time:.1f} s"

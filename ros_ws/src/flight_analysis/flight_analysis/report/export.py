@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Export flights: all signals as a wide table (CSV, Parquet), or as a figure (PNG)."""
+"""Export flights as a table with a column for each channel (CSV, Parquet) or a figure (PNG)."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ from flight_core.parameters import require
 if TYPE_CHECKING:  # polars takes some tenths of a second to load, and few reports need it
     import polars as pl
 
-# inches
+# in inches
 FIGURE_WIDTH = 15.0
 ROW_HEIGHT = 2.2
 DPI = 120
@@ -24,7 +24,8 @@ DPI = 120
 def signal_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
     """Return the table of a flight, or of several flights.
 
-    For several flights a first column "run" has the name of the flight.
+    The table has a column for each channel. For several flights, its first column "run" has the
+    name of the flight.
     """
     import polars as pl  # noqa: PLC0415
 
@@ -38,16 +39,16 @@ def signal_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
 
 
 def write_csv(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write the wide table as CSV.
+    """Write the table of one or several flights as CSV.
 
-    Numbers read back to the last bit. A null is an empty cell.
+    Every number has enough digits to be read back to the last bit. A null is an empty cell.
     """
     with replacing(path) as stream:
         signal_table(flights).write_csv(stream)
 
 
 def write_parquet(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write the wide table as Parquet (zstd)."""
+    """Write the table of one or several flights as Parquet, compressed with zstd."""
     with replacing(path) as stream:
         signal_table(flights).write_parquet(stream)
 
@@ -55,7 +56,7 @@ def write_parquet(path: Path, flights: Sequence[RecordedFlight]) -> None:
 def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
     """Write a figure of y over y_m, the best error, and u of one or several flights.
 
-    Each quantity has a column, and each channel a row.
+    The figure has a column for each of these quantities, and a row for each channel.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415
 

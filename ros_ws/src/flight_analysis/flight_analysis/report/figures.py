@@ -61,9 +61,9 @@ MEASURED = "#c9799b"
 WIND = "#2a7f62"
 END_STOP = "#8c8c8c"
 LIMIT = "#444444"
-# Contrast of each line on its page: 3 to 1 at least, as WCAG 2.2 asks of graphics (1.4.11).
-# Okabe and Ito 2008, distinct to the colour blind too, without the orange that REFERENCE has;
-# lighter on a dark page
+# Every line has a contrast of at least 3 to 1 with its page, as WCAG 2.2 requires of graphics
+# (1.4.11). The colours are those of Okabe and Ito 2008, which the colour blind can tell apart,
+# without the orange of REFERENCE. On a dark page they are lighter.
 FLIGHTS = {
     "#0072b2": "#4db3ea",
     "#5e3c99": "#b39ddb",
@@ -86,27 +86,27 @@ DARK = FLIGHTS | {
 SATURATION_COLOURS = {Saturation.MAGNITUDE: "#d62728", Saturation.RATE: "#8a63b8"}
 LIMIT_LINES = ({"color": END_STOP, "width": 4}, {"color": LIMIT, "width": 1.2, "dash": "dash"})
 NOISE_FLOOR_LINE = {"color": LIMIT, "width": 1.0, "dash": "dot"}
-INTEGRALS = {"integral_e": "∫e", "Pi": "Pi"}  # groups of `internals` and their labels
+INTEGRALS = {"integral_e": "∫e", "Pi": "Pi"}  # labels by group of `internals`
 MIN_SPECTRUM_SAMPLES = 64
 HISTOGRAM_BINS = 80
-# Hz, ticks of a spectrum
+# tick marks of the frequency axis of a spectrum, Hz
 FREQUENCIES = [digit * 10.0**power for power, digit in product(range(-4, 4), (1, 2, 5))]
-# share of the axis, about two pixels: shorter intervals are lengthened
+# share of the time axis, about two pixels, to which a shorter interval is lengthened
 MIN_VISIBLE_FRACTION = 1 / 500
-MOST_MARKED = 100  # times of messages: plotly is slow with more shapes
+MOST_MARKED = 100  # largest number of marked messages, because plotly is slow with more shapes
 LIMIT_VIEW_RATIO = 3.0  # a limit is in view if it is at most this many times the largest u
 
-# lower and upper limit by input, SI; infinite without a limit
+# lower and upper limit by input, SI; an input without a limit has infinite ones
 Limits = Mapping[str, tuple[float, float]]
 
-SAME_CURVE_TOLERANCE = 1e-3  # of the largest value: closer references are drawn as one curve
+SAME_CURVE_TOLERANCE = 1e-3  # part of the largest value: closer references are one curve
 
 
 def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
-    """Return the context of a flight or of several flights.
+    """Return what all figures of one or several flights share, such as units and shaded times.
 
-    Every figure shades the gusts and the failsafe modes of the controller; of several flights only
-    the gusts, and only if all had the same.
+    For one flight, the figures shade gusts, failsafe modes, faults and gaps. For several flights,
+    they shade only the gusts, and only if all flights had the same gusts.
     """
     longest = max((flight.tape for flight in flights), key=flight_end)
     end = flight_end(longest)
@@ -131,7 +131,7 @@ def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
 
 
 def runs_of(flights: Sequence[RecordedFlight]) -> dict[str, Run]:
-    """Return the flights of figures by label, each in its colour."""
+    """Return the tapes of flights by label, each with the colour of its curves."""
     colours = cycle(COLOURS) if len(flights) > 1 else (PLANT,)
     return {
         label: Run(tape=flight.tape, period_ns=flight.period_ns, colour=colour)
@@ -142,7 +142,11 @@ def runs_of(flights: Sequence[RecordedFlight]) -> dict[str, Run]:
 def _curves(
     context: PlotContext, name: str, signal: Callable[[Tape], Signal | None], **style: Any
 ) -> dict[str, Curve]:
-    """Return the curve of a flight that has a signal, as `name`, or of several by their labels."""
+    """Return the curves of a signal for all flights that have it.
+
+    The curve of a single flight is called `name`. Those of several flights have the labels of the
+    flights.
+    """
     curves = {}
     for label, run in context.runs.items():
         if (samples := signal(run.tape)) is not None:
@@ -154,7 +158,7 @@ def _curves(
 
 
 def _references(context: PlotContext) -> dict[str, Curve]:
-    """Return the references of the flights, with those that are equal as one."""
+    """Return the curves of y_m of the flights, where equal ones are a single curve."""
     references: dict[str, Curve] = {}
     for label, curve in _curves(context, "y_m", lambda tape: tape["y_m"]).items():
         equal = next(
@@ -173,9 +177,9 @@ def _references(context: PlotContext) -> dict[str, Curve]:
 
 
 def _is_same_curve(first: Curve, second: Curve) -> bool:
-    """Return whether two references are the same curve as long as both last.
+    """Return whether two references are equal over the time that they share.
 
-    They may differ by SAME_CURVE_TOLERANCE of the largest value.
+    They may differ by the fraction SAME_CURVE_TOLERANCE of the largest value.
     """
     one, two = first.signal, second.signal
     if set(one.names) != set(two.names) or not (len(one.stamp_ns) and len(two.stamp_ns)):
@@ -192,16 +196,17 @@ def _is_same_curve(first: Curve, second: Curve) -> bool:
 def tracking_figure(
     context: PlotContext, labels: Mapping[str, str] = MappingProxyType({})
 ) -> Figure:
-    """Draw y over y_m for every output; of several flights y over each different reference.
+    """Draw y and y_m of every output.
 
-    `labels` of axes replace those of their channels.
+    For several flights, y of each flight is drawn over every different y_m. `labels` has axis
+    labels that replace those of their channels.
     """
     y = _curves(context, "y", lambda tape: tape.signals.get("y"))
     return time_series_figure(context, _references(context) | y, labels=labels)
 
 
 def overlay_figure(context: PlotContext, topic: str) -> Figure | None:
-    """Draw a topic of several logs over each other, or return None if no log has it."""
+    """Draw the channels of a topic of several logs, or return None if no log has the topic."""
     curves = _curves(context, topic, lambda tape: tape.signals.get(topic))
     if topic == "pose":
         context = context._replace(units=POSE_UNITS)
@@ -209,10 +214,11 @@ def overlay_figure(context: PlotContext, topic: str) -> Figure | None:
 
 
 def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None) -> Figure:
-    """Draw e = y - y_m of every output; of several flights the best error of each.
+    """Draw e = y - y_m of every output.
 
-    If the tape has errors of the sensors, the true error is drawn over the measured one. Noise
-    floors, by channel in SI, are lines above and below 0 if they are wide enough to see.
+    If the tape of one flight has errors of the sensors, the true error is drawn over the measured
+    one. For several flights, only the best error of each is drawn. `floors` has the noise floors by
+    channel, SI. They are lines above and below 0 if they are wide enough to see.
     """
     if context.is_comparison:
         errors = _curves(context, "e", lambda tape: best_error(tape)[1])
@@ -237,9 +243,10 @@ def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None
 def input_figure(
     context: PlotContext, limits: Mapping[str, Limits] = MappingProxyType({})
 ) -> Figure | None:
-    """Draw the actuator positions over the command u; of several flights only u.
+    """Draw the command u and the actuator positions, or only u for several flights.
 
-    At most two kinds of limits are lines, and marks show where an input was saturated.
+    `limits` are drawn as lines, for at most two kinds of limits. Marks show where an input was
+    saturated.
     """
     curves = _curves(context, "u", lambda tape: tape.signals.get("u"), steps=True)
     if context.is_comparison or not curves:
@@ -289,7 +296,7 @@ def input_figure(
 
 
 def input_limits(scenario: Scenario, tape: Tape) -> dict[str, Limits]:
-    """Return the limits of u by kind and by input.
+    """Return the limits of u by their kind, and each kind by input.
 
     These are the limits of the controller and, if the actuators are simulated, their end stops.
     """
@@ -320,7 +327,7 @@ def _limit_pairs(names: Sequence[str], lower: Sequence[float], upper: Sequence[f
 
 
 def integral_figure(context: PlotContext) -> Figure | None:
-    """Draw the integrals of the law, of e and of the sign, for each output."""
+    """Draw the two integrals of the law, that of e and that of the sign, for each output."""
     if "internals" not in context.tape:
         return None
     internals = context.tape["internals"]
@@ -344,10 +351,10 @@ def integral_figure(context: PlotContext) -> Figure | None:
 
 
 def spectrum_figure(context: PlotContext) -> Figure | None:
-    """Draw the amplitude spectral density of u, a subplot for each channel, with all runs.
+    """Draw the amplitude spectral density of u of all runs, in a subplot for each channel.
 
-    Both axes are logarithmic. A run with fewer than MIN_SPECTRUM_SAMPLES is left out; if none
-    remains, there is no figure.
+    Both axes are logarithmic. A run with fewer than MIN_SPECTRUM_SAMPLES is left out. Returns None
+    if no run remains.
     """
     units = context.units
     runs = {
@@ -383,7 +390,7 @@ def spectrum_figure(context: PlotContext) -> Figure | None:
 
 
 def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
-    """Return the samples of the controller's timing, ms, except quantities that are always 0."""
+    """Return the samples of each timing quantity of the controller, ms, if it is not always 0."""
     samples: dict[str, FloatArray] = {}
     if "internals" in tape:
         periods = tick_periods(tape)
@@ -402,7 +409,7 @@ def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
 
 
 def timing_figure(context: PlotContext) -> Figure | None:
-    """Draw histograms of the controller's timing, ms, unless all of it is 0.
+    """Draw histograms of the controller's timing, ms, or return None if all values are 0.
 
     Each quantity has a subplot, in which the runs share their bins. The counts are logarithmic.
     """
@@ -450,9 +457,9 @@ def wind_figure(context: PlotContext) -> Figure | None:
 def state_figure(
     context: PlotContext, units: Mapping[str, DisplayUnit], labels: Mapping[str, str]
 ) -> Figure | None:
-    """Draw the states of a simulated aircraft in these units, first those that are outputs.
+    """Draw the states of a simulated aircraft, and first those that are outputs.
 
-    `labels` of axes replace those of their channels.
+    The curves have these `units`. `labels` has axis labels that replace those of their channels.
     """
     x = _truth_group(context.tape, "x")
     outputs = {name: units[name] for name in context.units if name in units}
@@ -463,7 +470,7 @@ def state_figure(
 
 
 def sensor_figure(context: PlotContext) -> Figure | None:
-    """Draw y less the true output for every sensor that has an error."""
+    """Draw the error of every sensor that has one, which is y less the true output."""
     noise = _nonzero_group(context.tape, "noise")
     if noise.names:
         return time_series_figure(
@@ -473,7 +480,7 @@ def sensor_figure(context: PlotContext) -> Figure | None:
 
 
 def tick_figure(context: PlotContext) -> Figure | None:
-    """Draw lateness, age of y and dt of the controller's ticks.
+    """Draw the lateness, the age of y and the dt of the controller's ticks.
 
     Returns None if each tick was in time and had a fresh y.
     """
@@ -493,14 +500,14 @@ def tick_figure(context: PlotContext) -> Figure | None:
 
 
 def _truth_group(tape: Tape, group: str) -> Signal:
-    """Return the channels "group.name" of `truth`; none if the tape lacks `truth`."""
+    """Return the channels "group.name" of `truth`, or no channels if the tape lacks `truth`."""
     if "truth" in tape:
         return tape["truth"].group(group)
     return Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))
 
 
 def _nonzero_group(tape: Tape, group: str) -> Signal:
-    """Return those channels of `_truth_group` that are not always 0."""
+    """Return the channels "group.name" of `truth` that are not always 0."""
     signal = _truth_group(tape, group)
     nonzero = np.flatnonzero(signal.values.any(axis=0))
     return Signal(
@@ -517,7 +524,7 @@ def _saturated(tape: Tape, name: str, kind: Saturation) -> tuple[FloatArray, NDA
 
 
 def _axis_range(values: FloatArray, bounds: FloatArray) -> tuple[float, float]:
-    """Return the range of an axis: all values, and the bounds that are near them."""
+    """Return the range of an axis that shows all values, and the bounds that are near them."""
     low = float(values.min(initial=0.0))
     high = float(values.max(initial=0.0))
     near = [

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Build the head of a flight's page: its name and time, what came of it, and a tile an output."""
+"""Build the head of a flight's page, with name, time, verdict and a tile for each output."""
 
 import shlex
 from collections.abc import Mapping
@@ -31,14 +31,14 @@ from flight_log.clock import SINCE_EPOCH_NS
 
 
 def title_of(flight: RecordedFlight) -> str:
-    """Return the name of a flight in words: its scenario, or the log that it was imported from."""
+    """Return the title of a flight, which is its scenario or the log that it was imported from."""
     if flight.scenario is not None:
         return flight.scenario.name
     return str(flight.summary["source"]["log"])
 
 
 def meta_lines(flight: RecordedFlight, scenario: Scenario) -> list[str]:
-    """Return when a flight was flown and how: airframe, law, length, speed and pace."""
+    """Return the lines on when and how a flight was flown, with airframe, law, speed and pace."""
     is_known = is_simulated(flight.tape) or "engagements" in flight.summary
     aircraft = scenario.aircraft.airframe if is_known else "an aircraft outside of the scenario"
     parts = [
@@ -58,7 +58,7 @@ def meta_lines(flight: RecordedFlight, scenario: Scenario) -> list[str]:
 
 
 def started(flight: RecordedFlight) -> str:
-    """Return the time of day at which a flight began, in words; "" if the log does not say it."""
+    """Return the date and time at which a flight began as text, or "" if the log lacks it."""
     start = (flight.summary["flight"] or {}).get("started")
     try:
         return f"{datetime.fromisoformat(start):%-d %b %Y, %H:%M} UTC" if start else ""
@@ -67,7 +67,7 @@ def started(flight: RecordedFlight) -> str:
 
 
 def pace(flight: RecordedFlight) -> str:
-    """Return in which time a flight was flown."""
+    """Return the pace of a flight as text, such as "in real time"."""
     if flight.tape.is_by_clock:
         return "by /clock"
     if flight.tape.start_ns > SINCE_EPOCH_NS:
@@ -81,7 +81,7 @@ def pace(flight: RecordedFlight) -> str:
 FLOWN = ("aircraft", "reference_model", "controller", "guidance")
 """Sections of a scenario that decide a flight, apart from its length."""
 
-FILE_MODEL = "file"  # name of the model of the file, which a learner may fly
+FILE_MODEL = "file"  # name of the model from the file, which a learner can fly as well
 NEXT = {
     Aim.ERROR: "Ask whether its loop is stable, and with what margins:",
     Aim.LOG: "Fly it in lockstep, where no message is late or lost:",
@@ -90,7 +90,7 @@ NEXT = {
 
 
 def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
-    """Return what came of a flight, in the colour of what it is about, and what to do next."""
+    """Return the verdict on a flight, with a colour for its subject, and the next step."""
     outcome = flight.summary["outcome"]
     sentence = f"{outcome['sentence'][:1].upper()}{outcome['sentence'][1:]}."
     injected = _injected(scenario)
@@ -104,7 +104,7 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
             sentence="Fly the same without the clock:", command=f"rise-di fly {name} --lockstep"
         )
     elif outcome["status"] == 0:
-        # What wind or noise excuses is a detail of a flight that went well.
+        # If a flight went well, errors that wind or noise excuses are only a detail.
         end = outcome["reason"] or outcome["end"]
         headline = f"{end[:1].upper()}{end[1:]}."
         within = "The error of every output stayed within what is allowed"
@@ -120,10 +120,10 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
             command=f"rise-di replay {run_argument(flight)}",
         )
     else:
-        # What is wrong comes first: a flight that completed may still fall short of much.
+        # The shortfalls come first, because a flight that completed can still fall short.
         end, _, worst = sentence.partition("; ")
         headline = worst.removeprefix("worst: ") or sentence
-        # The name of an output stays as it is.
+        # The sentence may begin with the name of an output, which stays as it is.
         if headline.split()[0] not in scenario.controller.outputs:
             headline = f"{headline[:1].upper()}{headline[1:]}"
         if worst:
@@ -147,7 +147,7 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
 
 
 def _next_step(outcome: Mapping[str, Any], scenario: Scenario, name: str, otherwise: Step) -> Step:
-    """Return what to do about a flight that falls short, by its gravest shortfall."""
+    """Return the next step for a flight that falls short, given its gravest shortfall."""
     order = list(Aim)
     aims = sorted((Aim(each["aim"]) for each in outcome["shortfalls"]), key=order.index)
     gravest = aims[0] if aims else None
@@ -161,7 +161,7 @@ def _next_step(outcome: Mapping[str, Any], scenario: Scenario, name: str, otherw
 
 
 def _route_text(flight: RecordedFlight) -> str:
-    """Return how a guided flight followed its route; "" without one."""
+    """Return how a guided flight followed its route as text, or "" without a route."""
     legs = (flight.summary["guidance"] or {}).get("legs") or ()
     if not legs:
         return ""
@@ -171,7 +171,7 @@ def _route_text(flight: RecordedFlight) -> str:
     log = flight.tape.signals.get("guidance")
     if log is None:
         return text
-    # The way onto a leg and what is not the route do not count.
+    # Only the time on a leg of the route counts, after the aircraft has joined the leg.
     is_on_leg = (log["mode.lateral"] == Lateral.ROUTE) & (log["joining"] == 0.0)
     beside = np.abs(log["xtrack"][is_on_leg])
     finite = beside[np.isfinite(beside)]
@@ -179,7 +179,7 @@ def _route_text(flight: RecordedFlight) -> str:
 
 
 def _models_text(flight: RecordedFlight) -> str:
-    """Return how many learned models flew; "" for a flight that did not learn."""
+    """Return how many learned models flew as text, or "" for a flight that did not learn."""
     if not flight.summary["models"]:
         return ""
     count = len(learned_spans(flight))
@@ -189,13 +189,13 @@ def _models_text(flight: RecordedFlight) -> str:
 
 
 def learned_spans(flight: RecordedFlight) -> list[Mapping[str, Any]]:
-    """Return the spans in which a learned model flew, not the law of the start or of the file."""
+    """Return the spans in which a learned model flew, not the first law or that of the file."""
     _, *later = flight.summary["models"]
     return [span for span in later if span["name"] != FILE_MODEL]
 
 
 def _injected(scenario: Scenario) -> str:
-    """Return the faults that the scenario injects, since they explain an error."""
+    """Return the faults that the scenario injects as text, since they explain an error."""
     faults = scenario.aircraft.actuators.read_faults()
     parts = [
         f"{fault.subject}{f' ({fault.extent})' if fault.extent else ''} at t = {fault.at:g} s"
@@ -205,10 +205,10 @@ def _injected(scenario: Scenario) -> str:
 
 
 def scenario_argument(flight: RecordedFlight, scenario: Scenario) -> str:
-    """Return how a command names what flew.
+    """Return the argument with which a command flies the same scenario again.
 
-    If the flight had the parameters of a shipped scenario, this is its name. Otherwise it is the
-    file in the folder of the run that holds the parameters that flew.
+    If the flight had the parameters of a shipped scenario, this is the scenario's name. Otherwise
+    it is the file, in the folder of the run, with the parameters that flew.
     """
     if scenario.name in scenarios():
         shipped = find_scenario(scenario.name)
@@ -218,12 +218,15 @@ def scenario_argument(flight: RecordedFlight, scenario: Scenario) -> str:
 
 
 def gains_command(verb: str, scenario: Scenario, name: str) -> str:
-    """Return a command on the gains of a scenario, which has the `name` in commands."""
+    """Return the command that applies `verb` to the gains of a scenario.
+
+    `name` is the argument that stands for the scenario in commands.
+    """
     return f"rise-di gains {verb} {shlex.quote(scenario.aircraft.airframe)} --scenario {name}"
 
 
 def run_argument(flight: RecordedFlight) -> str:
-    """Return how a command names the run in the folder where flights are recorded."""
+    """Return the argument that names the run of a flight in commands."""
     return shlex.quote(f"runs/{flight.name}")
 
 
@@ -234,11 +237,11 @@ NAMES = {"q": "pitch rate q", "p": "roll rate p", "r": "yaw rate r", "V": "airsp
 
 
 def tiles_of(flight: RecordedFlight) -> list[Tile]:
-    """Return a tile an output.
+    """Return a tile for each output.
 
-    It has the worst part of the flight beside what was allowed there. If the errors were not
-    judged, as in a flight that ended early or that the host starved, it has the error over the
-    whole flight.
+    A tile compares the error in the worst part of the flight with the error allowed there. If the
+    errors were not judged, the tile has the error over the whole flight. This happens if a flight
+    ended early, or if the host starved the nodes.
     """
     units = flight.units
     outcome = flight.summary["outcome"]

@@ -15,16 +15,17 @@ NEVER_ENGAGED = never_flew("the controller never engaged")
 
 
 def has_ticks(tape: Tape) -> bool:
-    """Return whether the controller engaged, so that the log holds a u or a tick."""
+    """Return whether the log holds a u or a tick, which shows that the controller engaged."""
     return any(name in tape and len(tape[name].stamp_ns) for name in TICKS)
 
 
 def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcome:
-    """Return the outcome of a flight that recorded none, as when nodes are started singly.
+    """Return the outcome of a flight from its signals, if the log has no outcome.
 
-    The flight is completed if the log holds y, y_m and u for the duration in the log, or if that is
-    missing, in the scenario. If only a part of the flight is in the log, its outcome is UNKNOWN. An
-    autopilot may end the last engagement, and u with it, before the end.
+    This happens if nodes are started singly. The flight is completed if y, y_m and u last for its
+    whole duration. The duration comes from the log or, if the log lacks it, from the scenario. If
+    the log has only a part of the flight, the outcome is UNKNOWN. If the flight is not simulated, u
+    does not count, because an autopilot may end the last engagement earlier.
     """
     is_part = bool(tape.lost_parts) or any(
         recording.step_ns for recording in tape.recording.values()
@@ -46,8 +47,8 @@ def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcom
 def until_last_tick(tape: Tape) -> Tape:
     """Cut the tape after the controller's last tick.
 
-    Later samples belong to the shutdown of the processes. But if u ends much earlier than y and
-    y_m, or before the end of a whole flight, this is a gap of the log, and we cut nothing there.
+    Later samples belong to the shutdown of the processes. If u ends much earlier than the planned
+    end and than y and y_m, the log has a gap, and the tape is cut only at the planned end.
     """
     ticks = [
         int(tape[name].stamp_ns[-1]) for name in TICKS if name in tape and len(tape[name].stamp_ns)

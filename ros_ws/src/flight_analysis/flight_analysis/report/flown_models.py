@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the parameters of the controller that flew, and their linear loops.
 
-A loop is around the aircraft of the file, or around the true aircraft of a simulation.
+A loop has the aircraft of the file, or the true aircraft of a simulation.
 """
 
 import re
@@ -37,13 +37,13 @@ from flight_core.tape import Tape
 from rise_di_controller.law.linear_loop import LoopTiming
 from rise_di_controller.params import ControllerConfig
 
-ENTRY = re.compile(r"([AB])\[(.+), (.+)\]")  # as in the topic `learned`
+ENTRY = re.compile(r"([AB])\[(.+), (.+)\]")  # an entry as the topic `learned` names it
 FILE = "file"
 TRUE = "true"
 
 
 class FlownController(NamedTuple):
-    """Parameters of a controller, and when they flew: first and last instants, s."""
+    """Parameters of a controller, and the first and last time, s, of each span they flew."""
 
     name: str  # "start", "file", "model 1"
     spans: tuple[tuple[float, float], ...]
@@ -51,7 +51,7 @@ class FlownController(NamedTuple):
 
     @property
     def times(self) -> str:
-        """Return the spans as text, in s."""
+        """The spans as text, in s."""
         return ", ".join(f"{start:.1f} to {stop:.1f}" for start, stop in self.spans)
 
 
@@ -59,23 +59,23 @@ class FlownController(NamedTuple):
 class FlownLoop:
     """The linear loop of parameters that flew, around an aircraft."""
 
-    name: str  # of the parameters; empty for those of the whole flight
-    times: str  # of the parameters, s
+    name: str  # name of the parameters; empty if they flew the whole flight
+    times: str  # when the parameters flew, as text, s
     aircraft: str  # FILE or TRUE
     loop: LinearLoop
 
     @cached_property
     def margins(self) -> LoopMargins:
-        """Return the margins of the loop. A card and a table of the page both show them."""
+        """The margins of the loop, computed once for all parts of the page."""
         return loop_margins(self.loop)
 
 
 def flown_controllers(
     tape: Tape, start: ControllerConfig, changes: Sequence[Change]
 ) -> tuple[FlownController, ...]:
-    """Return the parameters that flew, in order: at the start, and after each change in flight.
+    """Return the parameters that flew, in order, from the start and after each change in flight.
 
-    The digests of the ticks tell which flew when.
+    The digest of the parameters in each tick shows when they flew.
     """
     by_digest = {start.digest(): start}
     latest = start
@@ -93,10 +93,10 @@ def flown_controllers(
 
 
 class FlownLoops(NamedTuple):
-    """The linear loops of a flight, and what we have to say about them."""
+    """The linear loops of a flight, with sentences about them."""
 
-    loops: list[FlownLoop]  # none without a linear model, or where what flew is not known
-    sentences: tuple[str, ...]  # how what flew differs from what the controller was told
+    loops: list[FlownLoop]  # empty without a linear model, or if it is unknown what flew
+    sentences: tuple[str, ...]  # how the aircraft differs from what the controller was told
 
 
 UNKNOWN_AIRCRAFT = (
@@ -113,7 +113,8 @@ def flown_loops(
 ) -> FlownLoops:
     """Return the linear loops of a flight.
 
-    Their lags and delay are those that flew. `later` has the aircraft after each change in flight.
+    They have the lags and the delay of the aircraft that flew. `later` has the aircraft after each
+    change in flight.
     """
     loops = []
     sentences: list[str] = []
@@ -144,7 +145,7 @@ def facts_of(
     controllers: Sequence[FlownController],
     later: Sequence[AircraftConfig] = (),
 ) -> FlightFacts:
-    """Return what the log of a flight tells beyond its scenario."""
+    """Return the facts about a flight that its log has but its scenario lacks."""
     known = {start.digest(), *(each.controller.digest() for each in controllers)}
     age = age_metrics(tape)
     return FlightFacts(
@@ -158,7 +159,7 @@ def facts_of(
 
 
 def _period_of_ticks(tape: Tape) -> float | None:
-    """Return the median time from a tick to the next, s; None if the log has fewer than two."""
+    """Return the median time between two ticks, s, or None if the log has fewer than two."""
     if "internals" not in tape or "number" not in tape["internals"].names:
         return None
     steps = np.diff(tape["internals"]["number"])
@@ -169,7 +170,7 @@ def _period_of_ticks(tape: Tape) -> float | None:
 
 
 def _period_of(tape: Tape, topic: str) -> float | None:
-    """Return the median time between two samples of a topic, s; None if it has fewer than two."""
+    """Return the median time between two samples of a topic, s, or None with fewer than two."""
     if topic not in tape or len(tape[topic].stamp_ns) < 2:
         return None
     return float(np.median(np.diff(tape[topic].stamp_ns))) / NANOSECONDS
@@ -196,8 +197,8 @@ def _loop_around(
 def learned_lines(tape: Tape, scenario: Scenario) -> dict[str, dict[str, float]]:
     """Return known values of the entries in the topic `learned`, SI, by label.
 
-    They are those of the file and, if the flight was simulated, those of the true aircraft. For an
-    aircraft of JSBSim there are none.
+    One label has the values of the file. If the flight was simulated, another has those of the true
+    aircraft. For an aircraft of JSBSim no values are known.
     """
     if "learned" not in tape or scenario.aircraft.is_jsbsim:
         return {}

@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tell whether the y_m of a flight is that of the scenario.
+"""Check whether the y_m of a flight is that of the scenario.
 
-The error e = y - y_m does not tell if the reference model hangs or flies other commands: y follows
-whatever y_m is. So we compute y_m again, by the code of the node, from the commands of the
-scenario, and from the u_m of the log once there is one:
+The error e = y - y_m does not show that the reference model hangs or flies other commands, because
+y follows any y_m. Therefore this module computes y_m again, by the code of the node. It takes the
+commands of the scenario, and the u_m of the log from the first one on:
 
     x_m+ = Phi x_m + Gamma [u_m(t), u_m(t + T/2), u_m(t + T)],  y_m = C x_m      (2)
 
-Every bit must be equal, except for ROUNDING. In real time the log does not say before which step a
-u_m arrived. It acted from the step after which y_m has the right bits, if there is one within its
-age limit; if several steps give the right bits, we follow all of them until one is wrong. If the
-log lost a y_m or a u_m, an error smaller than the harmless ones cannot be seen.
+Every bit must be equal, except for ROUNDING. In real time the log does not show before which step a
+u_m arrived. The computation finds the step, within the age limit of u_m, from which on y_m has the
+right bits. If several steps give the right bits, it follows all of them until they differ from the
+log. If the log lost a y_m or a u_m, the check cannot see an error below the harmless ones.
 """
 
 import copy
@@ -52,23 +52,23 @@ MOST_PATHS = 16
 
 
 class NotCompared(Enum):
-    """Why y_m was not compared with the scenario."""
+    """The reason why y_m was not compared with the scenario."""
 
     FOREIGN = "y_m is of another reference model than that of the stack"
     NO_START = "the log does not hold the start of the reference model"
 
     def note(self) -> str:
-        """Return the sentence for the report."""
+        """Return the reason as a sentence for the report."""
         return f"y_m is not compared with the commands of the scenario: {self.value}"
 
 
 class ReferenceErrors(NamedTuple):
-    """How far y_m is from that of the scenario."""
+    """The difference between the y_m of a log and the y_m of the scenario."""
 
     t: FloatArray  # (N,) flight time, s
     outputs: tuple[str, ...]
-    error: FloatArray  # (N, m) y_m of the log less y_m of the scenario, SI
-    allowed: FloatArray  # (m,) SI
+    error: FloatArray  # y_m of the log less y_m of the scenario, (N, m), SI
+    allowed: FloatArray  # largest abs(error) that counts as none, (m,), SI
 
 
 class _Command(NamedTuple):
@@ -80,16 +80,16 @@ class _Command(NamedTuple):
 
 
 class _Path(NamedTuple):
-    """An order in which the u_m of the log may have acted."""
+    """A hypothesis on which u_m of the log have acted so far."""
 
     reference: Reference
-    taken: int  # the u_m up to this one have been taken, or are too old
+    taken: int  # number of u_m, in order, that have been taken or are too old
 
 
 def reference_errors(tape: Tape, scenario: Scenario) -> ReferenceErrors | NotCompared | None:
-    """Compute y_m again, and return how far that of the log is from it.
+    """Compute y_m again, and return the difference of the logged y_m from it.
 
-    Returns None if the log has no y_m.
+    Returns the reason if they cannot be compared, or None if the log has no y_m.
     """
     if "y_m" not in tape or not len(tape["y_m"].stamp_ns):
         return None
@@ -118,11 +118,11 @@ def reference_errors(tape: Tape, scenario: Scenario) -> ReferenceErrors | NotCom
 
 
 def reference_shortfalls(tape: Tape, scenario: Scenario) -> list[Shortfall]:
-    """Return a shortfall for the y_m that is farthest from that of the scenario, if one is off."""
+    """Return a shortfall for the channel of y_m that is farthest off, if any is off."""
     errors = reference_errors(tape, scenario)
     if not isinstance(errors, ReferenceErrors):
         return []
-    # We negate, so that NaN counts as off too.
+    # The negated comparison counts NaN as off, too.
     is_off = ~(np.abs(errors.error) <= errors.allowed)
     if not is_off.any():
         return []
@@ -151,7 +151,7 @@ def reason_not_compared(tape: Tape, scenario: Scenario) -> NotCompared | None:
 
 
 def _is_whole(tape: Tape) -> bool:
-    """Return whether the log tells which u_m acted: in real time a lost message hides it."""
+    """Return whether the log shows which u_m acted. In real time, a lost message hides this."""
     if "u_m" not in tape or tape.start_ns < SINCE_EPOCH_NS:
         return True
     return all(name in tape.recording and tape.recording[name].lost == 0 for name in ("y_m", "u_m"))
@@ -163,7 +163,7 @@ def _is_planned(tape: Tape) -> bool:
 
 
 def _commands(tape: Tape, outputs: Sequence[str], start_ns: int) -> list[_Command]:
-    """Return the u_m of the log in the order of their stamps."""
+    """Return the u_m of the log in order, with stamps in flight time."""
     if "u_m" not in tape or not set(outputs) <= set(tape["u_m"].names):
         return []
     log = tape["u_m"]
@@ -185,7 +185,8 @@ def _computed(
 ) -> FloatArray:
     """Return y_m of the reference model at the instants t_ns, (N, m).
 
-    `y_m` of the log, (N, m), serves only to tell between which two samples a u_m arrived.
+    `y_m` is that of the log, (N, m). It only serves to find between which two samples a u_m
+    arrived.
     """
     paths = [_Path(Reference(parameters), 0)]
     max_age_ns = nanoseconds(parameters.live.max_age)
@@ -199,11 +200,12 @@ def _computed(
             for trial in _next_paths(path, commands, before_ns, max_age_ns):
                 sample = trial.reference.sample(number)
                 error = float(np.max(np.abs(y_m[k] - sample)))
-                # With this order of its arguments, min turns an error that is NaN into inf.
+                # With its arguments in this order, min turns an error that is NaN into inf.
                 trials.append((min(np.inf, error), sample, trial))
         trials.sort(key=lambda each: each[0])
         least, expected[k], _ = trials[0]
-        # A wrong path has the right bits only while the u_m that it took too early hardly differs.
+        # A path that took a u_m too early has the right bits only as long as this u_m hardly
+        # differs from the one before.
         bound = ROUNDING if 0.0 < least <= ROUNDING else least
         paths = _distinct([trial for error, _, trial in trials if error <= bound])[:MOST_PATHS]
         before_ns = number * period_ns
@@ -213,7 +215,10 @@ def _computed(
 def _next_paths(
     path: _Path, commands: Sequence[_Command], before_ns: int, max_age_ns: int
 ) -> list[_Path]:
-    """Return the paths that go on from one: any u_m that may have arrived, or none, is newest."""
+    """Return the paths that can follow a path.
+
+    They take as the newest u_m any one that may have arrived since `before_ns`, or none.
+    """
     arrived = path.taken
     while arrived < len(commands) and commands[arrived].t_ns <= before_ns + AHEAD_NS:
         arrived += 1
@@ -230,7 +235,7 @@ def _next_paths(
 
 
 def _distinct(paths: Sequence[_Path]) -> list[_Path]:
-    """Leave out the paths that have become the same as an earlier one."""
+    """Leave out the paths with the same state as a path earlier in the list."""
     if len(paths) == 1:
         return list(paths)
     by_state: dict[tuple[int, bytes, bytes], _Path] = {}
@@ -242,6 +247,6 @@ def _distinct(paths: Sequence[_Path]) -> list[_Path]:
 
 
 def _take(reference: Reference, command: _Command) -> None:
-    """Hand a u_m to the reference model, which may refuse it as the node does."""
+    """Hand a u_m to the reference model. As in the node, the model may refuse it."""
     with suppress(ChannelError):
         reference.take(command.t_ns, command.u_m, command.attitude)

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Explain the words of tables and cards, each once: below a table in the terminal, and on a page.
+"""Explain the words of tables and cards.
 
-On a page the heading of a column shows its meaning, and all meanings stand together at the end.
+In a terminal, the meanings are printed below a table. On a page, the heading of a column shows its
+meaning, and all meanings are listed at the end.
 """
 
 import math
@@ -97,7 +98,7 @@ GLOSSARY = MappingProxyType(
 
 
 def words_in(texts: Iterable[str]) -> tuple[str, ...]:
-    """Return those of the texts that the glossary explains, each once."""
+    """Return the texts that the glossary explains, without repetition."""
     return tuple(dict.fromkeys(text for text in texts if text in GLOSSARY))
 
 

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute the figures of merit of a guided flight.
 
-For each segment, by mode and leg, these are the errors of the quantities that guidance held.
+A flight is split into segments by mode and leg. For each segment, the figures are the errors of the
+quantities that guidance held.
 """
 
 import math
@@ -64,25 +65,25 @@ PATHS = (Lateral.ORBIT, Lateral.ROUTE, Lateral.PLACE)
 class HoldErrors(ErrorMetrics):
     """The errors of a held quantity over a segment, in SI.
 
-    Only a segment that begins outside the band has overshoot and settling.
+    Overshoot and settling are None if the segment begins inside the settling band.
     """
 
     quantity: str
     overshoot: float | None = None  # largest error on the other side of the command
-    # s from the start of the segment; None: not settled by its end
+    # settling time from the start of the segment, s; None if not settled by its end
     settling: float | None = None
 
 
 class FlownLeg(NamedTuple):
-    """A leg of a route, as flown."""
+    """When and with which result a leg of a route was flown."""
 
     leg: int  # number of the leg, from 0 as in `target`
-    start: float  # s, when the aircraft begins to fly to the leg
-    joined: float | None  # s, when the aircraft has reached the line of the leg; None: never
+    start: float  # when the aircraft begins to fly to the leg, s
+    joined: float | None  # when the aircraft has reached the line of the leg, s; None if never
     stop: float  # s
-    # "flown", "missed", or "not ended": by another command, or by the end of the flight
+    # "flown", "missed", or "not ended" if another command or the end of the flight came before
     result: str
-    missed: float  # m, distance from the end of a missed leg; else 0
+    missed: float  # distance from the end of the leg, m, if it was missed; else 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +99,7 @@ class Segment:
 
 
 def segments(tape: Tape) -> list[Segment]:
-    """Return the segments of a guided flight, from `guidance`.
+    """Return the segments of a guided flight, which follow from the topic `guidance`.
 
     If commands come less than SETTLING_DWELL apart, they begin a single segment.
     """
@@ -109,7 +110,8 @@ def segments(tape: Tape) -> list[Segment]:
     targets = [f"target.{name}" for name in TARGETS]
     names = ["mode.lateral", "mode.vertical", "leg", *targets, "joining"]
     columns = np.column_stack([log[name] for name in names])
-    # The altitude and the climb of a profile change along the leg.
+    # On a leg with an altitude profile, altitude and climb change all the time, so they begin no
+    # segment.
     follows = [k for k, name in enumerate(names) if name in {"target.altitude", "target.climb"}]
     columns[np.ix_(log["mode.vertical"] == Vertical.PROFILE, follows)] = 0.0
     changes = np.any(np.diff(columns, axis=0) != 0.0, axis=1)
@@ -149,11 +151,11 @@ def segments(tape: Tape) -> list[Segment]:
 
 
 def flown_legs(tape: Tape) -> list[FlownLeg]:
-    """Return the legs of a guided flight in order, from `guidance`, each with its result."""
+    """Return the legs that the topic `guidance` shows, in order, each with its result."""
     t = tape.time("guidance")
     log = tape["guidance"]
     legs = np.where(log["mode.lateral"] == Lateral.ROUTE, log["leg"], -1.0)
-    # If a leg is commanded again, it begins again.
+    # If a leg is commanded again, it counts as a new leg.
     commands = log["given"].astype(np.int64) & bits(("leg",))
     edges = np.flatnonzero((np.diff(legs) != 0.0) | (commands[1:] != 0)) + 1
     result = []
@@ -179,11 +181,11 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
 
 
 def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
-    """Return the numbers of the legs that are ahead when the flight ends.
+    """Return the numbers of the legs that have not been flown when the flight ends.
 
-    The leg under way is one of them; the last leg of a route is an orbit without an end, and is
-    not. The result is empty if a command replaced the route, or if the route is not in the log. If
-    the fence, a lost pose or a lost link ended the route, its legs are still ahead.
+    The leg under way is one of them. The last leg of a route is not, because it is an orbit without
+    an end. The result is empty if a command replaced the route, or if the route is not in the log.
+    If the fence, a lost pose or a lost link ended the route, its remaining legs count as not flown.
     """
     log = tape["guidance"]
     on_route = np.flatnonzero(log["mode.lateral"] == Lateral.ROUTE)
@@ -204,8 +206,8 @@ def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
 def orbit_missed_by(tape: Tape, section: GuidanceConfig) -> float:
     """Return how far the flight ends from the circle of its last orbit, m.
 
-    This is 0 if the aircraft has joined the orbit, to within the distance at which a leg counts as
-    flown, and if the flight ends elsewhere.
+    The result is 0 if this distance is so small that a leg would count as flown. It is also 0 if
+    the flight does not end on the last orbit of a route.
     """
     log = tape["guidance"]
     if log["mode.lateral"][-1] != Lateral.ROUTE or log["joining"][-1] != 0.0:
@@ -221,7 +223,7 @@ def orbit_missed_by(tape: Tape, section: GuidanceConfig) -> float:
 def touched_beside(tape: Tape, section: GuidanceConfig) -> float:
     """Return how far from the touch-down zone the flight ends, m.
 
-    This is 0 if it ends inside, and if there is no zone.
+    The result is 0 if the flight ends inside the zone, or if there is no zone.
     """
     pose = best_pose(tape)
     if section.touchdown is None or pose is None:
@@ -235,21 +237,21 @@ SCREEN = 15.24
 
 
 class Touch(NamedTuple):
-    """How a landing ended, by the true pose if the log has it."""
+    """The figures of a touch-down, from the true pose if the log has it."""
 
     sink: float  # m/s
-    sideways: float  # m/s, across the heading
-    crab: float  # rad, of the nose from the line
-    beside: float  # m, to the right of the line
-    beyond: float  # m, along the line from the waypoint on the ground
-    V: float  # m/s, airspeed
-    V_screen: float | None  # m/s, airspeed at SCREEN over the ground; None: never there
+    sideways: float  # speed across the heading, m/s
+    crab: float  # angle of the nose from the line of the runway, rad
+    beside: float  # distance to the right of the line, m
+    beyond: float  # distance along the line from the waypoint on the ground, m
+    V: float  # airspeed, m/s
+    V_screen: float | None  # airspeed at the height SCREEN, m/s; None if never there
 
 
 def landing_touch(tape: Tape, section: GuidanceConfig | None) -> Touch | None:
     """Return the figures of a landing.
 
-    Returns None without a section `landing`, and if the flight did not end in a landing.
+    Returns None if guidance has no section `landing`, or if the flight did not end in a landing.
     """
     if section is None or section.landing is None or tape.outcome.end is not End.LANDED:
         return None
@@ -283,13 +285,13 @@ class Outside(NamedTuple):
     """How long and how far the aircraft was outside of limits while guidance flew."""
 
     outside_s: float
-    farthest_m: float  # from the limits, m; 0 inside
+    farthest_m: float  # largest distance from the limits, m; 0 if always inside
 
 
 def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
     """Return the time outside of the fence from the first step of guidance on.
 
-    Returns None if there is no fence, and if there is no pose from then on.
+    Returns None if there is no fence, or no pose from the first step on.
     """
     fence = None if section is None else section.fence_zones()
     pose = _guided_pose(tape)
@@ -301,8 +303,8 @@ def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
 def altitude_excess(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
     """Return the time above the ceiling or below the altitude floor.
 
-    It counts from the first step of guidance on. Returns None if there are no limits, and if there
-    is no pose from then on.
+    The time counts from the first step of guidance on. Returns None if there are no limits, or no
+    pose from the first step on.
     """
     pose = _guided_pose(tape)
     if section is None or (section.ceiling is None and section.altitude_floor is None):
@@ -315,7 +317,7 @@ def altitude_excess(tape: Tape, section: GuidanceConfig | None) -> Outside | Non
 
 
 def _guided_pose(tape: Tape) -> Signal | None:
-    """Return the pose from the first step of guidance on, or None if the log lacks either."""
+    """Return the pose from the first step of guidance on, or None without pose or guidance."""
     pose = best_pose(tape)
     if pose is None or "guidance" not in tape or not len(tape["guidance"].stamp_ns):
         return None
@@ -326,18 +328,21 @@ def _guided_pose(tape: Tape) -> Signal | None:
 
 
 def _outside(tape: Tape, pose: Signal, inside: FloatArray) -> Outside:
-    """Return how long and how far a distance from the limits is negative; `inside`: (N,), m."""
+    """Return how long and how far the aircraft was outside of the limits.
+
+    `inside` has the distance to the limits at each pose, (N,), m, which is negative outside.
+    """
     t = (pose.stamp_ns - tape.start_ns) / NANOSECONDS
     lasted = float(np.sum(np.diff(t)[inside[:-1] < 0.0]))
     return Outside(lasted, max(float(-np.min(inside)), 0.0))
 
 
 def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[str, Any]:
-    """Return what a map shows of a mission, ready for JSON, in m.
+    """Return what a map shows of a mission, ready for JSON, with lengths in m.
 
     `route` has the points of the line, and `legs` has [number, north, east] for each leg. `to_end`
-    has the lengths after each leg of the last route up to its last orbit. `fence` and `home` are as
-    in the section.
+    has, for each leg of the last route, the length of the path from its end to the last orbit.
+    `fence` and `home` come from the section.
     """
     legs: list[list[float]] = []
     outline: list[Any] = []
@@ -355,7 +360,7 @@ def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[st
 
 
 def leg_results(legs: Sequence[Mapping[str, Any]]) -> str:
-    """Return the legs of a summary with their results, or "" if it has none.
+    """Return the legs of a summary with their results as text, or "" without legs.
 
     An example is "legs: 0 flown, 1 missed by 321 m, 2 not ended".
     """
@@ -367,7 +372,7 @@ def leg_results(legs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def landing_results(landing: Mapping[str, Any] | None) -> str:
-    """Return the figures of a `Touch` as a sentence, or "" if there was none."""
+    """Return the figures of a `Touch` as a sentence, or "" without a landing."""
     if landing is None:
         return ""
     side = "right" if landing["beside"] > 0.0 else "left"
@@ -387,8 +392,8 @@ def landing_results(landing: Mapping[str, Any] | None) -> str:
 def control_errors(tape: Tape) -> dict[str, FloatArray]:
     """Return the errors of the quantities of guidance, measured less commanded, shape (N,).
 
-    They are taken at the samples of `guidance`. The cross-track error is that of the log, positive
-    to the right. Angles are within half a turn.
+    There is a value for each sample of `guidance`. The cross-track error comes from the log, and is
+    positive to the right. Errors of angles lie within half a turn.
     """
     log = tape["guidance"]
     pose = tape["guidance"].group("pose")
@@ -403,7 +408,7 @@ def control_errors(tape: Tape) -> dict[str, FloatArray]:
     errors = {name: values - log[f"target.{name}"] for name, values in measured.items()}
     for name in (name for name in errors if UNITS[name] == "rad"):
         errors[name] = np.remainder(errors[name] + math.pi, 2.0 * math.pi) - math.pi
-    # V of y is a deviation from the trim speed V0, and so is that of u_m: V_c - V0.
+    # V in y is a deviation from the trim speed V0, and so is V in u_m, which is V_c - V0.
     V = log["y.V"] - log["u_m.V"] if "y.V" in log.names else flown_speed(tape, 0.0) - log["V_c"]
     return errors | {"xtrack": log["xtrack"], "V": V}
 
@@ -411,7 +416,7 @@ def control_errors(tape: Tape) -> dict[str, FloatArray]:
 def distance(tape: Tape) -> float | None:
     """Return the length of the path over ground, m, or None if the log has no speed over ground.
 
-    It is the integral of that speed.
+    It is the integral of the speed over ground.
     """
     pose = tape.signals.get("pose")
     if pose is None or not {"v_north", "v_east"} <= set(pose.names):
@@ -420,7 +425,10 @@ def distance(tape: Tape) -> float | None:
 
 
 def top_speed(tape: Tape, trim: float) -> float | None:
-    """Return the largest airspeed by y, m/s, with `trim` added, or None if y has no V."""
+    """Return the largest airspeed, m/s, or None if y has no V.
+
+    It is `trim` plus the largest V in y, which is a deviation from trim.
+    """
     y = tape.signals.get("y")
     return None if y is None or "V" not in y.names else trim + float(np.max(y["V"]))
 
@@ -428,7 +436,7 @@ def top_speed(tape: Tape, trim: float) -> float | None:
 def flown_speed(tape: Tape, trim: float) -> FloatArray:
     """Return the airspeed at the samples of `guidance`, m/s: the trim speed plus V of y.
 
-    If y has no V, as that of a multicopter, it is the speed over ground.
+    If y has no V, as for a multicopter, it is the speed over ground.
     """
     log = tape["guidance"]
     over_ground: FloatArray = np.hypot(log["pose.v_north"], log["pose.v_east"])
@@ -463,7 +471,7 @@ def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
 
 
 def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[str, Any] | None:
-    """Return the figures of a guided flight as `summary.json` holds them, SI.
+    """Return the figures of a guided flight for `summary.json`, in SI.
 
     Returns None for a flight without guidance.
     """
@@ -489,7 +497,7 @@ def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[
 
 
 def _mean_wind(tape: Tape) -> dict[str, float]:
-    """Return the mean of the estimated wind to the north and to the east, m/s."""
+    """Return the mean components of the estimated wind, to the north and to the east, m/s."""
     log = tape["guidance"]
     return {name: float(np.mean(log[f"wind.{name}"])) for name in WIND}
 

@@ -38,21 +38,21 @@ from flight_guidance.steering.wind import wind_of
 TRACK_POINTS = 2400
 TRACK_HEIGHT = 560  # pixels
 WIND_ARROWS = 8
-ARROW_PIXELS = 45.0  # of the strongest wind
+ARROW_PIXELS = 45.0  # length of the arrow of the strongest wind
 LEG = "leg"  # name of the annotation with the number of a leg
-LEAST_WIND = 0.3  # m/s, below which no arrow is drawn
-# colours other than MODE_COLOURS, which are in the same figures
+LEAST_WIND = 0.3  # wind below which no arrow is drawn, m/s
+# colours that differ from MODE_COLOURS, which are used in the same figures
 MODE_SHADES = {
     GuidanceMode.DEAD_RECKONING: "#0072b2",
     GuidanceMode.POSE_LOST: "#cc79a7",
 }
 
-# least and largest command by channel, SI; infinite without a limit
+# least and largest command by channel, SI; infinite if there is no limit
 Bounds = Mapping[str, tuple[float, float]]
 
 
 def guided_context(context: PlotContext) -> PlotContext:
-    """Return the context with units of the held quantities, and the times of a stale pose."""
+    """Add the units of the held quantities, and the times of a stale pose, to a context."""
     t = context.tape.time("guidance")
     mode = context.tape["guidance"]["mode"]
     stale = []
@@ -79,7 +79,7 @@ def bounds_of(scenario: Scenario | None) -> Bounds:
 
 
 def flown_routes(scenario: Scenario | None, tape: Tape) -> list[Route]:
-    """Return the routes that flew, by the log: of the scenario and of the topic `route`."""
+    """Return the routes from the scenario and the topic `route` that flew, as the log shows."""
     if scenario is None or scenario.guidance is None:
         return []
     numbers = set(tape["guidance"]["route"].tolist())
@@ -93,10 +93,10 @@ def flown_routes(scenario: Scenario | None, tape: Tape) -> list[Route]:
 def track_figure(
     tape: Tape, routes: Sequence[Route], speed: float, fence: Fence | None = None
 ) -> Figure:
-    """Draw the ground track over the routes with their fillets, and arrows of the wind.
+    """Draw the ground track, the routes with their fillets, and arrows of the wind.
 
-    The axes have the same scale. The legs are numbered, start and end are marked, and the fence is
-    drawn with home. `speed` is the trim speed V0, m/s.
+    The two axes have the same scale. The legs are numbered, start and end are marked, and the fence
+    is drawn with home. `speed` is the trim speed V0, m/s.
     """
     figure = tracks_figure({"flown": (tape, PLANT)}, routes)
     pose = tape["guidance"].group("pose")
@@ -113,13 +113,13 @@ def track_figure(
 def _add_mark(
     figure: Figure, name: str, east: float, north: float, colour: str, symbol: str
 ) -> None:
-    """Mark a position. Its name is in the legend, where it covers no number of a leg."""
+    """Mark a position. Its name stands in the legend, so that it covers no number of a leg."""
     mark = {"color": colour, "size": 9, "symbol": symbol}
     figure.add_scatter(name, [east], [north], mode="markers", marker=mark, hoverinfo="skip")
 
 
 def _add_numbers(figure: Figure, route: Route) -> None:
-    """Write the numbers of the legs, last of all, so that they lie over the arrows of the wind."""
+    """Write the numbers of the legs. If called last, they lie over the arrows of the wind."""
     for number, (north, east) in enumerate(leg_places(route)):
         place = {"x": east, "y": north, "text": f"{number}", "showarrow": False}
         box = {"bgcolor": PAPER, "bordercolor": REFERENCE, "borderwidth": 1.5, "borderpad": 2}
@@ -144,7 +144,7 @@ def _add_fence(figure: Figure, fence: Fence) -> None:
 def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route]) -> Figure:
     """Draw ground tracks over routes, with the same scale on both axes.
 
-    `tracks` holds the tape of a guided flight and its colour, by label.
+    `tracks` holds the tape and the colour of each guided flight, by label.
     """
     figure = Figure(1, 1, TRACK_HEIGHT)
     for route in routes:
@@ -167,7 +167,7 @@ def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route
 
 
 def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
-    """Return the mean wind over equal parts of the flight, north and east, m/s, shape (parts, 2).
+    """Return the mean wind, north and east, over equal parts of the flight, m/s, (parts, 2).
 
     The wind is the velocity over ground less the velocity through the air, which is V cos(gamma)
     along psi + beta with V = V0 + V of y.
@@ -175,7 +175,7 @@ def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
     log = tape["guidance"]
     pose = log.group("pose")
     heading = log["pose.psi"] + log["pose.beta"]
-    wind = np.column_stack([log["wind.north"], log["wind.east"]])  # of a multicopter
+    wind = np.column_stack([log["wind.north"], log["wind.east"]])  # a multicopter logs its wind
     if "y.V" in log.names:
         flown = flown_speed(tape, speed)
         wind = np.column_stack(
@@ -209,7 +209,7 @@ def _add_wind(figure: Figure, tape: Tape, speed: float) -> None:
     figure.add_scatter(label, [None], [None], line={"color": WIND})
 
 
-AIRSPEED = "airspeed"  # absolute: V is the deviation from the trim speed
+AIRSPEED = "airspeed"  # name of the absolute speed, because V is the deviation from the trim speed
 
 
 def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figure:
@@ -243,14 +243,14 @@ def attitude_figure(context: PlotContext, bounds: Bounds) -> Figure:
 
 
 def cross_track_figure(context: PlotContext) -> Figure | None:
-    """Draw the cross-track error while a path is followed, by leg of the route.
+    """Draw the cross-track error while a path is followed, with a curve for each leg.
 
     Returns None if the flight followed no path.
     """
     log = context.tape["guidance"]
     lateral = log["mode.lateral"]
     on_path = np.isin(lateral, [Lateral.ORBIT, Lateral.ROUTE])
-    on_path &= log["joining"] == 0.0  # the way to a leg has no line to be beside
+    on_path &= log["joining"] == 0.0  # on the way to a leg there is no cross-track error
     if not on_path.any():
         return None
     error = Curve(_signal(context, {"xtrack": np.where(on_path, log["xtrack"], np.nan)}), ERROR)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Build the page of a flight, of an imported log, or of a linear loop, and write it.
+"""Build and write the page of a flight, of an imported log, or of a linear loop.
 
-`comparison_page` has the page of several flights, and `page` turns each of them into HTML.
+`comparison_page` builds the page of several flights, and `page` turns any of these pages into HTML.
 """
 
 from collections.abc import Mapping, Sequence
@@ -69,7 +69,7 @@ from flight_core.files import replacing
 
 ABOUT_V = "V is the airspeed; its value at trim is subtracted."
 ABOUT_Y_M = "y_m is what the aircraft was asked to follow, and y what it did."
-MOST_MESSAGES = 500  # messages of a log on a page
+MOST_MESSAGES = 500  # largest number of messages of a log on a page
 
 
 def write_page(
@@ -79,7 +79,7 @@ def write_page(
 ) -> None:
     """Write the page of a flight, or of a comparison if there are several.
 
-    `tolerances` are those of differences between several flights, by channel, SI.
+    `tolerances` has the allowed difference between several flights by channel, SI.
     """
     if len(flights) > 1:
         page = comparison_page(flights, tolerances)
@@ -96,7 +96,7 @@ def _write(path: Path, page: Page) -> None:
 
 
 def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
-    """Write a page of a linear loop that need not have flown: margins, Bode and Nyquist plot."""
+    """Write the page of a linear loop, flown or not, with margins, Bode and Nyquist plots."""
     differences = [each.sentence for each in loop.differences]
     table = margin_figures.margin_table(loop_margins(loop), kept_guarantee(loop), differences)
     figures_of_loop = Figures(groups=[TableGroup([table])])
@@ -107,7 +107,7 @@ def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
 
 
 def _imported_page(flight: RecordedFlight) -> Page:
-    """Return the page of y, u and pose of an aircraft that the log does not describe."""
+    """Return the page of an imported log, which has y, u and pose but no aircraft."""
     tape = flight.tape
     source = flight.summary["source"]
     context = figures.plot_context([flight])
@@ -148,7 +148,7 @@ def _imported_page(flight: RecordedFlight) -> Page:
 
 
 def _not_judged(flight: RecordedFlight) -> Verdict:
-    """Return why nothing is said about how an imported flight went."""
+    """Return the verdict that says why an imported flight is not judged."""
     lack = "no reference" if "y_m" not in flight.tape else "no model of its aircraft"
     return Verdict(
         headline="Not judged.",
@@ -181,7 +181,7 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
 def _blocks(
     flight: RecordedFlight, scenario: Scenario, context: PlotContext, flown: FlownLoops
 ) -> list[Block]:
-    """Return what stands below the head: what the aircraft did, why, and all of it in tables."""
+    """Return what stands below the head: what the aircraft did, why it did so, and the tables."""
     return [
         *_motion(flight, scenario, context),
         Cards(
@@ -202,7 +202,7 @@ def _blocks(
 
 
 def _motion(flight: RecordedFlight, scenario: Scenario, context: PlotContext) -> list[Block]:
-    """Return what the aircraft did: outputs, track, replay, inputs and errors."""
+    """Return the figures of what the aircraft did: outputs, track, replay, inputs and errors."""
     trim = about_trim(scenario)
     about = ABOUT_V if trim else ""
     floors = {name: metrics["floor"] or 0.0 for name, metrics in flight.summary["errors"].items()}
@@ -236,7 +236,7 @@ def _motion(flight: RecordedFlight, scenario: Scenario, context: PlotContext) ->
 def _causes(
     flight: RecordedFlight, scenario: Scenario, context: PlotContext, flown: FlownLoops
 ) -> list[Block]:
-    """Return why the aircraft did it: models, wind, states, the law, its loop and its ticks."""
+    """Return the figures of the causes: models, wind, states, the law, its loop and its ticks."""
     trim = about_trim(scenario)
     about = ABOUT_V if trim else ""
     spectrum = figures.spectrum_figure(context)
@@ -301,7 +301,7 @@ def _parameter_table(scenario: Scenario) -> tables.MetricTable:
 
 
 def _law(scenario: Scenario) -> str:
-    """Return the rate of the law, and how the law flies."""
+    """Return the text on the law and its rate."""
     controller = scenario.controller
     return f"At {controller.rate:g} Hz with the {controller.summary()}"
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find what the figures of a flight shade: gusts, modes, faults, a busy host and gaps."""
+"""Find the intervals that figures shade: gusts, modes, faults, a busy host and gaps."""
 
 import numpy as np
 
@@ -21,11 +21,11 @@ MODE_COLOURS = {
     Mode.TRIM: "#8a63b8",
     Mode.INACTIVE: "#5f6b73",
 }
-SHOWN_GAP = 0.1  # s without a sample of y
+SHOWN_GAP = 0.1  # least gap between samples of y that is shaded, s
 
 
 def flight_end(tape: Tape) -> float:
-    """Return the last instant of any signal, s; 0 for a tape without samples."""
+    """Return the time of the last sample of any signal, s, or 0 for a tape without samples."""
     return max(
         (float(tape.time(topic)[-1]) for topic in tape.signals if len(tape[topic].stamp_ns)),
         default=0.0,
@@ -33,7 +33,7 @@ def flight_end(tape: Tape) -> float:
 
 
 def gust_intervals(tape: Tape, gusts: Windows) -> list[Interval]:
-    """Return the gusts up to the end of the flight; a gust that repeats has one label."""
+    """Return the gusts up to the end of the flight. A gust that repeats has a single label."""
     end = flight_end(tape)
     return [
         Interval(
@@ -49,7 +49,7 @@ def gust_intervals(tape: Tape, gusts: Windows) -> list[Interval]:
 
 
 def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
-    """Return the intervals of the controller's modes except ENGAGED, by mode."""
+    """Return the intervals in which the controller had a mode other than ENGAGED."""
     if "internals" not in tape:
         return []
     t = tape.time("internals")
@@ -65,7 +65,7 @@ def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
 
 
 def fault_intervals(flight: RecordedFlight, end: float) -> list[Interval]:
-    """Return the faults that the scenario injects; each lasts to the end."""
+    """Return the faults that the scenario injects, each from its start to the end of the flight."""
     if flight.scenario is None:
         return []
     return [
@@ -85,7 +85,7 @@ def starved_intervals(flight: RecordedFlight) -> list[Interval]:
 
 
 def gap_intervals(tape: Tape) -> list[Interval]:
-    """Return the intervals without a sample of y that a reader of the page should see."""
+    """Return the intervals of at least SHOWN_GAP without a sample of y."""
     if "y" not in tape or len(tape["y"].stamp_ns) < 2:
         return []
     t = tape.time("y")

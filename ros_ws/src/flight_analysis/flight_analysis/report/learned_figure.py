@@ -11,7 +11,7 @@ from flight_analysis.metrics import known_entries
 from flight_analysis.report.figures import PLANT, REFERENCE
 from flight_analysis.report.plotting import Figure, PlotContext, add_line, set_layout
 
-BEYOND_END = 1.02  # of the length of a flight: the last bar is whole
+BEYOND_END = 1.02  # end of the time axis as a multiple of the flight, to show the last bar
 LEARNED_LINES: tuple[dict[str, Any], ...] = (
     {"color": REFERENCE, "width": 1.6},
     {"color": PLANT, "width": 1.2, "dash": "dot"},
@@ -19,10 +19,10 @@ LEARNED_LINES: tuple[dict[str, Any], ...] = (
 
 
 def learned_figure(context: PlotContext, lines: Mapping[str, Mapping[str, float]]) -> Figure | None:
-    """Draw the entries of A and B as identified in flight, over time, with bars of two deviations.
+    """Draw the identified entries of A and B over time, with bars of two standard deviations.
 
-    A mark is open if no model was proposed then. `lines` are known values by entry, by label. Only
-    `known_entries` are drawn. Returns None if nothing was learned.
+    A mark is open if the identification became no proposal. `lines` has known values, by label and
+    entry. Only `known_entries` are drawn. Returns None if nothing was learned.
     """
     if "learned" not in context.tape:
         return None

@@ -1,18 +1,19 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fly the linear loop with the commands, noise and wind of a log, to know which error to expect.
+"""Fly the linear loop with the commands, noise and wind of a log, to find the error to expect.
 
     x+ = A x + B u + integral_0^T exp(A s) ds d,  e = C x - y_m,  u = law(e + noise)
 
-y_m, the noise of the sensors and d come from the log; d is the part of x_dot that depends on
-neither x nor u. We leave out the limits of u, faults of the effectors and the state-dependent part
-of f. In the scenarios of the package, the error of a flight is 0.8 to 1.3 times this error.
+y_m, the noise of the sensors and d come from the log, where d is the part of x_dot that depends
+neither on x nor on u. Three things are left out: the limits of u, faults of the effectors and the
+part of f that depends on the state. In the scenarios of the package, the error of a flight is 0.8
+to 1.3 times the error of the linear loop.
 
-Because the loop is linear, e is a sum of three: what the commands leave, what the noise leaves and
-what the wind leaves. A log must not excuse itself. Noise therefore counts only as far as the sensor
-is declared to have it, and as far as the actuators can follow the law's answer to it; wind counts
-only as far as the travel of the actuators can hold it. Gravity acts along the path of y_m, so that
-an aircraft that pitches where nobody asked it to is not excused by its own pitch.
+Because the loop is linear, e is the sum of three errors, which the commands, the noise and the wind
+cause. These errors excuse an error of the flight, so the log must not provide too large ones. Noise
+therefore counts only up to the declared noise of the sensor, and only as far as the actuators can
+follow the law's response to it. Wind counts only as far as the travel of the actuators can counter
+it. Gravity acts along the path of y_m, so that a pitch that was not commanded is no excuse.
 """
 
 from typing import NamedTuple
@@ -51,7 +52,7 @@ from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 AIRSPEED = "V"
-WIND = "gust.longitudinal"  # of `truth`: the wind along the axis of the aircraft, m/s
+WIND = "gust.longitudinal"  # channel of `truth` with the wind along the axis of the aircraft, m/s
 
 NOISE_TIME = 1.0
 """s. The mean error of a sensor over this time counts as bias or drift; without it, white noise at
@@ -66,10 +67,10 @@ NOISE_PEAK = 3.0
 
 
 class Knowledge(NamedTuple):
-    """What we know of a flight."""
+    """What is known of a simulated flight beyond y and u."""
 
-    has_model: bool  # A and B of the aircraft
-    has_wind: bool  # the log holds what moved the aircraft
+    has_model: bool  # whether A and B of the aircraft are known
+    has_wind: bool  # whether the log has the wind that moved the aircraft
 
 
 class ErrorPair(NamedTuple):
@@ -77,19 +78,20 @@ class ErrorPair(NamedTuple):
 
     t: FloatArray  # (N,) flight time, s
     names: tuple[str, ...]
-    e: FloatArray  # (N, m) of the flight, SI
+    e: FloatArray  # error of the flight, (N, m), SI
     y_m: FloatArray  # (N, m)
     linear: "LinearErrors"
-    is_flown: NDArray[np.bool_]  # (N,) the law was to fly, and the log has the error
-    not_numbers: int  # ticks with an error that is not finite
-    noise: FloatArray  # (m,) rms of the noise in e: 0 of a true error
+    is_flown: NDArray[np.bool_]  # (N,), whether the law should fly and the log has the error
+    not_numbers: int  # number of ticks with an error that is not finite
+    noise: FloatArray  # rms of the noise in e, (m,), which is 0 for a true error
     knowledge: Knowledge
 
 
 class LinearErrors(NamedTuple):
     """Absolute errors of the linear loop, (N, m), SI; 0 if no linear loop is stable.
 
-    If the aircraft drifts, each is the larger one of the aircraft before and after the drift.
+    If the aircraft drifts, each error is the larger one of two, for the aircraft before and after
+    the drift.
     """
 
     whole: FloatArray
@@ -99,7 +101,10 @@ class LinearErrors(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """How far the actuators let each input of the law go, (m,), in its unit; inf if unlimited."""
+    """How far and how fast the actuators let each input of the law go, (m,), in its unit.
+
+    The values are infinite if there is no limit.
+    """
 
     travel: FloatArray
     rate: FloatArray  # per s
@@ -114,9 +119,9 @@ def error_pair(
 ) -> ErrorPair | None:
     """Return the errors of a flight and those of the linear loop.
 
-    Returns None if the log has no error, and if the law has no feedback. `aircraft` is the
-    simulated one, or None if the plant is unknown. If the law `may_pause`, the ticks in which it is
-    inactive do not count.
+    Returns None if the log has no error, or if the law has no feedback. `aircraft` is the simulated
+    aircraft, or None if the plant is unknown. If `may_pause` is True, ticks of an inactive
+    controller do not count.
     """
     kind, error = best_error(tape)
     names = tuple(name for name in controller.outputs if name in error.names)
@@ -146,7 +151,7 @@ def error_pair(
 
 
 def _has_feedback(controller: ControllerConfig) -> bool:
-    """Return whether u of a law depends on y; the excitation of an identification does not."""
+    """Return whether u of a law depends on y. That of a law for identification does not."""
     if is_literal(controller):
         return True
     law = linear_law(controller.tuned_law(), len(controller.outputs), 1.0 / controller.rate)
@@ -159,7 +164,7 @@ def _has_feedback(controller: ControllerConfig) -> bool:
 
 
 def _airframes(tape: Tape, aircraft: AircraftConfig | None) -> list[Airframe]:
-    """Return the simulated aircraft, before and after a drift; none if it is unknown."""
+    """Return the simulated airframes before and after a drift, or no airframe if it is unknown."""
     if aircraft is None or aircraft.is_jsbsim or "truth" not in tape:
         return []
     names = {f"{group}.{state}" for group in "xf" for state in aircraft.sampled_airframe().states}
@@ -189,7 +194,7 @@ def _linear_errors(
     """Fly the linear loop around the aircraft, and around the drifted one if there is one."""
     config = controller
     if is_literal(controller):
-        # The literal sign is the limit of the implicit one, which has a linear law.
+        # The literal sign is the limit of the implicit sign, which has a linear law.
         config = controller.model_copy(update={"sign": "implicit"})
     noise = _noise(tape, controller, aircraft, ticks)
     still = np.zeros_like(y_m)
@@ -254,9 +259,10 @@ def _reach(controller: ControllerConfig, aircraft: AircraftConfig | None) -> Rea
 
 
 def _share_within(reach: Reach, u: FloatArray, period: float) -> FloatArray:
-    """Return which part of u, (N, m), the actuators can follow, (m,), at most 1.
+    """Return the fraction of u that the actuators can follow, (m,), at most 1.
 
-    NOISE_PEAK standard deviations have to lie within travel and rate.
+    u has the shape (N, m). NOISE_PEAK standard deviations of this fraction lie within travel and
+    rate.
     """
     if len(u) < 2:
         return np.ones(u.shape[1])
@@ -266,10 +272,10 @@ def _share_within(reach: Reach, u: FloatArray, period: float) -> FloatArray:
 
 
 def _share_within_travel(reach: Reach, u: FloatArray) -> FloatArray:
-    """Return which part of u, (N, m), lies within the travel of the actuators, (m,), at most 1.
+    """Return the fraction of u, (N, m), within the travel of the actuators, (m,), at most 1.
 
-    The rate is left out: a gust has a peak rather than a deviation, and a slow engine cannot follow
-    it.
+    The largest abs(u) counts, because a gust has a peak rather than a standard deviation. The rate
+    is left out, because a slow engine cannot follow a gust.
     """
     return np.asarray(1.0 / np.maximum(np.abs(u).max(axis=0, initial=0.0) / reach.travel, 1.0))
 
@@ -287,7 +293,7 @@ def _known_loop(
 def _bare_loop(controller: ControllerConfig) -> tuple[LinearPlant, LinearLaw, LoopTiming]:
     """Return the loop around y_dot = Omega u with abs(Omega_ii) = omega / input_scale.
 
-    Omega is what the controller was told, if the aircraft is unknown.
+    It is used if the aircraft is unknown. Omega is then what the controller was told.
     """
     if controller.vanes:
         controller = controller.without_vanes()
@@ -301,7 +307,7 @@ def _bare_loop(controller: ControllerConfig) -> tuple[LinearPlant, LinearLaw, Lo
 
 
 class _LinearFlight(NamedTuple):
-    """What the linear loop does at the ticks."""
+    """The error and the input of the linear loop at the ticks."""
 
     e: FloatArray  # (N, m)
     u: FloatArray  # (N, m)
@@ -317,7 +323,7 @@ def _flight(
     y_m: FloatArray,
     e_0: FloatArray,
 ) -> _LinearFlight:
-    """Fly the linear loop, x_dot = A x + B u + d, with d: (N, n) and noise: (N, m).
+    """Fly the linear loop, x_dot = A x + B u + d, with d (N, n) and noise (N, m).
 
     `probed` is the controller if its probe acts, else None.
     """
@@ -327,7 +333,7 @@ def _flight(
     _, step = zero_order_hold(plant.A, np.eye(n), loop.period)
     drive = np.zeros((len(ticks), len(by_tick.A)))
     drive[:, :n] = d @ step.T
-    # Vanes add columns to y, which see the motion but neither noise nor y_m.
+    # Vanes add columns to y. These columns have neither noise nor y_m.
     vanes = len(by_tick.C) - m
     shift = np.concatenate([noise - y_m, np.zeros((len(ticks), vanes))], axis=1)
     probe = None if probed is None else probed.guard().probe
@@ -356,7 +362,7 @@ def _at(tape: Tape, topic: str, name: str, ticks: FloatArray) -> FloatArray:
 def _between(tape: Tape, signal: Signal, values: FloatArray, ticks: FloatArray) -> FloatArray:
     """Interpolate values at the samples of a signal, (K,), to the ticks, (N,).
 
-    Only finite values count; without any the result is 0.
+    Only finite values count. If there is none, the result is 0.
     """
     is_finite = np.isfinite(values)
     if not is_finite.any():
@@ -368,11 +374,12 @@ def _between(tape: Tape, signal: Signal, values: FloatArray, ticks: FloatArray) 
 def _noise(
     tape: Tape, controller: ControllerConfig, aircraft: AircraftConfig | None, ticks: FloatArray
 ) -> FloatArray:
-    """Return the errors of the sensors in the log less their mean over NOISE_TIME, (N, m).
+    """Return the noise of the sensors in the log, (N, m), in the units of y.
 
-    The units are those of y; the result is 0 if the log has no errors of sensors. Bias and drift do
-    not count as noise: the law follows them, and the aircraft is off by as much. Whatever exceeds
-    the sensor's declaration is a fault, and does not count either.
+    It is the error of each sensor less its moving mean over NOISE_TIME, or 0 if the log has no
+    errors of sensors. Bias and drift do not count as noise, because the law follows them and the
+    aircraft is off by as much. An error beyond the declared one is a fault, and does not count,
+    either.
     """
     count = max(round(NOISE_TIME * controller.rate), 1)
     noise = np.zeros((len(ticks), len(controller.outputs)))
@@ -389,7 +396,10 @@ def _noise(
 
 
 def _moving_mean(values: FloatArray, count: int) -> FloatArray:
-    """Return the mean of the `count` values around each; the ends go on as they are, (N,)."""
+    """Return the mean of the `count` values around each value, (N,).
+
+    Beyond the ends, the first and the last value are repeated.
+    """
     before = count // 2
     padded = np.pad(values, (before, count - 1 - before), mode="edge")
     return np.convolve(padded, np.full(count, 1.0 / count), mode="valid")
@@ -411,7 +421,7 @@ def _declared_noise(aircraft: AircraftConfig) -> list[float]:
 def _disturbance(
     tape: Tape, aircraft: AircraftConfig | None, ticks: FloatArray, n: int
 ) -> FloatArray:
-    """Return the disturbance d = f(x, t) less the part that depends on x, (N, n), from `truth`."""
+    """Return the disturbance d, (N, n): f(x, t) in `truth` less the part that depends on x."""
     truth: Signal = tape["truth"]
     d = np.zeros((len(ticks), n))
     if aircraft is None:
@@ -429,7 +439,7 @@ def _slope_of_wind(tape: Tape, controller: ControllerConfig, ticks: FloatArray) 
 
         V_dot = -W_dot
 
-    It is 0 for the rates, and if the log has no wind.
+    The disturbance is 0 for the rates. It is 0 throughout if the log has no wind.
     """
     d = np.zeros((len(ticks), len(controller.outputs)))
     if _has_path(tape, controller) and len(ticks) > 1:
@@ -441,13 +451,13 @@ def _slope_of_wind(tape: Tape, controller: ControllerConfig, ticks: FloatArray) 
 def _gravity_along_path(
     tape: Tape, controller: ControllerConfig, ticks: FloatArray, y_m: FloatArray
 ) -> FloatArray:
-    """Return d of y_dot = Omega u + d as the weight causes it along the path of y_m, (N, m).
+    """Return the d of y_dot = Omega u + d that the weight causes along the path of y_m, (N, m).
 
         theta_dot = q_m cos(phi) - r_m sin(phi),   V_dot = -g sin(theta)
 
-    theta is the deviation from trim, and begins as in the log; phi is that of the log. An aircraft
-    without a rudder has no r_m, and turns by its own r. If the law has an integral of e, the law
-    keeps the true theta within a hundredth of a radian of this one, whatever the gusts.
+    theta is the deviation from trim, and its first value comes from the log. phi comes from the log
+    throughout. An aircraft without a rudder has no r_m, and its true r is used instead. If the law
+    has an integral of e, it keeps the true theta within 0.01 rad of this theta, whatever the gusts.
     """
     d = np.zeros((len(ticks), len(controller.outputs)))
     names = controller.outputs
@@ -477,8 +487,8 @@ def _has_path(tape: Tape, controller: ControllerConfig) -> bool:
 def _flown(tape: Tape, ticks: FloatArray, *, may_pause: bool) -> NDArray[np.bool_]:
     """Return the mask of the ticks from the first engagement on.
 
-    If the law `may_pause`, the ticks of an inactive controller are left out. Without `internals` no
-    tick counts.
+    If `may_pause` is True, the ticks of an inactive controller are left out. If the log has no
+    `internals`, no tick counts.
     """
     if "internals" not in tape:
         return np.zeros(len(ticks), dtype=bool)
@@ -493,6 +503,6 @@ def _flown(tape: Tape, ticks: FloatArray, *, may_pause: bool) -> NDArray[np.bool
 
 
 def _sampled(t: FloatArray, ticks: FloatArray) -> NDArray[np.bool_]:
-    """Return the mask of the ticks that lie in no gap between the samples at t."""
+    """Return the mask of the ticks, (N,), that do not lie in a gap between the samples at t."""
     after = np.clip(np.searchsorted(t, ticks), 1, len(t) - 1)
     return t[after] - t[after - 1] <= LONGEST_INTERVAL

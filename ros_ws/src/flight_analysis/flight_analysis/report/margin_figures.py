@@ -28,14 +28,14 @@ MARGIN_COLUMNS = (
     Column(group="delay", head="ms"),
 )
 ALONE = ".3g"  # format of a column that does not show the worst aircraft
-FORMATS = (".0f", ALONE, ".2g", ".2f", ".2f", ".0f")  # of MARGIN_COLUMNS
+FORMATS = (".0f", ALONE, ".2g", ".2f", ".2f", ".0f")  # format of each of MARGIN_COLUMNS
 ALL_INPUTS = "all inputs"
 MARGIN_WORDS = ("phase", "gain", "largest S", "disk", "delay", ALL_INPUTS)
 """Words of the glossary that explain margins."""
 SHOWN_DAMPING = 0.8  # slow modes with less damping are listed
-FREQUENCIES_SHOWN = 240  # of Bode and Nyquist plots
-LOWEST_SHOWN = 1e-3  # of pi / T, rad/s
-NYQUIST_RANGE = ((-3.0, 1.0), (-2.0, 2.0))  # around the point -1
+FREQUENCIES_SHOWN = 240  # number of frequencies of Bode and Nyquist plots
+LOWEST_SHOWN = 1e-3  # lowest frequency of the plots, as a fraction of pi / T
+NYQUIST_RANGE = ((-3.0, 1.0), (-2.0, 2.0))  # real and imaginary range around the point -1
 UNIT_CIRCLE = "#8c8c8c"
 BOUND = "#444444"
 
@@ -49,7 +49,8 @@ def decibels(factor: FloatArray | float) -> FloatArray:
 def margin_rows(margins: LoopMargins) -> list[list[str]]:
     """Return a row for each input, then one for ALL_INPUTS, with the cells of MARGIN_COLUMNS.
 
-    A cell reads: nominal (worst uncertain aircraft).
+    A cell has the value of the nominal aircraft, and then the worst of the uncertain ones in
+    parentheses.
     """
     columns = _values(margins.nominal, (*margins.channel_delay, margins.delay))
     uncertain = columns
@@ -73,7 +74,7 @@ def margin_rows(margins: LoopMargins) -> list[list[str]]:
 
 
 def _values(margins: Margins, delay: Sequence[float]) -> list[list[float]]:
-    """Return the values of MARGIN_COLUMNS by row, in the units of the columns; NaN for none."""
+    """Return a row of values for each of MARGIN_COLUMNS, in its unit, with NaN for no value."""
     phase = np.append(margins.phase, disk_phase(margins.disk_all))
     gain = np.append(margins.gain, disk_gain(margins.disk_all))
     return [
@@ -87,7 +88,7 @@ def _values(margins: Margins, delay: Sequence[float]) -> list[list[float]]:
 
 
 def _cell(value: float, worst: float | None, form: str) -> str:
-    """Write a value, and in parentheses that of the worst aircraft."""
+    """Write a value, followed by that of the worst aircraft in parentheses."""
 
     def text(number: float) -> str:
         if math.isnan(number):
@@ -112,7 +113,7 @@ inputs at once."""
 
 
 def least_margins(margins: LoopMargins | None) -> list[str]:
-    """Return the values of LEAST_MARGINS as text: nominal (worst uncertain aircraft)."""
+    """Return the values of LEAST_MARGINS as text, with the worst aircraft in parentheses."""
     if margins is None:
         return [NO_VALUE] * len(LEAST_MARGINS)
     nominal = _least(margins.nominal, margins.delay)
@@ -123,7 +124,7 @@ def least_margins(margins: LoopMargins | None) -> list[str]:
 
 
 def _least(margins: Margins, delay: float) -> list[float]:
-    """Return LEAST_MARGINS of a set of margins, in the units that their names say."""
+    """Return the values of LEAST_MARGINS, each in the unit that its name states."""
     phase = np.degrees(margins.phase.min())
     gain = decibels(margins.gain.min())
     values = (
@@ -152,7 +153,7 @@ def modes_text(margins: LoopMargins) -> str:
 def margin_table(
     margins: LoopMargins, promise: Guarantee | None = None, differences: Sequence[str] = ()
 ) -> MetricTable:
-    """Return the margins of a flight's loop, and the guarantee that was computed for it.
+    """Return the table of the margins of a flight's loop, with the guarantee for this loop.
 
     `differences` are sentences on how the aircraft differs from what the controller was told.
     """
@@ -168,7 +169,7 @@ def margin_table(
 
 
 def flown_margin_table(flown: FlownLoops) -> MetricTable:
-    """Return the least margins of the loops of a flight, a row for each."""
+    """Return the table of the least margins of a flight's loops, with a row for each loop."""
     columns = [
         Column(group="flown", head="from to (s)"),
         Column(group="", head="aircraft"),
@@ -194,7 +195,7 @@ def flown_margin_table(flown: FlownLoops) -> MetricTable:
 
 
 def margins_as_json(margins: LoopMargins) -> dict[str, Any]:
-    """Return the margins in SI: phase in rad, gain as factors, delay in s; None if infinite."""
+    """Return the margins for JSON in SI, with gains as factors. An infinite value is None."""
     nominal = _aircraft_as_json(margins.nominal, margins.inputs) | {
         "stable": bool(margins.nominal.stable)
     }
@@ -224,7 +225,7 @@ def _aircraft_as_json(margins: Margins, inputs: Sequence[str]) -> dict[str, Any]
 
 
 def guarantee_text(promise: Guarantee) -> list[str]:
-    """Say a guarantee in sentences, with what it means by stable and what it takes as exact."""
+    """Return a guarantee as sentences, which define stability and name the exact entries."""
     if promise.stable == 0.0:
         return ["guarantee: none, not even the aircraft of the file is proved stable"]
     late = f", u up to {1e3 * promise.late:g} ms late" if promise.late else ""
@@ -257,12 +258,12 @@ def guarantee_text(promise: Guarantee) -> list[str]:
 
 
 def proved_percent(part: float) -> str:
-    """Write a part that is proved, rounded down."""
+    """Write the part of a box that is proved as a percentage, rounded down."""
     return f"{math.floor(1e3 * part) / 10.0:.1f} %"
 
 
 def found_percent(part: float) -> str:
-    """Write a part at which an unstable aircraft was found, rounded up."""
+    """Write the deviation of an unstable aircraft as a percentage, rounded up."""
     return f"{math.ceil(1e3 * part) / 10.0:.1f} %"
 
 
@@ -274,7 +275,10 @@ def _first_found(first: Unstable | None) -> str:
 
 
 def guarantee_rows(promise: Guarantee, margins: LoopMargins) -> list[tuple[str, float, float]]:
-    """Return input, guaranteed disk margin and least disk margin found; ALL_INPUTS comes last."""
+    """Return a row for each input, and one for ALL_INPUTS at the end.
+
+    A row has the input, the guaranteed disk margin, and the least disk margin that was found.
+    """
     worst = margins.worst
     least_disks = [math.nan] * (len(promise.disk) + 1)
     if worst is not None:
@@ -367,7 +371,7 @@ def _inputs(loops: Mapping[str, LinearLoop]) -> tuple[str, ...]:
 def add_curve(
     figure: Figure, place: int, label: str, x: FloatArray, y: FloatArray, colour: str, unit: str
 ) -> None:
-    """Add a curve of a loop to a subplot, with one entry in the legend."""
+    """Add a curve of a loop to a subplot. Curves with the same label share a legend entry."""
     hover = f"%{{y:.3g}} {unit} at %{{x:.3g}} rad/s" if unit else "%{x:.3g} %{y:+.3g} j"
     figure.add_scatter(
         label, x, y, place, legendgroup=label, line={"color": colour, "width": 1.4},

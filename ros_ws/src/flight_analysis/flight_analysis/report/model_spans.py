@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find when the controller flew which parameters, and the error under each set."""
+"""Find the spans in which the controller flew each set of parameters, and the errors there."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -16,7 +16,7 @@ class ParameterSpan(NamedTuple):
     """A span of a flight in which the controller had the same parameters."""
 
     digest: int
-    name: str  # of `model_names`
+    name: str  # name of the parameters, as in `model_names`
     start: float  # s
     stop: float  # s
 
@@ -24,18 +24,19 @@ class ParameterSpan(NamedTuple):
 class ModelSpan(NamedTuple):
     """The error over a span of a flight in which the controller had the same parameters."""
 
-    name: str  # of `model_names`
-    model: int  # 0: the parameters of the start
+    name: str  # name of the parameters, as in `model_names`
+    model: int  # index of the parameters; 0 for those at the start
     start: float  # s
     stop: float  # s
-    rms: dict[str, float]  # of `best_error` by channel
+    rms: dict[str, float]  # rms of `best_error` by channel
 
 
 def model_names(first: Sequence[float], proposals: Sequence[float]) -> list[str]:
-    """Name sets of parameters by when they first flew, s, in that order.
+    """Name the sets of parameters that flew, given the times at which they first flew, s.
 
-    The first is "start". Until the first of the `proposals` of a model, s, others are "file", "file
-    2" and so on; from then on they are "model 1", "model 2" and so on.
+    The times in `first` ascend, and the first set is named "start". A set that first flew before
+    the first of the `proposals` of a learner, s, is "file", "file 2" and so on. The later ones are
+    "model 1", "model 2" and so on.
     """
     names = ["start"]
     for time in first[1:]:
@@ -47,7 +48,7 @@ def model_names(first: Sequence[float], proposals: Sequence[float]) -> list[str]
 
 
 def parameter_spans(tape: Tape) -> list[ParameterSpan]:
-    """Return the spans of a flight by the controller's parameters; none without `internals`."""
+    """Return the spans with the same parameters of the controller, or [] without `internals`."""
     if "internals" not in tape or "parameters" not in tape["internals"].names:
         return []
     t = tape.time("internals")
@@ -70,7 +71,7 @@ def parameter_spans(tape: Tape) -> list[ParameterSpan]:
 
 
 def errors_by_model(tape: Tape) -> list[ModelSpan]:
-    """Return the rms of `best_error` before the first model of a learner, and under every model.
+    """Return the rms of `best_error` in each span with the same parameters of the controller.
 
     The result is empty if nothing was learned. Only the time in which the law is engaged counts.
     """

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compare the signals that logs have in common, whatever wrote them.
+"""Compare the signals that several logs have in common, even if other programs wrote them.
 
-The difference of a signal is taken at the instants of the first log, where the other log has
-samples at most LONGEST_INTERVAL apart: y and pose are linear between two samples, and u is held. A
-value that is no number is not compared. The table says which part was compared. Each signal has
-a tolerance: that of its name, or else TOLERANCE of the largest absolute value in the first log.
+The difference of a signal is taken at the instants of the first log. The other log must have
+samples at most LONGEST_INTERVAL apart there. Between these, y and pose are interpolated linearly,
+and u is held. A value that is not finite is not compared. The table states which part was compared.
+Each signal has a tolerance, given by its name. Otherwise it is the fraction TOLERANCE of the
+largest absolute value in the first log.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,27 +34,28 @@ from flight_core.vectors import FloatArray
 
 TOPICS = ("y", "u", "pose")
 HELD = ("u",)  # topics whose values are held until the next sample
-ANGLES = ("phi", "theta", "psi")  # rad, of a pose: they differ by at most pi
+ANGLES = ("phi", "theta", "psi")  # angles of a pose, rad, which differ by at most pi
 TOLERANCE = 0.02
 
 
 class Difference(NamedTuple):
-    """How a signal differs from that of the first log, SI."""
+    """How a signal of a log differs from the same signal of the first log, SI."""
 
     rms: float
     most: float
-    at: float  # s, where the difference is largest
+    at: float  # when the difference is largest, s
     tolerance: float
-    outside: float  # part of the compared instants
-    compared: float  # part of the instants of the first log
+    outside: float  # fraction of the compared instants beyond the tolerance
+    compared: float  # fraction of the instants of the first log that were compared
 
 
 def difference(
     first: Tape, second: Tape, topic: str, name: str, tolerance: float | None = None
 ) -> Difference | None:
-    """Return how a channel of two logs differs, or None if they have no time in common.
+    """Return how a channel differs between two logs, or None if they have no time in common.
 
-    The tolerance is in SI; None: TOLERANCE of the largest absolute value in the first log.
+    The tolerance is in SI. If None, it is the fraction TOLERANCE of the largest absolute value in
+    the first log.
     """
     t, before = _samples(first, topic, name)
     instants, values = _samples(second, topic, name)
@@ -90,7 +92,7 @@ def difference(
 
 
 def _samples(tape: Tape, topic: str, name: str) -> tuple[FloatArray, FloatArray]:
-    """Return the instants, s from the start of the log, and the finite values of a channel."""
+    """Return the times of the finite values of a channel, s from the start, and these values."""
     signal: Signal = tape[topic]
     values = signal[name]
     is_finite = np.isfinite(values)
@@ -103,10 +105,10 @@ def difference_table(
     units: Mapping[str, DisplayUnit],
     tolerances: Mapping[str, float],
 ) -> MetricTable:
-    """Return the differences of each later log from the first, a row for each common signal.
+    """Return the differences of each later log from the first, with a row for each common signal.
 
-    `tolerances` has those of channels by name, SI. Raises ParameterError for a channel that no two
-    logs have in common.
+    `tolerances` has the tolerances of channels by name, SI. Raises ParameterError for a channel
+    that no two logs have in common.
     """
     first, *others = flights
     rows = []
@@ -140,7 +142,7 @@ def difference_table(
 
 
 def _cells(found: Difference | None, unit: DisplayUnit) -> list[str]:
-    """Return the cells of a row, in the unit of the signal; "0.0" compared if nothing was."""
+    """Return the cells of a row in the unit of the signal, or empty ones for None."""
     if found is None:
         return [*[NO_VALUE] * 5, "0.0"]
     rms, most, tolerance = (

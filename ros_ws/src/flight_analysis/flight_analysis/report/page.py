@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Describe a page as records, and write it as HTML that needs no network.
+"""Describe a report page as records, and write it as HTML that needs no network.
 
-A page leads with its head: title, verdicts and tiles. Blocks follow in their order: figures, a
-replay, cards, messages and tables. A line of contents names the blocks that have a short name.
+A page begins with its head, which has the title, the verdicts and the tiles. The blocks follow in
+their order. They are figures, a replay, cards, messages and tables. The line of contents links to
+the blocks that have a short name.
 """
 
 import base64
@@ -36,7 +37,7 @@ HERE = Path(__file__).parent
 
 
 class Colour(StrEnum):
-    """The colour of a verdict, by what it is about."""
+    """The colour of a verdict, which shows its subject."""
 
     GOOD = "good"  # green: nothing is wrong
     HOST = "host"  # amber: the host was too busy, and nothing is wrong with the aircraft
@@ -46,7 +47,7 @@ class Colour(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """What to do next: a sentence, and the command to type."""
+    """What to do next, as a sentence and a command to type."""
 
     sentence: str
     command: str
@@ -54,9 +55,9 @@ class Step:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What came of a flight: a sentence in bold, more of it, details to unfold, and a next step.
+    """The verdict on a flight: a bold sentence, more text, details to unfold, and a next step.
 
-    In a comparison it has the label and the colour of its flight.
+    In a comparison, a verdict has the label and the colour of its flight.
     """
 
     headline: str
@@ -70,26 +71,26 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class Tile:
-    """The error of an output beside what was allowed, as text, and as a part of the bar.
+    """The error of an output beside the allowed error, as text and as a bar.
 
-    Without a limit the tile has no bar, because the error was not judged.
+    If there is no limit, the tile has no bar, because the error was not judged.
     """
 
     name: str
     value: str
     unit: str
     text: str
-    part: float = 0.0  # of what was allowed
+    part: float = 0.0  # error as a fraction of the allowed error
     has_limit: bool = False
 
     @property
     def is_within(self) -> bool:
-        """Return whether the error is one that is allowed."""
+        """Return whether the error is within the allowed one."""
         return self.part <= 1.0
 
     @property
     def length(self) -> float:
-        """Return the length of the bar in percent; what is allowed is half of it."""
+        """The length of the bar in percent, where 50 percent is the allowed error."""
         return min(50.0 * self.part, 100.0)
 
 
@@ -97,7 +98,7 @@ class Tile:
 
 
 def anchor(title: str) -> str:
-    """Return the name of a place on the page, made of its title."""
+    """Return the name by which links find a block on the page, made from the block's title."""
     return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
@@ -108,19 +109,19 @@ class Section(NamedTuple):
     hint: str
     figure: Figure | None
     over_time: bool = True  # all figures over time are zoomed together
-    contents: str = ""  # its name in the line of contents; "": not there
+    contents: str = ""  # name in the line of contents, or "" to leave it out there
 
     @property
     def kind(self) -> str:
-        """Return the kind of block, by which the template draws it."""
+        """The kind of the block, which tells the template how to draw it."""
         return "figure"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Card:
-    """A claim about a flight: what holds, within what, and how to check it.
+    """A claim about a flight, with its range of validity and a way to check it.
 
-    `words` of the glossary explain it.
+    `words` are the words of the claim that the glossary explains.
     """
 
     title: str
@@ -131,7 +132,7 @@ class Card:
 
 @dataclass(frozen=True, kw_only=True)
 class Cards:
-    """Cards beside each other under one heading."""
+    """A block of cards beside each other, under one heading."""
 
     kind: ClassVar[str] = "cards"
     title: str
@@ -141,7 +142,7 @@ class Cards:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayBlock:
-    """The replay of a flight in three dimensions."""
+    """The block with the replay of a flight in three dimensions."""
 
     kind: ClassVar[str] = "replay"
     replay: Replay
@@ -159,7 +160,7 @@ class MessageLine(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Messages:
-    """The messages of a log."""
+    """The block with the messages of a log."""
 
     kind: ClassVar[str] = "messages"
     lines: Sequence[MessageLine]
@@ -171,9 +172,9 @@ Tables = Sequence[MetricTable] | Sequence[ComparisonTable]
 
 
 class TableGroup(NamedTuple):
-    """Tables that stand together, and the same in radians.
+    """Tables that are shown together, and the same tables in radians.
 
-    Tables of a comparison have the `colours` of the flights.
+    In a comparison, `colours` has the colours of the flights.
     """
 
     tables: Tables
@@ -185,14 +186,14 @@ class TableGroup(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Figures:
-    """Groups of tables, which a page with a flight folds."""
+    """The block with groups of tables. The page of a flight can fold it."""
 
     kind: ClassVar[str] = "tables"
     groups: Sequence[TableGroup]
     is_folded: bool = False
     title: str = "All figures"
     contents: str = "All figures"
-    # words that the glossary explains, apart from those of the tables
+    # words that the glossary explains, in addition to those in the tables
     words: Sequence[str] = ()
 
 
@@ -200,30 +201,30 @@ Block = Section | Cards | ReplayBlock | Messages | Figures
 
 
 class Page(NamedTuple):
-    """The content of a page."""
+    """The content of a report page."""
 
     title: str
     blocks: Sequence[Block]
-    lines: Sequence[str] = ()  # below the title
+    lines: Sequence[str] = ()  # lines of text below the title
     verdicts: Sequence[Verdict] = ()
     tiles: Sequence[Tile] = ()
     notes: Sequence[str] = ()
-    samples: SampleStore | None = None  # None: no figure has long curves
+    samples: SampleStore | None = None  # None if no figure has long curves
 
     @property
     def shown(self) -> list[Block]:
-        """Return the blocks that have something to show."""
+        """The blocks that have something to show."""
         return [block for block in self.blocks if _has_content(block)]
 
     @property
     def contents(self) -> list[tuple[str, str]]:
-        """Return the line of contents: the anchor and the name of each block that has one."""
+        """The line of contents, with anchor and name of each block that has a name there."""
         entries = [(anchor(block.title), block.contents) for block in self.shown if block.contents]
         return [*entries, *([("words", "Words")] if self.words else [])]
 
     @property
     def words(self) -> dict[str, str]:
-        """Return the words on the page that the glossary explains, in its order."""
+        """The words on the page that the glossary explains, with meanings, in its order."""
         used: set[str] = set()
         for block in self.shown:
             if isinstance(block, Cards):
@@ -238,7 +239,7 @@ class Page(NamedTuple):
 
     @property
     def replay(self) -> Replay | None:
-        """Return the replay, or None if the page has none."""
+        """The replay, or None if the page has no replay."""
         for block in self.blocks:
             if isinstance(block, ReplayBlock):
                 return block.replay
@@ -282,7 +283,7 @@ def page_html(page: Page) -> str:
 
 
 def page_parts(page: Page) -> Iterator[str]:
-    """Return the text of a page in parts: the page of a long flight has some 100 MB."""
+    """Yield the text of a page in parts, because that of a long flight has some 100 MB."""
     environment = Environment(
         loader=FileSystemLoader(HERE),
         autoescape=True,
@@ -306,7 +307,7 @@ def page_parts(page: Page) -> Iterator[str]:
 
 
 def script_json(value: Any) -> Markup:
-    """Write JSON for a script element: "<" occurs only in strings, as an escape."""
+    """Write JSON for a script element, where "<" is escaped. It occurs only in strings."""
     content = finite_or_null(
         {"data": value.data, "layout": value.layout} if isinstance(value, Figure) else value
     )
@@ -315,12 +316,12 @@ def script_json(value: Any) -> Markup:
 
 
 def _typed_array(array: FloatArray | NDArray[np.float32]) -> dict[str, str]:
-    """Return an array for plotly.js: type "f8" or "f4", and bytes, little endian."""
+    """Return an array for plotly.js, as its type "f8" or "f4" and its bytes, little endian."""
     return {"dtype": array.dtype.str[1:], "bdata": base64.b64encode(array.tobytes()).decode()}
 
 
 def format_ratio(ratio: float | None) -> Markup:
-    """Write a ratio with three digits, or as a whole number from 100 on."""
+    """Write a ratio with three digits, or as an integer if it is 100 or more."""
     if ratio is None:
         return Markup()
     return Markup("&times;{}").format(format_value(ratio) if ratio < 100.0 else f"{ratio:.0f}")

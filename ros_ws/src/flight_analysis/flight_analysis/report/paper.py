@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Draw a figure of flights for a paper, as vectors in the width of a column."""
+"""Draw a figure of flights for a paper, as vector graphics in the width of a column."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,24 +27,24 @@ if TYPE_CHECKING:  # matplotlib takes some tenths of a second to load
     from matplotlib.axes import Axes
 
 FORMATS = ("pdf", "svg", "eps", "png")
-WIDTH = "88mm"  # a column of IEEE and of many journals
+WIDTH = "88mm"  # width of a column of IEEE and of many journals
 NARROWEST = 0.03  # m
 WIDEST = 1.0  # m
-ROW_RATIO = 0.42  # height of a channel over the width
+ROW_RATIO = 0.42  # height of the row of a channel, as a fraction of the width
 INCH = FOOT / 12.0  # m
 LEGEND_HEIGHT = 0.35  # inches
 FONT_SIZE = 8.0  # points
 LINE_WIDTH = 0.8  # points
-DPI = 300.0  # of PNG
+DPI = 300.0  # resolution of PNG
 STYLE: Any = {
     "font.size": FONT_SIZE,
     "axes.linewidth": 0.5,
     "xtick.major.width": 0.5,
     "ytick.major.width": 0.5,
-    "pdf.fonttype": 42,  # TrueType: publishers refuse Type 3
+    "pdf.fonttype": 42,  # TrueType, because publishers refuse Type 3
     "ps.fonttype": 42,
     "svg.fonttype": "none",  # text stays text
-    "svg.hashsalt": "rise-di",  # the same file for the same flight
+    "svg.hashsalt": "rise-di",  # makes the same file for the same flight
 }
 
 
@@ -56,14 +56,15 @@ def write_figure(
 ) -> None:
     """Write a figure for a paper in the width of a column.
 
-    Each channel has a row: y over y_m, the error, or u.
+    Each channel has a row, with y over y_m, the error, or u.
 
     Args:
-        path: File: .pdf, .svg and .eps have vectors and text, .png pixels.
-        flights: The flights, one curve each.
+        path: Path of the figure. A .pdf, .svg or .eps file has vectors and text, and a .png has
+            pixels.
+        flights: The flights, each of which has a curve in every row.
         width: Width of the figure, with a unit ("88mm", "3.5in") or in m.
         channels: Names of outputs (y over y_m) and inputs (u), and "e.NAME" for the error of an
-            output; empty: each output.
+            output. If empty, the figure has every output.
 
     Raises ParameterError if the ending or a channel is unknown, or if the width is not 30 mm
     to 1 m.
@@ -112,7 +113,8 @@ def write_figure(
 def channels_by_title(flights: Sequence[RecordedFlight]) -> dict[str, list[str]]:
     """Return the names of outputs, errors ("e.NAME") and inputs of all flights, by title.
 
-    Their order is that of the controller, so that the n-th of each belong together.
+    Each list is in the order of the controller, so that the n-th output, error and input belong
+    together.
     """
     names: dict[str, dict[str, None]] = {"y": {}, "y_m": {}, "u": {}}
     for flight in flights:
@@ -125,14 +127,14 @@ def channels_by_title(flights: Sequence[RecordedFlight]) -> dict[str, list[str]]
 
 
 def last_instant(flights: Sequence[RecordedFlight]) -> float:
-    """Return the end of the longest flight, s; 1 if there are no samples."""
+    """Return the end of the longest flight, s, or 1 if there are no samples."""
     return max(flight_end(flight.tape) for flight in flights) or 1.0
 
 
 def draw_channel(
     axes: "Axes", flights: Sequence[RecordedFlight], name: str, line_width: float = LINE_WIDTH
 ) -> None:
-    """Draw a channel of each flight, with the reference and the gusts of the first."""
+    """Draw a channel of each flight, with the reference and the gusts of the first flight."""
     units = common_units(flights)
     channel = name.removeprefix("e.")
     is_error = name != channel
@@ -159,7 +161,7 @@ def draw_channel(
         if signal is None or channel not in signal.names:
             continue
         style = {} if is_output else {"drawstyle": "steps-post"}
-        # A single flight needs no name, but its y must be told from y_m.
+        # A single flight needs no name in the legend, but y must be distinguished from y_m.
         legend = label
         if len(flights) == 1:
             legend = "y" if is_output and not is_error else ""

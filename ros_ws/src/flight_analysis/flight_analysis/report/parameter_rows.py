@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""List the parameters of a flight that differ from their defaults, or have none."""
+"""List the parameters of a flight that differ from their defaults or have no default."""
 
 from collections.abc import Iterator
 
@@ -10,13 +10,13 @@ from flight_core.parameters import Config, flatten
 from flight_log.log_messages import shown
 
 NONE = "none"
-LEFT_OUT = ("recorder.", "flight.")  # of the log and of the executable, not of the flight
+LEFT_OUT = ("recorder.", "flight.")  # sections about the log and the run, not the flight
 
 
 def parameter_rows(scenario: Scenario) -> list[tuple[str, str, str]]:
-    """Return name, flown value and default of each parameter that is not at its default, SI.
+    """Return name, flown value and default of each parameter that differs from its default, SI.
 
-    Those that have no default come last, with NONE.
+    Parameters without a default come last, and have NONE in its place.
     """
     rows: list[tuple[str, str, str]] = []
     for section in SCHEMAS:

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Draw time series with plotly.js: a subplot for each channel, intervals shaded over all of them.
+"""Draw time series with plotly.js, with a subplot for each channel, and shaded intervals.
 
 The figures of a page share the time axis and the margins, so that their subplots line up. A figure
 holds short curves itself. `SampleStore` holds the samples of longer curves, and the page decimates
-them to the view. If a curve has more than MAX_STORED samples, the page gets only the smallest and
-the largest value of each bin of time; all figures in numbers are still taken over all samples.
+them to the present view. If a curve has more than MAX_STORED samples, the page gets only the
+smallest and the largest value of each bin of time. The metrics are always computed from all
+samples.
 """
 
 import base64
@@ -27,26 +28,27 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 
 T = TypeVar("T", bound=np.generic)
-# points of a curve over the page's width; of more, a pixel shows the smallest and largest value
+# largest number of points of a curve over the width of the page; beyond it, each pixel shows the
+# smallest and the largest value
 MAX_POINTS = 2400
-LEVEL = 4  # of zlib: samples of a flight take 1 % more space than with 6, and 60 % of the time
-PACKERS = 2  # threads that pack: each holds a channel twice
-# samples of a curve on a page: 60 s at 500 Hz, or 13 times MAX_POINTS, so that we can zoom. With
-# all samples an hour of flight would take 141 MB
+LEVEL = 4  # level of zlib, which takes 1 % more space and 60 % of the time of level 6
+PACKERS = 2  # threads that pack samples, each of which holds a channel twice
+# largest number of samples of a curve on a page. It is 60 s at 500 Hz, or 13 times MAX_POINTS, so
+# that one can zoom. With all samples, an hour of flight would take 141 MB.
 MAX_STORED = 32_000
-BINS = 12_000  # of a longer curve: 10 times the pixels of a wide screen
-# bits of a stored value, with the leading one: within 1 in 2^14, finer than a pixel, and a hover
-# shows no more than 4 digits
+BINS = 12_000  # bins of a longer curve, 10 times the pixels of a wide screen
+# bits of a stored value, including the leading one. The error is at most 1 in 2^14, which is finer
+# than a pixel, and a label at the pointer shows only 4 digits.
 MANTISSA = 14
 MARGIN = {"l": 80, "r": 36}  # pixels, left and right of the subplots
-ACROSS = 0.3  # of a column: between two columns
-LABELS = 70  # pixels, of the labels and the title of an axis; four columns fit the page
+ACROSS = 0.3  # space between two columns, as a fraction of a column
+LABELS = 70  # pixels for the labels and the title of an axis; four columns fit the page
 MIN_GAP_PERIODS = 10.0  # a curve is broken at a gap of this many median periods
 INTERVAL_OPACITY = 0.25
-INTERVAL_LABEL = 11  # pixels
-INTERVAL = "interval"  # name of its label, which the page places
+INTERVAL_LABEL = 11  # size of the label of an interval, pixels
+INTERVAL = "interval"  # name of the label of an interval, which the page places
 MESSAGE_LINE = {"color": "#7a6a00", "width": 1.2, "dash": "dot"}
-SHOWS_ANGLES = {"angles": True}  # the page can draw the figure in rad
+SHOWS_ANGLES = {"angles": True}  # marks a figure that the page can also draw in rad
 TRANSPARENT = "rgba(0,0,0,0)"
 PAPER = "#ffffff"
 INK = "#2b3640"
@@ -60,10 +62,11 @@ DARK = {PAPER: "#1b1f24", INK: "#d3d9df", GRID: "#2c323a", ZERO: "#4b545e"}
 class Instants:
     """The instants at which a curve is drawn."""
 
-    # since the start of the flight, with one more at the start of each gap; two of each bin
+    # ns since the start of the flight, with a further instant at the start of each gap; two for
+    # each bin
     t_ns: NDArray[np.int64]
-    gaps: NDArray[np.intp]  # the samples before which a NaN stands for a gap
-    width: int  # samples of a bin; 1 where each sample is drawn
+    gaps: NDArray[np.intp]  # indices of the samples before which a NaN marks a gap
+    width: int  # number of samples in a bin; 1 if each sample is drawn
 
 
 class SampleStore:
@@ -74,10 +77,11 @@ class SampleStore:
 
     def __init__(self) -> None:
         self._packed: dict[str, Future[str]] = {}
-        # Compression releases the interpreter, so that threads help.
+        # Compression releases the lock of the interpreter, so that threads help.
         self._pool = ThreadPoolExecutor(PACKERS)
         self._instants: dict[tuple[str, int, bool], Instants] = {}
-        # Digests of stamps by id. We keep the stamps too, so that Python reuses no id.
+        # Digests of stamps by the id of their array. The arrays are kept, so that Python does not
+        # reuse an id.
         self._digests: dict[int, tuple[str, NDArray[np.int64]]] = {}
         self._times: dict[int, tuple[str, NDArray[np.int64]]] = {}
 
@@ -87,7 +91,7 @@ class SampleStore:
         return {name: packed.result() for name, packed in self._packed.items()}
 
     def instants(self, stamp_ns: NDArray[np.int64], start_ns: int, *, steps: bool) -> Instants:
-        """Return the instants of a curve, the same for equal stamps. A step curve has no gaps."""
+        """Return the instants of a curve, cached for equal stamps. A step curve has no gaps."""
         if id(stamp_ns) not in self._digests:
             self._digests[id(stamp_ns)] = _digest(stamp_ns), stamp_ns
         key = self._digests[id(stamp_ns)][0], start_ns, steps
@@ -96,7 +100,7 @@ class SampleStore:
         return self._instants[key]
 
     def times(self, t_ns: NDArray[np.int64]) -> str:
-        """Store instants as float64 steps in ns, the first from 0. Equal steps compress well."""
+        """Store instants as float64 steps in ns, beginning at 0. Equal steps compress well."""
         if id(t_ns) not in self._times:
             self._times[id(t_ns)] = (
                 self._add("t", np.diff(t_ns, prepend=np.int64(0)).astype("<f8")),
@@ -107,8 +111,9 @@ class SampleStore:
     def values(self, values: FloatArray) -> str:
         """Store values as float32, rounded to MANTISSA bits.
 
-        We round because noise does not compress, and a pixel shows fewer digits. The bits are
-        stored as steps modulo 2^32, the first from 0, since successive samples hardly differ.
+        Values are rounded because noise does not compress, and a pixel shows fewer digits. Their
+        bits, as integers, are stored as differences modulo 2^32, beginning at 0, because successive
+        samples hardly differ.
         """
         spare = 24 - MANTISSA
         bits = values.astype("<f4").view("<u4")
@@ -119,7 +124,7 @@ class SampleStore:
     def _add(self, kind: str, array: NDArray[Any]) -> str:
         name = kind + _digest(array)
         if name not in self._packed:
-            # Each waiting job holds its array, so we limit how many there are.
+            # Each waiting job holds its array, so the number of jobs is limited.
             wait([packed for packed in self._packed.values() if not packed.done()][: 1 - PACKERS])
             self._packed[name] = self._pool.submit(pack, array, array.itemsize)
         return name
@@ -130,10 +135,10 @@ def _digest(array: NDArray[Any]) -> str:
 
 
 def pack(content: bytes | NDArray[Any], width: int = 1) -> str:
-    """Compress bytes by zlib after a byte shuffle of items of `width` bytes, and encode as base64.
+    """Shuffle the bytes of items of `width` bytes, compress them by zlib, and encode as base64.
 
-    The shuffle puts the first bytes of the items first, then the second bytes, and so on: the high
-    bytes of small steps are all equal.
+    The shuffle puts the first bytes of all items first, then the second bytes, and so on. This
+    helps because the high bytes of small steps are all equal.
     """
     shuffled = np.frombuffer(content, dtype=np.uint8).reshape(-1, width).T.tobytes()
     return base64.b64encode(zlib.compress(shuffled, LEVEL)).decode()
@@ -147,31 +152,31 @@ class Interval:
     start: float
     stop: float
     colour: str
-    labelled: bool  # with a label over the interval, else in the legend
+    labelled: bool  # whether the label stands over the interval, not in the legend
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """A flight of a figure."""
+    """A flight as the figures of a page draw it."""
 
     tape: Tape
-    period_ns: int  # of the controller's ticks
+    period_ns: int  # period of the controller's ticks
     colour: str
 
 
 class PlotContext(NamedTuple):
     """What the figures of a page have in common."""
 
-    runs: Mapping[str, Run]  # by label; one, or several that are compared
-    units: Mapping[str, DisplayUnit]  # by channel
+    runs: Mapping[str, Run]  # by label; a single flight, or several to compare
+    units: Mapping[str, DisplayUnit]  # units by channel
     intervals: Sequence[Interval]
-    end: float  # of the longest flight, s
+    end: float  # end of the longest flight, s
     samples: SampleStore
     messages: Sequence[float] = ()  # times of the messages of a log, s
 
     @property
     def tape(self) -> Tape:
-        """Return the tape of the flight, or of the first of several."""
+        """The tape of the flight, or of the first of several flights."""
         return next(iter(self.runs.values())).tape
 
     @property
@@ -188,11 +193,11 @@ class Curve(NamedTuple):
     width: float = 1.4
     steps: bool = False  # each value is held until the next sample, like u
     faint: bool = False
-    start_ns: int | None = None  # where t is 0; None: the start of the flight of the page
+    start_ns: int | None = None  # stamp of t = 0; None for the start of the page's flight
 
 
 class Extent(NamedTuple):
-    """The smallest and the largest value of a curve in a subplot, as shown."""
+    """The smallest and the largest value of a curve in a subplot, in the unit shown."""
 
     place: int
     name: str
@@ -201,7 +206,7 @@ class Extent(NamedTuple):
 
 
 def _finite(values: Any) -> FloatArray:
-    """Return the finite values of a trace; none if it has something else than numbers."""
+    """Return the finite values of a trace, or no values if it has other data than numbers."""
     try:
         array = np.asarray([] if values is None else values, dtype=np.float64).ravel()
     except (TypeError, ValueError):
@@ -212,16 +217,17 @@ def _finite(values: Any) -> FloatArray:
 class Figure:
     """Subplots for plotly.js: the traces `data` and the `layout`.
 
-    `x` and `y` are the axes by subplot. There are `count` subplots, filled row by row and `height`
-    pixels high, with `spacing` between the rows as a fraction of the figure. Source of the names:
-    https://plotly.com/javascript/reference.
+    `x` and `y` are the axes of each subplot. There are `count` subplots, which fill the figure row
+    by row. Each is `height` pixels high. `spacing` is the space between two rows as a fraction of
+    the figure. Source of the names: https://plotly.com/javascript/reference.
     """
 
     def __init__(self, count: int, columns: int, height: int, spacing: float | None = None) -> None:
         self.rows = -(-count // columns)
         self.height = height
         across = ACROSS / columns
-        # px: on a narrower page labels would cover the next column, and the page scrolls instead
+        # least width in pixels. On a narrower page labels would cover the next column, so the page
+        # scrolls instead.
         self.least_width = sum(MARGIN.values()) + round(LABELS / across) if columns > 1 else 0
         between = min(0.14, 24.0 / (self.rows * height)) if spacing is None else spacing
         wide = (1.0 - across * (columns - 1)) / columns
@@ -241,7 +247,10 @@ class Figure:
             self.layout |= {axis(f"{letter}axis", index): value for index, value in enumerate(axes)}
 
     def add(self, trace: dict[str, Any], index: int = 0, values: FloatArray | None = None) -> None:
-        """Add a trace to a subplot; `values` are those that it has on the page, if it has none."""
+        """Add a trace to a subplot.
+
+        `values` are the samples of the trace if it has none itself, because the page holds them.
+        """
         self.data.append(trace | {"xaxis": axis("x", index), "yaxis": axis("y", index)})
         shown = trace.get("y") if values is None else values
         finite = _finite(shown)
@@ -251,7 +260,7 @@ class Figure:
 
     @property
     def text(self) -> str:
-        """Return the figure in words: the least and the largest value of each curve, by subplot."""
+        """The figure in words, with the smallest and largest value of each curve by subplot."""
         by_plot: dict[int, list[str]] = {}
         for index, name, low, high in self.extents:
             by_plot.setdefault(index, []).append(f"{name} from {low:.3g} to {high:.3g}")
@@ -270,7 +279,7 @@ class Figure:
 
 
 def axis(name: str, index: int) -> str:
-    """Return the name of an axis of a subplot counted from 0: x, x2, x3."""
+    """Return the name of an axis of the subplot `index`, counted from 0, such as x, x2 or x3."""
     return name if index == 0 else f"{name}{index + 1}"
 
 
@@ -282,9 +291,10 @@ def time_series_figure(
     height: int = 150,
     labels: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
-    """Draw a subplot of `height` pixels for each channel, with all curves that have it.
+    """Draw a subplot of `height` pixels for each channel, with all curves of this channel.
 
-    Two columns are filled row by row. `labels` of axes replace those of their channels.
+    Two columns are filled row by row. `labels` has axis labels that replace those of their
+    channels.
     """
     names = dict.fromkeys(chain.from_iterable(curve.signal.names for curve in curves.values()))
     channels = in_order(names, context.units)
@@ -300,7 +310,7 @@ def time_series_figure(
                 in_legend = len(curves) > 1 and first_in_legend(figure, label)
                 trace |= {
                     "name": label,
-                    # If a legend has one group, plotly stacks its entries.
+                    # If all entries of a legend are in one group, plotly stacks them.
                     "legendgroup": label if len(curves) > 1 else "",
                     "showlegend": in_legend,
                     "hovertemplate": f"%{{y:.4g}} {unit.unit}",
@@ -319,10 +329,10 @@ def time_series_figure(
 
 
 def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
-    """Set size, margins and colours of a figure.
+    """Set the size, the margins and the colours of a figure.
 
-    The margin above the rows has room for the legend, if there is one, and for `labels` pixels. The
-    margin below them has `below` pixels, for the axis.
+    The margin above the rows has room for the legend, if any, and `labels` pixels for labels. The
+    margin below the rows has `below` pixels for the axis.
     """
     above = 24 * any(trace.get("showlegend") for trace in figure.data) + labels
     rows = figure.height * figure.rows
@@ -333,17 +343,17 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
                 "zerolinecolor": ZERO,
                 "title": axis.get("title", {}) | {"standoff": standoff},
             }
-            # Without a type plotly would read the samples to find one.
+            # Without a type of the axis, plotly would read all samples to find it.
             axis |= {"type": axis.get("type", "linear")}
     for axis in figure.y:
-        # The margin has room for the labels, so plotly need not measure each.
+        # The margin has room for the labels, so plotly need not measure each label.
         axis["ticklabeloverflow"] = "allow"
     figure.layout |= {
         "height": above + rows + below,
         "font": {"family": "system-ui, sans-serif", "size": 12, "color": INK},
         "paper_bgcolor": TRANSPARENT,
         "plot_bgcolor": TRANSPARENT,
-        # beside the figure, where it covers no label
+        # The legend is beside the figure, where it covers no label.
         "modebar": {"bgcolor": TRANSPARENT, "color": ZERO, "activecolor": INK, "orientation": "v"},
         "hoverlabel": {"bgcolor": PAPER, "font": {"color": INK}},
         "margin": MARGIN | {"t": above, "b": below},
@@ -359,7 +369,7 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
 
 
 def first_in_legend(figure: Figure, label: str) -> bool:
-    """Return whether no trace has this label yet; the legend shows a label only once."""
+    """Return whether no trace has this label yet, because the legend shows it only once."""
     return all(trace["name"] != label for trace in figure.data)
 
 
@@ -371,7 +381,7 @@ def add_line(
     y: Sequence[float],
     style: Mapping[str, Any],
 ) -> None:
-    """Add a line to a subplot, with an entry in the legend. None in x breaks the line."""
+    """Add a line to a subplot, with an entry in the legend. A None in x breaks the line."""
     if not x:
         return
     in_legend = first_in_legend(figure, label)
@@ -389,7 +399,7 @@ def _trace(
         "width": curve.width,
         "shape": "hv" if curve.steps else "linear",
     }
-    # If plotly simplifies a line, it cuts off peaks.
+    # The line is not simplified, because plotly would cut off peaks.
     trace = {"type": "scatter", "mode": "lines", "line": style | {"simplify": False}} | (
         {"opacity": 0.35} if curve.faint else {}
     )
@@ -404,9 +414,9 @@ def _trace(
 
 
 def stored(context: PlotContext, signal: Signal, channel: str, factor: float) -> tuple[str, str]:
-    """Store times and values of a channel, times a factor, and return their places on the page.
+    """Store the times and the scaled values of a channel, and return their names on the page.
 
-    A long curve that is there already is not stored again.
+    The values are multiplied by `factor`. Arrays that the page already holds are not stored again.
     """
     t_ns, values = _drawn(context, Curve(signal, ""), channel, factor)
     return context.samples.times(t_ns), context.samples.values(values)
@@ -415,7 +425,10 @@ def stored(context: PlotContext, signal: Signal, channel: str, factor: float) ->
 def _drawn(
     context: PlotContext, curve: Curve, channel: str, factor: float
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    """Return instants and values of a channel times a factor, with a NaN where a gap begins."""
+    """Return instants and scaled values of a channel, with a NaN where a gap begins.
+
+    The values are multiplied by `factor`. A long curve has two values for each bin.
+    """
     start_ns = context.tape.start_ns if curve.start_ns is None else curve.start_ns
     drawn = context.samples.instants(curve.signal.stamp_ns, start_ns, steps=curve.steps)
     values = curve.signal[channel] * factor
@@ -424,7 +437,7 @@ def _drawn(
 
 
 def _extremes_of_bins(values: FloatArray, width: int) -> FloatArray:
-    """Return the smallest and the largest value of each bin, two a bin, in their order.
+    """Return the smallest and the largest value of each bin, in the order in which they occur.
 
     If a bin has a gap, its second value is NaN.
     """
@@ -439,7 +452,7 @@ def _extremes_of_bins(values: FloatArray, width: int) -> FloatArray:
 
 
 def _bins(values: NDArray[T], width: int) -> NDArray[T]:
-    """Return the values by bin, (N, width); the last value fills up the last bin."""
+    """Return the values in bins, (N, width). The last value is repeated to fill the last bin."""
     return np.append(values, np.full(-len(values) % width, values[-1])).reshape(-1, width)
 
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Build the 3-D replay of a report page from the scene of the live view.
 
-Its samples are those of the figures.
+The replay uses the samples of the figures.
 """
 
 import re
@@ -27,7 +27,7 @@ SCRIPTS = (
 )
 
 POSE = ("phi", "theta", "psi", "north", "east", "altitude")
-POSE_RATE = 10.0  # Hz; the page interpolates
+POSE_RATE = 10.0  # rate of the poses on the page, Hz, between which it interpolates
 MAX_POSES = 6000
 
 
@@ -35,14 +35,14 @@ class Replay(NamedTuple):
     """What a page needs for the replay, except the samples."""
 
     data: dict[str, Any]
-    code: str  # packed
+    code: str  # packed scripts
     style: str
 
 
 def replay_of(flight: RecordedFlight, context: PlotContext) -> Replay | None:
     """Return the replay of a flight, or None if its attitude is not logged.
 
-    This adds the poses to the samples of the page.
+    The poses are added to the samples of the page.
     """
     tape = flight.tape
     topics = {}
@@ -82,9 +82,9 @@ def replay_of(flight: RecordedFlight, context: PlotContext) -> Replay | None:
 
 
 def _topic(context: PlotContext, signal: Signal, channels: dict[str, str]) -> dict[str, Any]:
-    """Return where the page has times and values of channels, and the factors of their units.
+    """Store a topic on the page, and return the names of its arrays and the factors of its units.
 
-    `channels` maps the channels to the names under which their units are known.
+    `channels` maps each channel to the name under which its unit is known.
     """
     stored_channels = {}
     times = ""
@@ -97,7 +97,7 @@ def _topic(context: PlotContext, signal: Signal, channels: dict[str, str]) -> di
 
 
 def _thinned(pose: Signal) -> Signal:
-    """Return the channels of a pose at POSE_RATE, but at most MAX_POSES rows."""
+    """Return the pose thinned to POSE_RATE, or further to at most MAX_POSES rows."""
     count = len(pose.stamp_ns)
     span = (pose.stamp_ns[-1] - pose.stamp_ns[0]) / 1e9 if count > 1 else 0.0
     rows = np.unique(
@@ -110,9 +110,9 @@ def _thinned(pose: Signal) -> Signal:
 
 
 def _code() -> str:
-    """Return the scripts as a function that calls itself.
+    """Return the scripts as a single JavaScript function that calls itself.
 
-    It is made of modules: imports, exports, lines of comment and indentation are left out.
+    It is made of modules, of which imports, exports, lines of comment and indentation are left out.
     """
     text = "\n".join(path.read_text(encoding="utf-8") for path in SCRIPTS)
     text = re.sub(r"^(import |\s*//).*\n|^\s+", "", text, flags=re.MULTILINE)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Report recorded runs: write the page of a run or of a comparison, and data for others to read."""
+"""Write the report page of a run or of a comparison of runs, and files for other programs."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -26,7 +26,7 @@ COMPARISON = "comparison.html"
 
 
 class File(NamedTuple):
-    """A file beside the page: its key in refusals, its path, and what writes flights to a path."""
+    """A file beside the page: its name in errors, its path, and the function that writes it."""
 
     key: str
     path: Path
@@ -64,27 +64,29 @@ def report(
     """Write the report page of a recorded run, or of a comparison of several runs.
 
     Several runs are compared with the first, as `rise-di report` does. If one of them is an
-    imported log, the signals that have a name in common are laid over each other.
+    imported log, signals with the same name are drawn over each other.
 
     Args:
         runs: Folders of runs, or MCAP files.
-        html: Page of a comparison; None: comparison.html in a new folder beside the first run.
-            With one run: its page alone.
-        output: Folder for the report of one run; None: the folder of the log.
-        png: File for y over y_m, e and u as one figure.
-        csv: File for all signals, one row an instant, one column a channel.
-        parquet: File for the same table as Parquet.
-        figure: File for a figure of a paper: .pdf, .svg or .eps as vectors, or .png.
+        html: Path of the page of a comparison. If None, it is comparison.html in a new folder
+            beside the first run. With one run, it is the path of its page, and no other file is
+            written.
+        output: Folder for the report of one run. If None, it is the folder of the log.
+        png: Path of a figure with y over y_m, e and u.
+        csv: Path of a table of all signals, with a row for each instant and a column for each
+            channel.
+        parquet: Path of the same table as Parquet.
+        figure: Path of a figure for a paper: .pdf, .svg or .eps for vectors, or .png.
         width: Width of the figure, with a unit ("88mm") or in m.
-        channels: Channels of the figure: outputs, inputs, and "e.NAME" for the error of an output;
-            empty: each output.
+        channels: Channels of the figure: outputs, inputs, and "e.NAME" for the error of an output.
+            If empty, the figure has every output.
         namespace: Namespace of the aircraft, for logs with several aircraft.
-        remaps: Topics of the log by names of the stack, for logs of remapped nodes, as {"y":
-            "/sensors/y"}.
-        scenario: Scenario file of the flights, for logs without a scenario; None: the scenario in
-            each log.
-        tolerances: Tolerance of the difference between several runs by channel, SI, as {"q":
-            0.02}; for any other channel 2 % of the largest value in the first run.
+        remaps: Topics of the log by the names that the stack gives them, as in {"y": "/sensors/y"}.
+            They are needed if the nodes were remapped.
+        scenario: Scenario file of the flights, for logs without a scenario. If None, each log has
+            its scenario.
+        tolerances: Tolerance of the difference between several runs by channel, SI, as in {"q":
+            0.02}. For any other channel it is 2 % of the largest value in the first run.
 
     Returns:
         The path of the page, and the flights on the page.
@@ -114,7 +116,7 @@ def report(
         )
         if path is not None
     ]
-    # One run gets its own page, or with `html` that of a comparison.
+    # One run gets its report, or only a page if `html` is given.
     is_single = len(folders) == 1 and html is None
     require(
         output is None or is_single,
@@ -144,14 +146,14 @@ def report(
 
 
 def _require_no_figure(channels: str | Sequence[str], width: str | float) -> None:
-    """Raise ParameterError for channels or a width without a figure to use them for."""
+    """Raise ParameterError if channels or a width are given, but no figure that uses them."""
     key = "channels" if channels else "width"
     is_default = not channels and width == WIDTH
     require(is_default, key, "no figure to use it for", "a path for figure too")
 
 
 def _comparison_folder(first: Path) -> Path:
-    """Create a folder for a comparison, beside the first run: a new one each time."""
+    """Create a new folder for a comparison beside the first run, and return its path."""
     folder = first.absolute().parent
     stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-comparison"
     for name in chain([stem], (f"{stem}-{number}" for number in count(2))):

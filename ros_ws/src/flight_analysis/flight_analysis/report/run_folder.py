@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Create the folder of a run, read the run back and report it.
+"""Create the folder of a run before its flight, read the run back, and write its report.
 
-The folder is created before the flight, with the attachments of the log.
+The folder gets the attachments of the log before the flight.
 """
 
 import json
@@ -79,10 +79,10 @@ PROVENANCE = "provenance.yaml"
 
 
 class FlightResult(NamedTuple):
-    """A flight that is over.
+    """A recorded flight with its log and its report.
 
     Attributes:
-        flight: The flight with tape and figures.
+        flight: The flight with its tape and its metrics.
         mcap: Path of the log.
         report: Path of the page.
     """
@@ -93,7 +93,7 @@ class FlightResult(NamedTuple):
 
 
 class UnwrittenReportError(ParameterError):
-    """The files of a report could not be written, as on a full disk; `result` has the flight."""
+    """A report could not be written, as on a full disk. `result` still has the flight."""
 
     def __init__(self, sentence: str, result: FlightResult) -> None:
         super().__init__(sentence)
@@ -101,7 +101,7 @@ class UnwrittenReportError(ParameterError):
 
 
 class UnflownError(ParameterError):
-    """A log has no y or no y_m, so the `outcome` is all that can be reported of the flight."""
+    """A log lacks y or y_m, so that only the `outcome` of the flight can be reported."""
 
     def __init__(self, sentence: str, outcome: Outcome) -> None:
         super().__init__(sentence)
@@ -111,7 +111,7 @@ class UnflownError(ParameterError):
 def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
     """Create the folder of a new run, runs/<UTC stamp>-<kind><scenario>.
 
-    Raises ParameterError if it cannot.
+    Raises ParameterError if the folder cannot be created.
     """
     place = str(runs.absolute())
     is_text = not any("\ud800" <= character <= "\udfff" for character in place)
@@ -131,9 +131,9 @@ def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
 
 
 def remove_empty(*runs: Path) -> None:
-    """Remove those folders of runs that hold no file.
+    """Remove the folders of runs that hold no file.
 
-    Their flights were interrupted before they began.
+    The flights of such runs were interrupted before they began.
     """
     for run in runs:
         with suppress(OSError):
@@ -147,13 +147,14 @@ def attachments_for(
     further: Sequence[Path] = (),
     replaced: Sequence[str] = (),
 ) -> LogAttachments:
-    """Return what is attached to the log of a flight.
+    """Return the attachments of the log of a flight.
 
-    This is the scenario, the airframe or the user's own model of JSBSim, every parameter after
-    validation, the `further` files, and the provenance. What is not a file yet is written into the
-    folder of the run. `overrides` are parameters of the scenario's nodes by the name of the node,
-    or None for a flight without nodes. Other nodes fly in place of those that are `replaced`, and
-    the files say so. Raises ParameterError if a file cannot be written.
+    They are the scenario, the airframe or the user's own model of JSBSim, every parameter after
+    validation, the `further` files, and the provenance. Attachments that are no files yet are
+    written into the folder of the run. `overrides` are parameters of the scenario's nodes by the
+    name of the node, or None for a flight without nodes. `replaced` names the nodes in place of
+    which other nodes fly, and the attachments state this. Raises ParameterError if a file cannot be
+    written.
     """
     unflown = {
         name: comment([f"did not fly: {name}; another node took its place"]) for name in replaced
@@ -181,26 +182,27 @@ def read_accounted(
     scenario: FilePath | None = None,
     remaps: Mapping[str, str] = {},
 ) -> RecordedRun:
-    """Read the folder or a file of a run: named vectors by topic name, samples by stamp.
+    """Read the folder or a file of a run, and return its signals, scenario and files.
 
-    The topic name is without the namespace. The bag comes from this stack or from `ros2 bag
-    record`: MCAP, in one or several files, compressed or not. A truncated MCAP file is read up to
-    the last complete chunk. `run.tape.account` has the share of each topic, and `run.tape.notes`
-    say what the log lacks; a log without a scenario has no account.
+    The signals are named vectors, by topic name without the namespace. The bag, which is the log as
+    ROS stores it, comes from this stack or from `ros2 bag record`. It is MCAP, in one or several
+    files, compressed or not. A truncated MCAP file is read up to the last complete chunk.
+    `run.tape.account` has the number of samples of each topic, and `run.tape.notes` say what the
+    log lacks. A log without a scenario has no account.
 
     Args:
         run: Folder of a run, or a file of the bag.
         namespace: Namespace of the aircraft, for a log with several aircraft.
         scenario: Scenario file in place of the scenario in the log.
-        remaps: Topics of the log by names of the stack, as {"y": "/sensors/y"}, for a log of
-            remapped nodes without these names.
+        remaps: Topics of the log by the names that the stack gives them, as in {"y": "/sensors/y"}.
+            They are needed if the nodes were remapped.
 
     Returns:
         The content of the log: a tape with signals of shape (N, k), SI, the scenario and the files.
 
     Raises:
         ParameterError: The bag is missing or has no sample, the log has several aircraft and no
-            `namespace` selects, or the scenario file cannot be read.
+            `namespace` selects one, or the scenario file cannot be read.
 
     Examples:
         >>> flight = rise_di.fly(rise_di.find_scenario("osprey_servo", duration=0.1))
@@ -225,9 +227,9 @@ def read_flight(
 ) -> RecordedFlight:
     """Read a recorded flight and summarise it, without writing a file.
 
-    If no outcome is given, the one in the run's summary is kept. `namespace`, `scenario` and
-    `remaps` are those of `read_run`. Raises ParameterError if the log cannot be read or holds no
-    scenario.
+    If no outcome is given, the outcome in the run's summary is kept. `namespace`, `scenario` and
+    `remaps` have the same meaning as in `read_run`. Raises ParameterError if the log cannot be read
+    or holds no scenario.
     """
     return _flight(read_run(run, namespace, scenario, remaps), run, outcome)
 
@@ -236,7 +238,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
     recorded.require()
     folder = _folder(run)
     name = printable(run.resolve().name if run.is_dir() else run.stem)
-    # For an imported log we can summarise only y and u.
+    # For an imported log only y and u can be summarised.
     if (source := recorded.metadata.get(IMPORTED)) is not None:
         recorded.require("y", "u")
         require(
@@ -263,7 +265,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
         outcome = NEVER_ENGAGED
     if "guidance" in log:
         require_channels(log["guidance"].names)
-    # The account covers the whole log, the figures only its engaged part.
+    # The account covers the whole log, but the metrics only its engaged part.
     tape = until_last_tick(log)
     flight_account = account(log, scenario, outcome, simulated=engagements is None)
     engaged_part = _engaged(tape, engagements or [])
@@ -296,7 +298,10 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
 def _with_cause(
     error: ParameterError, recorded: RecordedRun, run: Path, outcome: Outcome
 ) -> ParameterError:
-    """Return an UnflownError, with what the nodes said at the end, if the log lacks y or y_m."""
+    """Return the error as an UnflownError with the last messages of the nodes, without y or y_m.
+
+    If the log has y and y_m, return the error itself.
+    """
     if {"y", "y_m"} <= set(recorded.tape.signals):
         return error
     causes = last_words(recorded.messages)
@@ -308,7 +313,7 @@ def _with_cause(
 
 
 def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedFlight:
-    """Return the flight of a user's own aircraft, whose log describes only the controller."""
+    """Return the flight of an aircraft of the user, whose log describes only the controller."""
     recorded.require("y", "u")
     controller = recorded_parameters(recorded.scenario_file(), recorded.namespace)
     summary = summarise_own(recorded.tape, controller.law, name, outcome)
@@ -320,10 +325,10 @@ def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedF
 
 
 def _with_times_of_messages(recorded: RecordedRun) -> Tape:
-    """Return the tape with the times of messages as signals.
+    """Return the tape with the latency and the age of u as further signals.
 
-    In lockstep and in one process the nodes wait for each other, however long the host takes, so
-    there is no time from y to u.
+    In lockstep and in one process there is no latency, because the nodes wait for each other,
+    however long the host takes.
     """
     latency = recorded.latency if is_real_time(recorded.tape) else None
     timed = {"latency": latency, "age_of_u": recorded.age_of_u}
@@ -334,7 +339,7 @@ def _with_times_of_messages(recorded: RecordedRun) -> Tape:
 def _controllers(
     recorded: RecordedRun, tape: Tape, scenario: Scenario
 ) -> tuple[FlownController, ...]:
-    """Return the parameters that flew, if they changed in flight."""
+    """Return the parameters that flew, or () if they did not change in flight."""
     if len({span.digest for span in parameter_spans(tape)}) < 2:
         return ()
     changes = recorded_changes(recorded, scenario.controller)
@@ -342,7 +347,7 @@ def _controllers(
 
 
 def log_account(recorded: RecordedRun) -> Account | None:
-    """Return what a log lacks.
+    """Return the account of what a log holds and lacks.
 
     Returns None if the log has no flight, or no scenario that can be read.
     """
@@ -362,9 +367,9 @@ def log_account(recorded: RecordedRun) -> Account | None:
 
 
 def _engaged(tape: Tape, engagements: Sequence[Engagement]) -> Tape:
-    """Return the engaged part of a flight with a bridge, from which the figures are taken.
+    """Return the engaged part of a flight with a bridge, from which the metrics are computed.
 
-    If there was no engagement, the whole tape counts, so that the duration is known.
+    If there was no engagement, return the whole tape, so that the duration is known.
     """
     end_ns = max(
         (int(signal.stamp_ns[-1]) for signal in tape.signals.values() if len(signal.stamp_ns)),
@@ -380,7 +385,7 @@ def _engaged(tape: Tape, engagements: Sequence[Engagement]) -> Tape:
 
 
 def _engagement(tape: Tape, engagement: Engagement) -> dict[str, Any]:
-    """Return start and end of an engagement in flight time, s, and why it ended."""
+    """Return when an engagement began and ended, in flight time, s, and why it ended."""
     start, stop = (
         (time_ns - tape.start_ns) / NANOSECONDS if time_ns else None
         for time_ns in (engagement.start_ns, engagement.stop_ns)
@@ -406,9 +411,9 @@ def _scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
 
 
 def _write_scenario(recorded: RecordedRun, path: Path) -> None:
-    """Write the scenario of a log, once.
+    """Write the scenario of a log to a file, if the file does not exist yet.
 
-    Raises ParameterError if another file has the name already.
+    Raises ParameterError if the file exists and has another content.
     """
     if recorded.scenario is None:
         return
@@ -434,12 +439,12 @@ def write_report(
 ) -> FlightResult:
     """Read the bag back and write scenario, summary.json and report.html.
 
-    runs/latest becomes a link to the run. The files go beside the log, or into the new folder
-    `output`. If no outcome is given, the report of an old run is written again and runs/latest
-    stays. A `scenario` that replaces the one in the log is not written. Raises ParameterError as
-    `read_flight` does, before any file is written, and UnwrittenReportError if a file cannot be
-    written. Of an old run without y or y_m summary.json has the outcome, before UnflownError is
-    raised.
+    runs/latest becomes a link to the run. The files are written beside the log, or into the new
+    folder `output`. If no outcome is given, the report of an old run is written again, and
+    runs/latest stays. A `scenario` that replaces the one in the log is not written. Raises
+    ParameterError as `read_flight` does, before any file is written, and UnwrittenReportError if a
+    file cannot be written. If a run lacks y or y_m, summary.json gets only the outcome, and
+    UnflownError is raised.
     """
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
 
@@ -472,7 +477,7 @@ def write_report(
 def write_empty_summary(run: Path, scenario: Scenario, outcome: Outcome) -> dict[str, Any]:
     """Write summary.json of a flight that ended before its first sample.
 
-    The log does not change. Raises ParameterError.
+    The log does not change. Raises ParameterError if the file cannot be written.
     """
     summary = empty_summary(scenario, outcome)
     with writing("", run, "a folder that can"):
@@ -482,29 +487,31 @@ def write_empty_summary(run: Path, scenario: Scenario, outcome: Outcome) -> dict
 
 
 def _write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
-    """Write summary.json. Raises OSError."""
+    """Write summary.json into a folder. Raises OSError if this fails."""
     write_file(folder / SUMMARY, json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
 
 def _folder(run: Path) -> Path:
-    """Return the folder of a run that is given as a folder, a log or a link such as runs/latest."""
+    """Return the folder of a run, given this folder, its log, or a link such as runs/latest."""
     return run.resolve() if run.is_dir() else run.resolve().parent
 
 
 def _identity(recorded: RecordedRun) -> dict[str, Any]:
-    """Return what tells a flight from all others.
+    """Return the values that identify a flight.
 
-    This is the stamp of t = 0, ns, and the time of day at which it started if that is logged.
+    They are the stamp of t = 0, ns, and the time of day at which the flight started, if it is
+    logged.
     """
     started = recorded.metadata.get(FLIGHT, {}).get("start")
     return {"start_ns": recorded.tape.start_ns, "started": started}
 
 
 def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scenario) -> Outcome:
-    """Return the outcome in the log, or else in the summary of this flight, or else of a launch.
+    """Return the outcome of a flight from the log, the summary, a launch, or the samples.
 
-    A launch leaves its outcome beside the log, if that has the name of the folder. If nodes were
-    started by hand, only the samples in the log tell.
+    The first of these that has an outcome counts. The summary must be that of this flight. A launch
+    leaves its outcome beside the log, and counts if the log has the name of the folder. If nodes
+    were started by hand, only the samples in the log show the outcome.
     """
     tape = recorded.tape
     outcome = tape.outcome
@@ -513,7 +520,8 @@ def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scen
             summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
             if summary["flight"] == _identity(recorded):
                 before = read_outcome(summary["outcome"])
-                # We keep what the log of one aircraft cannot tell, as of a fleet.
+                # The shortfalls of the summary are kept, because some, such as those of a fleet, do
+                # not show in the log of one aircraft.
                 outcome = replace(outcome, shortfalls=before.shortfalls)
                 outcome = before if outcome.end is End.UNKNOWN else outcome
     has_folder = folder is not None and (folder / f"{folder.name}_0.mcap").is_file()

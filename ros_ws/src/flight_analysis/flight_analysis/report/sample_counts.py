@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Count the samples of a flight by topic: those planned, those in the log, those never sent."""
+"""Count the samples of each topic of a flight that were planned, logged, and never sent."""
 
 import math
 import re
@@ -17,14 +17,14 @@ from flight_core.tape import Recording, Signal, Tape
 from flight_log.clock import SINCE_EPOCH_NS
 from flight_log.flight_processes import controller_starts
 
-# least share of the samples of a topic of which we say nothing; a single missing one is ignored too
+# share of its samples from which on a topic counts as whole; a single missing sample does not count
 WHOLE = 0.99
-LEAST = 0.9  # if a topic has a smaller share, the log lacks it, whatever the cause
-SILENCE = 1.0  # s: we name a longer gap even if the share is large
-LATE_TICK_NS = NANOSECONDS // 10  # the last u of a whole flight may be so much older than its end
+LEAST = 0.9  # with a smaller share, the log lacks the topic, whatever the cause
+SILENCE = 1.0  # s; a longer gap is named even if the share is large
+LATE_TICK_NS = NANOSECONDS // 10  # largest age of the last u at the end of a whole flight
 GUIDED = ("guidance", "u_m")  # topics of guidance
-OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its stamps
-TICKS = ("u", "internals")  # topics of the controller: during a failsafe their stamps stand still
+OF_AIRCRAFT = ("truth", "pose")  # further topics of the aircraft, with the stamps of y
+TICKS = ("u", "internals")  # topics of the controller, whose stamps stand still in a failsafe
 # the node of the stack that sends each topic with a rate
 SENDERS = {
     "y": "aircraft",
@@ -34,12 +34,15 @@ SENDERS = {
     **dict.fromkeys(GUIDED, "guidance"),
 }
 RATED = tuple(SENDERS)
-STEADY_RUN = 60  # samples, for which a steady publisher always takes about the same time
-SHORT_RUN = 6  # samples: if a publisher leaves out 30 %, a tenth of such runs is still whole
+STEADY_RUN = 60  # number of samples that take a steady publisher about the same time
+SHORT_RUN = 6  # if a publisher leaves out 30 %, a tenth of runs of so many is whole
 
 
 class TopicAccount(NamedTuple):
-    """The samples of a topic. Times are flight times, s, and None if there is no sample."""
+    """The numbers of samples of a topic.
+
+    Times are flight times in s, and None if there is no sample.
+    """
 
     expected: (
         int | None
@@ -48,26 +51,27 @@ class TopicAccount(NamedTuple):
     first: float | None
     last: float | None
     gap: float | None  # longest interval between two samples
-    gap_at: float | None  # begin of the interval
-    # samples with the stamp of the sample before, except in a failsafe; not among `found`
+    gap_at: float | None  # when this interval begins
+    # samples with the same stamp as the sample before, except in a failsafe; `found` does not count
+    # them
     repeated: int
-    unset: int  # samples without a usable stamp, left out
-    step: float  # of the clock of the stamps, s; 0 without a step
-    left_out: int  # samples after the step
-    # samples that the publisher left out, by the numbers of the messages
+    unset: int  # number of samples without a usable stamp, which are left out
+    step: float  # step in the clock of the stamps, s; 0 if there is none
+    left_out: int  # samples after the step, which are left out
+    # samples that the publisher never sent, as the numbers of the messages show
     unsent: int
-    is_of_stack: bool = True  # sent by a node of the stack, which leaves out samples on a busy host
+    is_of_stack: bool = True  # whether a node of the stack sent the topic
 
     @property
     def share(self) -> float | None:
-        """Return the share of the expected samples, at most 1; None if that number is unknown."""
+        """The share of the expected samples, at most 1, or None if their number is unknown."""
         return None if self.expected is None else min(self.found / max(self.expected, 1), 1.0)
 
     def holds(self, count: int) -> bool:
-        """Return whether `count` samples are the whole topic, or their expected number is unknown.
+        """Return whether `count` samples are the whole topic, or the expected number is unknown.
 
-        One missing sample of a short topic does not count: the first or the last instant of a
-        flight may fall on either side of its beginning or end.
+        In a short topic one missing sample does not count, because the first or the last instant
+        may fall on either side of the beginning or end of the flight.
         """
         return self.expected is None or count >= min(
             WHOLE * self.expected, max(self.expected - 1, 1)
@@ -75,22 +79,22 @@ class TopicAccount(NamedTuple):
 
 
 class Span(NamedTuple):
-    """The part of a flight that an account covers."""
+    """The time span of a flight that an account covers."""
 
     end_ns: int  # stamp of the end
-    from_start: bool  # from t = 0; else from the first sample of a topic
-    simulated: bool  # the aircraft of the scenario flew, no autopilot
+    from_start: bool  # whether it begins at t = 0, not at the first sample of a topic
+    simulated: bool  # whether the aircraft of the scenario flew, no autopilot
 
 
 def topic_accounts(
     tape: Tape, scenario: Scenario | None, span: Span
 ) -> tuple[dict[str, TopicAccount], dict[str, float]]:
-    """Return the accounts by topic, and how long before the end a last sample may be stamped, s.
+    """Return the account of each topic, and how long before the end its last sample may be, s.
 
     The expected number of samples is rate times time. The rate is that of the scenario if a node of
-    the stack sends them in the host's time, else that of the log. Ticks of the controller count
-    from the first. If a controller or a foreign publisher leaves out samples, they do not count as
-    missing, up to a tenth.
+    the stack sends the samples in the host's time. Otherwise it is that of the log. Ticks of the
+    controller count from the first tick. If a controller or a publisher outside of the stack leaves
+    out up to a tenth of the samples, these do not count as missing.
     """
     periods = {} if scenario is None else _periods(tape, scenario, simulated=span.simulated)
     expected = {} if scenario is None else _expected(tape, scenario, span, periods)
@@ -116,8 +120,8 @@ def topic_accounts(
     if "internals" in tape and "mode" in tape["internals"].names:
         failsafe = int(np.count_nonzero(tape["internals"]["mode"] != Mode.ENGAGED))
     for name, topic in topics.items():
-        # During a failsafe stamps stand still. If others are equal, the clock stood still, and we
-        # cannot know that a sample is new.
+        # During a failsafe stamps stand still. If other stamps are equal, the clock stood still,
+        # and it is unknown whether a sample is new.
         repeated = max(topic.repeated - (failsafe if name in TICKS else 0), 0)
         topics[name] = topic._replace(found=max(topic.found - repeated, 0), repeated=repeated)
     return topics, late
@@ -126,7 +130,7 @@ def topic_accounts(
 def _expected(
     tape: Tape, scenario: Scenario, span: Span, periods: Mapping[str, int]
 ) -> dict[str, int]:
-    """Return how many samples of each topic the log should hold, if we can know."""
+    """Return how many samples the log should hold, for each topic for which this is known."""
     sensors = scenario.aircraft.sensors
     pose = scenario.aircraft.pose
     expected = {}
@@ -144,13 +148,13 @@ def _expected(
             mean = count * (1.0 - sensors.dropout)
             count = max(math.floor(mean - 4.0 * math.sqrt(mean * sensors.dropout)), 0)
         expected[name] = count
-    if not span.simulated:  # the controller is inactive until the bridge engages
+    if not span.simulated:  # then the controller is inactive until the bridge engages
         return expected
     guided_time = seconds(span.end_ns - tape.start_ns)
     if is_sent_by_stack(tape, "u"):
         ticks, engaged_time = _ticks(tape, scenario, span)
         expected |= dict.fromkeys(TICKS, ticks)
-        # In lockstep and in one process guidance flies whatever the mode of the controller is.
+        # In lockstep and in one process guidance steps in any mode of the controller.
         if is_real_time(tape):
             guided_time = engaged_time
     if scenario.guidance is not None:
@@ -164,14 +168,15 @@ def _expected(
 
 
 def is_real_time(tape: Tape) -> bool:
-    """Return whether the nodes flew by a clock: that of the host since the epoch, or /clock."""
+    """Return whether the nodes flew by a clock, which is that of the host or /clock."""
     return tape.is_by_clock or tape.start_ns > SINCE_EPOCH_NS
 
 
 def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, int]:
-    """Return the periods of the topics that have a sample at each instant of a rate, ns.
+    """Return the period of each topic that has samples at a fixed rate, ns.
 
-    A foreign aircraft may have no truth and no pose. Foreign commands u_m have no rate.
+    An aircraft outside of the stack may have no truth and no pose. Commands u_m from outside of the
+    stack have no rate.
     """
     y_m_ns = period_ns(scenario.reference_model.rate, "reference_model.rate")
     if not simulated:
@@ -192,9 +197,10 @@ def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, in
 
 
 def is_sent_by_stack(tape: Tape, name: str) -> bool:
-    """Return whether a node of the stack sent a topic, by the names of the processes.
+    """Return whether a node of the stack sent a topic, as the names of the processes show.
 
-    A flight in one process has no such names. A foreign controller publishes no `internals`.
+    A flight in one process has no such names, and counts as the stack's. A controller outside of
+    the stack publishes no `internals`.
     """
     if name in TICKS and ("internals" in tape or "u" not in tape):
         return True
@@ -213,8 +219,8 @@ def is_simulated(tape: Tape) -> bool:
 def _period(tape: Tape, name: str, nominal_ns: int) -> int:
     """Return the period of the samples of a topic, ns.
 
-    In the host's time, a node of the stack has the period of its parameters. By /clock, a node
-    leaves out the instants between two messages of the clock.
+    In the host's time, a node of the stack has the period from its parameters. By /clock, a node
+    skips the instants between two messages of the clock, so its period can be longer.
     """
     is_of_stack = is_sent_by_stack(tape, name)
     if is_of_stack and not tape.is_by_clock:
@@ -227,11 +233,12 @@ def _period(tape: Tape, name: str, nominal_ns: int) -> int:
 
 
 def period_of(stamp_ns: NDArray[np.int64], lost: int, otherwise_ns: int) -> int:
-    """Return the period at which a publisher sent samples, ns, by their stamps, shape (N,).
+    """Return the period at which a publisher sent samples, ns, given their stamps, (N,).
 
     `lost` is the number of lost messages. A steady publisher takes the same time for any STEADY_RUN
     samples, to within an interval, even if a coarse clock makes the intervals differ. If samples
-    are missing, these times scatter; then the quickest tenth of short runs shows the period.
+    are missing, these times scatter. In this case the quickest tenth of short runs shows the
+    period. If there are too few samples, the result is `otherwise_ns`.
     """
     stamp_ns = np.unique(stamp_ns)
     intervals_ns = np.diff(stamp_ns)
@@ -252,10 +259,10 @@ def period_of(stamp_ns: NDArray[np.int64], lost: int, otherwise_ns: int) -> int:
 
 
 def _with_unsent(tape: Tape, name: str, topic: TopicAccount, step_ns: int) -> TopicAccount:
-    """Add to the account of a topic the instants that the publisher left out.
+    """Count the instants between first and last sample for which a publisher sent nothing.
 
-    They lie between the first and the last sample. The numbers of the messages prove it: except for
-    lost messages and samples left out, no number is missing.
+    An instant without a sample was left out by the publisher if no message was lost there, which
+    the numbers of the messages show. Samples with unusable stamps do not count as left out.
     """
     recording = tape.recording.get(name, Recording(0))
     if (
@@ -271,10 +278,10 @@ def _with_unsent(tape: Tape, name: str, topic: TopicAccount, step_ns: int) -> To
 
 
 def _of_foreign(topic: TopicAccount) -> TopicAccount:
-    """Return the account of a topic whose publisher is not ours, so that we do not know its plan.
+    """Return the account of a topic whose publisher is outside of the stack.
 
-    What it sent counts as the whole, if that is at most a tenth below the rate and without a
-    silence.
+    Its planned samples are unknown. What it sent counts as the whole topic if it left out at most a
+    tenth of the samples, and no gap is longer than SILENCE.
     """
     is_silent = topic.gap is not None and topic.gap > SILENCE
     if topic.expected is None or is_silent or topic.unsent > (1.0 - LEAST) * topic.expected:
@@ -285,7 +292,7 @@ def _of_foreign(topic: TopicAccount) -> TopicAccount:
 def ends_last(tape: Tape, name: str) -> bool:
     """Return whether a topic ends later than all other topics of the flight.
 
-    Then a leap of the clock may be the gap.
+    In this case a gap in the topic may be a jump of the clock.
     """
     ends = {
         topic: int(signal.stamp_ns[-1])
@@ -297,11 +304,11 @@ def ends_last(tape: Tape, name: str) -> bool:
 
 
 def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
-    """Return how many instants after the last sample of a topic its publisher left out.
+    """Return for how many instants, from the last sample to the end, a publisher sent nothing.
 
-    The numbers of the messages prove it: either the next sample comes after the end, or the
-    aircraft sent y at other instants only. If the log ends with the topic, nothing is proved, and
-    none counts.
+    The numbers of the messages must show that none was lost. Further, the topic must have a later
+    sample after the end, or the aircraft must have sent y only at other instants. Otherwise nothing
+    is proved, and the result is 0.
     """
     signal = tape.signals.get(name)
     if signal is None or tape.recording.get(name, Recording(0)).lost != 0:
@@ -326,8 +333,9 @@ def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
 def _ticks(tape: Tape, scenario: Scenario, span: Span) -> tuple[int, float]:
     """Return the number of the controller's ticks up to the end, and the engaged time, s.
 
-    Each controller numbers its own ticks, so they are counted by publisher. If y and y_m come from
-    a user's nodes, it can fly before t = 0; these ticks do not count in an account from t = 0.
+    Each controller numbers its own ticks, so the ticks are counted for each publisher. If y and y_m
+    come from nodes of the user, the controller can fly before t = 0. Such ticks do not count in an
+    account from t = 0.
     """
     end_ns = span.end_ns
     step_ns = period_ns(scenario.controller.rate, "controller.rate")
@@ -374,9 +382,9 @@ def _ticks(tape: Tape, scenario: Scenario, span: Span) -> tuple[int, float]:
 def _instants_with_y(tape: Tape, internals: Signal, step_ns: int) -> int:
     """Return the number of ticks that have a new y or are in a failsafe.
 
-    The controller publishes u only if there is a new y. A foreign aircraft has its own rate of y,
-    and a sensor may be declared to drop samples. What the log lacks of y is not counted here, since
-    it is a lack of y.
+    The controller publishes u only if there is a new y. An aircraft outside of the stack has
+    another rate of y, and a sensor may be declared to drop samples. Samples of y that only the log
+    lacks are counted as well, because the controller had them.
     """
     age_ns = internals["age"] * NANOSECONDS
     first_tick_ns = internals.stamp_ns[0] + age_ns[0]
@@ -420,7 +428,7 @@ def _topic(
 def _latest(scenario: Scenario) -> dict[str, float]:
     """Return how long before the end the last sample of a topic may be stamped, s.
 
-    This is its delay and, if the pose is slow, a period of the pose.
+    It is the delay of the topic. If the pose is slow, it is a period of the pose in addition.
     """
     aircraft = scenario.aircraft
     return {

@@ -23,23 +23,23 @@ PLACE = ("north", "east", "altitude")  # m
 
 
 class Track(NamedTuple):
-    """Where an aircraft was: stamps, and PLACE in a map that the aircraft share."""
+    """Where an aircraft was, as stamps, and PLACE in a map that all aircraft share."""
 
-    start_ns: int  # stamp of its t = 0
+    start_ns: int  # stamp of t = 0 of this aircraft's flight
     place: Signal
-    origin: tuple[float, ...] | None = None  # of the map
+    origin: tuple[float, ...] | None = None  # origin of the map
 
 
 @dataclass(frozen=True, kw_only=True, order=True)
 class Approach:
-    """The least distance of two aircraft, m, and its stamp."""
+    """The least distance of two aircraft, m, and the stamp at which it occurred."""
 
     distance: float
     at_ns: int
 
 
 def place_of(tape: Tape) -> Signal | None:
-    """Return where an aircraft was, by its true place if the log has it, or None."""
+    """Return where an aircraft was, from the true pose if logged, or None without a pose."""
     pose = best_pose(tape)
     if pose is None or not set(PLACE) <= set(pose.names):
         return None
@@ -47,11 +47,11 @@ def place_of(tape: Tape) -> Signal | None:
 
 
 def approach(first: Signal, second: Signal) -> Approach | None:
-    """Return how near two aircraft came, or None if they have no common time.
+    """Return the least distance of two aircraft, or None if they have no time in common.
 
-    Between two samples each moves in a straight line. With d_0 and d_1 the differences of their
-    places at the ends of a part and v = d_1 - d_0, they are nearest at the fraction -d_0 v / v^2 of
-    it, if that is within the part.
+    Between two samples each aircraft moves in a straight line. Let d_0 and d_1 be the differences
+    of their places at the ends of such an interval, and v = d_1 - d_0. They are nearest at the
+    fraction -d_0 v / v^2 of the interval, if this lies between 0 and 1.
     """
     begin_ns = max(int(first.stamp_ns[0]), int(second.stamp_ns[0]))
     end_ns = min(int(first.stamp_ns[-1]), int(second.stamp_ns[-1]))
@@ -61,7 +61,8 @@ def approach(first: Signal, second: Signal) -> Approach | None:
     stamps = np.union1d(
         stamps[(stamps >= begin_ns) & (stamps <= end_ns)], np.array([begin_ns, end_ns])
     )
-    # We count from an instant of the flight: float64 does not resolve 1 ns in a time of day.
+    # Times count from an instant of the flight, because float64 does not resolve 1 ns in a time of
+    # day.
     t = (stamps - begin_ns).astype(float)
     d = _at(first, t, begin_ns) - _at(second, t, begin_ns)
     v = np.diff(d, axis=0)
@@ -75,7 +76,7 @@ def approach(first: Signal, second: Signal) -> Approach | None:
 
 
 def _at(signal: Signal, t: FloatArray, begin_ns: int) -> FloatArray:
-    """Return the places at times in ns since an instant, shape (N, 3)."""
+    """Return the places at the times t, (N, 3), where t is in ns since `begin_ns`."""
     own = (signal.stamp_ns - begin_ns).astype(float)
     return np.column_stack([np.interp(t, own, signal[name]) for name in PLACE])
 

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Judge a completed or landed flight by what it has to show, and name its shortfalls.
+"""Judge whether a completed or landed flight did what it should, and name its shortfalls.
 
 A flight succeeds if
 
-- the law was engaged in ENGAGED of the ticks in which it was asked to fly,
+- the law was engaged in at least the fraction ENGAGED of the ticks in which it should fly,
 - y_m was that of the scenario (`flown_reference`),
 - the linear loop allows the error of each output (`tracking`),
 - the airspeed stayed above the stall speed, and the aircraft above the ground and between the
@@ -13,8 +13,8 @@ A flight succeeds if
 - a landing ended in the touch-down zone,
 - and the log holds the whole flight.
 
-If the host starved a flight in real time, the flight says nothing about the law. If that alone is
-why it falls short, it has no shortfall: its end is HOST.
+If the host was too busy for a flight in real time, the flight says nothing about the law. If this
+alone explains what is wrong, the flight has no shortfall, and its end is HOST.
 """
 
 import math
@@ -45,7 +45,7 @@ from flight_core.tape import Tape
 from flight_guidance.params import GuidanceConfig
 from rise_di_controller.params import ControllerConfig
 
-FED = Starvation()  # if the host gave a flight what it needs
+FED = Starvation()  # of a flight whose host was never too busy
 
 ENGAGED = 0.9
 """Least share of the ticks with the law engaged. If u is held or at trim for longer, the figures
@@ -59,9 +59,10 @@ def judge(
     account: Account,
     controller: ControllerConfig | None = None,
 ) -> Outcome:
-    """Return the outcome of a flight with its shortfalls; a flight that ended early has none.
+    """Return the outcome of a flight with its shortfalls, or without any if it ended early.
 
-    `controller` is that of a flight without a scenario; without either the errors are not judged.
+    `controller` is given for a flight without a scenario. If there is neither, the errors are not
+    judged.
     """
     starved = account.starvation
     seems_unflown = outcome.end is End.NEVER_FLEW or account.late is not None
@@ -90,10 +91,10 @@ def judge(
     of_path = _height(tape, aircraft, section)
     if section is not None:
         of_path += _guided(tape, section, has_landed=outcome.end is End.LANDED)
-    # What the host withheld adds up in the path of the aircraft, long after a starved span.
+    # A starved span changes the path of the aircraft, and this lasts long after the span.
     says_nothing_of_path = starved.length > (1.0 - ENGAGED) * account.end
     shortfalls = [
-        # The log of one aircraft does not tell where the others were, so we keep these.
+        # The log of one aircraft does not show where the others were, so these shortfalls are kept.
         *(each for each in outcome.shortfalls if each.aim is Aim.SEPARATION),
         *engagement,
         *([] if scenario is None else reference_shortfalls(tape, scenario)),
@@ -121,17 +122,17 @@ def _incomplete(lack: str) -> Shortfall:
 
 
 def _never_flown_by_host(starved: Starvation, end: float) -> Outcome:
-    """Return the outcome of a flight of `end` s that could not begin for its host."""
+    """Return the outcome of a flight of `end` s that never began because the host was busy."""
     return host_starved(
         f"never flew: this host was too busy for real time in {starved.length:.0f} of {end:.0f} s"
     )
 
 
 def _may_pause(tape: Tape, scenario: Scenario | None) -> bool:
-    """Return whether somebody else decides when the law flies.
+    """Return whether the law may be inactive at times, because somebody else decides about it.
 
-    Behind a bridge the autopilot does, and with `start_active: false` the user. In any other
-    simulated flight the law must fly from its first u to the end, whoever deactivates it.
+    Behind a bridge the autopilot decides, and with `start_active: false` the user. In any other
+    simulated flight, the law must fly from its first u to the end.
     """
     if scenario is None or not is_simulated(tape):
         return True
@@ -141,7 +142,7 @@ def _may_pause(tape: Tape, scenario: Scenario | None) -> bool:
 def _engagement(tape: Tape, *, may_pause: bool, starved: Starvation = FED) -> list[Shortfall]:
     """Return a shortfall if the law was engaged in too few of the ticks.
 
-    Ticks in spans in which the host `starved` the flight do not count.
+    Ticks in the spans `starved`, in which the host was too busy, do not count.
     """
     if "internals" not in tape or "mode" not in tape["internals"].names:
         return []
@@ -164,7 +165,7 @@ def _engagement(tape: Tape, *, may_pause: bool, starved: Starvation = FED) -> li
 def _height(
     tape: Tape, aircraft: AircraftConfig | None, section: GuidanceConfig | None
 ) -> list[Shortfall]:
-    """Return the time below the ground of the scenario as a shortfall, if there was any."""
+    """Return a shortfall if the aircraft was below the ground of the scenario."""
     ground = None if aircraft is None or aircraft.is_jsbsim else aircraft.ground()
     if ground is None and section is not None and not (aircraft and aircraft.is_jsbsim):
         landing = section.landing_on(section.plan(section.waypoints())) if section.landing else None
@@ -211,7 +212,7 @@ def _guided(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Sh
 
 
 def _failed_steps(tape: Tape) -> list[Shortfall]:
-    """Return a shortfall if steps of guidance failed, so that the commands before went on."""
+    """Return a shortfall if steps of guidance failed, so that the earlier commands went on."""
     count = int(tape["guidance"]["failed"].max())
     if not count:
         return []
@@ -220,7 +221,7 @@ def _failed_steps(tape: Tape) -> list[Shortfall]:
 
 
 def _stall(tape: Tape, section: GuidanceConfig) -> list[Shortfall]:
-    """Return a shortfall if V fell below the stall speed other than in the flare of a landing."""
+    """Return a shortfall if V fell below the stall speed, except in the flare of a landing."""
     if section.stall_speed is None or "guidance" not in tape or section.drag is not None:
         return []
     log = tape["guidance"]
@@ -249,7 +250,7 @@ def _stall(tape: Tape, section: GuidanceConfig) -> list[Shortfall]:
 
 
 def _route(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Shortfall]:
-    """Return a shortfall for missed legs, for legs not flown, and for a last orbit not joined."""
+    """Return the shortfalls for missed legs, legs not flown, and a last orbit not joined."""
     shortfalls = []
     for leg in flown_legs(tape):
         if leg.missed:

@@ -10,17 +10,18 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 
-# samples of a window, 82 s at 100 Hz: however long a flight, it has no more frequencies than 14 min
+# Largest number of samples of a window, which is 82 s at 100 Hz. A flight longer than 14 min
+# therefore has no further frequencies.
 MAX_WINDOW = 8192
 
 
 def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return frequencies, Hz, and the amplitude spectral density of each channel, unit / sqrt(Hz).
+    """Return the frequencies, Hz, and each channel's amplitude spectral density, unit / sqrt(Hz).
 
-    The method is Welch's (Welch 1967). The Hann windows overlap by half, each without its mean, and
-    span a tenth of the flight, but at most MAX_WINDOW. If a sample is missing, the last one is
-    repeated, for at most LONGEST_INTERVAL: a gap of the log may be of any length. The square of the
-    density, integrated over the frequencies, is the variance.
+    The method is that of Welch (1967). The Hann windows overlap by half, and the mean of each is
+    removed. They span a tenth of the flight, but at most MAX_WINDOW. If a sample is missing, the
+    last one is repeated. This fills at most LONGEST_INTERVAL, because a gap of the log can have any
+    length. The square of the density, integrated over the frequencies, is the variance.
     """
     places = np.round((signal.stamp_ns - signal.stamp_ns[0]) / period_ns).astype(np.int64)
     longest = max(round(LONGEST_INTERVAL * NANOSECONDS / period_ns), 1)
@@ -33,9 +34,9 @@ def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, Float
 
 
 def _welch(values: FloatArray, rate: float, window: int) -> tuple[FloatArray, FloatArray]:
-    """Return frequencies, Hz, and one-sided power spectral density of the columns, (F, m).
+    """Return the frequencies, Hz, and the one-sided power spectral density of each column, (F, m).
 
-    The result is that of `scipy.signal.welch`, but scipy.signal takes half a second to load, a
+    The result is that of `scipy.signal.welch`. This module takes half a second to load, which is a
     tenth of a whole flight in one process.
     """
     hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(window) / window)
@@ -43,6 +44,7 @@ def _welch(values: FloatArray, rate: float, window: int) -> tuple[FloatArray, Fl
     parts = sliding_window_view(values, window, axis=0)[:: window - window // 2]
     spectra = np.fft.rfft((parts - parts.mean(axis=-1, keepdims=True)) * hann)
     power: FloatArray = np.mean(np.abs(spectra) ** 2, axis=0).T / (rate * np.sum(hann**2))
-    # Each frequency stands for its negative too, except 0 and the highest of an even window.
+    # Each frequency counts for its negative as well, except 0 and the highest one of an even
+    # window.
     power[1 : (window + 1) // 2] *= 2.0
     return np.fft.rfftfreq(window, 1.0 / rate).astype(np.float64), power

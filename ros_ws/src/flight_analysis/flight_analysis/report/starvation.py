@@ -1,13 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find the spans of a flight in real time in which its host starved the nodes.
+"""Find the spans of a flight in real time in which the host was too busy to run the nodes.
 
 A node of the stack sends a sample at each instant of its rate, and numbers its messages. If an
-instant has no sample and yet no number is missing, the node did not send: the host did not let it
-run. The errors of the flight say nothing about that, and we do not ask them.
+instant has no sample and yet no number is missing, the node did not send, because the host did not
+let it run. The errors of the flight are not used to find such spans.
 
-A law that computes for too long leaves out ticks too, so ticks count only if another node has left
-out samples as well. If a publisher was replaced, or if messages were lost, a gap proves nothing.
+A law that computes for too long also leaves out ticks. Ticks therefore count only if another node
+has left out samples as well. If a publisher was replaced, or if messages were lost, a gap proves
+nothing.
 """
 
 import math
@@ -23,9 +24,9 @@ from flight_analysis.report.sample_counts import TopicAccount, is_real_time, is_
 from flight_core.tape import Recording, Tape
 from flight_core.vectors import FloatArray
 
-BUSY = 0.05  # share of the ticks: a host that leaves out more is too busy
+BUSY = 0.05  # share of the ticks; a host that leaves out more is too busy
 
-WINDOW = 1.0  # s, over which BUSY counts: a single missing sample is no starvation
+WINDOW = 1.0  # s, window in which BUSY counts, so that one missing sample is harmless
 
 RECOVERY = 5.0
 """s, after a starved part, until the errors that it caused have decayed: the airspeed of the osprey
@@ -39,7 +40,7 @@ class Starvation(NamedTuple):
 
     @property
     def length(self) -> float:
-        """Return how long the spans are together, s."""
+        """The total length of the spans, s."""
         return math.fsum(stop - start for start, stop in self.spans)
 
     def holds(self, t: FloatArray) -> NDArray[np.bool_]:
@@ -53,7 +54,9 @@ class Starvation(NamedTuple):
 def starvation(
     tape: Tape, scenario: Scenario, topics: Mapping[str, TopicAccount], end: float
 ) -> Starvation:
-    """Return the spans in which the host starved the nodes of a flight that lasts `end` s.
+    """Return the spans in which the host was too busy to run the nodes, with recovery times.
+
+    `end` is the length of the flight, s.
 
     There are none in lockstep, in one process or by the clock of a simulator.
     """
@@ -63,7 +66,7 @@ def starvation(
     count = math.ceil(end / step)
     drops = scenario.aircraft.sensors.dropout > 0.0
     rates = {
-        # If a sensor drops samples of y, truth still has a sample at each instant.
+        # A sensor may drop samples of y, but truth has a sample at each instant.
         "truth" if drops else "y": scenario.aircraft.rate,
         "y_m": scenario.reference_model.rate,
     }
@@ -90,9 +93,9 @@ def starvation(
 
 
 def _missing(tape: Tape, name: str, period: float, step: float, count: int) -> NDArray[np.bool_]:
-    """Return the mask of the instants k step, (count,), that a node left out of a topic.
+    """Return the mask of the instants k * step for which a node sent no sample, (count,).
 
-    `period` is that of the samples, s, and at least a step.
+    `period` is the period of the samples, s, and is at least a step.
     """
     is_missing = np.zeros(count, dtype=bool)
     signal = tape.signals.get(name)
@@ -113,7 +116,7 @@ def _missing(tape: Tape, name: str, period: float, step: float, count: int) -> N
 
 
 def _windowed(is_missing: NDArray[np.bool_], length: int) -> FloatArray:
-    """Return how many instants are missing in the window around each instant, (N,)."""
+    """Return the number of missing instants in the window around each instant, (N,)."""
     total = np.concatenate([[0.0], np.cumsum(is_missing)])
     k = np.arange(len(is_missing))
     first = np.maximum(k - length // 2, 0)

@@ -89,11 +89,11 @@ def command_edges(scenario: Scenario) -> list[Transient]:
 
 
 def transients(scenario: Scenario, tape: Tape, *, follows_scenario: bool = True) -> list[Transient]:
-    """Return engagements, commands and gusts.
+    """Return the transients of a flight, which are engagements, commands and gusts.
 
     From the first live command on, live commands replace those of the scenario. In a guided flight,
-    turns and captures replace commands. Unless y_m `follows_scenario`, its commands are none of the
-    flight.
+    turns and captures replace commands. If `follows_scenario` is False, y_m did not follow the
+    commands of the scenario, and they are left out.
     """
     windows = scenario.gust_windows() if is_simulated(tape) else {}
     gusts = [
@@ -114,26 +114,26 @@ def transients(scenario: Scenario, tape: Tape, *, follows_scenario: bool = True)
 
 
 class RecordedFlight(NamedTuple):
-    """A flight under the name of its run.
+    """A recorded flight, with its tape, its scenario and its summary.
 
-    Figures, tables, exports and comparisons are made from this.
+    Its name is that of the run. Figures, tables, exports and comparisons are made from it.
     """
 
     name: str
-    scenario: Scenario | None  # None: an imported flight
+    scenario: Scenario | None  # None for an imported flight
     tape: Tape
-    summary: dict[str, Any]  # of `summarise`, or of `summarise_imported`
-    si_units: Mapping[str, str] = {}  # by channel, of an imported flight
-    # the parameters that flew, where they changed in flight
+    summary: dict[str, Any]  # the result of `summarise` or of `summarise_imported`
+    si_units: Mapping[str, str] = {}  # units by channel of an imported flight
+    # the parameters that flew, if they changed in flight
     controllers: tuple[FlownController, ...] = ()
-    later_aircraft: tuple[AircraftConfig, ...] = ()  # after each change in flight
+    later_aircraft: tuple[AircraftConfig, ...] = ()  # the aircraft after each change in flight
     messages: tuple[LogMessage, ...] = ()
 
     @property
     def period_ns(self) -> int:
-        """Return the period of the controller's ticks, ns.
+        """The period of the controller's ticks, ns.
 
-        For an imported flight it is the median interval of u.
+        For an imported flight it is the median interval between samples of u.
         """
         if self.scenario is None:
             return max(int(np.median(np.diff(self.tape["u"].stamp_ns))), 1)
@@ -141,7 +141,7 @@ class RecordedFlight(NamedTuple):
 
     @property
     def units(self) -> dict[str, DisplayUnit]:
-        """Return the units of tables and figures by channel of y and u."""
+        """The units that tables and figures use, by channel of y and u."""
         if self.scenario is None:
             known = {name: display_unit(unit) for name, unit in self.si_units.items()}
             inputs = self.tape["u"].names if "u" in self.tape else ()
@@ -150,19 +150,19 @@ class RecordedFlight(NamedTuple):
 
     @property
     def message_times(self) -> list[float]:
-        """Return the flight times of the messages of the log, s."""
+        """The flight times of the messages of the log, s."""
         return [(message.stamp_ns - self.tape.start_ns) / NANOSECONDS for message in self.messages]
 
     @property
     def gusts(self) -> dict[str, tuple[float, float]]:
-        """Return start and end of each gust of the scenario, s."""
+        """The start and the end of each gust of the scenario, s."""
         if self.scenario is None or not is_simulated(self.tape):
             return {}
         return self.scenario.gust_windows()
 
 
 def labels(flights: Sequence[RecordedFlight]) -> list[str]:
-    """Return the names of the flights; equal names get a number."""
+    """Return a label for each flight, which is its name, with a number if names are equal."""
     names = [flight.name for flight in flights]
     return [
         f"{name} ({k})" if names.count(name) > 1 else name for k, name in enumerate(names, start=1)
@@ -170,7 +170,7 @@ def labels(flights: Sequence[RecordedFlight]) -> list[str]:
 
 
 def common_units(flights: Sequence[RecordedFlight]) -> dict[str, DisplayUnit]:
-    """Return units by channel, each from the first flight that has the channel."""
+    """Return the units by channel, taken from the first flight with this channel."""
     by_channel: dict[str, DisplayUnit] = {}
     for flight in reversed(flights):
         by_channel |= flight.units
@@ -185,14 +185,14 @@ def summarise(
 ) -> dict[str, Any]:
     """Return the metrics of a flight, SI, ready for JSON.
 
-    The section Figures of docs/log.md explains the keys.
+    The keys are explained in docs/log.md, section Figures.
 
     Args:
         tape: A flight with y and y_m.
-        scenario: The scenario of the flight; None: the scenario on the tape. The tape of a log
-            needs the argument.
-        outcome: How the flight ended; None: the outcome on the tape.
-        flight_account: The account of the whole flight, where the tape is a part.
+        scenario: The scenario of the flight. If None, it is the scenario on the tape. The tape of a
+            log has none, so it needs the argument.
+        outcome: How the flight ended. If None, it is the outcome on the tape.
+        flight_account: The account of the whole flight, if the tape is only a part of it.
 
     Returns:
         The figures by key.
@@ -256,7 +256,7 @@ def summarise(
 
 
 def _flown_scenario(tape: Tape, scenario: Scenario | None) -> Scenario:
-    """Return the scenario given or that of the tape. Raises ParameterError if there is neither."""
+    """Return the given scenario or that of the tape. Raises ParameterError without a scenario."""
     of_flight = as_tape(tape).scenario if scenario is None else scenario
     require(
         of_flight is not None,
@@ -277,15 +277,15 @@ def _require_topics(tape: Tape) -> None:
 
 
 def _finite(metrics: TickMetrics | LatencyMetrics | AgeMetrics | None) -> dict[str, Any] | None:
-    """Return metrics by name, or None unless all are finite."""
+    """Return metrics by name, or None if any is not finite."""
     return metrics._asdict() if metrics is not None and np.isfinite(metrics).all() else None
 
 
 def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
     """Return the metrics of a flight that the stack did not fly.
 
-    There are metrics of y and u about trim, and an account of the topics. Such a flight has no
-    reference, and so no error. `source` is the metadata record IMPORTED of `rise-di import`.
+    The result has metrics of y and u about trim, and an account of the topics. Such a flight has no
+    reference, so it has no error. `source` is the metadata record IMPORTED of `rise-di import`.
     """
     flight_account = account(tape, None)
     deviations = {}
@@ -307,9 +307,10 @@ def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
 
 
 def summarise_own(tape: Tape, law: str, log: str, outcome: Outcome) -> dict[str, Any]:
-    """Return the metrics of a flight of a user's aircraft that the log does not describe.
+    """Return the metrics of a flight of a user's aircraft, which its log does not describe.
 
-    The errors are those of the measured y. Nothing is judged by a model of the aircraft.
+    The errors are those of the measured y. Nothing is judged, because there is no model of the
+    aircraft.
     """
     source = {"log": log, "kind": f"an aircraft of its own under the law {law}"}
     summary = summarise_imported(tape, source) | {"outcome": outcome.as_json()}
@@ -322,18 +323,18 @@ def summarise_own(tape: Tape, law: str, log: str, outcome: Outcome) -> dict[str,
 
 
 def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
-    """Return the sentence on a u that is older at the aircraft than planned, if it is.
+    """Return a sentence if u is older at the aircraft than planned.
 
-    The linear loop is computed with the delay that the controller was told, and any further delay
-    takes from its delay margin. If u is more than a period older than planned, the sentence states
-    this margin too.
+    The linear loop is computed with the delay that the controller was told. Any further delay uses
+    up its delay margin. If u is more than a period older than planned, the sentence also states
+    this margin.
     """
     controller = scenario.controller
     if age is None or age.mean - controller.delay < 1.0 / controller.rate:
         return []
     from flight_analysis.linear_loop.loop_margins import scenario_loop  # noqa: PLC0415 - loads SciPy, which few flights need
 
-    told = FlightFacts(is_simulated=False)  # the margin is beyond the delay that the gains know
+    told = FlightFacts(is_simulated=False)  # the margin comes on top of the delay in the gains
     try:
         linear = scenario_loop(scenario, controller, flight=told)
     except ParameterError:  # no linear model
@@ -368,7 +369,7 @@ def _commands(tape: Tape, events: Sequence[Transient], end: float) -> Commands:
 
 
 def command_results(summary: Mapping[str, Any]) -> str:
-    """Return how many commands the flight flew, if not all, and the targets; "" if neither.
+    """Return a text on commands that were not flown and on targets, or "" without either.
 
     An example is "8 of 24 commands flown".
     """
@@ -390,16 +391,16 @@ def command_results(summary: Mapping[str, Any]) -> str:
     return "; ".join(parts)
 
 
-STANDS_STILL = 5.0  # s: if a vane stands still for longer at the end of a flight, we name it
+STANDS_STILL = 5.0  # s; a vane that stands still longer at the end of a flight is named
 
 
 def _with_late_ticks(
     flight_account: Account, ticks: TickMetrics | None, scenario: Scenario
 ) -> Account:
-    """Say in the account that the host is too busy, if ticks found no new y.
+    """Add to the account that the host is too busy, if too many ticks found no new y.
 
-    This holds only if the log has every y, and if y has the rate of the scenario: a foreign
-    aircraft and an autopilot have their own.
+    Such ticks show this only if the log has every y, and if y has the rate of the scenario. An
+    aircraft outside of the stack or an autopilot has another rate.
     """
     log_complete = (
         not (flight_account.over("y", "internals") and not flight_account.busy)
@@ -424,7 +425,7 @@ def _with_late_ticks(
 
 
 def _duration(tape: Tape, flight_account: Account) -> float | None:
-    """Return the flight time of the last y, s, or if the log lacks y, of the end of the flight."""
+    """Return the flight time of the last y, s, or the end of the flight if the log lacks y."""
     if not len(tape["y"].stamp_ns):
         return None
     return flight_account.end if flight_account.over("y") else float(tape.time("y")[-1])
@@ -444,9 +445,9 @@ of the flight."""
 
 
 def taken_over(summary: Mapping[str, Any], table: str) -> str:
-    """Return which part of the flight the figures of a table are taken over, after a comma.
+    """Return which part of the flight the metrics of a table cover, as a text after a comma.
 
-    If it is all of the flight, this is "".
+    If they cover the whole flight, the text is "".
     """
     flight_account = account_of_json(summary)
     truth = ("truth",) if table == "errors" and summary["error"] == TRUE_ERROR else ()
@@ -455,19 +456,20 @@ def taken_over(summary: Mapping[str, Any], table: str) -> str:
 
 
 def is_in_host_time(summary: Mapping[str, Any]) -> bool:
-    """Return whether a flight was flown in the time of its host, so that its delays are known."""
+    """Return whether a flight was flown by the clock of its host, so that its delays are known."""
     return bool(summary["flight"]) and summary["flight"]["start_ns"] > SINCE_EPOCH_NS
 
 
 def time_flown(summary: Mapping[str, Any]) -> str:
-    """Return how long the flight was, and which part of it the errors are taken over."""
+    """Return a text with the duration of the flight, and the part that its errors cover."""
     return f"{format_seconds(summary['duration'])} flown{taken_over(summary, 'errors')}"
 
 
 def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
     """Return sentences on the engagements of a flight with a bridge.
 
-    If they are shorter than a sample, they have no figures of their own.
+    `has_figures` is False if they are so short that no y lies in them. The metrics are then those
+    of the whole flight.
     """
     if not engagements:
         return ["never engaged: the figures are of an aircraft that this controller did not fly"]
@@ -490,8 +492,8 @@ def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: b
 def mode_notes(tape: Tape, part: str) -> list[str]:
     """Return a sentence if the controller did not fly the law in more than 1 % of the ticks.
 
-    Ticks count from the first engagement on. `part` is the part of them in the log, as "over 49 %
-    of internals", or "" for all.
+    Ticks count from the first engagement on. `part` says which part of the ticks the log has, as in
+    "over 49 % of internals", or is "" if it has all.
     """
     if "internals" not in tape:
         return []
@@ -511,7 +513,7 @@ def mode_notes(tape: Tape, part: str) -> list[str]:
 
 
 def vane_notes(tape: Tape) -> list[str]:
-    """Return sentences on vanes of an observer that stand still at the end of a flight."""
+    """Return a sentence for each vane of an observer that stands still at the end of a flight."""
     if "internals" not in tape:
         return []
     measures = tape["internals"].group("vane_measures")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Declare the metrics of a summary once, and turn them into rows of text for tables.
+"""Declare the metrics of a summary, and turn them into rows of text for tables.
 
 Each metric has its place in the summary, a heading, a unit and a number of digits.
 """
@@ -25,32 +25,32 @@ MILLISECONDS = DisplayUnit(unit="ms", factor=1e3)
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """A column of a table, or a metric.
+    """A column of a table, which shows a metric of a summary.
 
-    `head` is its heading, `group` the heading above that neighbouring columns share, and `path`
-    where the metric is in a summary.
+    `head` is the heading of the column. `group` is the heading above it that neighbouring columns
+    share. `path` has the keys that lead to the metric in a summary.
     """
 
     group: str
     head: str
     path: tuple[str, ...] = ()
-    unit: DisplayUnit | None = None  # None: that of its row
-    decimals: int | None = None  # after the point; None: three digits in all
+    unit: DisplayUnit | None = None  # None for the unit of its row
+    decimals: int | None = None  # digits after the point; None for three digits in all
 
     @property
     def label(self) -> str:
-        """Return the whole heading."""
+        """The whole heading, including the group."""
         return f"{self.group} {self.head}".strip()
 
     def value(self, figures: Mapping[str, Any]) -> float | None:
-        """Return the metric, SI, from the part of a summary in which the path begins, or None."""
+        """Return the metric, SI, or None. `figures` is the summary's part where `path` begins."""
         value: Any = figures
         for key in self.path:
             value = value.get(key) if isinstance(value, Mapping) else None
         return value if isinstance(value, float | int) else None
 
     def text(self, figures: Mapping[str, Any], row_unit: DisplayUnit = NO_UNIT) -> str:
-        """Return the metric as text, in its own unit or in that of the row."""
+        """Return the metric as text, in the unit of the column or else of the row."""
         value = self.value(figures)
         factor = (self.unit or row_unit).factor
         if value is None or self.decimals is None:
@@ -112,7 +112,7 @@ HELD_COLUMNS = (
 
 
 def _ms(group: str, topic: str, **heads: str) -> tuple[Column, ...]:
-    """Return columns for times of one topic of the summary, with a heading for each key."""
+    """Return columns for times, ms, of one topic of the summary, given a heading for each key."""
     return tuple(
         Column(group=group, head=head, path=(topic, key), unit=MILLISECONDS, decimals=3)
         for key, head in heads.items()
@@ -139,7 +139,7 @@ TIMING_COLUMNS = (
 
 
 def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[Column, ...]:
-    """Return the columns that have a value: a part of the flight that did not occur has none."""
+    """Return the columns with a value. A part of the flight that did not occur has no value."""
     return tuple(
         column
         for column in columns
@@ -150,7 +150,10 @@ def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[
 def model_rows(
     models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]
 ) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows for "models" of a summary: model, times and rms of the errors."""
+    """Return the headings and rows of "models" in a summary.
+
+    A row has the model, the times at which it flew, and the rms of the errors.
+    """
     channels = list(models[0]["rms"]) if models else []
     headings = ["from (s)", "to (s)", *(f"{name} ({units[name].unit})" for name in channels)]
     rows = []
@@ -163,7 +166,7 @@ def model_rows(
 def table_rows(
     channels: Mapping[str, Any], columns: Sequence[Column], units: Mapping[str, DisplayUnit]
 ) -> list[list[str]]:
-    """Return the rows for "errors" or "inputs" of a summary.
+    """Return the rows of a table for the channels in "errors" or "inputs" of a summary.
 
     A row begins with the channel and its unit. A cell for each column follows.
     """
@@ -175,10 +178,10 @@ def table_rows(
 
 
 def timing_rows(summary: Mapping[str, Any], *, is_timed: bool) -> list[tuple[str, str, str]]:
-    """Return the timing of the controller, a row for all metrics with the same heading.
+    """Return the timing of the controller, with one row for all metrics of the same heading.
 
-    A row has the topic of the summary, the heading with its unit, and the values. Unless the flight
-    `is_timed` by its host, there are no times.
+    A row has the topic of the summary, the heading with its unit, and the values. If `is_timed` is
+    False, the host did not time the flight, and rows with times are left out.
     """
     rows = []
     shown = [column for column in TIMING_COLUMNS if is_timed or column.unit is not MILLISECONDS]
@@ -197,9 +200,9 @@ def timing_rows(summary: Mapping[str, Any], *, is_timed: bool) -> list[tuple[str
 def segment_table(
     segments: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]
 ) -> tuple[list[Column], list[list[str]]]:
-    """Return columns and rows of what guidance held in each segment.
+    """Return the columns and rows of a table on what guidance held in each segment.
 
-    The units are `units` or, if these have none for a quantity, QUANTITY_UNITS.
+    Quantities without a unit in `units` have that of QUANTITY_UNITS.
     """
     units = {**QUANTITY_UNITS, **units}
     columns = [Column(group="", head=head) for head in ("from (s)", "to (s)")]
@@ -222,9 +225,9 @@ def segment_table(
 
 
 def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[list[str]]:
-    """Return rows with the flight's INPUT_COLUMNS and SATURATION_COLUMN.
+    """Return the rows of the table of inputs, with INPUT_COLUMNS and SATURATION_COLUMN.
 
-    Saturation is given in percent of the ticks, by magnitude / by rate.
+    Saturation is given in percent of the ticks, first by magnitude and then by rate.
     """
     rows = table_rows(summary["inputs"], columns_of(INPUT_COLUMNS, summary["inputs"]), units)
     for row, metrics in zip(rows, summary["inputs"].values(), strict=True):
@@ -240,8 +243,8 @@ def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> 
 def slowest_settling(summary: Mapping[str, Any], channel: str, kind: str) -> str:
     """Return the longest settling time of a channel after transients of a kind, s.
 
-    If the error did not settle after one of them, this is "> x", where x is the longest time of
-    all, settled or not.
+    If the error did not settle after one of them, the result is "> x". Here x is the longest time
+    of all, whether the error settled or not.
     """
     times: list[float] = []
     unsettled: list[float] = []

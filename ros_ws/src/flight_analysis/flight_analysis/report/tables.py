@@ -47,10 +47,10 @@ TIMES = ("jitter", "age of y", "age of u")  # words of the glossary
 
 
 class MetricTable(NamedTuple):
-    """A table whose first column has the names of the rows; `columns` follow.
+    """A table whose first column has the names of the rows, and is followed by `columns`.
 
-    `note` says what holds for this table. The glossary explains the headings that it has, and
-    `of_rows` are words in the names of the rows that it explains too.
+    `note` has remarks on this table. The glossary explains its headings, and the words `of_rows`,
+    which occur in the names of the rows.
     """
 
     caption: str
@@ -61,18 +61,18 @@ class MetricTable(NamedTuple):
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Return the words of this table that the glossary explains."""
+        """The words of this table that the glossary explains."""
         headings = ((each.group, each.head, each.label) for each in self.columns)
         return words_in([*chain.from_iterable(headings), *self.of_rows])
 
     @property
     def legend(self) -> str:
-        """Return what stands below the table in a terminal: its note and its words."""
+        """The text below the table in a terminal, with its note and the meanings of its words."""
         return ". ".join(filter(None, (self.note, legend(self.words))))
 
     @property
     def aligned(self) -> list[list[str]]:
-        """Return the rows with the decimal points of each column below each other."""
+        """The rows, with the decimal points of each column aligned."""
         if not self.rows:
             return []
         first, *columns = zip(*self.rows, strict=True)
@@ -80,7 +80,7 @@ class MetricTable(NamedTuple):
 
     @property
     def groups(self) -> list[tuple[str, int]]:
-        """Return the headings that neighbouring columns share, each with their number."""
+        """The headings that neighbouring columns share, each with the number of these columns."""
         return [
             (group, len(list(columns)))
             for group, columns in groupby(self.columns, key=lambda column: column.group)
@@ -88,7 +88,7 @@ class MetricTable(NamedTuple):
 
     @property
     def group_starts(self) -> list[bool]:
-        """Return whether each column starts a group; a column without a group does."""
+        """Whether each column starts a group. A column without a group does."""
         groups = [column.group for column in self.columns]
         return [
             not group or group != before
@@ -102,10 +102,10 @@ NUMBER = re.compile(r"[-+>\s]*\d+(?:\.(\d+))?")
 
 
 def aligned(cells: Sequence[str]) -> list[str]:
-    """Return the cells of a column, in which spaces stand for decimals that a number has not.
+    """Return the cells of a column, with spaces for the decimals that a number lacks.
 
-    In a column that is aligned right, the decimal points then stand below each other. Cells that
-    are no number stay.
+    If the column is aligned right, its decimal points are then aligned as well. Cells that are not
+    numbers stay as they are.
     """
     numbers = [NUMBER.fullmatch(cell) for cell in cells]
     decimals = [len(number[1] or "") if number else 0 for number in numbers]
@@ -120,7 +120,7 @@ def aligned(cells: Sequence[str]) -> list[str]:
 class EventInterval(NamedTuple):
     """A gust, a fault, a failsafe mode, a saturation or a vane that stands still.
 
-    It lasts from its first to its last instant, s.
+    It lasts from `start` to `stop`, s.
     """
 
     name: str
@@ -132,7 +132,8 @@ class EventInterval(NamedTuple):
 def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.bool_]:
     """Return the mask of the ticks in which a vane stands still, shape (N,).
 
-    After each engagement a tick counts once the vane has moved, or once `time` s have passed.
+    After an engagement, ticks count from the moment at which the vane has moved, or `time` s have
+    passed.
     """
     internals = tape["internals"]
     t = tape.time("internals")
@@ -147,12 +148,12 @@ def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.b
 def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list[EventInterval]:
     """Return gusts, faults, modes except ENGAGED, saturated inputs and vanes that stand still.
 
-    They are in the order of their starts. The scenario is that of the tape; the tape of a log has
-    none, and needs the argument.
+    They are sorted by their starts. By default the scenario is that of the tape. The tape of a log
+    has none, so it needs the argument.
     """
     of_flight = scenario if scenario is not None else tape.scenario
     listed = []
-    # Gusts and modes, the intervals of one name as one row.
+    # Gusts and modes. All intervals of one name share a row.
     intervals = gust_intervals(tape, gusts) + mode_intervals(tape)
     for label, group in groupby(intervals, key=lambda interval: interval.label):
         spans = [(interval.start, interval.stop) for interval in group]
@@ -206,9 +207,9 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
 def metric_tables(
     summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
 ) -> list[MetricTable]:
-    """Return the tables that have rows: error, inputs, guidance, models and ticks.
+    """Return the tables of error, inputs, guidance, models and ticks, if they have rows.
 
-    The page and the terminal show them.
+    Both the page and the terminal show these tables.
     """
     inputs = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
     tables = (
@@ -231,7 +232,7 @@ def flight_tables(
     units: Mapping[str, DisplayUnit],
     event_list: Sequence[EventInterval],
 ) -> list[MetricTable]:
-    """Return the tables of metrics, and those of events and processes."""
+    """Return the tables of a flight, which are those of metrics, events and processes."""
     times = [Column(group="", head=head) for head in ("from (s)", "to (s)", "")]
     rows = [
         (event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent)
@@ -276,7 +277,7 @@ def imported_tables(
 
 def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> MetricTable:
     is_true = summary["error"].startswith(TRUE_ERROR)
-    # The noise of y is not in the true error, which may be smaller.
+    # The true error has no noise of y, so it can be smaller than the noise floor.
     floor = () if is_true else (NOISE_FLOOR_COLUMN,)
     columns = columns_of((*ERROR_COLUMNS, *floor, SWITCH_COLUMN), summary["errors"])
     kinds = {transient["kind"] for transient in summary["transients"]}
@@ -303,7 +304,7 @@ def model_table(
 ) -> MetricTable:
     """Return the rms of the error before the first learned model, and under every model.
 
-    `part` says what the log has of the flight, after a comma.
+    `part` is a text, after a comma, on which part of the flight the log has.
     """
     headings, rows = model_rows(models, units)
     columns = [Column(group="", head=head) for head in headings]
@@ -313,7 +314,7 @@ def model_table(
 
 
 def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
-    """Return the timing of the controller; in simulated time only how many ticks there were."""
+    """Return the table of the controller's timing, or of only the tick counts in simulated time."""
     caption = f"Ticks of the controller{taken_over(summary, 'ticks')}"
     rows = []
     for topic, label, text in timing_rows(summary, is_timed=is_in_host_time(summary)):
@@ -327,7 +328,7 @@ def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
 def _process_table(summary: Mapping[str, Any]) -> MetricTable:
     flight_account = account_of_json(summary)
     processes = {} if flight_account is None else flight_account.processes
-    # In lockstep we do not know when a process was ready, and all of them run to the end.
+    # In lockstep it is unknown when a process was ready, and all processes run to the end.
     if not is_in_host_time(summary):
         processes = {}
     columns = [

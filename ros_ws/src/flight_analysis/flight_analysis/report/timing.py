@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measure the timing of a flight: ticks of the controller, latency and age of u."""
+"""Measure the timing of a flight, which is that of the ticks, and the latency and age of u."""
 
 from typing import NamedTuple
 
@@ -12,29 +12,29 @@ from flight_core.tape import Tape
 
 
 class TickMetrics(NamedTuple):
-    """The timing of the controller's ticks; times in s."""
+    """The timing of the controller's ticks, with times in s."""
 
     ticks: int
-    # periods without a step of the controller: no new y arrived, or the tick was missed
+    # number of periods in which no new y arrived, or the tick was missed
     without_new_y: int
     period_mean: float
     period_p99: float
     period_max: float
-    jitter: float  # rms deviation of the time between two ticks from a whole number of periods
+    jitter: float  # rms deviation of the time between ticks from a whole number of periods, s
     late_p99: float
     late_max: float
     age_p99: float
 
 
 class AgeMetrics(NamedTuple):
-    """The age of u at the aircraft, s: the delay of the whole loop from the instant of y to u."""
+    """The age of u at the aircraft, s, which is the delay of the whole loop from y to u."""
 
     mean: float
     max: float
 
 
 class LatencyMetrics(NamedTuple):
-    """The time from sending y to sending the u that answers it, s."""
+    """The time from sending y to sending the u that is computed from it, s."""
 
     median: float
     p99: float
@@ -44,7 +44,7 @@ class LatencyMetrics(NamedTuple):
 def tick_periods(tape: Tape) -> NDArray[np.int64]:
     """Return the time between successive ticks of the controller, ns, shape (N - 1,).
 
-    The instant of a tick is stamp + "age", which is its deadline plus "late".
+    The instant of a tick is its stamp plus "age". It is also the deadline of the tick plus "late".
     """
     internals = tape["internals"]
     return np.diff(internals.stamp_ns + np.round(internals["age"] * 1e9).astype(np.int64))
@@ -53,8 +53,8 @@ def tick_periods(tape: Tape) -> NDArray[np.int64]:
 def tick_metrics(tape: Tape, period_ns: int) -> TickMetrics | None:
     """Return the metrics of the controller's ticks, or None if there are fewer than two.
 
-    `internals` holds only ticks with a new y. If a period has no tick there, either no y came or
-    the tick was missed; we count both.
+    `internals` holds only ticks with a new y. A period without a tick there counts as one without a
+    new y, although the tick may have been missed.
     """
     internals = tape["internals"]
     if len(internals.stamp_ns) < 2:

@@ -1,20 +1,21 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Judge whether a flight tracks the reference as the linear loop does.
+"""Judge whether a flight tracks the reference as well as the linear loop would.
 
-The rms error over WINDOW, and over END at the end, may be
+The rms error of an output, over any WINDOW and over the last END of the flight, may be at most
 
     FACTOR rms(e by commands) + excuse + floor,  of an output with a command of its own at most
     COMMAND_PART rms(y_m) + excuse + floor,      and never above FACTOR rms(e) + floor
 
-with e of the linear loop by `linear_flight.error_pair`. The excuse is FACTOR times what noise and
-wind leave, and at most MOST over WINDOW: if an aircraft shakes more than that it is no success,
-whatever shakes it. The floor is
+Here e is the error of the linear loop from `linear_flight.error_pair`. The second line holds for an
+output with its own command. The excuse is FACTOR times the error that noise and wind cause, and at
+most MOST over a WINDOW. If an aircraft shakes more than this, the flight is no success, whatever
+the cause. The floor is
 
-- HARMLESS of the least errors of a divergence, 0.02 rad/s and 0.2 m/s, and the noise of a measured
-  error, at most MOST;
-- SPEED_PART of the trim speed if the model of the aircraft is unknown, and with it the drag, in a
-  part in which V changes by its command or by the wind;
+- the fraction HARMLESS of the least errors of a divergence, which is 0.02 rad/s and 0.2 m/s, plus
+  the noise of a measured error, at most MOST;
+- the fraction SPEED_PART of the trim speed, while V changes by its command or by the wind, if the
+  model of the aircraft and therefore its drag is unknown;
 - the least errors of a divergence, 0.1 rad/s and 1 m/s, if the wind is unknown.
 
 `rise_di_controller.learning.divergence` keeps a learned model below these least errors.
@@ -69,30 +70,30 @@ SPEED_PART = 0.0075
 """Of the trim speed: what the drag of an unknown polar leaves while V changes by a few m/s. While V
 is constant, a law with an integral of e leaves nothing of it."""
 
-SATURATED = 0.5  # of the ticks: a stable loop of the osprey has 0.14 at most in moderate gusts
-SIDE = 0.1  # of the ticks, on either side
+SATURATED = 0.5  # share of the ticks; a stable osprey has at most 0.14 in moderate gusts
+SIDE = 0.1  # share of the ticks at either limit
 
 
 class Excess(NamedTuple):
-    """The rms error of an output over a part of a flight, and what was allowed there, SI."""
+    """The rms error of an output over a part of a flight, and the allowed error there, SI."""
 
     output: str
     start: float  # s
     stop: float  # s
     rms: float
     allowed: float
-    excuse: float  # part of what is allowed: for noise and wind
-    is_noise: bool  # noise leaves more of it than wind
+    excuse: float  # part of `allowed` that is for noise and wind
+    is_noise: bool  # whether noise causes more of the excuse than wind
 
 
 class TrackingVerdict(NamedTuple):
-    """What the errors of a flight say."""
+    """The verdict on the errors of a flight."""
 
     shortfalls: list[Shortfall]
     allowances: list[Allowance]
-    # the worst part of each output, whether it is within what is allowed or not
+    # the worst part of the flight for each output, whether its error is allowed or not
     worst: tuple[Excess, ...] = ()
-    is_excused: bool = False  # an output is off where the host starved the flight, and only there
+    is_excused: bool = False  # whether an output is off only in spans with a busy host
 
 
 def tracking_verdict(
@@ -103,10 +104,11 @@ def tracking_verdict(
     may_pause: bool = True,
     starved: Starvation | None = None,
 ) -> TrackingVerdict:
-    """Return the outputs whose error is larger than allowed, and those that noise or wind excuses.
+    """Return the outputs whose error is too large, and those that noise or wind excuses.
 
-    Each comes with the worst part of the flight. If the law `may_pause`, the ticks in which it is
-    inactive do not count. Spans in which the host `starved` the flight say nothing about the law.
+    Each output comes with the worst part of the flight. If `may_pause` is True, ticks of an
+    inactive controller do not count. The spans `starved`, in which the host was too busy, do not
+    count either.
     """
     nothing = TrackingVerdict([], [])
     if not {"y", "y_m"} <= set(tape.signals):
@@ -124,7 +126,7 @@ def tracking_verdict(
 
 
 def _verdict(pair: ErrorPair, aircraft: AircraftConfig | None) -> TrackingVerdict:
-    """Return what the errors of the flown ticks say."""
+    """Return the verdict on the errors in the ticks that count."""
     if not pair.is_flown.any():
         sentence = "no error in the log while the law was engaged"
         return TrackingVerdict([Shortfall(aim=Aim.LOG, sentence=sentence)], [])
@@ -155,20 +157,20 @@ def _verdict(pair: ErrorPair, aircraft: AircraftConfig | None) -> TrackingVerdic
 
 
 class _Limits(NamedTuple):
-    """How far an output may be off in addition to the linear loop, SI."""
+    """The errors that an output may have in addition to that of the linear loop, SI."""
 
     floor: float
-    most: float  # of noise and wind
-    drag: float  # the same in a part in which the output changes
+    most: float  # largest excuse for noise and wind
+    drag: float  # floor while the output changes, if it is larger than `floor`
 
 
 def _has_engaged(tape: Tape) -> bool:
-    """Return whether the law engaged."""
+    """Return whether the law engaged in any tick."""
     return "internals" in tape and bool((tape["internals"]["mode"] == Mode.ENGAGED).any())
 
 
 def _floor(pair: ErrorPair, i: int, unit: str) -> float:
-    """Return the floor of an output, SI; `unit` is that of the output."""
+    """Return the floor of output i, which has the unit `unit`, in SI."""
     is_speed = quantity(unit).dimension == SPEED
     smallest = LEAST[AIRSPEED] if is_speed else LEAST_RATE
     if pair.knowledge.has_wind:
@@ -177,7 +179,7 @@ def _floor(pair: ErrorPair, i: int, unit: str) -> float:
 
 
 def _drag(pair: ErrorPair, i: int, speed: float) -> float:
-    """Return what an unknown drag leaves of an output while it changes, SI.
+    """Return the error that an unknown drag causes in output i while it changes, SI.
 
     `speed` is the trim speed V0, m/s.
     """
@@ -186,14 +188,14 @@ def _drag(pair: ErrorPair, i: int, speed: float) -> float:
 
 
 def _most(unit: str) -> float:
-    """Return the largest excuse for noise and wind of an output of this unit, SI."""
+    """Return the largest excuse for noise and wind of an output with this unit, SI."""
     return MOST[AIRSPEED] if quantity(unit).dimension == SPEED else MOST_RATE
 
 
 def _excesses(pair: ErrorPair, i: int, group: list[int], limits: _Limits) -> list[Excess]:
-    """Return the worst parts of each span of a flight, and of its end.
+    """Return the worst parts of each flown span of a flight, and of its end, for output i.
 
-    `group` holds the outputs of the same kind: the airspeed, or the rates.
+    `group` holds the outputs of the same kind, which are the airspeed or the rates.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], pair.is_flown, [False]])))
     spans = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
@@ -211,10 +213,10 @@ def _excesses(pair: ErrorPair, i: int, group: list[int], limits: _Limits) -> lis
 def _largest_excesses(
     pair: ErrorPair, i: int, group: list[int], limits: _Limits, span: tuple[int, int]
 ) -> list[Excess]:
-    """Return the part of WINDOW in a span of ticks with the largest rms over the allowed error.
+    """Return the two worst parts of a span of ticks for output i, each of the length WINDOW.
 
-    After it comes the part that needs the largest excuse. If the span is shorter than WINDOW, it is
-    a single part.
+    The first has the largest ratio of rms error to allowed error, and the second needs the largest
+    excuse. A span that is shorter than WINDOW has only one part.
     """
     start, stop = span
     count = min(_ticks(pair, WINDOW), stop - start)
@@ -232,7 +234,7 @@ def _largest_excesses(
     floor = np.where(is_changing, np.maximum(limits.drag, limits.floor), limits.floor)
     others = np.max([rms(pair.y_m, output) for output in group], axis=0)
     has_command = (command >= 0.5 * others) & (command > 2.0 * floor)
-    # If a span is shorter than WINDOW, a gust that is harmless has a larger rms over it.
+    # Over a span that is shorter than WINDOW, a harmless gust has a larger rms.
     most = limits.most * math.sqrt(_ticks(pair, WINDOW) / count)
     excuse = np.minimum(FACTOR * np.hypot(by_noise, by_wind), most)
     by_command = FACTOR * rms(pair.linear.command)
@@ -254,18 +256,18 @@ def _largest_excesses(
 
 
 def _ticks(pair: ErrorPair, length: float) -> int:
-    """Return how many ticks a length, s, has."""
+    """Return the number of ticks in a time of `length` s, at least 1."""
     return max(round(length / (pair.t[1] - pair.t[0])), 1) if len(pair.t) > 1 else 1
 
 
 def _sums(values: FloatArray, count: int) -> FloatArray:
-    """Return the sum over each `count` values in a row."""
+    """Return the sums over every `count` successive values."""
     total = np.concatenate([[0.0], np.cumsum(values)])
     return np.asarray(total[count:] - total[:-count])
 
 
 def _shortfall(excess: Excess, pair: ErrorPair, i: int, unit: DisplayUnit) -> Shortfall:
-    """Return the shortfall of an excess, with the period if it is a limit cycle."""
+    """Return the shortfall for an error that is too large, with the period of a limit cycle."""
     rms, allowed = unlike_numbers(excess.rms * unit.factor, excess.allowed * unit.factor)
     brief = f"{excess.output} off by {rms} {unit.unit} rms, {allowed} allowed"
     sentence = f"{brief}, from t = {excess.start:.1f} to {excess.stop:.1f} s"
@@ -291,11 +293,11 @@ def _allowance(excess: Excess, unit: DisplayUnit) -> Allowance:
 
 
 def saturation_notes(tape: Tape) -> list[str]:
-    """Return sentences on inputs that went from limit to limit in SATURATED of a WINDOW.
+    """Return sentences on inputs that go from limit to limit in most ticks of a WINDOW.
 
-    SIDE of the ticks or more must be at either limit: a climb at full throttle stays at one of
-    them. A limit of the rate does not count, because noise drives a slow engine to either of its
-    rates.
+    An input is at a limit in at least the share SATURATED of the ticks, and in at least SIDE at
+    each of its limits. In a climb at full throttle it stays at one limit. A limit of the rate does
+    not count, because noise drives a slow engine to both of its rate limits.
     """
     if "internals" not in tape:
         return []
@@ -318,7 +320,7 @@ def saturation_notes(tape: Tape) -> list[str]:
 
 
 def _windowed(signal: Signal, values: NDArray[np.generic]) -> FloatArray:
-    """Return the mean over each whole WINDOW of samples."""
+    """Return the mean of the values over every whole WINDOW of samples."""
     steps = np.diff(signal.stamp_ns)
     count = round(WINDOW / seconds(int(np.median(steps)))) if len(steps) else 1
     return _sums(values.astype(np.float64), count) / count if len(values) >= count else np.zeros(0)
