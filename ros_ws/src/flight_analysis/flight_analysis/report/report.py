@@ -68,13 +68,11 @@ def report(
 
     Args:
         runs: Folders of runs, or MCAP files.
-        html: Path of the page of a comparison. If None, it is comparison.html in a new folder
-            beside the first run. With one run, it is the path of its page, and no other file is
-            written.
+        html: Path of the page of a comparison, or of the only file for one run. If None, a
+            comparison is written to comparison.html in a new folder beside the first run.
         output: Folder for the report of one run. If None, it is the folder of the log.
         png: Path of a figure with y over y_m, e and u.
-        csv: Path of a table of all signals, with a row for each instant and a column for each
-            channel.
+        csv: Path of a table of all signals, with a row per instant and a column per channel.
         parquet: Path of the same table as Parquet.
         figure: Path of a figure for a paper: .pdf, .svg or .eps for vectors, or .png.
         width: Width of the figure, with a unit ("88mm") or in m.

@@ -61,8 +61,7 @@ def judge(
 ) -> Outcome:
     """Return the outcome of a flight with its shortfalls, or without any if it ended early.
 
-    `controller` is given for a flight without a scenario. If there is neither, the errors are not
-    judged.
+    A flight without a scenario has its `controller`. Without either, errors are not judged.
     """
     starved = account.starvation
     seems_unflown = outcome.end is End.NEVER_FLEW or account.late is not None
