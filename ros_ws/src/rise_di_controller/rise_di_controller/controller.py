@@ -27,13 +27,13 @@ from rise_di_controller.params import ControllerConfig, as_controller
 
 
 class ControlOutput(NamedTuple):
-    """Output of a tick."""
+    """The output of a tick of the controller."""
 
-    stamp_ns: int  # of the y from which u was computed
-    u: FloatArray  # (p,) in the order of the parameters' effectors
+    stamp_ns: int  # stamp of the y from which u was computed
+    u: FloatArray  # (p,), in the order of `effectors` of the parameters
     inputs: guard.TickInputs
     log: Callable[[], FloatArray]
-    effects: FloatArray | None = None  # (m,) by `EffectTest.most`; None if no test was due
+    effects: FloatArray | None = None  # bound of each input's effect, (m,); None if no test was due
 
     @property
     def internals(self) -> FloatArray:
@@ -47,18 +47,18 @@ class ControlOutput(NamedTuple):
 class Prepared(NamedTuple):
     """What a controller computes from new parameters before they take effect.
 
-    This is a third of the time that a change in flight takes.
+    Computing it takes a third of the time of a change in flight.
     """
 
     parameters: ControllerConfig
     law: TunedLaw
     guard: guard.GuardParams
     digest: int
-    names: tuple[str, ...]  # of the channels of `internals`
+    names: tuple[str, ...]  # names of the channels of `internals`
 
 
 def preparing(parameters: ControllerConfig) -> Generator[None, None, Prepared]:
-    """Prepare parameters as `prepared` does, in steps of at most about 1 ms."""
+    """Prepare parameters as `prepared` does, but yield after at most about 1 ms."""
     law = parameters.tuned_law()
     yield
     limits = parameters.guard()
@@ -73,7 +73,7 @@ def preparing(parameters: ControllerConfig) -> Generator[None, None, Prepared]:
 
 
 def prepared(parameters: ControllerConfig) -> Prepared:
-    """Prepare parameters for a controller."""
+    """Compute what a controller needs before it can take new parameters."""
     parts = preparing(parameters)
     while True:
         try:
@@ -84,7 +84,7 @@ def prepared(parameters: ControllerConfig) -> Prepared:
 
 
 class Controller:
-    """Controller without ROS: `guard.tick` with its state and the last samples of y and y_m.
+    """The controller without ROS, which holds its state and the last samples of y and y_m.
 
     Args:
         parameters: Parameters of the controller.
@@ -106,7 +106,7 @@ class Controller:
         _, self._law, self._guard, self._digest, self.names = prepared(parameters)
         self._state = guard.initial_state(len(parameters.inputs), self._guard.allocation)
         self.period_ns = self._guard.period_ns
-        self._number = 0  # of the last `internals`
+        self._number = 0  # number of the last sample of `internals`
         self._effects = self._effect_test(parameters)
         self._first = self._parameters = parameters
         self._given_up = parameters.given_up()
@@ -120,7 +120,7 @@ class Controller:
         self._engaged_ns = 0
         self._vanes_moved = self._vanes_still = np.zeros(len(parameters.vanes), dtype=bool)
         self._samples: samples.SampleState | None = None  # None before the first y
-        self._restart_reason: Refusal | None = None  # why the law has engaged again by itself
+        self._restart_reason: Refusal | None = None  # why the law engaged again by itself
         self._y: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
         self._y_m: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
 
@@ -136,7 +136,7 @@ class Controller:
 
     @property
     def has_internals(self) -> bool:
-        """Whether the law has a state to log, as it does from the first engagement on."""
+        """Whether the law has a state to log, which it has from the first engagement on."""
         return self._state.law is not None
 
     @property
@@ -151,7 +151,7 @@ class Controller:
 
     @property
     def has_learned_model(self) -> bool:
-        """Whether the feedforward or the observer differs from the one at the start.
+        """Whether feedforward or observer differ from those with which the flight started.
 
         Only the proposals of a learner change them.
         """
@@ -166,16 +166,17 @@ class Controller:
             self._state = self._state._replace(mode=Mode.WAITING)
 
     def retune(self, parameters: "ControllerConfig | Prepared") -> None:
-        """Replace the parameters between two ticks without a jump of u (bumpless transfer).
+        """Replace the parameters between two ticks, without a jump of u (bumpless transfer).
 
         If the parameters are equal, nothing changes.
 
         Args:
-            parameters: The new parameters, or what `prepared` returned for them outside of a tick.
+            parameters: The new parameters, or the result of `prepared` for them, so that this call
+                is short.
 
         Raises:
-            ParameterError: The log would have other channels, because the law is another one or
-                because an observer is added or removed.
+            ParameterError: The channels of the log would change, because the law changes or because
+                an observer is added or removed.
         """
         new = parameters if isinstance(parameters, Prepared) else prepared(parameters)
         if new.digest == self._digest:
@@ -203,8 +204,8 @@ class Controller:
     def still_vanes(self) -> tuple[str, ...]:
         """Return the names of the vanes that the observer leaves out because they stand still.
 
-        Each engagement measures the motion afresh, from 0. Until a vane has moved, or the
-        averaging time has passed, the vane counts as it did before the engagement.
+        At each engagement the measurement of the motion begins again at 0. Until the vane has
+        moved, or the averaging time has passed, its result from before the engagement holds.
         """
         return tuple(
             name
@@ -219,7 +220,7 @@ class Controller:
         return EffectTest(self._guard.probe, gain, parameters.probe.false_alarm)
 
     def _tested(self, inputs: guard.TickInputs) -> FloatArray | None:
-        """Return the effects of the inputs after a tick, or None if no test was due."""
+        """Return the measured effects of the inputs after a tick, or None if no test was due."""
         if self._effects is None:
             return None
         if self.mode is not Mode.ENGAGED or inputs.dt == 0.0:
@@ -254,7 +255,8 @@ class Controller:
     def oscillations(self) -> dict[str, float]:
         """Return the period, s, of each output that oscillates under a model learned in flight.
 
-        An output counts only if it oscillates more than it did under the law of the start.
+        An output counts only if it oscillates more than under the law with which the flight
+        started.
         """
         if self._first_law or not self._oscillations.periods.any():
             return {}
@@ -269,18 +271,18 @@ class Controller:
         return parameters.models() == self._first.models()
 
     def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """Buffer a sample of y, in the law's order.
+        """Buffer a sample of y, with its channels in the law's order.
 
-        A sample that no aircraft can give (see `samples`) is lost, as if it had never arrived. If a
-        sample is lost because y changed too fast, the next one must still have a later stamp. If
-        later samples confirm a jump, the law engages again.
+        A sample that no aircraft can give (see `samples`) is lost, as if it had never arrived. The
+        next sample must have a later stamp than a sample that is lost because y changed too fast.
+        If later samples confirm a jump of y, the law engages again.
 
         Args:
             sample: The sample, shape (m,), or (m + k,) with k vanes, SI, deviations from trim.
             now_ns: The clock, ns.
 
         Returns:
-            Why the sample is lost; None if it is taken.
+            The reason why the sample is lost, or None if it is taken.
 
         Raises:
             ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
@@ -308,14 +310,14 @@ class Controller:
         return None
 
     def take_y_m(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """Buffer a sample of y_m, (m,), as `take_y` does, except that y_m may jump or stand still.
+        """Buffer a sample of y_m as `take_y` does, except that y_m may jump or stand still.
 
         Args:
             sample: The sample, shape (m,), SI, deviations from trim.
             now_ns: The clock, ns.
 
         Returns:
-            Why the sample is lost; None if it is taken.
+            The reason why the sample is lost, or None if it is taken.
 
         Raises:
             ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
@@ -330,7 +332,7 @@ class Controller:
     def _reason_against(
         self, sample: StampedVector, last: StampedVector | None, now_ns: int
     ) -> Refusal | None:
-        """Refuse a sample of m values that is beyond the bounds.
+        """Return why a sample of m values is refused, if a value is beyond its bound, else None.
 
         Raises ChannelError if its stamp is in the future or not newer than that of `last`.
         """
@@ -340,9 +342,9 @@ class Controller:
         return samples.bound_violation(sample.value, self._parameters.outputs, self._guard.samples)
 
     def pop_restart_reason(self) -> Refusal | None:
-        """Return why the law has engaged again by itself since the last call.
+        """Return why the law engaged again since the last call of this method, and forget it.
 
-        Returns None if it has not.
+        Returns None if the law did not engage again, or only because of `restart`.
         """
         reason, self._restart_reason = self._restart_reason, None
         return reason
@@ -366,7 +368,7 @@ class Controller:
         )
         if inputs is None:
             return None
-        # in a step of the law dt is above 0, at an engagement it is 0
+        # dt is above 0 in a step of the law, and 0 at an engagement
         if was_engaged and self._state.mode is Mode.ENGAGED and inputs.dt == 0.0:
             gap_ns = 0 if last is None else inputs.stamp_ns - last.stamp_ns
             self._restart_reason = Refusal(
@@ -398,7 +400,7 @@ class Controller:
         )
 
     def watch(self, e: FloatArray, dt: float) -> None:
-        """Record the error of a tick for `diverging` and `oscillations`.
+        """Record the error of a tick, from which `diverging` and `oscillations` are computed.
 
         Args:
             e: y - y_m, shape (m,), SI.
@@ -409,7 +411,7 @@ class Controller:
             self._oscillations.take(e, dt, None if self._first_law else self._learned)
 
     def resume(self, state: guard.ControllerState) -> None:
-        """Continue from the state of a flight that a campaign has stepped with the same parameters.
+        """Continue a flight that a campaign has simulated with the same parameters, from its state.
 
         Args:
             state: State of the guard and of the law after the last tick.
@@ -421,16 +423,16 @@ class Controller:
 
         They are needed if the last tick is longer ago than the age limit.
 
-        The aircraft has meanwhile started its own failsafe, since u was missing. Two ticks without
-        fresh inputs bring the controller's u to the same failsafe value, so that the re-engagement
-        is bumpless.
+        Because u was missing, the aircraft has meanwhile started its own failsafe. Two ticks
+        without fresh inputs bring the controller's u to the same value as in the aircraft, so that
+        the law engages again without a bump.
 
         Args:
             last_ns: Instant of the last tick, ns.
             now_ns: Instant of the tick, ns.
 
         Returns:
-            The instants, ns; empty if there was no overrun.
+            The instants, ns, or () if there was no overrun.
         """
         begin_ns = last_ns + self._guard.max_age_ns
         return (begin_ns + self.period_ns, now_ns) if now_ns > begin_ns else ()
@@ -447,7 +449,7 @@ class Controller:
         return next((sample for sample in reversed(self._y) if sample.stamp_ns <= known_ns), newest)
 
     def ages(self, now_ns: int) -> dict[str, float]:
-        """Return the ages of the newest y and y_m, s; an input that never came is absent.
+        """Return the ages of the newest y and y_m, s, without an input that never came.
 
         Args:
             now_ns: The clock, ns.
@@ -463,13 +465,13 @@ class Controller:
         }
 
     def stale(self, now_ns: int) -> tuple[str, ...]:
-        """Name the stale inputs: y or y_m, if never received or older than the age limit.
+        """Return those of y and y_m that never came or are older than the age limit.
 
         Args:
             now_ns: The clock, ns.
 
         Returns:
-            The names; empty if y and y_m are fresh.
+            The names of the stale inputs, or () if y and y_m are fresh.
         """
         ages = self.ages(now_ns)
         limit = seconds(self._guard.max_age_ns)
@@ -479,7 +481,7 @@ class Controller:
 def _with_feedforward(parameters: ControllerConfig) -> NDArray[np.bool_]:
     """Return the mask of the channels with a feedforward, (m,).
 
-    A learner leaves out the channels that fly the law of the start.
+    In a learner's proposal, channels without a learned model have no feedforward.
     """
     some = None if parameters.feedforward is None else parameters.feedforward.inputs
     return np.array([some is None or name in some for name in parameters.inputs])

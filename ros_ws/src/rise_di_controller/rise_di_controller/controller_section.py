@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The section `controller` of a scenario: the fields that it has under any control law.
+"""The fields that the section `controller` of a scenario has under any control law.
 
 The arrays of guard, feedforward and observer are built from these fields.
 """
@@ -73,7 +73,8 @@ class ControllerSection(NodeConfig):
         description="change of u that changes y_dot by one: 1 / abs(Omega_ii)"
     )
     lag: NonNegatives = Field(description="time constants of the actuators, s; 0 for none")
-    # y at 500 Hz is at most 2 ms old at a tick, and u waits 1 ms for an aircraft on the same host
+    # Delay for y at 500 Hz, at most 2 ms old at a tick, and a u that waits 1 ms for an aircraft on
+    # the same host.
     delay: NonNegative = Field(
         default=0.003,
         description="delay from y to the actuators beside sampling, s; default: topics on one host",
@@ -82,15 +83,17 @@ class ControllerSection(NodeConfig):
         default=None,
         description="largest abs(y) and abs(y_m); none: p, q, r 2000 deg/s, V 340 m/s, else 1e6",
     )
-    # ten ticks at 100 Hz: a busy host stalls for a shorter time, and a command takes longer to rise
+    # Ten ticks at 100 Hz. A busy host stalls for a shorter time, and a command takes longer to
+    # rise.
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(
         default=0.1, description="age above which y or y_m is stale, s"
     )
-    # a short loss of y costs no command, and an aircraft is seldom upset within half a second
+    # A short loss of y costs no command, and an aircraft is seldom upset within half a second.
     hold: Annotated[float, Field(ge=0, le=1e6)] = Field(
         default=0.5, description="how long the failsafe holds u, s"
     )
-    # slow compared with the modes of an aircraft, so that the return to trim excites none of them
+    # This is slow compared with the modes of an aircraft, so the return to trim excites none of
+    # them.
     ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(
         default=2.0, description="how long the failsafe then takes to bring u to trim, s"
     )
@@ -137,7 +140,7 @@ class ControllerSection(NodeConfig):
         return (*self.outputs, *self.vanes)
 
     def without_vanes(self) -> Self:
-        """Return the parameters with an observer that uses y alone."""
+        """Return the parameters without vanes, so that the observer uses y alone."""
         if self.observer is None or not self.vanes:
             return self
         return self.model_copy(
@@ -153,7 +156,7 @@ class ControllerSection(NodeConfig):
         raise NotImplementedError
 
     def summary(self) -> str:
-        """Describe what flies, as a sentence for the log."""
+        """Describe the law and its settings in a sentence for the log."""
         return f"law {self.law}"
 
     def tuned_law(self) -> TunedLaw:
@@ -196,7 +199,7 @@ class ControllerSection(NodeConfig):
         """Group the channels of `internals`, and list the names in each group.
 
         Args:
-            law: The law of `tuned_law`, if you have it; otherwise it is computed.
+            law: The law of `tuned_law`. If None, it is computed.
 
         Returns:
             Names of the channels by group.
@@ -226,14 +229,16 @@ class ControllerSection(NodeConfig):
         return guard.limits if guard.allocation is None else guard.allocation.limits
 
     def given_up(self) -> FloatArray:
-        """Return 1 for each output that has no model until the engagement ends, else 0, (m,).
+        """Return 1 for each output whose learned model was given up, else 0, shape (m,).
+
+        Such an output flies without a model until the engagement ends.
 
         The array is empty if the controller does not learn.
         """
         return np.zeros(0)
 
     def history_ticks(self) -> int:
-        """Return the number of past ticks that initialise an observer which is new in flight."""
+        """Return the number of past ticks from which a new observer gets its estimates."""
         return 0
 
     def nominal(self) -> Nominal | None:
@@ -254,13 +259,13 @@ class ControllerSection(NodeConfig):
         return nominal._replace(acts=np.zeros(len(self.inputs))) if self.history_ticks() else None
 
     def digest(self) -> int:
-        """Compute a hash of the parameters of law and guard, 0 to 2^48 - 1, exact as a float64.
+        """Compute a hash of the parameters of law and guard, from 0 to 2^48 - 1.
 
-        It is the BLAKE2b hash of names and values, so it changes with any bit of any gain.
-        Parameters that concern only the node are left out.
+        It is the BLAKE2b hash of names and values, so it changes with any bit of any gain. A
+        float64 represents it exactly. Parameters that concern only the node are left out.
         """
         content = self.model_dump(exclude=OF_NODE)
-        # older versions had only this law, and the digests in their logs do not include its name
+        # Older versions had only RISE-DI, and the digests in their logs do not include its name.
         if content["law"] == "rise_di":
             del content["law"]
         return int.from_bytes(
@@ -268,10 +273,10 @@ class ControllerSection(NodeConfig):
         )
 
     def probe_gain(self) -> FloatArray:
-        """Compute abs(y_i / u_i) at the frequency of each sine, (m,), 0 where there is no sine.
+        """Compute abs(y_i / u_i) at the frequency of each sine of the probe, shape (m,).
 
-        The model is C (j omega - A)^-1 B if there is a nominal one, and 1 / (input_scale omega) if
-        not. The lag of the actuator is included.
+        It is 0 for an input without a sine. The model is C (j omega - A)^-1 B if there is a nominal
+        model, and 1 / (input_scale omega) otherwise. The lag of the actuator is included.
         """
         gain = np.zeros(len(self.outputs))
         if self.probe is None:
@@ -289,7 +294,7 @@ class ControllerSection(NodeConfig):
         return gain
 
     def _probe(self) -> Probe | None:
-        """Build the probe, whose sines move y by the amplitudes of the section; None without one.
+        """Build the probe, whose sines move y by the amplitudes of its section, or return None.
 
         The size of each sine follows from `probe_gain`.
         """
@@ -304,7 +309,7 @@ class ControllerSection(NodeConfig):
         )
 
     def _limits(self) -> Limits:
-        """Return the limits of u, infinite where there is none."""
+        """Return the limits of u, which are infinite if none is given."""
         unlimited = (np.inf,) * len(self.inputs)
         return Limits(
             -np.array(unlimited) if self.lower is None else np.array(self.lower),
@@ -313,13 +318,13 @@ class ControllerSection(NodeConfig):
         )
 
     def _authority(self) -> FloatArray:
-        """Compute the y_dot that full inputs give, (m,), units of y / s."""
+        """Compute the y_dot of each output at the limit of its input, (m,), units of y / s."""
         limits = self._limits()
         full = np.minimum(np.maximum(-limits.lower, limits.upper), samples.UNLIMITED)
         return np.asarray(full / np.array(self.input_scale))
 
     def guard(self) -> GuardParams:
-        """Collect times, limits and nominal model for the guard."""
+        """Return the parameters of the guard, which are times, limits and the nominal model."""
         return GuardParams(
             period_ns=period_ns(self.rate, "rate"),
             max_age_ns=nanoseconds(self.max_age),

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's log: a named vector at each tick.
+"""Define the controller's log, which is a named vector at each tick.
 
-Together with the parameters, it is enough to recompute u.
+The log and the parameters are enough to compute u again.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,11 +18,11 @@ SCALARS = ("mode", "dt", "y_m_offset", "late", "age", "number", "parameters")
 OUTPUT_GROUPS = ("y", "y_m", "e")
 INPUT_GROUPS = ("u_free", "u", "u_trim", "limited", "u_ff")
 OBSERVER_GROUPS = ("z", "u_o", "sigma")
-EFFECTOR = "effector"  # group of an allocation
-# groups of the vanes of an observer
+EFFECTOR = "effector"  # group of channels of an allocation
+# groups of channels of the vanes of an observer
 VANE_STATE = ("vane_mean", "vane_square", "vane_measures")
 VANE_READING = ("vane", "vane_m")
-GIVEN_UP = "given_up"  # group of a controller that learns
+GIVEN_UP = "given_up"  # group of channels of a controller that learns
 RESERVED = frozenset(
     {
         *SCALARS,
@@ -40,7 +40,7 @@ state e, which must be y - y_m."""
 
 
 class Saturation(IntEnum):
-    """Limit of a saturated input in a tick; published as a number in `internals`."""
+    """The limit that saturates an input in a tick, published as a number in `internals`."""
 
     NO = 0
     MAGNITUDE = 1
@@ -57,12 +57,13 @@ def groups(
 ) -> dict[str, tuple[str, ...]]:
     """Group the channels of `internals` and list the names in each group, in the order of the log.
 
-    Each output has y, y_m, e = y - y_m, then the state of the law; for RISE-DI that is e_0 (e at
-    engagement), integral_e (units of y times s) and Pi (scaled input). Each input has u before
-    (u_free) and after saturation (u), u_trim, limited (Saturation) and u_ff (feedforward). An
-    observer adds its estimates z, u_o for each input, and sigma, the fade-in. Vanes add their mean,
-    the mean square around it, 1 if the vane is in use, the reading, and the reading in the
-    reference motion. An allocation adds effector, the commanded effectors.
+    Each output has y, y_m, e = y - y_m, and then the state of the law. For RISE-DI this state is
+    e_0 (e at engagement), integral_e (units of y times s) and Pi (scaled input). Each input has u
+    before (u_free) and after saturation (u), u_trim, limited (Saturation) and u_ff (feedforward).
+    An observer adds its estimates z, u_o for each input, and sigma, the fade-in. Vanes add the mean
+    of their readings, the mean square around the mean, 1 for a vane in use, the reading, and the
+    reading in the reference motion. An allocation adds the group effector with the commanded
+    effectors.
     """
     state_groups = [
         name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS, *VANE_STATE)
@@ -77,11 +78,12 @@ def groups(
 
 
 def names(grouped: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """List the channel names of `internals`: the scalars, then "group.name".
+    """List the channel names of `internals`, first the scalars and then "group.name".
 
-    The scalars are mode (flight_core.modes.Mode), dt (s), y_m_offset (s), late (s, delay of the
-    tick after its deadline), age (s, of y at the tick), number (counts the samples from 1 since the
-    start, so a gap is a lost sample) and parameters (ControllerConfig.digest).
+    The scalars are mode (flight_core.modes.Mode), dt (s), y_m_offset (s), late (time of the tick
+    after its deadline, s), age (age of y at the tick, s), number and parameters
+    (ControllerConfig.digest). number counts the samples from 1 since the start, so a gap shows a
+    lost sample.
     """
     channels = list(SCALARS)
     for group, members in grouped.items():
@@ -101,9 +103,9 @@ def values(
 ) -> FloatArray:
     """Return the values of `internals` in the order of `names`.
 
-    `given_up` is 1 for an output without a model until the engagement ends, (m,), and empty without
-    a learner. With an allocation, an input counts as limited by MAGNITUDE if it or any effector is
-    at a stop. Raises ValueError if the law was never engaged.
+    `given_up` is 1 for each output whose learned model was given up, (m,), and is empty without a
+    learner. With an allocation, an input counts as limited by MAGNITUDE if it or any effector is at
+    a stop. Raises ValueError if the law was never engaged.
     """
     if state.law is None:
         raise ValueError(

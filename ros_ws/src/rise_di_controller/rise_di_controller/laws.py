@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control laws of the controller, by name.
+"""Find the control laws of the controller by name.
 
-They are RISE-DI, and the laws that installed packages register.
-
-A package registers a law by an entry point in setup.py; see docs/laws.md:
+They are RISE-DI, and the laws that installed packages register. A package registers a law by an
+entry point in setup.py (see docs/laws.md):
 
     entry_points={"rise_di_controller.laws": ["pi = control_laws.pi:PiConfig"]}
 """
@@ -96,14 +95,14 @@ class AnyLaw(ControllerConfig):
 
     @classmethod
     def keys_beside(cls, values: Mapping[str, Any]) -> Set[str]:
-        """Return the keys of the law that the values name; if it is unknown, those of every law."""
+        """Return the keys of the law that `values` name, or of all laws if it is unknown."""
         with suppress(ParameterError):
             return schema(values.get("law", DEFAULT)).model_fields.keys()
         return ControllerConfig.model_fields.keys()
 
     @classmethod
     def validate_mapping(cls, values: Mapping[str, Any], where: str) -> ControllerConfig:  # type: ignore[override]
-        """Build the parameters of the law. Raises ParameterError."""
+        """Build the parameters of the law that `values` name. Raises ParameterError if invalid."""
         name = values.get("law", DEFAULT)
         try:
             config = schema(name)

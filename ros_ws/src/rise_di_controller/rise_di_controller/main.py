@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `controller`."""
+"""The executable `controller`, which starts the controller node."""
 
 from flight_ros.startup import start_nodes
 

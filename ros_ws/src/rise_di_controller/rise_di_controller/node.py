@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller node: a lifecycle node that runs the guarded law at a fixed rate or in lockstep.
+"""Run the guarded law as a ROS 2 lifecycle node, at a fixed rate or in lockstep.
 
-It subscribes to y and y_m and publishes u and internals. It handles overruns, conflicting
+The node subscribes to y and y_m, and publishes u and internals. It handles overruns, conflicting
 publishers and stale inputs.
 """
 
@@ -51,8 +51,8 @@ from rise_di_controller.learning.proposals import (
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-LONG_MAX_AGE = 1.0  # s, max_age above which the log warns that the failsafe begins late
-SLOW_PERIOD_NS = 60 * NANOSECONDS  # between two warnings that a rate is too low for max_age
+LONG_MAX_AGE = 1.0  # max_age, s, above which the log warns that the failsafe begins late
+SLOW_PERIOD_NS = 60 * NANOSECONDS  # time between two warnings that a rate is too low for max_age
 BEHIND_NS = 1_000_000
 """Time from the instants of y and y_m, every 2 ms of the system clock at 500 Hz, to a tick. By then
 both have arrived, and their nodes have finished their own ticks of up to 1 ms. Ticks at a random
@@ -75,7 +75,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         answer_invalid_transitions(self)
         self._active = False
         self._is_shut_down = False
-        # a standby that was never activated publishes no u beside that of the active node
+        # A standby node that was never activated publishes no u, because the active node does.
         self._publishes = self.parameters.autostart
         self._controller = Controller(self.parameters)
         y_input = self.parameters.measured, self._taking(self._controller.take_y)
@@ -95,7 +95,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._internals_encoder = self.encoder(self._controller.names)
         self._publish_effects = self.advertise(EFFECTS) if self.parameters.probe else None
         self._effects_encoder = self.encoder(self.parameters.inputs)
-        self._stuck: Refusal | None = None  # the inputs without effect
+        self._stuck: Refusal | None = None  # a refusal that names the inputs without effect
         self._learning = self._new_learning()
         if self.parameters.lockstep:
             self._empty_encoder = self.encoder(())
@@ -106,9 +106,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
                 receive_other=self._y_m.receive,
                 is_ready=self._has_proposal,
             )
-        self._last_ns = 0  # of the last tick
+        self._last_ns = 0  # instant of the last tick
         self._still_vanes: tuple[str, ...] = ()
-        self._restarts = 0  # how often the law has engaged again by itself
+        self._restarts = 0  # how often the law has engaged again without a command
         self._slow = Throttle(SLOW_PERIOD_NS)
         if self.parameters.autostart:
             self.trigger_configure()
@@ -121,7 +121,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Reset the law. The parameters were validated when they were set."""
-        # this keeps u, so that a node that is configured again transfers without a bump
+        # This keeps u, so that a node that is configured again continues without a jump of u.
         self._controller.restart()
         self.get_logger().info(self.parameters.summary())
         self._warn_long_max_age(self.parameters)
@@ -138,7 +138,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop the law for good, and publish nothing any more: the aircraft begins a failsafe."""
+        """Stop the law for good, and publish nothing more. The aircraft's failsafe then begins."""
         self._active = self._publishes = False
         self._is_shut_down = True
         return TransitionCallbackReturn.SUCCESS
@@ -161,9 +161,10 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return self._y.subscription, self._y_m.subscription
 
     def start_ns(self) -> int:
-        """Return a start BEHIND_NS after a whole period of the system clock, ns.
+        """Return the start of the ticks, ns, which is BEHIND_NS after a whole period of the clock.
 
-        If half a period is shorter than BEHIND_NS, the start is half a period after it.
+        If half a period is shorter than BEHIND_NS, the start is half a period after the whole
+        period. The clock is the system clock.
         """
         return self.next_period_ns() + min(BEHIND_NS, self.period_ns() // 2)
 
@@ -202,7 +203,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return taking
 
     def _tell_restart(self) -> None:
-        """Count that the law has engaged again by itself, and log it at most once in 2 s."""
+        """Count if the law engaged again without a command, and log it at most once in 2 s."""
         if (reason := self._controller.pop_restart_reason()) is not None:
             self._restarts += 1
             self.get_logger().warning(f"the law engages again: {reason}", throttle_duration_sec=2.0)
@@ -220,7 +221,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self.get_logger().info("every probed input answers again")
 
     def _tell_vanes(self) -> None:
-        """Log when a vane begins or ends to stand still."""
+        """Log when a vane begins or ceases to stand still."""
         before = self._still_vanes
         self._still_vanes = self._controller.still_vanes()
         if before == self._still_vanes:
@@ -236,8 +237,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     def _timeouts_ns(self) -> tuple[int, int]:
         """Return the ages above which a publisher has timed out, ns.
 
-        The first age is for the same node in a new process, the second for a different node, which
-        may take over only after the failsafe has brought u to trim.
+        The first age holds for the same node in a new process. The second age holds for a different
+        node, which may take over only after the failsafe has brought u to trim.
         """
         return self._max_age_ns(), self._max_age_ns() + nanoseconds(
             self.parameters.hold + self.parameters.ramp
@@ -255,8 +256,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._tell_restart()
         if output is None or not self._publishes:
             return False
-        # If a tick was suspended halfway, do not publish its old u: the aircraft has started its
-        # failsafe, and u would jump.
+        # If a tick was suspended halfway, its old u is not published. The aircraft has started its
+        # failsafe meanwhile, and u would jump.
         if self.parameters.lockstep or self.now_ns() - now_ns <= self._max_age_ns():
             self._publish_u(self._u_encoder.encode(output.stamp_ns, output.u))
         if self._controller.has_internals:
@@ -290,12 +291,12 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     # With a learner
 
     def _new_learning(self) -> Learning | None:
-        """Make the side that takes a learner's proposals; None if the controller does not learn."""
+        """Create the object that takes a learner's proposals, or return None without learning."""
         self._decoded = self._waits_for_proposal = False
         parameters = self.parameters
         if not isinstance(parameters, RiseDiConfig) or parameters.learn is None:
             return None
-        # A learner that is started again identifies for the first time after the first of
+        # A learner that is started again makes its first identification after the first of
         # `updates`.
         timeouts_ns = (
             nanoseconds(parameters.learn.updates[0]),
@@ -305,7 +306,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             PROPOSAL,
             self._decode_proposal,
             self._take_proposal,
-            max_age_ns=None,  # `Learning` limits the age
+            max_age_ns=None,  # `Learning` limits the age instead
             lock=self.publisher_lock(lambda: timeouts_ns),
             qos=LOCKSTEP if parameters.lockstep else PROPOSALS,
             max_size=MAX_REPORT_SIZE,
@@ -318,7 +319,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return Learning(parameters, self._say, simulated=parameters.lockstep)
 
     def _learn(self, now_ns: int) -> None:
-        """Take the proposals, between two ticks."""
+        """Let due proposals act, between two ticks."""
         if self._learning is None:
             return
         self._decoded = False
@@ -327,7 +328,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self.adopt(parameters)
 
     def _publish_authority(self, now_ns: int) -> None:
-        """Tell guidance what the inputs can do according to the model that flies.
+        """Publish the authority of the inputs, by the model that flies, for guidance.
 
         Without a learner nothing is published.
         """
@@ -337,9 +338,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             )
 
     def _has_proposal(self, now_ns: int) -> bool:
-        """In lockstep, return whether the proposal that is due before a step has arrived.
+        """Return whether a step in lockstep has the proposal that is due before it.
 
-        Return True if none is due.
+        Returns True if no proposal is due.
         """
         if self._learning is None:
             return True
@@ -359,7 +360,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         flown = change.pop("flown", None)
         if not isinstance(start, int) or not isinstance(flown, int):
             raise ChannelError("malformed", "a proposal without the digests start and flown")
-        assert self._learning is not None  # noqa: S101 - made together with the receiver
+        assert self._learning is not None  # noqa: S101 - created together with the receiver
         self._learning.receive(
             Proposal(
                 stamp_ns=report.stamp_ns,
@@ -373,7 +374,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         )
 
     def _say(self, event: Event) -> None:
-        """Log and publish what became of a proposal."""
+        """Log and publish the result of a proposal, or a fallback."""
         sentence = bounded(event.sentence)
         if event.kind is EventKind.REFUSED:
             self.get_logger().warning(sentence)

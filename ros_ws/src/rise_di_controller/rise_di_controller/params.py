@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the controller under any control law.
+"""Validate the parameters of the controller under any control law.
 
-They are validated here; `controller_section` has the fields, and builds the arrays from them.
+`controller_section` has the fields, and builds the arrays from them.
 
 The parameters of a law are a subclass, which `AnyLaw.validate_mapping` finds by the name of the
 law.
@@ -137,14 +137,14 @@ class ControllerConfig(ControllerSection):
             yield from self._check_observer(self.observer, nominal)
 
     def _check_names(self) -> None:
-        """Refuse a channel or state that has two places: a log could not tell them apart."""
+        """Raise ParameterError if a name is used twice, which a log could not distinguish."""
         require_distinct("outputs", self.outputs)
         require_distinct("inputs", self.inputs)
         for key, section in (("feedforward", self.feedforward), ("observer", self.observer)):
             require_distinct(f"{key}.states", () if section is None else section.states)
 
     def _check_state(self) -> None:
-        """Refuse a state of the law that the log cannot hold.
+        """Raise ParameterError if the log cannot hold the state of the law.
 
         Each array must have one value per output, and a name that the log does not use.
         """
@@ -212,7 +212,7 @@ class ControllerConfig(ControllerSection):
     def _check_observer(self, observer: ObserverConfig, nominal: Nominal) -> Iterator[None]:
         """Check sizes, stability of filter and feedback, and the delay margin of the nominal loop.
 
-        The delay margin certifies what flies.
+        The nominal loop must be stable up to fractions of its delay margin.
         """
         expected = (
             tuple(f"x.{name}" for name in self.feedforward.states) if self.feedforward else ()
@@ -233,7 +233,7 @@ class ControllerConfig(ControllerSection):
         )
         Phi, Gamma, H, L, F = observer.matrices(nominal)
         matrices = {"L": Phi @ (np.eye(len(Phi)) - L @ H)}
-        if F.any(axis=1).all():  # a channel without F flies the law alone: see the loop below
+        if F.any(axis=1).all():  # a channel without F has only the law, see the loop below
             matrices["F"] = Phi - Gamma @ F
         for key, matrix in matrices.items():
             radius = spectral_radius(matrix)
@@ -279,13 +279,13 @@ class ControllerConfig(ControllerSection):
 
 
 def _subsets(names: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield every subset of the names, the small ones first."""
+    """Yield every subset of the names, from small to large."""
     for count in range(len(names) + 1):
         yield from combinations(names, count)
 
 
 def as_controller(value: object, key: str) -> ControllerConfig:
-    """Return the value if it holds the parameters of a controller, or raise ParameterError."""
+    """Return the value if it holds the parameters of a controller, else raise ParameterError."""
     return as_instance(
         value, ControllerConfig, key, "the parameters of a controller, as scenario.controller"
     )

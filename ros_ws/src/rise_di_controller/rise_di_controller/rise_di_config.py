@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of RISE-DI: validation, and conversion to the arrays of the law."""
+"""Validate the parameters of RISE-DI, and convert them to the arrays of the law."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -37,8 +37,8 @@ from rise_di_controller.law.control_law import ControlLaw, TunedLaw
 from rise_di_controller.law.law import CONTROL_LAWS, LawParams, Sign, gain, total_lag
 from rise_di_controller.params import ControllerConfig
 
-# s of past ticks over which a new observer runs before it flies, so that its estimates of the
-# disturbances take over what the law has integrated
+# Time, s, of past ticks over which a new observer runs before it flies, so that its estimates of
+# the disturbances replace what the law has integrated.
 HISTORY = 5.0
 
 
@@ -73,7 +73,7 @@ class ScheduleConfig(Config):
 
     @property
     def models(self) -> tuple[SpeedConfig, ...]:
-        """Models at other speeds: two, or none."""
+        """The models at two other speeds, or none."""
         return () if self.slow is None or self.fast is None else (self.slow, self.fast)
 
 
@@ -96,7 +96,7 @@ class PriorConfig(Config):
     )
 
 
-LEAST_MARGIN = 0.02  # s, delay margin that a learned model must keep: two periods at 100 Hz
+LEAST_MARGIN = 0.02  # delay margin that a learned model must keep, s: two periods at 100 Hz
 
 
 class LearnConfig(Config):
@@ -133,9 +133,9 @@ class LearnConfig(Config):
     def least_margin(self, margin: float) -> float:
         """Return the delay margin that a learned model must keep, s.
 
-        It is the configured margin. If none is configured, it is `margin`, the delay margin at the
-        start, but at most LEAST_MARGIN, because around the real aircraft the loop of the file may
-        have less.
+        It is the configured margin. If none is configured, it is `margin`, which is the delay
+        margin at the start, but at most LEAST_MARGIN. This is because the first loop can have less
+        margin around the real aircraft than around the model in the file.
         """
         return min(margin, LEAST_MARGIN) if self.margin is None else self.margin
 
@@ -168,17 +168,17 @@ class RiseDiConfig(ControllerConfig):
     beta: Positives = Field(
         description="the diagonal of beta (21) in scaled inputs, units of y / s^2"
     )
-    # It is 1 if input_scale is 1 / abs(Omega_ii). If it is left out, `read` sets it to 1.
+    # omega is 1 if input_scale is 1 / abs(Omega_ii). If omega is left out, `read` sets it to 1.
     omega: Positives = Field(
         default=(),
         description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign); by "
         "default 1 for each output",
     )
-    # the lag decides whether implicit or soft is stable
+    # The lag decides whether the implicit or the soft sign is stable.
     sign: Literal["auto", "literal", "implicit", "soft"] = Field(
         default="auto", description="how the sign of (21) is sampled; auto: implicit or soft"
     )
-    # three times the width at which the loop of the sign and the lags is on the edge of stability
+    # Three times the width at which the loop of the sign and the lags is at the limit of stability.
     softening: Positive | Positives = Field(
         default=3.0,
         description="width of the softened sign in total lags; stable above 1, 3 is usual",
@@ -214,19 +214,19 @@ class RiseDiConfig(ControllerConfig):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Return the parameters that may change in flight, with input_scale and without `learn`."""
+        """Return the parameters that may change in flight, with input_scale, without `learn`."""
         return (super().tunable() | {"input_scale"}) - {"learn"}
 
     @classmethod
     def learned(cls) -> frozenset[str]:
         """Return the models, which only proposals of a learner may change.
 
-        A change by an operator would skip the proof.
+        A change by an operator would bypass the certification.
         """
         return frozenset({"feedforward", "observer"})
 
     def check_law(self) -> None:
-        """Check that each key has a value per channel, except k_d, which has none for the last.
+        """Check that each key has a value for each channel, except k_d, which lacks the last one.
 
         A schedule needs the output V, and a learner needs an observer without vanes.
         """
@@ -268,7 +268,7 @@ class RiseDiConfig(ControllerConfig):
     def _check_schedule(self, schedule: ScheduleConfig) -> None:
         """Check that a schedule has V, another output, and models below and above the trim speed.
 
-        These are models of both the feedforward and the observer.
+        At both speeds, feedforward and observer need models.
         """
         followed = "V" in self.outputs and len(self.outputs) > 1
         require(
@@ -311,9 +311,9 @@ class RiseDiConfig(ControllerConfig):
         )
 
     def checks(self) -> Iterator[None]:
-        """Check the controller, at several speeds if it has models at two more speeds.
+        """Check the controller, at five speeds if it has models at other speeds.
 
-        These speeds are the trim speed, the two others, and those halfway between.
+        The five speeds are the trim speed, the two other speeds, and the two halfway to them.
         """
         if self.schedule is None or not self.schedule.models:
             yield from super().checks()
@@ -324,7 +324,7 @@ class RiseDiConfig(ControllerConfig):
             yield
             try:
                 self._with_models(model).tuned_law()
-            except ParameterError as error:  # of feedforward.KEY or observer.KEY
+            except ParameterError as error:  # its key is feedforward.KEY or observer.KEY
                 raise ParameterError(f"schedule.{name}.{str(error).partition('.')[2]}") from None
         yield
         observer = self.tuned_law().params.observer
@@ -371,7 +371,7 @@ class RiseDiConfig(ControllerConfig):
     def _with_models(self, models: SpeedConfig) -> Self:
         """Return the parameters with `models` in place of the models of the trim speed.
 
-        They have no schedule.
+        The result has no schedule.
         """
         sections: dict[str, Any] = {"schedule": None}
         for key, names in (
@@ -402,7 +402,7 @@ class RiseDiConfig(ControllerConfig):
     def _nominal_over_speed(self, at_trim: Nominal) -> OverSpeed:
         """Return the model of the feedforward over the airspeed.
 
-        Its leads and inputs come from the model at the trim speed.
+        The leads, and the choice of inputs, come from the model at the trim speed.
         """
 
         def matrices(config: RiseDiConfig, scale: FloatArray) -> FloatArray:
@@ -411,11 +411,11 @@ class RiseDiConfig(ControllerConfig):
         return self._over_speed(matrices, partial(nominal_of, at_trim))
 
     def models(self) -> tuple[Any, ...]:
-        """Include the models at other speeds."""
+        """Return the models as in the base class, and those at other speeds."""
         return (*super().models(), () if self.schedule is None else self.schedule.models)
 
     def guard(self) -> GuardParams:
-        """Include the models of the feedforward over the airspeed."""
+        """Return the guard of the base class with the feedforward's models over the airspeed."""
         guard = super().guard()
         if guard.nominal is None or self.schedule is None or not self.schedule.models:
             return guard
@@ -424,11 +424,11 @@ class RiseDiConfig(ControllerConfig):
     def known_nominal(self) -> Nominal:
         """Return the arrays of the feedforward, which must exist."""
         nominal = self.nominal()
-        assert nominal is not None  # noqa: S101 - beside an observer
+        assert nominal is not None  # noqa: S101 - an observer needs a feedforward
         return nominal
 
     def tuned_law(self) -> TunedLaw:
-        """Return the law with its parameters, with the observer and the schedule if it has them."""
+        """Return the law with its parameters, extended by the observer and the schedule, if any."""
         law = super().tuned_law()
         if self.schedule is None:
             return law
@@ -448,7 +448,7 @@ class RiseDiConfig(ControllerConfig):
         )
 
     def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:
-        """Add the outputs that are given up, if the controller learns.
+        """Return the groups as in the base class, and outputs given up if the controller learns.
 
         Args:
             law: As in `ControllerConfig.logged_groups`.
@@ -469,11 +469,11 @@ class RiseDiConfig(ControllerConfig):
         return np.array([float(name in (self.learn.without or ())) for name in self.outputs])
 
     def history_ticks(self) -> int:
-        """Return the ticks of HISTORY if the models are learned, else 0."""
+        """Return the number of ticks in HISTORY if the models are learned, else 0."""
         return 0 if self.learn is None else round(HISTORY * self.rate)
 
     def control_law(self) -> ControlLaw:
-        """Return RISE-DI with the sampled sign."""
+        """Return the law RISE-DI, with the sign sampled as the parameters choose."""
         return CONTROL_LAWS[self.sampled_sign()[0]]
 
     def law_params(self) -> LawParams:
@@ -494,7 +494,7 @@ class RiseDiConfig(ControllerConfig):
         )
 
     def summary(self) -> str:
-        """Say how the sign is sampled and why, as a sentence.
+        """Return a sentence on how the sign is sampled and why.
 
         The sentence also says whether input_scale is scheduled.
         """

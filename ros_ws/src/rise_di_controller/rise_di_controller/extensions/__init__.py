@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Extensions of the paper, all off by default: feedforward, observer, schedule, allocation."""
+"""Extend the law of the paper by feedforward, observer, schedule and allocation."""

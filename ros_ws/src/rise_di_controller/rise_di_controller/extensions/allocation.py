@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Allocation of the m inputs v of a law to p >= m effectors u, inside end stops and rates.
+"""Allocate the m inputs v of a law to p >= m effectors u, inside end stops and rates.
 
 u = T v, effect u = v.
 
-The law, its gains and its theorem stay m x m in v. T is a right inverse of `effect`, so the
-effects of all effectors together add up to v. Every sum is computed in a fixed order, so that u has
-the same bits on every host.
+The law, its gains and its theorem stay m x m in v. The law computes v, and the effectors are the
+actuators that u moves. T is a right inverse of `effect`, so the effects of all effectors together
+add up to v. Every sum is computed in a fixed order, so that u has the same bits on every host.
 """
 
 from collections.abc import Sequence
@@ -31,23 +31,23 @@ HALVINGS = 5
 stops, the first input gets 99 % of what a linear program finds for it if there are 5 bisections,
 and 92 % if there are 3."""
 
-SMALL = 1e-9  # diagonal entry of `exchange` below which the others cannot replace an effector
+SMALL = 1e-9  # below this diagonal entry of `exchange`, no other effector can replace one
 
 
 class Allocation(NamedTuple):
-    """Parameters of an allocation."""
+    """Parameters of an allocation of m inputs v to p effectors u."""
 
-    T: FloatArray  # (p, m) u = T v
-    effect: FloatArray  # (m, p) v = effect u, with effect T = I
-    exchange: FloatArray  # (p, p) I - T effect: the motions of u without effect on v
+    T: FloatArray  # u = T v, (p, m)
+    effect: FloatArray  # v = effect u, with effect T = I, (m, p)
+    exchange: FloatArray  # I - T effect, (p, p): the motions of u without effect on v
     order: tuple[int, ...]  # inputs of the law by priority, the highest first
-    limits: Limits  # (p,) of u
+    limits: Limits  # limits of u, (p,)
 
 
 def allocation(
     T: FloatArray, effect: FloatArray, order: Sequence[int], limits: Limits
 ) -> Allocation:
-    """Compute the parameters, with `exchange`."""
+    """Build the parameters of an allocation, and compute `exchange` from T and effect."""
     columns = [product(T, column) for column in effect.T]
     return Allocation(
         T=T,
@@ -61,19 +61,22 @@ def allocation(
 def allocate(
     v: FloatArray, u_before: FloatArray, dt: Array, params: Allocation
 ) -> tuple[FloatArray, FloatArray]:
-    """Find u (p,) inside the limits for a demanded v (m,), and return it with the v that it gives.
+    """Find a u inside the limits for a demanded v, and return u and the v that it gives.
+
+    v has the shape (m,), and u has (p,).
 
     If no limit acts, the results are exactly T v and v.
 
-    If T v is beyond an end stop, `exchange w` passes what the effector lacks on to the others, one
-    stop after the other. If that is not enough, the inputs of the law are added in the order of
-    priority, each as far as the stops allow:
+    If T v is beyond an end stop, `exchange w` passes what this effector cannot give on to the other
+    effectors. This is done for one stop after the other. If it is not enough, the inputs of the law
+    are added in the order of priority, each as far as the stops allow:
 
         u += s (T_i v_i + exchange w)
 
     The sum begins at u = 0, and s is the largest number in [0, 1] for which u stays inside the end
-    stops. If the rate limits do not permit this u, then u goes from u_before towards it: the inputs
-    are added in the same way, with the change of v in place of v, and inside the rate limits, too.
+    stops. If the rate limits do not permit this u, then u goes from u_before towards it. The inputs
+    are then added in the same way, with the change of v in place of v, and inside the rate limits
+    as well.
 
     Source: pseudo-inverse with redistribution and priority, T. A. Johansen, T. I. Fossen, "Control
     allocation - a survey", Automatica 49(5), 2013, section 2; the exchange is the relaxation method
@@ -103,9 +106,9 @@ def allocate(
 
 
 def limits_of_effectors(v_free: Array, v: Array) -> Limits:
-    """Return the limits that saturate v_free to v, which the effectors give.
+    """Return limits of v that saturate the demanded `v_free` to the `v` that effectors give.
 
-    The anti-windup of a law takes these limits.
+    The anti-windup of a law works with these limits.
     """
     xp = array_namespace(v)
     infinite = xp.full_like(v, xp.inf)
@@ -123,10 +126,11 @@ def _towards(
     high: FloatArray,
     params: Allocation,
 ) -> FloatArray:
-    """Move u by each of the moves in turn, as far as the limits allow, starting from inside them.
+    """Move u by each of the moves in turn, as far as the limits allow.
 
-    HALVINGS bisections find the fraction of a move that fits. From there u goes straight on, as
-    far as the limits allow.
+    `start` lies inside the limits `low` and `high`. HALVINGS bisections find the fraction of a move
+    that can be reached with the help of `exchange`. From there u goes on in a straight line, as far
+    as the limits allow.
     """
     u = start
     for move in moves:
@@ -158,7 +162,7 @@ def _towards(
 def _exchanged(
     u: FloatArray, low: FloatArray, high: FloatArray, exchange: FloatArray
 ) -> FloatArray:
-    """Change u without changing its effect, inside its limits if the sweeps find such a u."""
+    """Return a u with the same effect that lies inside the limits, if the sweeps find one."""
     columns = exchange.T.tolist()
     ends = list(enumerate(zip(low.tolist(), high.tolist(), strict=True)))
     values_of_u = u.tolist()

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Feedforward by model inversion, an extension of the paper, off by default.
+"""Compute a feedforward by model inversion, an extension of the paper, off by default.
 
-It is the input with which a nominal model of the aircraft would follow y_m.
+The feedforward is the input with which a nominal model of the aircraft would follow y_m.
 
 It uses only y_m, not the state of the aircraft, and does not change the law. See docs/theory.md.
 """
@@ -17,8 +17,8 @@ from flight_core.arithmetic import product, sine
 from flight_core.integrators import rk4
 from flight_core.vectors import Array, array_namespace
 
-# 1/s. A smaller real part counts as zero: rounding errors are about 1e-14, and a mode at 1e-6 1/s
-# has a time constant of 11 days.
+# A real part below this, 1/s, counts as zero. Rounding errors are about 1e-14, and a mode at 1e-6
+# 1/s has a time constant of 11 days.
 ZERO_REAL_PART = 1e-6
 
 
@@ -37,21 +37,21 @@ class Nominal(NamedTuple):
     B: Array  # (n, m)
     C: Array  # (m, n), selects the outputs
     gravity: Array  # (n, n), f(x) = gravity @ sin(x)
-    inverse: Array  # (m, m), inverse of Omega = C B
-    path: Array  # (n, n), I - B Omega^-1 C: the part of a drift that the ideal input leaves
+    inverse: Array  # inverse of Omega = C B, (m, m)
+    path: Array  # I - B Omega^-1 C, (n, n): the part of a drift that the ideal input leaves
     path_A: Array  # (n, n), path A
     path_gravity: Array  # (n, n), path gravity
-    # (m,) time from a tick until the input acts: half a period of hold, delay, actuator lag; s
+    # time from a tick until the input acts, s, (m,): half a period of hold, delay and actuator lag
     lead: Array
     sine_states: tuple[int, ...]  # indices of the states with a sine term
-    # (m,) 1 for the inputs with a feedforward, 0 for all others; None if all have one
+    # 1 for the inputs with a feedforward, else 0, (m,); None if all inputs have a feedforward
     acts: Array | None = None
 
 
 def nominal_model(
     A: Array, B: Array, C: Array, gravity: Array, lead: Array, acts: Array | None = None
 ) -> Nominal:
-    """Build the nominal model with the products that a tick needs; C B must be invertible."""
+    """Build the nominal model, and the products that a tick needs. C B must be invertible."""
     inverse = arithmetic.inverse(product(C, B))
     path = np.eye(len(A)) - product(product(B, inverse), C)
     angles = tuple(np.flatnonzero(gravity.any(axis=0)).tolist())
@@ -73,15 +73,15 @@ def nominal_model(
 class FeedforwardState(NamedTuple):
     """State of the feedforward between two ticks."""
 
-    x: Array  # (n,) state of the nominal model, C x = y_m
-    u: Array  # (m,) input in the middle of the last tick
-    dt: Array  # () length of the last tick, s
-    ticks: Array  # () number of ticks since engagement
-    u_0: Array  # (m,) u_ff at engagement
+    x: Array  # state of the nominal model, with C x = y_m, (n,)
+    u: Array  # input in the middle of the last tick, (m,)
+    dt: Array  # length of the last tick, s, ()
+    ticks: Array  # number of ticks since engagement, ()
+    u_0: Array  # u_ff at engagement, (m,)
 
 
 def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
-    """Return the state at engagement: outputs at y_m, shape (m,), other states at 0, the trim."""
+    """Return the state at engagement, with outputs at y_m, (m,), and other states at trim, 0."""
     xp = array_namespace(y_m)
     zeros = xp.zeros_like(y_m)
     zero = xp.zeros_like(y_m[0])
@@ -91,10 +91,10 @@ def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
 def with_new_model(
     state: FeedforwardState | None, y_m: Array, y_m_dot: Array, dt: Array, nominal: Nominal
 ) -> FeedforwardState:
-    """Return the state for a new model in the same motion.
+    """Return the state with which a new model continues the same motion.
 
-    x and u_0 stay if the old state has them, and u is computed with the new model. u_ff goes on
-    from u - u_0. y_m_dot and dt are those of the last tick.
+    If there is an old state, x and u_0 stay, and u is computed with the new model. The contribution
+    of the feedforward continues at u - u_0. y_m_dot and dt belong to the last tick.
     """
     start = initial_state(y_m, nominal)
     if state is not None and state.x.shape == start.x.shape:
@@ -128,7 +128,7 @@ def sines(x: Array, nominal: Nominal) -> Array:
         return array_namespace(x).stack(rows)
     values = np.zeros_like(x)
     for j in nominal.sine_states:
-        # a Python float takes a fifth of the time of an array
+        # math.sin on a float takes a fifth of the time of an array
         values[j] = sine(x[j].item() if x.ndim == 1 else x[j])
     return values
 
@@ -144,7 +144,9 @@ def step_count(span_ns: int, period_ns: int) -> int:
 def step(
     state: FeedforwardState, y_m: Array, dt: Array, nominal: Nominal, parts: int = 1
 ) -> tuple[FeedforwardState, Array]:
-    """Advance by a tick: (state, y_m, dt) -> (state, u_ff - u_0), which is added to u of the law.
+    """Advance the feedforward by a tick, and return the state and u_ff - u_0.
+
+    The law adds u_ff - u_0 to its u.
 
     y_m is taken as linear over the last tick. The outputs of the nominal model follow it, and the
     other states (the zero dynamics) are integrated under the input that this requires:
@@ -154,13 +156,13 @@ def step(
         u       = ideal((x + x_p) / 2, y_m_dot)            in the middle of the tick, dt / 2 ago
         u_ff    = u + (dt / 2 + lead) (u - u_p) / ((dt + dt_p) / 2)
 
-    u_ff extrapolates the last two u linearly to the instant at which this tick's input acts: a
-    first-order actuator follows u if its command is u + lag u_dot. The first two ticks after
-    engagement only determine the slope and add nothing. u_0 is u_ff of the second tick, so that u
-    does not jump (bumpless transfer). dt > 0.
+    u_ff extrapolates the last two u linearly to the instant at which this tick's input acts. This
+    includes the lag, because a first-order actuator follows u if its command is u + lag u_dot. The
+    first two ticks after engagement only determine the slope and add nothing. u_0 is u_ff of the
+    second tick, so that u does not jump (bumpless transfer). dt > 0.
 
-    Shapes: y_m, u_ff (m,), dt (). Units: SI and radians; u in the units of B. Source: this project,
-    after the feedforward of model inversion; see docs/theory.md.
+    y_m and u_ff have the shape (m,), and dt has (). The units are SI and radians, and u has the
+    units of B. Source: this project, after the feedforward of model inversion; see docs/theory.md.
     """
     xp = array_namespace(y_m)
     y_m_dot = (y_m - product(nominal.C, state.x)) / dt
@@ -184,9 +186,9 @@ def of_active_inputs(u: Array, nominal: Nominal) -> Array:
 def nominal_zeros(nominal: Nominal) -> NDArray[np.complex128]:
     """Compute the zeros of the nominal model, shape (n - m,), 1/s.
 
-    They are the eigenvalues of its zero dynamics, H' (I - B Omega^-1 C) (A + gravity) H, where H
-    has the columns of I for the states that are not outputs, and sin(x) is linearised to x. NumPy
-    arrays only.
+    They are the eigenvalues of its zero dynamics, H' (I - B Omega^-1 C) (A + gravity) H. H has the
+    columns of I for the states that are not outputs, and sin(x) is linearised to x. Only NumPy
+    arrays are accepted.
     """
     hidden = ~np.asarray(nominal.C).any(axis=0)
     matrix = nominal.path @ (nominal.A + nominal.gravity)

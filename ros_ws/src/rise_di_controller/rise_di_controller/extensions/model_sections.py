@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sections of the parameters that contain a model: feedforward, observer, vanes, allocation."""
+"""The parameter sections with a model: feedforward, observer, vanes and allocation."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated
@@ -28,12 +28,12 @@ from rise_di_controller.extensions.observer import VaneParams
 from rise_di_controller.law.decomposition import DecompositionError, signs
 from rise_di_controller.law.saturation import Limits
 
-# largest error of an entry of effect T against I; if the file has ten digits, it is about 1e-9
+# largest error of an entry of effect T against I, which is about 1e-9 if the file has ten digits
 MAX_INVERSE_ERROR = 1e-6
 
 
 def _require_sizes(section: Config, key: str, sizes: Mapping[str, tuple[int, int]]) -> None:
-    """Refuse a matrix, given row by row, whose number of entries is wrong."""
+    """Raise ParameterError if a matrix, given row by row, has a wrong number of entries."""
     for name, (rows, columns) in sizes.items():
         values = getattr(section, name)
         require(
@@ -45,7 +45,7 @@ def _require_sizes(section: Config, key: str, sizes: Mapping[str, tuple[int, int
 
 
 def require_same_signs(Omega: FloatArray, D: Sequence[int], where: str) -> None:
-    """Refuse a model whose C B has no D, or another D than the controller."""
+    """Raise ParameterError if C B of a model has no D, or another D than the controller."""
     try:
         signs_of_model = [int(sign) for sign in signs(Omega)]
     except DecompositionError as error:
@@ -134,7 +134,10 @@ class VanesConfig(Config):
     time: Positive = Field(default=1.0, description="time over which the motion is averaged, s")
 
     def params(self, outputs: Sequence[str], states: Sequence[str], estimates: int) -> VaneParams:
-        """Return the arrays, or refuse a channel without a state or a wrong size."""
+        """Return the arrays of the vanes.
+
+        Raises ParameterError if a vane has no state of the same name, or if a size is wrong.
+        """
         k = len(self.channels)
         s = estimates
         m = len(outputs)
@@ -184,7 +187,7 @@ class ObserverConfig(Config):
     vanes: VanesConfig | None = Field(default=None, description="vanes in addition to y")
 
     def matrices(self, nominal: Nominal) -> tuple[FloatArray, ...]:
-        """Return Phi, Gamma, H, L and F, or raise ParameterError if their sizes do not match."""
+        """Return Phi, Gamma, H, L and F. Raises ParameterError if their sizes do not match."""
         s, (n, m) = len(self.states), nominal.B.shape
         sizes = {"Phi": (s, s), "Gamma": (s, m), "L": (s, m), "F": (m, s)}
         _require_sizes(self, "observer", sizes)
@@ -193,7 +196,9 @@ class ObserverConfig(Config):
         return Phi, Gamma, H, L, np.reshape(self.F, (m, s))
 
     def at_rate(self, rate: float, nominal: Nominal) -> "ObserverConfig":
-        """Convert the observer to another rate; a = self.rate / rate is the ratio of the periods.
+        """Convert the observer to another rate.
+
+        With the ratio a = self.rate / rate of the new period to the old one,
 
         [Phi, Gamma; 0, I]' = [Phi, Gamma; 0, I]^a,  I - L' H = (I - L H)^a,  F' = F
         """
@@ -236,7 +241,7 @@ class AllocationConfig(Config):
     )
 
     def ordered(self, inputs: Sequence[str], order: Sequence[str]) -> "AllocationConfig":
-        """Return the allocation for the same inputs in the order `order` instead of `inputs`."""
+        """Return the allocation with the law's inputs in the order `order`, not `inputs`."""
         places = [list(inputs).index(name) for name in order]
         p = len(self.effectors)
         T = np.reshape(self.T, (p, -1))[:, places]
@@ -248,7 +253,7 @@ class AllocationConfig(Config):
     def arrays(self, inputs: Sequence[str]) -> Allocation:
         """Return the arrays of the allocation.
 
-        Raises ParameterError if sizes do not match or effect T is not I.
+        Raises ParameterError if sizes do not match, or if effect T is not I.
         """
         p = len(self.effectors)
         m = len(inputs)

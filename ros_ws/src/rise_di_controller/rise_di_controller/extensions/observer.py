@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Observer, an extension of the paper, off by default.
+"""Extend a control law by an observer, an extension of the paper, off by default.
 
-Its estimates of states, wind and disturbances correct the trim of a law.
-
-It extends any control law without changing the law's own equations. Its matrices are parameters, so
-nothing is solved here. See docs/theory.md.
+The observer estimates states, wind and disturbances, and corrects the trim of the law. It extends
+any control law without changing the law's own equations. Its matrices are parameters, so nothing is
+solved here. See docs/theory.md.
 """
 
 from collections.abc import Sequence
@@ -23,15 +22,16 @@ from rise_di_controller.law.saturation import Limits, saturate
 class VaneParams(NamedTuple):
     """Parameters of k vanes, which are sensors beside y that only the observer uses.
 
-    H z predicts by how much a reading differs from the reading in the reference motion.
+    H z predicts how much a reading differs from the reading in the reference motion, where z has
+    the s estimates.
     """
 
     H: Array  # (k, s)
-    # (k, s, m + 1) gains of a vane, added to L; the last column acts on the innovation of the vane
+    # gains that a vane adds to L, (k, s, m + 1); the last column acts on the innovation of the vane
     L: Array
-    # (k,) mean square of the motion of a reading below which the vane counts as frozen
+    # mean square of a reading's motion below which the vane counts as frozen, (k,)
     least: Array
-    time: Array  # () averaging time of the motion, s
+    time: Array  # averaging time of the motion, s, ()
 
 
 class ObserverParams(NamedTuple):
@@ -47,30 +47,30 @@ class ObserverParams(NamedTuple):
     Phi: Array  # (s, s)
     Gamma: Array  # (s, m)
     H: Array  # (m, s)
-    L: Array  # (s, m) correction of the estimates by the innovation
-    F: Array  # (m, s) feedback gain, u_o = -F z
-    limits: Limits  # of u_o
-    fade_rate: Array  # () 1/s, inverse of the fade-in time of u_o after engagement
-    vanes: VaneParams | None = None  # None: the observer of y alone
+    L: Array  # correction of the estimates by the innovation, (s, m)
+    F: Array  # feedback gain of u_o = -F z, (m, s)
+    limits: Limits  # limits of u_o
+    fade_rate: Array  # inverse of the fade-in time of u_o after engagement, 1/s, ()
+    vanes: VaneParams | None = None  # None if the observer uses y alone
 
 
 class PastTick(NamedTuple):
     """A tick of the recent record, over which a new observer runs to get its first estimates."""
 
-    e: Array | None  # (m,); None for a tick without a y
-    u: Array  # (m,) u less the trim and the feedforward of the tick
+    e: Array | None  # error, (m,), or None for a tick without a y
+    u: Array  # u less the trim and the feedforward of the tick, (m,)
     y_m: Array  # (m,)
-    dt: Array  # () length of the tick, s
-    scale: Array | None = None  # (m,) factor of input_scale; None without a schedule
+    dt: Array  # length of the tick, s, ()
+    scale: Array | None = None  # factor of input_scale, (m,); None without a schedule
 
 
 class ObserverState(NamedTuple):
     """State of the extended law and of the observer between two ticks."""
 
     law: Any
-    z: Array  # (s,) estimates, predicted for the next tick
-    u_o: Array  # (m,) the observer's contribution to the trim
-    sigma: Array  # (1,) fade-in after engagement, 0 to 1
+    z: Array  # estimates, predicted for the next tick, (s,)
+    u_o: Array  # the observer's contribution to the trim, (m,)
+    sigma: Array  # fade-in after engagement, 0 to 1, (1,)
 
 
 class VaneObserverState(NamedTuple):
@@ -80,9 +80,9 @@ class VaneObserverState(NamedTuple):
     z: Array
     u_o: Array
     sigma: Array
-    vane_mean: Array  # (k,) mean of the readings
-    vane_square: Array  # (k,) mean square of the readings around the mean
-    vane_measures: Array  # (k,) 1 for a vane in use, 0 for a still vane
+    vane_mean: Array  # mean of the readings, (k,)
+    vane_square: Array  # mean square of the readings around their mean, (k,)
+    vane_measures: Array  # 1 for a vane in use, 0 for a still vane, (k,)
 
 
 def predict(z: Array, u: Array, params: ObserverParams) -> Array:
@@ -91,25 +91,26 @@ def predict(z: Array, u: Array, params: ObserverParams) -> Array:
 
 
 def initial_estimates(e: Array, params: ObserverParams) -> Array:
-    """Return the estimates at engagement, H'e: outputs at the errors, the rest at 0."""
+    """Return the estimates at engagement, H'e, with outputs at the errors and the rest at 0."""
     return product(params.H.swapaxes(0, 1), e)
 
 
 def estimates_after(
     history: tuple[PastTick, ...], change: Array, filters: Sequence[ObserverParams]
 ) -> Array:
-    """Run the filter over the last ticks, and return its estimates for the next tick.
+    """Run the observer over the last ticks, and return its estimates for the next tick.
 
         z = (I - Phi (I - L H))^-1 (mean(Phi L e) + mean(Gamma (u - change)))
             the steady state at the means
         z = z + L (e - H z),  z = Phi z + Gamma (u - change)                       over the ticks,
         that is z = (Phi - Phi L H) z + Phi L e + Gamma (u - change)
 
-    This start includes the disturbances that the law has compensated so far. From z = 0 the filter
-    would need longer than the record to estimate them. A tick without a y has no correction. The
-    products with e and u are computed for all ticks of a filter at once, in a third of the time.
-    `history` must contain at least one y. `change` is the change of the feedforward since the
-    record, (m,), and `filters` has the parameters of the observer at each tick.
+    The start at the steady state includes the disturbances that the law has compensated so far.
+    From z = 0 the observer would need longer than the record to estimate them. A tick without a y
+    has no correction. The products with e and u are computed for all ticks with the same parameters
+    at once, which takes a third of the time. `history` has these ticks, at least one of them with a
+    y. `change` is the change of the feedforward since the record, (m,). `filters` has the
+    parameters of the observer at each tick.
     """
     known = np.array([tick.e is not None for tick in history])
     e = np.array([np.zeros_like(change) if tick.e is None else tick.e for tick in history]).T
@@ -137,15 +138,15 @@ def estimates_after(
 def with_motion(
     state: VaneObserverState, reading: Array, dt: Array, params: VaneParams
 ) -> VaneObserverState:
-    """Update the motion of the readings, and which vanes are in use.
+    """Update the measured motion of the readings, and which vanes are in use.
 
         part    = min(dt / time, 1)
         mean   += part (reading - mean)
         square += part ((reading - mean)^2 - square)
         measures 1 where square > least, else 0
 
-    A frozen vane shows only electrical noise, with a mean square below `least`. The same is true of
-    a vane in calm air, where there is no wind to measure.
+    A frozen vane shows only electrical noise, with a mean square below `least`. A vane in calm air
+    does so as well, but there it has no wind to measure.
     """
     xp = array_namespace(reading)
     part = xp.minimum(dt / params.time, 1.0 + 0.0 * dt)
@@ -158,10 +159,10 @@ def with_motion(
 def by_vanes(
     z: Array, innovation: Array, deviation: Array, measures: Array, params: VaneParams
 ) -> Array:
-    """Compute the correction by the vanes in use, (s,): sum of L_v [e - H z, deviation_v - H_v z].
+    """Compute the correction of the estimates by the vanes in use, (s,).
 
-    `innovation` is e - H z, (m,). `deviation` is the readings minus those of the reference motion,
-    (k,).
+    It is the sum over v of L_v [e - H z, deviation_v - H_v z]. `innovation` is e - H z, (m,).
+    `deviation` is the readings minus those of the reference motion, (k,).
     """
     xp = array_namespace(z)
     residual = deviation - product(params.H, z)
@@ -174,16 +175,16 @@ def by_vanes(
 
 
 def without_frozen(params: ObserverParams, frozen: Sequence[bool]) -> ObserverParams:
-    """Return parameters with which frozen vanes are never used, and all others always."""
+    """Return parameters with which the frozen vanes are never used, and all other vanes always."""
     if params.vanes is None:
         return params
     return params._replace(vanes=params.vanes._replace(least=np.where(frozen, np.inf, 0.0)))
 
 
 def filter_matrix(params: ObserverParams) -> FloatArray:
-    """Compute Phi (I - L H - sum of L_v [H, H_v]), (s, s), the step of z from tick to tick.
+    """Compute the matrix that advances z by a tick, (s, s).
 
-    Only vanes with a finite `least` count.
+    It is Phi (I - L H - sum of L_v [H, H_v]). Only vanes with a finite `least` count.
     """
     corrected = params.L @ params.H
     if params.vanes is not None:
@@ -223,7 +224,7 @@ def correct(state: Any, measurements: Measurements, dt: Array, params: ObserverP
 def _at_engagement(
     law_state: Any, measurements: Measurements, params: ObserverParams, *, vanes: bool
 ) -> Any:
-    """Return the state at engagement: estimates from the first e, u_o = 0."""
+    """Return the state at engagement, with u_o = 0 and estimates from the first e."""
     e = measurements.y - measurements.y_m
     zero = array_namespace(e).zeros_like(e)
     state = ObserverState(law_state, initial_estimates(e, params), zero, zero[:1])
@@ -237,11 +238,11 @@ def _at_engagement(
 def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
     """Extend a control law so that it starts from the trim u_trim + u_o.
 
-    The observer also takes u after saturation (anti-windup) and the readings of the vanes.
+    The observer also takes the readings of the vanes, and u after saturation as an anti-windup.
 
         u_o by `correct`
         u   = law(y, y_m) from the trim u_trim + u_o
-        z   = Phi z + Gamma (u - u_trim)        for the next tick, and again per missed tick
+        z   = Phi z + Gamma (u - u_trim) for the next tick, and again for each missed tick
 
     The law takes the measured e, not the estimate.
     """

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Schedule of input_scale over dynamic pressure, an extension of the paper, off by default.
+"""Schedule input_scale over dynamic pressure, an extension of the paper, off by default.
 
-The response to a control surface grows with the dynamic pressure: Omega grows with V^2, and the
-delay margin of fixed gains falls accordingly. The schedule keeps Omega input_scale near its value
-at trim. It extends a law that has the parameter input_scale, without changing the law's own
+The response to a control surface grows with the dynamic pressure. Omega therefore grows with V^2,
+and the delay margin of fixed gains falls accordingly. The schedule keeps Omega input_scale near its
+value at trim. It extends a law that has the parameter input_scale, without changing the law's own
 equations. If there is a feedforward and an observer, they use models for the present airspeed, too.
 """
 
@@ -26,29 +26,29 @@ SCALE_RANGE = (0.3, 3.0)
 """Least and largest factor of input_scale, reached at 1.83 and 0.58 of the trim speed."""
 
 
-# steps of the model per unit of V / V0. At 25 m/s the model changes every 0.2 m/s, so that most
-# ticks find theirs in the cache.
+# Number of steps of the model per unit of V / V0. At 25 m/s the model changes every 0.2 m/s, so
+# that most ticks find their model in the cache.
 STEPS = 128
 
 
 class OverSpeed(NamedTuple):
-    """A model as a function of the airspeed, for d = V / V0 - 1 from `least` to `most`."""
+    """A model as a function of d = V / V0 - 1, from `least` to `most`, for the airspeed V."""
 
     model: Callable[[float], Any]  # the model at d, a multiple of 1 / STEPS
     least: float
     most: float
-    airspeed: FloatArray  # (m,) 1 for the output V, else 0
+    airspeed: FloatArray  # 1 for the output V, else 0, (m,)
 
     def at_scale(self, scale: FloatArray) -> Any:
-        """Return the model at which the factors of input_scale are `scale`, (m,).
+        """Return the model at the airspeed at which the factors of input_scale are `scale`, (m,).
 
-        They are (V0 / V)^2 in every channel except V.
+        The factors are (V0 / V)^2 in every channel except V.
         """
         d = 1.0 / math.sqrt(((1.0 - self.airspeed) * scale).max()) - 1.0
         return self.model(round(min(max(d, self.least), self.most) * STEPS) / STEPS)
 
     def at_scales(self, scales: FloatArray) -> list[Any]:
-        """Return the models of T ticks with the factors `scales`, (T, m), as `at_scale` does."""
+        """Return the models of T ticks with the factors `scales` of input_scale, (T, m)."""
         d = 1.0 / np.sqrt(((1.0 - self.airspeed) * scales).max(axis=1)) - 1.0
         return [
             self.model(place)
@@ -62,12 +62,12 @@ def over_speed(
     airspeed: FloatArray,
     model: Callable[[FloatArray, FloatArray], Any],
 ) -> OverSpeed:
-    """Interpolate a model between airspeeds: trim + d (slope + d curvature).
+    """Interpolate a model between three airspeeds by trim + d (slope + d curvature).
 
-    The matrices pass through `values` at the trim speed and at two ratios to it, the first below 1
-    and the second above. Whatever turns y_dot into u, such as F of an observer or the inverse of
-    Omega, is divided by the factor of input_scale in `values`. `model` takes the matrices and these
-    factors, (m,).
+    The stacked matrices equal `values` at the trim speed and at the two `ratios` to it, the first
+    below 1 and the second above 1. Matrices that turn y_dot into u, such as F of an observer or the
+    inverse of Omega, are divided by the factor of input_scale in `values`. `model` builds the model
+    from the matrices and these factors, (m,).
     """
     trim, slow, fast = values
     least, most = (ratio - 1.0 for ratio in ratios)
@@ -87,9 +87,9 @@ class ScheduleParams(NamedTuple):
     """Parameters of the extended law and of the schedule over m channels."""
 
     law: Any  # parameters of the extended law
-    speed: Array  # () trim speed V0, m/s
-    airspeed: Array  # (m,) 1 for the output V, else 0
-    time: Array  # () time constant with which the factor follows, s
+    speed: Array  # trim speed V0, m/s, ()
+    airspeed: Array  # 1 for the output V, else 0, (m,)
+    time: Array  # time constant with which the factor follows the airspeed, s, ()
     # the law's parameters as a function of the airspeed; None without an observer
     observer: OverSpeed | None = None
 
@@ -98,16 +98,19 @@ class ScheduleState(NamedTuple):
     """State of the extended law and of the schedule between two ticks."""
 
     law: Any
-    scale: Array  # (m,) factor of input_scale
+    scale: Array  # factor of input_scale, (m,)
 
 
 def airspeed_range(params: ScheduleParams) -> tuple[Array, Array]:
-    """Return the airspeeds at which the factor is the largest and the least of SCALE_RANGE, m/s."""
+    """Return the airspeeds, m/s, at which the factor reaches both ends of SCALE_RANGE.
+
+    The first has the largest factor, and the second the least.
+    """
     return params.speed / math.sqrt(SCALE_RANGE[1]), params.speed / math.sqrt(SCALE_RANGE[0])
 
 
 def target_scale(y: Array, params: ScheduleParams) -> Array:
-    """Compute the factor of input_scale at the airspeed V0 + V of y, shape (m,).
+    """Compute the factor of input_scale, shape (m,), at the airspeed V0 + V with V from y.
 
     It is (V0 / (V0 + V))^2 within SCALE_RANGE, and 1 in channel V.
 
@@ -141,8 +144,8 @@ def observer_of(
 def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
     """Stack the matrices of a feedforward side by side, with the inverse divided by `scale`.
 
-    They are [A, gravity, B, path A, path gravity, inverse'], the last one with zeros in the rows
-    from m to n.
+    The result is [A, gravity, B, path A, path gravity, inverse'], where inverse' has zeros in the
+    rows from m to n.
     """
     n, m = nominal.B.shape
     inverse = np.zeros((n, m))
@@ -153,7 +156,7 @@ def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
 
 
 def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nominal:
-    """Return the model with stacked matrices, the inverse of `nominal_side_by_side`."""
+    """Return the feedforward's model with stacked matrices, inverting `nominal_side_by_side`."""
     n, m = nominal.B.shape
     ends = (0, n, 2 * n, 2 * n + m, 3 * n + m, 4 * n + m, 4 * n + 2 * m)
     A, gravity, B, path_A, path_gravity, inverse = (
@@ -168,7 +171,8 @@ def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nom
 def law_at(params: ScheduleParams, scale: Array) -> Any:
     """Return the parameters of the extended law at an airspeed.
 
-    input_scale is multiplied by `scale`. With an observer, the models are those of this airspeed.
+    input_scale is multiplied by `scale`. With an observer, the models are those of the airspeed
+    that belongs to `scale`.
     """
     return _scaled(
         params.law if params.observer is None else params.observer.at_scale(scale), scale
@@ -183,7 +187,7 @@ def _scaled(params: Any, scale: Array) -> Any:
 
 
 def observers_of(params: Any, scales: Sequence[Array | None]) -> list[ObserverParams]:
-    """Return the observer of each tick, for its factor of input_scale if there is a schedule."""
+    """Return the observer at each tick, given each tick's factor of input_scale, if any."""
     if not isinstance(params, ScheduleParams):
         return [params] * len(scales)
     if params.observer is None:
@@ -198,9 +202,9 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
         scale += min(dt / time, 1) (target_scale(y) - scale)
         the law is retuned to input_scale scale (bumpless transfer), then takes the step
 
-    The retuning keeps u, so the schedule acts only on u_dot. Engagement starts at target_scale(y).
-    An observer keeps its estimates, which mean the same at every speed, and u_o moves on to -F z at
-    its own rate.
+    The retuning keeps u, so the schedule acts only on u_dot. At engagement scale = target_scale(y).
+    An observer keeps its estimates, which have the same meaning at every speed, and u_o moves to
+    the new -F z at the rate limit of u_o.
     """
 
     def followed(

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What stands between the law and the aircraft: samples, engagement, failsafe, probe."""
+"""Guard the law with checks of samples, engagement, failsafe and probe."""

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guard of the control law: saturation, engagement and failsafe.
+"""Guard a control law with saturation, engagement and failsafe.
 
-The guard is pure, like the law, and fits every control law.
+The guard consists of pure functions, like the law, and works with every control law.
 
 - Saturation limits the magnitude and rate of u (`saturation.saturate`). Anti-windup is part of the
   law (`ControlLaw.limited`).
@@ -10,10 +10,10 @@ The guard is pure, like the law, and fits every control law.
   effectors (`allocation.allocate`).
 - The watchdog finds stale inputs, which are older than `max_age` (`tick`).
 - The failsafe for stale inputs holds u, then ramps it to trim (modes HOLD, RAMP, TRIM).
-- Bumpless transfer: every engagement starts from the present u, with the law's state as at the
-  first engagement.
-- Only finite values: a sample with NaN or infinity counts as missing. If u or the state of the law
-  would not be finite, the law engages again.
+- Bumpless transfer means that every engagement starts from the present u, with the state of the law
+  as at the first engagement.
+- Only finite values pass. A sample with NaN or infinity counts as missing. If u or the state of the
+  law would not be finite, the law engages again.
 """
 
 from collections.abc import Sequence
@@ -35,11 +35,11 @@ from rise_di_controller.guard.samples import SampleLimits
 from rise_di_controller.law.control_law import Measurements, TunedLaw, fields
 from rise_di_controller.law.saturation import Limits, saturate
 
-# Least time between two samples that give a slope, as a fraction of the longest extrapolation. If
-# they were closer, extrapolating would amplify the noise of their difference more than 20 times.
+# Least time between two samples whose slope is extrapolated, as a fraction of the longest
+# extrapolation. Closer samples would amplify the noise of their difference more than 20 times.
 MIN_SLOPE_SPAN = 0.05
 
-LARGEST_VANE = np.pi  # rad, largest reading of a vane
+LARGEST_VANE = np.pi  # largest reading of a vane, rad
 
 # Number of samples of y and of y_m that are kept, so that y_m is known at the stamp of y. They span
 # 0.1 s at 1 kHz, and more at lower rates.
@@ -47,33 +47,34 @@ SAMPLE_BUFFER_SIZE = 100
 
 
 class GuardParams(NamedTuple):
-    """Watchdog and failsafe times, saturation limits, and the nominal model of the feedforward."""
+    """Parameters of the guard: times, saturation limits, and the model of the feedforward."""
 
-    period_ns: int  # of the controller's ticks
+    period_ns: int  # period of the controller's ticks
     max_age_ns: int  # an older sample is stale
-    hold_ns: int  # failsafe: how long u is held
-    ramp_ns: int  # failsafe: how long u then takes to trim
+    hold_ns: int  # how long u is held in a failsafe
+    ramp_ns: int  # how long u then takes to reach trim
     deactivation_holds: bool  # whether u is held when deactivated; otherwise u ramps to trim
     limits: Limits
-    samples: SampleLimits  # of y and y_m, for the controller
-    nominal: Nominal | None = None  # None: no feedforward
-    # ticks over which a new observer runs before it flies; 0: it starts from the present error
+    samples: SampleLimits  # bounds of the samples of y and y_m
+    nominal: Nominal | None = None  # None without a feedforward
+    # number of ticks over which a new observer runs before it flies; if 0, it starts from the
+    # present error
     history: int = 0
-    allocation: Allocation | None = None  # None: the inputs of the law are the effectors
-    # indices of the states of the nominal model that the vanes measure; in y their readings come
-    # after the outputs
+    allocation: Allocation | None = None  # None if the inputs of the law are the effectors
+    # indices of the states of the nominal model that the vanes measure; in y the readings of the
+    # vanes come after the outputs
     vanes: tuple[int, ...] = ()
-    # the nominal model as a function of the airspeed; None: `nominal` at every airspeed
+    # the nominal model as a function of the airspeed; if None, `nominal` holds at every airspeed
     over_speed: OverSpeed | None = None
-    probe: Probe | None = None  # added to u_trim; None: no probe
+    probe: Probe | None = None  # sines that are added to u_trim; None without a probe
 
     @property
     def longest_ns(self) -> int:
-        """Longest time between two y that a step of the law spans; after that it engages again.
+        """Longest time between two y for one step of the law. Beyond it, the law engages again.
 
-        The last tick with a y within the age limit can be a period before the tick of the next y. A
-        step integrates the whole time: if half of the ticks are lost, a limit of 3 periods would
-        raise the error by 15 % in q and 22 % in r.
+        It is longer than the age limit, because the last tick with a fresh y can be a period before
+        the tick of the next y. A step integrates the whole time. If half of the ticks are lost, a
+        limit of only 3 periods would raise the error by 15 % in q and 22 % in r.
         """
         return self.max_age_ns + self.period_ns
 
@@ -82,7 +83,7 @@ class GuardParams(NamedTuple):
 LEAST_DT = 0.2
 
 
-# Stamp of the last u before there is one. Every y is later.
+# Stamp that stands for the last u before the first u. Every y is later.
 BEFORE_ALL_NS = -(2**63)
 
 
@@ -90,48 +91,49 @@ class VaneReadings(NamedTuple):
     """Readings of the k vanes at the last step."""
 
     reading: FloatArray  # (k,)
-    reference: FloatArray  # (k,) of the motion of the nominal model
+    reference: FloatArray  # readings in the motion of the nominal model, (k,)
 
 
 class ControllerState(NamedTuple):
     """State of the controller between two ticks."""
 
     mode: Mode
-    law: Any  # state of the control law; None until engaged
+    law: Any  # state of the control law; None before the first engagement
     y: StampedVector | None  # y of the last step
     y_m: FloatArray | None  # the reference at the stamp of y
-    u: FloatArray  # commanded, after saturation
-    u_free: FloatArray  # before saturation
+    u: FloatArray  # commanded input, after saturation
+    u_free: FloatArray  # input before saturation
     u_trim: FloatArray  # u at engagement, to which the law adds its output
     failsafe_start_ns: int  # when the inputs became stale, or the controller was deactivated
     u_failsafe: FloatArray  # u at the start of the failsafe
-    u_ff: FloatArray  # the feedforward, 0 where there is none
+    u_ff: FloatArray  # the feedforward, 0 for an input without it
     feedforward: FeedforwardState | None = None
-    # times of the present failsafe: new parameters count from the next failsafe on, so that u does
-    # not jump
+    # Times of the present failsafe. New times act from the next failsafe on, so that u does not
+    # jump.
     hold_ns: int = 0
     ramp_ns: int = 0
     history: tuple[PastTick, ...] = ()
-    # (p,) commanded effectors, None without an allocation; u is the input of the law that they give
+    # Commanded effectors, (p,), or None without an allocation. u is then the input of the law that
+    # these effectors give.
     effectors: FloatArray | None = None
     effectors_failsafe: FloatArray | None = None  # effectors at the start of the failsafe
     vanes: VaneReadings | None = None  # None without vanes
-    stamp_ns: int = BEFORE_ALL_NS  # of the last u
+    stamp_ns: int = BEFORE_ALL_NS  # stamp of the last u
     tick_ns: int = 0  # instant of the tick that gave the last u
 
     @property
     def command(self) -> FloatArray:
-        """What is published: the effectors, or u if there is no allocation."""
+        """The command that is published, which is u or, with an allocation, the effectors."""
         return self.u if self.effectors is None else self.effectors
 
 
 class TickInputs(NamedTuple):
     """Inputs of a tick, for the log.
 
-    If you compute the tick again from these inputs, you get u to the last bit.
+    Computing the tick again from these inputs gives the same u to the last bit.
     """
 
-    stamp_ns: int  # of u: that of its y, or without a y continued with the clock
+    stamp_ns: int  # stamp of u: that of its y, or continued with the clock without a y
     y: FloatArray
     y_m: FloatArray  # interpolated to the stamp of y
     y_m_offset: float  # stamp of the newest y_m minus stamp of y, s
@@ -158,14 +160,14 @@ def initial_state(m: int, allocation: Allocation | None = None) -> ControllerSta
 
 
 def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> FloatArray | None:
-    """Return the signal at an instant, shape (m,).
+    """Return a signal at the instant `stamp_ns`, shape (m,).
 
     Returns None if neither interpolation nor extrapolation is possible.
 
-    If a sample has this very stamp, it is returned unchanged. Between two samples the signal is
-    linear. Beyond the newest sample it is extrapolated by at most `reach_ns`, with the slope from a
-    sample at least MIN_SLOPE_SPAN `reach_ns` older to the newest one. If there is no such sample,
-    the newest one is held.
+    If a sample has exactly this stamp, its value is returned unchanged. Between two samples the
+    signal is linear. Beyond the newest sample it is extrapolated by at most `reach_ns`, with the
+    slope between the newest sample and one that is at least MIN_SLOPE_SPAN `reach_ns` older. If
+    there is no such older sample, the newest value is held.
 
     The samples must have increasing stamps.
     """
@@ -200,7 +202,7 @@ def _with_history(
     missed: int,
     guard: GuardParams,
 ) -> ControllerState:
-    """Append a step of the law, and the ticks missed before it, to the history."""
+    """Append a step of the law, and the ticks that were missed before it, to the history."""
     scale = getattr(stepped.law, "scale", None)
     nominal = np.float64(seconds(guard.period_ns))
     lost_ticks = (
@@ -229,28 +231,28 @@ def tick(
     u_ff_recorded: FloatArray | None = None,
     vane_m_recorded: FloatArray | None = None,
 ) -> tuple[ControllerState, TickInputs | None]:
-    """Advance the controller by a tick: (state, now, y, y_m) -> (state, inputs of the tick).
+    """Advance the controller by a tick, and return the new state and the inputs of the tick.
 
-    u is in the state that is returned.
+    The new state has u.
 
-    Fresh inputs engage or re-engage the law with u_trim = u (bumpless transfer). Each new y is then
-    a step of the law with the measured dt, which is at least LEAST_DT periods; if more than
+    Fresh inputs engage or re-engage the law with u_trim = u (bumpless transfer). With each new y,
+    the law then takes a step with the measured dt, which is at least LEAST_DT periods. If more than
     `longest_ns` have passed, the law engages again instead. Before the step, `ControlLaw.missed`
-    predicts over every whole period that had no y. The law adds its output to u_trim, or to u_trim
-    + u_ff if there is a feedforward. Without a new y nothing changes.
+    predicts the state over every whole period that had no y. The law adds its output to u_trim, or
+    to u_trim + u_ff if there is a feedforward. Without a new y nothing changes.
 
-    Stale inputs start the failsafe: HOLD, in which nothing is integrated, then RAMP to trim, then
-    TRIM. The stamp of u is normally that of its y. In a failsafe it continues from there with the
-    clock, like the stamp of the y that is missing. A y that is older than the last u does not
-    engage the law, so the stamp of u never goes back.
+    Stale inputs start the failsafe. Its modes are HOLD, in which nothing is integrated, then RAMP
+    to trim, then TRIM. The stamp of u is normally that of its y. In a failsafe it continues from
+    there with the clock, like the stamp of the y that is missing. A y that is older than the last u
+    does not engage the law, so the stamp of u never goes back.
 
     If `active` is false, the mode is INACTIVE, and u is held or ramps to trim. With fresh inputs u
-    is published, at trim, even before the first engagement. The inputs are None if there is nothing
-    to publish.
+    is published even before the first engagement, and is then at trim. The returned inputs are None
+    if there is nothing to publish.
 
-    `y` is the newest sample, and `y_m` holds the last samples with increasing stamps, in the law's
-    order; readings of vanes follow the outputs in y. In a replay, `u_ff_recorded` and
-    `vane_m_recorded` replace a feedforward whose state is not known.
+    `y` is the newest sample, and `y_m` holds the last samples with increasing stamps. Their
+    channels are in the law's order, and the readings of vanes follow the outputs in y. In a replay,
+    `u_ff_recorded` and `vane_m_recorded` stand for a feedforward whose state is unknown.
     """
     vane = None
     if guard.vanes and y is not None:
@@ -258,7 +260,7 @@ def tick(
         vane = _readings(y.value[m:], state.vanes)
         y = y._replace(value=y.value[:m])
     reference = None if y is None else _fresh_reference(now_ns, y, y_m, guard)
-    # A y from before the last u is too late, so the law waits for the next one.
+    # A y that is older than the last u is too late, so the law waits for the next y.
     is_late = y is not None and state.mode is not Mode.ENGAGED and y.stamp_ns < state.stamp_ns
     if y is None or reference is None:
         after, inputs = _failsafe(state, _going_on(state, now_ns), now_ns, guard, active)
@@ -291,7 +293,7 @@ def tick(
 
 
 def _going_on(state: ControllerState, now_ns: int) -> int:
-    """Return the stamp of a u without a y, ns: that of the last u plus the time since then."""
+    """Return the stamp of a u without a y, ns, which is that of the last u plus the time since."""
     return state.stamp_ns + max(now_ns - state.tick_ns, 0)
 
 
@@ -305,7 +307,10 @@ def _with_sample(
     u_ff_recorded: FloatArray | None,
     vane_m_recorded: FloatArray | None,
 ) -> tuple[ControllerState, TickInputs | None]:
-    """Advance by a tick with fresh inputs: engage, step the law, or do nothing without a new y."""
+    """Advance by a tick with fresh inputs, in which the law engages or steps.
+
+    Without a new y nothing happens.
+    """
     last = state.y
     if state.law is None or last is None or state.y_m is None or state.mode is not Mode.ENGAGED:
         return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
@@ -346,7 +351,7 @@ def _stepped(
     u_ff_recorded: FloatArray | None,
     vane_m_recorded: FloatArray | None,
 ) -> ControllerState:
-    """Step the law, and the feedforward if there is one, from the predicted `state`."""
+    """Step the law, and the feedforward if any, from a state predicted over missed ticks."""
     assert state.y is not None  # noqa: S101 - for the type checker
     assert state.y_m is not None  # noqa: S101 - for the type checker
     span_ns = y.stamp_ns - state.y.stamp_ns
@@ -393,7 +398,7 @@ def _stepped(
 
 
 def _predicted(law_state: Any, held: Measurements, missed: int, law: TunedLaw) -> Any:
-    """Predict the state of the law over periods without a y, with u held."""
+    """Predict the state of the law over `missed` periods without a y, while u is held."""
     for _ in range(missed):
         law_state = law.control_law.missed(law_state, held, law.params)
     return law_state
@@ -409,7 +414,7 @@ def _fresh_reference(
 ) -> FloatArray | None:
     """Return the reference at the stamp of y, (m,).
 
-    Returns None if y or y_m is stale or not finite, or if y_m has no sample near that stamp.
+    Returns None if y or y_m is stale or not finite, or if y_m has no sample near the stamp of y.
     """
     if not y_m or max(abs(now_ns - sample.stamp_ns) for sample in (y, y_m[-1])) > guard.max_age_ns:
         return None
@@ -463,9 +468,9 @@ def _is_finite(state: ControllerState) -> bool:
 
 
 def _readings(reading: FloatArray, before: VaneReadings | None) -> FloatArray:
-    """Return the readings of the vanes, (k,).
+    """Return the readings of the vanes, (k,), without gaps.
 
-    If a reading is missing, the one of the tick before is repeated, so that the vane counts as
+    If a reading is missing, the reading of the tick before is repeated, so that the vane counts as
     still.
     """
     last = np.zeros_like(reading) if before is None else before.reading
@@ -489,9 +494,10 @@ def _vanes(
     guard: GuardParams,
     recorded: FloatArray | None,
 ) -> VaneReadings | None:
-    """Pair the readings of the vanes with those of the reference motion; None without vanes.
+    """Pair the readings of the vanes with those of the reference motion, or return None.
 
-    The states of the nominal model along y_m are what the vanes would read in the reference motion.
+    The reference motion is that of the nominal model along y_m, and the vanes would read its
+    states. Returns None without vanes.
     """
     if reading is None:
         return None
@@ -515,7 +521,7 @@ def law_within_limits(
     u, effector_values = _within_effectors(
         saturate(u_free, measurements.u_before, dt, guard.limits), effectors, dt, guard
     )
-    # if u was not limited, `limited` would give the same and take three times as long
+    # Without an active limit, `limited` would give the same u and take three times as long.
     if not np.array_equal(u, u_free):
         limits = guard.limits if guard.allocation is None else limits_of_effectors(u_free, u)
         after, u_free, u = law.control_law.limited(state, measurements, dt, law.params, limits)
@@ -528,7 +534,7 @@ def _within_effectors(
 ) -> tuple[FloatArray, FloatArray | None]:
     """Return the u that the effectors give for a demanded u, and the effectors.
 
-    Without an allocation these are u itself and None.
+    Without an allocation the result is u itself and None.
     """
     if guard.allocation is None or before is None:
         return u, None
@@ -539,7 +545,7 @@ def _within_effectors(
 def _failsafe(
     state: ControllerState, stamp_ns: int, now_ns: int, guard: GuardParams, active: bool
 ) -> tuple[ControllerState, TickInputs | None]:
-    """Advance by a tick without fresh inputs or while deactivated; u gets the stamp `stamp_ns`."""
+    """Advance by a tick without fresh inputs, or while deactivated. u gets the stamp `stamp_ns`."""
     y = state.y
     y_m = state.y_m
     if y is None or y_m is None:

@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Probe of the inputs while engaged, and the test for their effect.
+"""Probe the inputs while the law is engaged, and test whether they have an effect.
 
 Without a probe nothing shows a surface that is stuck at trim in calm air, because it causes no
 error there.
 
-Each probed input carries a sine of its own frequency on top of what the law commands. Over a window
-all sines are orthogonal, also to the frequencies in between, where the disturbances are measured.
+A sine is added to the command of each probed input. The frequencies of the sines differ. Over a
+window all sines are orthogonal to each other, and to the frequencies between them, at which the
+disturbances are measured.
 """
 
 from collections import deque
@@ -21,14 +22,14 @@ from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
 
 RATES = frozenset({"p", "q", "r"})
-EFFECT = 0.02  # rad/s, default amplitude of a body rate; ArduPlane's noise in calm air is 0.006 rms
-GAP = 4  # multiples of 1 / window between two sines; the ones in between show disturbances
+EFFECT = 0.02  # default amplitude of a body rate, rad/s; ArduPlane has 0.006 rms noise
+GAP = 4  # distance of two sines in 1 / window; disturbances are measured in between
 BIN_NS = NANOSECONDS // 20  # length of the bins over which y and u are averaged
 TESTS = 12  # tests in a window
 FILLED = 0.8  # fraction of the bins of a window that a test needs
-DRIFT = 3  # degree of the polynomial that fits what is slower than the window, such as a turn
-LEAST_SINE = 0.05  # fraction of its amplitude that a sine must keep in u; at a limit it keeps less
-LARGEST = 4.0  # Hz, highest frequency of a sine: five bins a period
+DRIFT = 3  # degree of the polynomial for motions slower than the window, as in a turn
+LEAST_SINE = 0.05  # least fraction of a sine that must remain in u, which a limit reduces
+LARGEST = 4.0  # highest frequency of a sine, Hz, with five bins a period
 
 
 class ProbeConfig(Config):
@@ -51,12 +52,14 @@ class ProbeConfig(Config):
     )
 
     def amplitudes(self, outputs: tuple[str, ...]) -> FloatArray:
-        """Return the amplitudes of the outputs, (m,), units of y."""
+        """Return the amplitude of the motion of each output, (m,), units of y."""
         rates = tuple(EFFECT if name in RATES else 0.0 for name in outputs)
         return np.array(self.effect or rates)
 
     def harmonics(self, outputs: tuple[str, ...], input_scale: tuple[float, ...]) -> FloatArray:
-        """Choose the multiple of 1 / window of each sine, (m,), 0 for an input that is not probed.
+        """Choose the frequency of each sine as a multiple of 1 / window, (m,).
+
+        It is 0 for an input that is not probed.
 
         The weakest input gets the lowest frequency, because it moves the aircraft the least.
         """
@@ -71,21 +74,21 @@ class ProbeConfig(Config):
 class Probe(NamedTuple):
     """The sines that a controller adds to its m inputs."""
 
-    amplitude: FloatArray  # (m,) units of u
-    harmonic: FloatArray  # (m,) whole multiples of 1 / window, 0 without a sine
+    amplitude: FloatArray  # amplitude of each sine, (m,), units of u
+    harmonic: FloatArray  # frequencies as integer multiples of 1 / window, (m,), 0 without a sine
     window_ns: int
 
     def at(self, stamp_ns: int) -> FloatArray:
         """Evaluate amplitude sin(2 pi harmonic t / window) at a stamp, (m,).
 
-        Flight and replay get the same value.
+        A replay gets the same value as the flight, because t is the stamp.
         """
         part = (stamp_ns % self.window_ns) / self.window_ns
         return np.asarray(self.amplitude * np.sin(2.0 * np.pi * self.harmonic * part))
 
 
 class EffectTest:
-    """The effect of each probed input over the last window.
+    """Tests the effect of each probed input over the last window.
 
     Args:
         probe: The sines.
@@ -106,18 +109,18 @@ class EffectTest:
         self._between = np.setdiff1d(np.arange(len(self._harmonics)), self._sines)
         self._quantile = float(stdtrit(2.0 * len(self._between), 1.0 - false_alarm))
         bins = probe.window_ns // BIN_NS
-        self._means: deque[FloatArray] = deque(maxlen=bins)  # t, y, u of the bins
+        self._means: deque[FloatArray] = deque(maxlen=bins)  # means of t, y and u in each bin
         self._every = max(bins // TESTS, 1)
         self.clear()
 
     def clear(self) -> None:
-        """Begin again, as at an engagement."""
+        """Forget all ticks, as is necessary at an engagement."""
         self._means.clear()
         self._bin = -1
         self._samples: list[FloatArray] = []
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> FloatArray | None:
-        """Take a tick, and return `most` if a test is due, else None."""
+        """Record a tick, and return `most()` if a test is due, else None."""
         place = stamp_ns // BIN_NS
         result = None
         if place != self._bin:
@@ -140,17 +143,19 @@ class EffectTest:
     def most(self) -> FloatArray:
         """Compute an upper bound of the effect of each input over the window, (m,).
 
-        It is relative to the effect in the model, and UNKNOWN for an input without a sine.
+        The bound is a fraction of the effect in the model. It is UNKNOWN for an input without a
+        sine.
 
             H = Y(f) / U(f),  R = Y - H (f / f') U  at the frequencies f' between the sines
             s^2 = mean abs(R)^2 / 2
             most = (abs(H) + q s / abs(U(f))) / gain
 
-        Y and U are the complex amplitudes by least squares, fitted together with a cubic, and q is
-        the quantile of Student's t with two degrees of freedom per frequency. If the noise is
-        Gaussian and flat over the frequencies, the result falls below the true effect of an input
-        with a probability of at most `false_alarm`. The law responds to both the sine and the
-        disturbances, so H is the quotient of y and the command, each correlated with the sine.
+        Y and U are the complex amplitudes, fitted by least squares together with a cubic. q is the
+        quantile of Student's t with two degrees of freedom per frequency. If the noise is Gaussian
+        and flat over the frequencies, the result falls below the true effect of an input with a
+        probability of at most `false_alarm`. The law responds to both the sine and the
+        disturbances, so H is the ratio of y to the command, where y and the command are each
+        correlated with the sine.
         """
         window = np.array(self._means)
         t = (window[:, 0] - window[-1, 0]) / (self._probe.window_ns / NANOSECONDS)
@@ -164,7 +169,7 @@ class EffectTest:
         for i, place in zip(self._probed.tolist(), self._sines.tolist(), strict=True):
             size = abs(U[place, i])
             if size < LEAST_SINE * self._probe.amplitude[i]:
-                continue  # a u that stays at a limit tells us nothing
+                continue  # a u that stays at a limit shows nothing
             H = Y[place, i] / U[place, i]
             slope = self._harmonics[place] / self._harmonics[self._between]
             residual = Y[self._between, i] - H * slope * U[self._between, i]

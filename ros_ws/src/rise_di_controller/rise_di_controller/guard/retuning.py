@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""New parameters of a law in flight, without a jump of u (bumpless transfer)."""
+"""Change the parameters of a law in flight without a jump of u (bumpless transfer)."""
 
 from typing import Any
 
@@ -28,11 +28,11 @@ def retune_state(
     |---|---|---|
     | same matrices of the observer | it continues | it continues |
     | new observer | z from the new filter, u_o continues | starts from the present e |
-    | new feedforward | continues in the same motion | u_ff becomes part of u_trim |
+    | new feedforward | goes on from the same motion | u_ff becomes part of u_trim |
 
     An observer that starts from the present error also hands its u_o over to u_trim. With a
-    schedule, the models are those of the present speed, and over the history those of each tick.
-    `guards` are the old and the new guard, which have the models of the feedforward.
+    schedule, the models are those of the present speed. Over the history, each tick has the models
+    of its speed. `guards` are the old and the new guard, which hold the models of the feedforward.
     """
     y = state.y
     y_m = state.y_m
@@ -43,7 +43,7 @@ def retune_state(
         (None, None) if guards is None else (nominal_at_speed(guard, law) for guard in guards)
     )
     has_new_nominal = not _same_arrays(before, after)
-    inner = law  # the state inside a schedule
+    inner = law  # state of the law that a schedule may wrap
     observers = (old.params, new.params)
     if isinstance(law, ScheduleState):
         inner, observers = law.law, tuple(law_at(params, law.scale) for params in observers)
@@ -56,7 +56,7 @@ def retune_state(
         and isinstance(inner.law, LawState)
     ):
         # With a history, the observer and the feedforward continue in the same motion.
-        change: Array = np.zeros_like(state.u)  # of u_ff
+        change: Array = np.zeros_like(state.u)  # change of u_ff
         if has_new_nominal:
             state, change = _with_nominal(state, y_m, after)
         if has_new_observer or has_new_nominal:
@@ -88,13 +88,13 @@ def _with_estimates(
     change: Array,
     observers: tuple[ObserverParams, ...],
 ) -> ObserverState:
-    """Give the observer new parameters in the same motion.
+    """Return the state of an observer with new parameters that continues the same motion.
 
-    It continues from the estimates z and the change of u_ff, (m,).
+    z has its estimates, and `change` is the change of u_ff, (m,).
 
-    u_o moves on to -F z at its own rate. In a channel that had no observer before, u_o takes
-    over what the law has integrated. Otherwise this would stay in the law, and the observer would
-    take long to build it up again.
+    From here on, u_o moves to -F z at its rate limit. In a channel that had no observer before, u_o
+    takes over what the law has integrated. Otherwise the integral would stay in the law, and the
+    observer would need a long time to build it up.
     """
     law_part = state.u - state.u_trim - state.u_ff
     limits = observers[1].limits
@@ -114,7 +114,7 @@ def _with_estimates(
 def _with_nominal(
     state: ControllerState, y_m: FloatArray, nominal: Nominal | None
 ) -> tuple[ControllerState, Array]:
-    """Give the state the feedforward of another model in the same motion.
+    """Return the state with the feedforward of another model that continues the same motion.
 
     The second result is the change of u_ff, (m,).
     """

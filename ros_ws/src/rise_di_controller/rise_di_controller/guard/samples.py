@@ -1,15 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Checks that decide which samples the controller takes.
+"""Decide which samples the controller takes.
 
-An impossible sample is lost: it counts as a sample that did not arrive.
+An impossible sample is lost, which means that it counts as a sample that did not arrive.
 
-- `bound_violation`: a value is beyond the bound of its output. No sensor gives such a value.
-- `step`: y changes faster than an aircraft can. The test compares y with the y before it and uses
-  no model, so a wrong model locks nothing out. If y really jumps, two samples are lost: the
-  controller takes the third one in a row that agrees with the one before.
-- `step`: y stands still, equal to the last bit in every value, after it has changed with every
-  sample.
+- `bound_violation` finds a value beyond the bound of its output. No sensor gives such a value.
+- `step` finds a y that changes faster than an aircraft can. The test compares y with the y before
+  it, and uses no model, so a wrong model does not lock any sample out. If y really jumps, two
+  samples are lost. The controller takes the third sample in a row that agrees with the sample
+  before it.
+- `step` also finds a y that stands still. It is then equal to the last bit in every value, after it
+  has changed with every sample.
 """
 
 from collections.abc import Sequence
@@ -28,13 +29,13 @@ TIMES = 5.0
 four standard deviations in a minute, so a factor of 5 allows 20 of them. In flights of seven of the
 scenarios no change exceeded a quarter of the limit."""
 
-MEMORY = 60.0  # s, time constant with which the largest change fades
+MEMORY = 60.0  # time constant with which the largest change fades, s
 FIRST_NS = NANOSECONDS  # time after the first sample, in which y shows how it changes
 AUTHORITY = 2.0
 """Largest possible change of y in a period, divided by the change that full inputs cause. Wind can
 move an aircraft as much as its inputs do."""
 
-UNLIMITED = 1.0  # SI, the full input if it has no limit: 57 deg, or a thrust equal to the weight
+UNLIMITED = 1.0  # full input without a limit, SI: 57 deg, or thrust equal to weight
 
 LEAST = {"V": 1.0}
 """Change that is always possible, m/s per sample. An airspeed may come in whole knots."""
@@ -61,13 +62,13 @@ so never count as frozen. A simulation settles by ever rarer changes of the last
 class SampleLimits(NamedTuple):
     """Bounds of the m outputs of y and of y_m."""
 
-    largest: FloatArray  # (m,) of abs(y)
-    reach: FloatArray  # (m,) change of y in a period that is always possible, units of y
-    period_ns: int  # of the ticks
+    largest: FloatArray  # largest abs(y), (m,)
+    reach: FloatArray  # change of y in a period that is always possible, (m,), units of y
+    period_ns: int  # period of the ticks
 
 
 class SampleChange(IntEnum):
-    """How a sample of y relates to the samples before it."""
+    """The judgement on a sample of y, compared with the samples before it."""
 
     NEAR = 0  # taken
     FAR = 1  # lost
@@ -76,11 +77,11 @@ class SampleChange(IntEnum):
 
 
 class Stillness(NamedTuple):
-    """How y changes from sample to sample."""
+    """A record of whether y changes from sample to sample."""
 
     since_ns: int  # stamp of the first sample with the present values
-    changes: int = 0  # samples in a row with a change, at most MOVING
-    equal: int = 0  # samples in a row since, with every value as before, at most STILL
+    changes: int = 0  # number of samples in a row with a change, at most MOVING
+    equal: int = 0  # number of equal samples in a row after that, at most STILL
     is_frozen: bool = False
 
 
@@ -89,12 +90,13 @@ class SampleState(NamedTuple):
 
     begin_ns: int  # stamp of the first sample
     last: StampedVector  # the last sample taken
-    # (m,) largest change per period of the samples taken, which fades with time, units of y
+    # largest change per period of the samples taken, (m,), units of y, which fades with time
     change: FloatArray
-    # The last sample that was compared, which differs from `last` if it was lost. Its stamp does
-    # not come again: one wrong sample that is sent three times does not count as three that agree.
+    # The last sample that was compared, which differs from `last` if it was lost. A sample with the
+    # same stamp is refused, so that a wrong sample that is sent three times does not count as three
+    # that agree.
     far: StampedVector
-    agreeing: int  # lost samples in a row up to `far`, each agreeing with the one before
+    agreeing: int  # number of lost samples in a row, up to `far`, that agree with each other
     stillness: Stillness
 
 
@@ -104,7 +106,7 @@ def sample_limits(
     """Return the limits of outputs by name.
 
     `authority` is the y_dot that full inputs give, (m,), units of y / s. `largest` holds the bounds
-    of the parameters; if it is None, plausible ones are used.
+    from the parameters. If it is None, plausible bounds are used.
     """
     least = [LEAST.get(name, LEAST_RATE) for name in names]
     reach = np.maximum(AUTHORITY * authority * seconds(period_ns), least)
@@ -115,7 +117,7 @@ def sample_limits(
 def bound_violation(
     value: FloatArray, names: Sequence[str], limits: SampleLimits
 ) -> Refusal | None:
-    """Refuse the first of the m values that is NaN or beyond its bound."""
+    """Return a refusal of the first of m values that is NaN or beyond its bound, else None."""
     is_inside = np.abs(value) <= limits.largest
     if is_inside.all():
         return None
@@ -127,14 +129,14 @@ def bound_violation(
 
 
 def jump(before: StampedVector, sample: StampedVector, names: Sequence[str]) -> str:
-    """Describe the changes from one sample to another, in a sentence."""
+    """Describe the changes between two samples in a sentence."""
     values = zip(names, before.value.tolist(), sample.value.tolist(), strict=True)
     moves = ", ".join(f"{name} from {old:g} to {new:g}" for name, old, new in values)
     return f"a jump of y in {seconds(sample.stamp_ns - before.stamp_ns):g} s: {moves}"
 
 
 def standstill(state: SampleState, sample: StampedVector) -> Refusal:
-    """Refuse a sample because y stands still."""
+    """Return the refusal of a sample because y stands still."""
     span = seconds(sample.stamp_ns - state.stillness.since_ns)
     return Refusal(
         f"y: found every value as before for {span:g} s, expected an aircraft that moves"
@@ -160,15 +162,15 @@ def step(
     """Judge a sample of y with a later stamp, and return the new state with the judgement.
 
         change = abs(y - last) / periods,  periods = max(stamp - last stamp, period) / period
-        NEAR if change <= max(TIMES largest, reach) in all outputs; then largest = max(change,
+        NEAR if change <= max(TIMES largest, reach) in all outputs, and then largest = max(change,
         faded largest)
 
-    The change that is possible grows with the time since the last sample that was taken, so no
-    sensor is locked out for ever. After lost samples, `largest` takes the whole change, since y may
-    be that noisy.
+    The possible change grows with the time since the last sample that was taken, so no sensor is
+    locked out for ever. After lost samples, `largest` takes the whole change instead of the change
+    per period, because y may be so noisy.
 
-    The samples of the first FIRST_NS are NEAR, too. A gyro may start with garbage, so during that
-    time `largest` takes no far change, and of a near change at most `reach`.
+    The samples of the first FIRST_NS are NEAR, too. A gyro may start with wrong values. During this
+    time `largest` therefore takes at most `reach` of a near change, and nothing of a larger change.
 
     A sample is FROZEN if every value has been the same for STILL samples and periods, after MOVING
     samples that changed.
@@ -189,7 +191,7 @@ def step(
         return state._replace(
             last=sample, change=largest, far=sample, agreeing=0
         ), SampleChange.NEAR
-    # If no sample was lost before, `far` has the values of `last`: the sample is far from it, too.
+    # If no sample was lost before, `far` has the values of `last`, so the sample is far from both.
     agrees = _comparison(state.far, sample, state.change, limits)[0]
     agreeing = state.agreeing + 1 if agrees else 1
     if agreeing < AGREEING:
@@ -200,7 +202,7 @@ def step(
 def _next_stillness(
     before: Stillness, sample: StampedVector, last: StampedVector, limits: SampleLimits
 ) -> Stillness:
-    """Update how y changes, given a sample and the last sample taken."""
+    """Update the record of whether y changes, given a sample and the last sample taken."""
     if not np.array_equal(sample.value, last.value):
         is_moving = before.is_frozen or before.equal == 0
         changes = min(before.changes + 1, MOVING) if is_moving else 1
@@ -213,7 +215,7 @@ def _next_stillness(
 def _comparison(
     before: StampedVector, sample: StampedVector, largest: FloatArray, limits: SampleLimits
 ) -> tuple[bool, FloatArray]:
-    """Return whether a sample is near the one before, and its change per period, (m,)."""
+    """Return whether a sample is near the sample before it, and its change per period, (m,)."""
     periods = max((sample.stamp_ns - before.stamp_ns) / limits.period_ns, 1.0)
     change = np.abs(sample.value - before.value) / periods
     return bool((change <= np.maximum(TIMES * largest, limits.reach)).all()), change

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Protocol of a control law: pure functions over a state.
+"""Define the protocol of a control law as pure functions over a state.
 
 Controller, replay and campaigns fly every law through this protocol.
 
@@ -17,25 +17,25 @@ from rise_di_controller.law.saturation import Limits
 
 
 class Measurements(NamedTuple):
-    """Inputs of a law at a tick: SI units, deviations from trim, channels in the law's order.
+    """Inputs of a law at a tick, as deviations from trim in SI, with channels in the law's order.
 
-    Arrays have shape (m,) for a single aircraft. In a campaign the N aircraft are the last axis:
-    (m, N), or (m, 1) for a value that they share. The fields from `position` to `y_dot` are not on
-    the topics: only campaigns fill them in, for laws that need more sensors.
+    Arrays have shape (m,) for a single aircraft. In a campaign the N aircraft are the last axis,
+    with the shape (m, N), or (m, 1) for a value that they share. The fields from `position` to
+    `y_dot` are not on the topics: only campaigns fill them in, for laws that need more sensors.
     """
 
     y: Array  # measured outputs
     y_m: Array  # reference at the stamp of y
     y_m_dot: Array  # slope of y_m since the previous tick
-    u_trim: Array  # the input to which the law adds: u at engagement plus the feedforward
+    u_trim: Array  # u at engagement plus the feedforward, to which the law adds its output
     u_before: Array  # the last command, after saturation
     position: Array | None = None  # positions of the actuators
-    # (n, N) state: measured values of the outputs, true values of all other states
+    # state, (n, N), with measured values of the outputs and true values of all other states
     x: Array | None = None
-    x_air: Array | None = None  # (n, N) x with alpha and beta relative to the air
+    x_air: Array | None = None  # x with alpha and beta relative to the air, (n, N)
     y_dot: Array | None = None  # true derivative of C x, free of noise and delay
-    vane: Array | None = None  # (k,) readings of the vanes of an observer, rad
-    # (k,) readings of the vanes in the reference motion, by the model of the feedforward
+    vane: Array | None = None  # readings of the vanes of an observer, (k,), rad
+    # readings of the vanes in the reference motion of the feedforward's model, (k,)
     vane_m: Array | None = None
 
 
@@ -49,9 +49,9 @@ class ControlLaw(NamedTuple):
     The state is a NamedTuple of arrays, (m,) or (m, N). The log records its fields by name, so that
     a replay can continue from any tick. The parameters can be any NamedTuple of arrays.
 
-    `engage` makes the state at engagement; the first u must equal u_trim. `step` advances the law
-    by a tick of dt seconds without limits. `limited` advances it inside limits, with the law's own
-    anti-windup; if no limit acts, it must give the same bits as `step`. `retune` carries the state
+    `engage` makes the state at engagement, and the first u must equal u_trim. `step` advances the
+    law by a tick of dt seconds without limits. `limited` advances the law inside limits, with its
+    anti-windup. If no limit acts, it must give the same bits as `step`. `retune` carries the state
     over to new parameters without a jump of u. `missed` predicts the state over one period without
     a sample, while u is held.
     """
@@ -65,7 +65,7 @@ class ControlLaw(NamedTuple):
     retune: Callable[[Any, Any, Any], Any]  # (state, old params, new params) -> state
     # (state, measured, params) -> state
     missed: Callable[[Any, Measurements, Any], Any] = _no_prediction
-    # the law that this one extends; the state field `law` holds the state of `inner`
+    # the law that this law extends, if any; the state field `law` holds the state of `inner`
     inner: "ControlLaw | None" = None
 
 
@@ -114,7 +114,7 @@ def without_limits(
 
 
 def fields(state: Any) -> dict[str, Array]:
-    """Return the arrays of a law's state by name; those of the law that it extends come first."""
+    """Return the arrays of a law's state by name, first those of a law that it extends."""
     values: dict[str, Array] = {}
     for name, value in state._asdict().items():
         values |= fields(value) if hasattr(value, "_asdict") else {name: value}

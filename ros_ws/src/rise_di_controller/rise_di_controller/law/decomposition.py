@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""SDU decomposition Omega = C B = S D U, equations (10)-(11).
+"""Compute the SDU decomposition Omega = C B = S D U, equations (10)-(11).
 
 D is all that the law has to know of the aircraft.
 
-D depends on the order of the channels, on which input is paired with which output and on the signs
-of the inputs, so it is validated together with the channels. U measures the quality of the pairing:
-the beta and K that channel i needs grow with abs(U_ij), j > i.
+D depends on the order of the channels, on the pairs of inputs and outputs, and on the signs of the
+inputs, so it is validated together with the channels. U measures the quality of the pairing,
+because the beta and K that channel i needs grow with abs(U_ij), j > i.
 """
 
 import math
@@ -31,7 +31,8 @@ MANY = 5
 """Up to this number of channels all orders are tried: the (5!)^2 = 14,400 of five channels take a
 second, those of six a minute, and those of eight do not fit into memory."""
 
-# each round halves the spread of the exponents: 10 rounds reduce 1e300 to less than a factor of 2
+# Each round halves the spread of the exponents, so 10 rounds reduce 1e300 to less than a factor of
+# 2.
 _EQUILIBRATIONS = 10
 
 
@@ -65,19 +66,19 @@ class Pairing(NamedTuple):
     Channel k of the law is row k and column k.
     """
 
-    outputs: tuple[int, ...]  # row of Omega by channel
-    inputs: tuple[int, ...]  # column of Omega by channel
-    signs: tuple[int, ...]  # by channel +1, or -1 where the sign of the input changes
-    U: FloatArray  # (m, m) of the reordered matrix in inputs of unit response
+    outputs: tuple[int, ...]  # row of Omega for each channel
+    inputs: tuple[int, ...]  # column of Omega for each channel
+    signs: tuple[int, ...]  # for each channel, -1 if the sign of its input changes, else +1
+    U: FloatArray  # U of the reordered matrix in inputs of unit response, (m, m)
 
 
 def decompose(Omega: ArrayLike) -> SDU:
-    """Compute S, D and U of Omega, shape (m, m), by elimination without pivoting; they are unique.
+    """Compute the unique S, D and U of Omega, shape (m, m), by elimination without pivoting.
 
         Omega = L diag(p) W,  p_k = Delta_k / Delta_(k-1),  Delta_k the leading minors, Delta_0 = 1
         S = L diag(abs(p)) L',  D = sign(p),  U = D L^-T D W
 
-    Source: equations (10)-(11) of Tanyer, Tatlicioglu, Zergeroglu; existence as in A. S.
+    Source: equations (10)-(11) of Tanyer, Tatlicioglu, Zergeroglu; for their existence see A. S.
     Morse, "A Gain Matrix Decomposition and Some of Its Applications", Systems & Control Letters 21,
     1993.
 
@@ -124,7 +125,7 @@ def unit_diagonal(Omega: FloatArray) -> FloatArray:
     Each entry becomes Omega_ij / abs(Omega_jj).
 
     Raises DecompositionError if Omega is not square or not finite, or if an output does not respond
-    to the input it is paired with.
+    to the input that it is paired with.
     """
     matrix = _square(Omega)
     diagonal = np.abs(np.diag(matrix))
@@ -142,8 +143,9 @@ def coupling(Omega: FloatArray) -> float:
 
     A large value means a bad pairing.
 
-    It is infinite if an output does not respond to the input it is paired with. It depends on the
-    units of y, but not on the units or signs of u. Raises DecompositionError as `decompose` does.
+    The coupling is infinite if an output does not respond to the input that it is paired with. It
+    depends on the units of y, but not on the units or signs of u. Raises DecompositionError as
+    `decompose` does.
     """
     signs(Omega)
     return _excess(decompose(unit_diagonal(Omega)).U) if np.diag(Omega).all() else math.inf
@@ -154,14 +156,14 @@ def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
 
     Returns None if none of the orders that are tried gives D = I.
 
-    Up to MANY channels, every order of the outputs is combined with every order of the inputs:
-    (m!)^2. With more channels only three orders are tried: the given one, the inputs by their
-    largest responses, and the order of complete pivoting. A smaller change may then exist, even if
-    None is returned. Each combination leaves a single choice of input signs, namely D, because a
-    change of the sign of input k changes only D_k. Pairings are preferred in this order: most
-    outputs keep their input, most outputs keep their place, most inputs keep their sign, and max
-    abs(U - I) in inputs of unit response is smallest. Orders with a zero on the diagonal, or with
-    max abs(U - I) above `largest_U`, are excluded.
+    Up to MANY channels, every order of the outputs is combined with every order of the inputs,
+    which is (m!)^2 cases. With more channels only three orders are tried: the given one, the inputs
+    by their largest responses, and the order of complete pivoting. A smaller change may then exist,
+    even if None is returned. For each combination the signs of the inputs follow, namely as D,
+    because the sign of input k changes only D_k. Pairings are preferred in this order: most outputs
+    keep their input, most outputs keep their place, most inputs keep their sign, and max abs(U - I)
+    in inputs of unit response is smallest. Orders with a zero on the diagonal, or with max abs(U -
+    I) above `largest_U`, are excluded.
 
     Raises DecompositionError if Omega is not square or not finite.
     """
@@ -246,9 +248,9 @@ def _square(Omega: ArrayLike) -> FloatArray:
 
 
 def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return scales of the rows and of the columns, (m,) each.
+    """Return scales of the rows and of the columns of a matrix, (m,) each.
 
-    The largest abs(Omega_ij) / (rows_i columns_j) is 1 in every row and column.
+    With them, the largest abs(Omega_ij) / (rows_i columns_j) is 1 in every row and column.
 
     The scales follow the units of the channels, so a comparison with the scales does not depend on
     units. A row or column of zeros keeps the scale 1. Source: D. Ruiz, "A Scaling Algorithm to
@@ -269,7 +271,7 @@ def _eliminate(Omega: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, Fl
     """Return L, p, W and L^-1 of Omega = L diag(p) W, without pivoting.
 
     L is unit lower and W unit upper triangular. The sign of p_k counts as certain if p_k
-    is large enough beside the terms of the sum p_k = (L^-1)_k Omega (W^-1)_k.
+    is large enough compared with the terms of the sum p_k = (L^-1)_k Omega (W^-1)_k.
     """
     remainder = _square(Omega)
     m = len(remainder)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control law, equations (20)-(22), as a pure step.
+"""Compute the control law of the paper, equations (20)-(22), as a pure step.
 
-Its inputs are y and y_m only: it needs neither A, B and f nor any acceleration.
+Its only inputs are y and y_m. It needs no A, B or f, and no acceleration.
 
 `CONTROL_LAWS` offers the law through the protocol of `control_law`, with anti-windup and retuning.
 """
@@ -14,8 +14,8 @@ from flight_core.vectors import Array, array_namespace
 from rise_di_controller.law.control_law import ControlLaw, Measurements, TunedLaw
 from rise_di_controller.law.saturation import LEAST_DIVISOR, Limits, saturate
 
-# lower bound of k_d (1/s), k_g (1/s) and beta (units of y / s^2), which (21) and (22) require to be
-# positive
+# Lower bound of k_d (1/s), k_g (1/s) and beta (units of y / s^2), because (21) and (22) require
+# positive values.
 MIN_GAIN = 0.01
 
 
@@ -31,8 +31,8 @@ class LawParams(NamedTuple):
     """Parameters of the law over m channels.
 
     The law works in inputs scaled to unit response, v_i = u_i / input_scale_i with abs(Omega_ii)
-    about 1. So K is a bandwidth in rad/s, and beta has units of y / s^2. The theorem holds for v as
-    for u.
+    about 1. Therefore K is a bandwidth in rad/s, and beta has units of y / s^2. The theorem holds
+    for v as well as for u.
 
     Attributes:
         K: Diagonal of equation (22), shape (m,), 1/s.
@@ -40,10 +40,11 @@ class LawParams(NamedTuple):
         beta: Diagonal of beta, shape (m,), units of y / s^2.
         D: Diagonal of D, shape (m,), +1 or -1.
         input_scale: u per scaled input, shape (m,), units of u s / units of y.
-        omega: abs(Omega_ii) in scaled inputs, or an over-estimate, shape (m,); for Sign.IMPLICIT.
-        eps: Half-width of the softened sign, shape (m,), units of y, > 0; for Sign.SOFT.
-        sign: How the sign is sampled. It is None in the parameters of many aircraft, because
-            there the control law has it.
+        omega: abs(Omega_ii) in scaled inputs, or an over-estimate of it, shape (m,). Only
+            Sign.IMPLICIT uses it.
+        eps: Half-width of the softened sign, shape (m,), units of y, > 0. Only Sign.SOFT uses it.
+        sign: How the sign is sampled. It is None in parameters for many aircraft, because in that
+            case the functions of the control law contain the choice.
 
     Examples:
         >>> rise_di.find_scenario("osprey_servo").rise_di().law_params().D.shape
@@ -90,7 +91,7 @@ def gain(k_g: Array, k_d: Array) -> Array:
 
 
 def total_lag(lag: Array, delay: float, period: float) -> Array:
-    """Compute the lag from y to the actuator positions, shape of `lag`, s.
+    """Compute the lag from y to the actuator positions, s, in the shape of `lag`.
 
     It is the sum of actuator lag, 1.5 periods (sampling and hold) and delay.
     """
@@ -124,9 +125,9 @@ def engage(y: Array, y_m: Array) -> LawState:
 def step(
     state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams
 ) -> tuple[LawState, Array]:
-    """Advance the law by a tick: (state, y, y_m, dt) -> (state, u).
+    """Advance the law by a tick, and return the state and u.
 
-    With e = y - y_m (3), e_p = e at the previous tick, dt the time between the two ticks:
+    With e = y - y_m (3), e_p the e at the previous tick, and dt the time between the two ticks:
 
         integral_e += dt (e + e_p) / 2                                    trapezoid
         LITERAL:   u from the present Pi, then Pi += dt beta sgn(e)       (21) by forward Euler
@@ -136,9 +137,9 @@ def step(
         u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi)         (20)
 
     e_hat predicts e one tick ahead if Pi does not change, and s is the element of Sgn(e one tick
-    ahead) that agrees with this prediction: backward Euler of (21), with an error of order dt^2 and
-    without chatter. SOFT is for loops with lag. u is the deviation from its value at engagement;
-    sgn(0) = 0.
+    ahead) that agrees with this prediction. This is backward Euler of (21), with an error of order
+    dt^2 and without chatter. SOFT is for loops with lag. u is the deviation from the input at
+    engagement, and sgn(0) = 0.
 
     Source: (20)-(22) of Tanyer, Tatlicioglu, Zergeroglu; the sampling is this project's, see
     docs/theory.md.
@@ -188,7 +189,7 @@ def control(before: LawState, after: LawState, params: LawParams) -> Array:
     """Compute u of (20), shape (m,): u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi).
 
     e and integral_e are the values after the tick. With the literal sign, Pi is the value before
-    the tick, because it is used first and updated afterwards; with the soft and implicit signs it
+    the tick, because it is used first and updated afterwards. With the soft and implicit signs, Pi
     is the value after the tick. u has the units of input_scale.
     """
     Pi = before.Pi if params.sign is Sign.LITERAL else after.Pi
@@ -209,12 +210,13 @@ def step_with_anti_windup(
 ) -> tuple[LawState, Array, Array]:
     """Advance the law by a step with anti-windup.
 
-    Returns (law state, u before saturation, u commanded), with u of shape (m,).
+    Returns the state of the law, u before saturation, and the commanded u, each u with the shape
+    (m,).
 
-    This is conditional integration. If u_trim + u exceeds a magnitude or rate limit, any increment
-    of integral_e or of Pi that pushes u further out is reduced; an increment that brings u back
-    stays. The increment of integral_e is dropped. The increment of Pi, the faster integral, is
-    scaled so that u ends at the limit:
+    The anti-windup is conditional integration. If u_trim + u exceeds a magnitude or rate limit, any
+    increment of integral_e or of Pi that pushes u further out is reduced. An increment that brings
+    u back stays. The increment of integral_e is dropped. The increment of Pi, the faster integral,
+    is scaled so that u ends at the limit:
 
         beyond = abs(u_trim + u - saturated)
         excess = max(beyond - abs(change of u by the increment of integral_e), 0)
@@ -253,8 +255,8 @@ def retune(state: LawState, old: LawParams, new: LawParams) -> LawState:
 
         Pi+ = -D u / input_scale - K (e - e_0 + Lambda integral_e)
 
-    D, input_scale, K and Lambda are the new ones; u is that of the old parameters. All other states
-    stay. Equation (23) continues from the same u with the new gains.
+    D, input_scale, K and Lambda are the new parameters, and u is computed with the old ones. All
+    other states stay. Equation (23) continues from the same u with the new gains.
     """
     u = control(state, state, old)
     Pi = -new.D * u / new.input_scale - new.K * (
@@ -264,7 +266,7 @@ def retune(state: LawState, old: LawParams, new: LawParams) -> LawState:
 
 
 def shifted(state: LawState, u: Array, params: LawParams) -> LawState:
-    """Raise the u of equation (20) by a given u, (m,): Pi+ = Pi - D u / input_scale."""
+    """Shift Pi so that u of (20) grows by the given u, (m,): Pi+ = Pi - D u / input_scale."""
     return state._replace(Pi=state.Pi - params.D * u / params.input_scale)
 
 
@@ -298,5 +300,5 @@ CONTROL_LAWS = {sign: _control_law(sign) for sign in Sign}
 
 
 def tuned(params: LawParams) -> TunedLaw:
-    """Return RISE-DI with parameters."""
+    """Return the law RISE-DI with these parameters."""
     return TunedLaw(CONTROL_LAWS[Sign.SOFT if params.sign is None else params.sign], params)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled linear loop of a control law around a model, and whether it is stable.
+"""Compute the sampled linear loop of a control law around a model, and whether it is stable.
 
 The loop includes the actuators and the delay.
 """
@@ -24,28 +24,28 @@ ROOT = np.sqrt(3.0)  # factor of the normalised second Legendre polynomial, ROOT
 
 SMALL = (
     2.0**-40
-    # size of the steps from 0. It is below every limit and every width of a sign, and as a power of
-    # two it loses no digit.
+    # Size of the steps from 0. It is below every limit and every width of a soft sign. As a power
+    # of two it loses no digit.
 )
 
 
 class LinearPlant(NamedTuple):
-    """x_dot = A x + B u_a, y = C x with an actuator per input, in the law's order, SI.
+    """A linear plant x_dot = A x + B u_a, y = C x, with an actuator for each input, SI.
 
-    lag_i u_a,i_dot = u_i - u_a,i.
+    The channels are in the law's order, and the actuators have lag_i u_a,i_dot = u_i - u_a,i.
     """
 
     A: FloatArray  # (n, n)
     B: FloatArray  # (n, m)
-    C: FloatArray  # (m, n), with k vanes (m + k, n)
+    C: FloatArray  # (m, n), or (m + k, n) with k vanes
 
 
 class LoopTiming(NamedTuple):
     """Actuators, delay and sampling between y and the response of the aircraft, over m channels."""
 
-    lag: FloatArray  # (m,) time constants of the actuators, s; 0 without an actuator
+    lag: FloatArray  # time constants of the actuators, (m,), s; 0 without an actuator
     delay: float  # pure delay beyond sampling, s
-    period: float  # of the law, s
+    period: float  # period of the law, s
 
     @property
     def total(self) -> FloatArray:
@@ -54,13 +54,13 @@ class LoopTiming(NamedTuple):
 
 
 class LinearLaw(NamedTuple):
-    """A law near e = 0 with k values in the state: z+ = A z + B y, u = C z + D y, at y_m = 0.
+    """A law, linearised near e = 0 at y_m = 0, as z+ = A z + B y, u = C z + D y.
 
-    Leading axes are batches.
+    The state z has k values. Leading axes are batches.
     """
 
     A: FloatArray  # (..., k, k)
-    B: FloatArray  # (..., k, m); each vane adds a column, as in D
+    B: FloatArray  # (..., k, m); each vane adds a column here and in D
     C: FloatArray  # (..., m, k)
     D: FloatArray  # (..., m, m)
 
@@ -70,25 +70,25 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
 
     Each column is the response to a step of SMALL in one value of the state or of y.
 
-    An observer counts as faded in, and its vanes as moving: each vane adds a column after those of
-    y. With `candidates` N, the parameters hold N sets of gains in the last axis, and the matrices
-    hold them in the first. Raises ParameterError for the literal sign, which is not linear
+    An observer counts as faded in, and its vanes as moving. Each vane adds a column after those of
+    y. If `candidates` is N, the parameters hold N sets of gains in the last axis, and the matrices
+    hold them in the first axis. Raises ParameterError for the literal sign, which is not linear
     anywhere.
     """
     control_law, params = law
     core = params
-    while hasattr(core, "law"):  # under an observer or a schedule
+    while hasattr(core, "law"):  # an observer or a schedule extends another law
         core = core.law
     literal = isinstance(core, LawParams) and core.sign is Sign.LITERAL
     require(not literal, "sign", "literal", "soft or implicit, which are linear near e = 0")
-    # Put the sets of gains in the last axis; without sets, the columns of the matrix take its
-    # place.
+    # Put the sets of gains in the last axis. Without sets, the last axis has the columns of the
+    # matrix.
     sets = () if candidates is None else (candidates,)
     at_once = candidates is None and _takes_columns(params)
     if at_once:
         params = _for_columns(params)
         sets = (1,)
-    # The equilibrium at engagement, with the observer faded in and the vanes measuring.
+    # Start from the equilibrium at engagement, with the observer faded in and the vanes in use.
     zero = np.zeros((m, *sets))
     vanes = getattr(params, "vanes", None)
     none = None if vanes is None else np.zeros((len(vanes.H), *sets))
@@ -106,7 +106,7 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
     }
     if "sigma" in at_rest:
         at_rest["sigma"] = np.ones((1, *sets))
-    # A step as a map from the vector of state and y to the vector of state and u.
+    # Write a step as a map from the vector of state and y to the vector of state and u.
     ends = np.cumsum([len(value) for value in at_rest.values()])
     size = int(ends[-1]) if len(ends) else 0
 
@@ -170,7 +170,7 @@ def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatA
 
 @lru_cache(maxsize=64)
 def _exponential(matrices: bytes, shape: tuple[int, ...]) -> FloatArray:
-    """Compute exp of matrices; cached, because new gains in flight meet the same plant."""
+    """Compute exp of matrices. It is cached, because new gains in flight meet the same plant."""
     from scipy.linalg import expm  # noqa: PLC0415 - a controller without an observer starts without it
 
     exponential = np.asarray(expm(np.frombuffer(matrices).reshape(shape).copy()), dtype=np.float64)
@@ -179,7 +179,7 @@ def _exponential(matrices: bytes, shape: tuple[int, ...]) -> FloatArray:
 
 
 class SampledPlant(NamedTuple):
-    """Aircraft, actuators and delay from tick to tick: x+ = A x + B u, y = C x.
+    """Aircraft, actuators and delay, sampled from tick to tick as x+ = A x + B u, y = C x.
 
     Leading axes are batches.
     """
@@ -192,13 +192,14 @@ class SampledPlant(NamedTuple):
 def sampled_plant(
     plant: LinearPlant, loop: LoopTiming, extra: FloatArray, *, rising: bool = False
 ) -> SampledPlant:
-    """Compute the exact motion over a period, with k = n + m + kept m states.
+    """Compute the exact motion of aircraft, actuators and delay over a period.
 
-    The states are x, then the actuators, then u of the `kept` earlier ticks that still act.
+    The n + m + kept m states are x, then the actuators, then u of the `kept` earlier ticks that
+    still act.
 
     u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,).
-    With `rising`, u of a tick multiplies ROOT (2 s - 1), s from 0 to 1 over the period, instead of
-    1: the second Legendre polynomial.
+    If `rising`, u of a tick is not constant but multiplies the second Legendre polynomial ROOT (2 s
+    - 1), where s rises from 0 to 1 over the period.
 
     Source: K. J. Astrom, B. Wittenmark, "Computer-Controlled Systems", section 2.3, for the
     sampling of a plant with delay.
@@ -206,7 +207,7 @@ def sampled_plant(
     n, m = plant.B.shape[-2:]
     batch = np.broadcast_shapes(plant.A.shape[:-2], plant.B.shape[:-2])
     has_lag = loop.lag > 0.0
-    # without an actuator: any rate, unused
+    # an input without an actuator can have any rate here, which is not used
     rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)
     # Aircraft and actuators in continuous time.
     motion = np.zeros((*batch, n + m, n + m))
@@ -219,7 +220,7 @@ def sampled_plant(
     # Split the delay into whole periods and a remainder.
     ticks = np.floor((loop.delay + extra) / loop.period + 1e-9).astype(int)
     part = np.maximum(loop.delay + extra - ticks * loop.period, 0.0)
-    kept_ticks = int(ticks.max()) + 1  # earlier ticks whose u still acts, the newest first
+    kept_ticks = int(ticks.max()) + 1  # number of earlier ticks whose u still acts
 
     size = n + m + kept_ticks * m
     A = np.zeros((*batch, size, size))
@@ -227,10 +228,10 @@ def sampled_plant(
     C = np.zeros((*batch, len(plant.C), size))
     C[..., :n] = plant.C
     A[..., : n + m, : n + m], _ = zero_order_hold(motion, drive, loop.period)
-    # the effect of u of this tick, then of each earlier tick
+    # the effect of this tick's u, then of the u of each earlier tick
     inputs = np.zeros((*batch, n + m, m + kept_ticks * m))
-    # Within a period, the u that arrives during it acts from the instant `split` before the end;
-    # until then the u of the tick before it acts.
+    # The u that arrives within a period acts from the instant `split` before the end of the period.
+    # Until then the u of the tick before acts.
     for i in range(m):
         split = loop.period - part[i]
         transition, new = _driven(motion, drive, split, 0.0, loop.period if rising else None)
@@ -248,9 +249,10 @@ def sampled_plant(
 def _driven(
     motion: FloatArray, drive: FloatArray, time: float, begin: float, period: float | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the transition over a time, s, and the motion that a held input causes in that time.
+    """Return the transition over a time, s, and the motion that a held input causes in this time.
 
-    With a period, the input is ROOT (2 s - 1) instead, where s rises from `begin` by time / period.
+    If `period` is given, the input is ROOT (2 s - 1) instead, where s rises from `begin` by time /
+    period.
     """
     transition, step = zero_order_hold(motion, drive, time)
     if period is None:
@@ -271,8 +273,8 @@ def closed_loop(
 
     The loop is stable if no eigenvalue lies outside the unit circle.
 
-    The state is that of `sampled_plant`, followed by that of the law. Leading axes of plant and law
-    are batches.
+    Its state is the state of `sampled_plant`, followed by the state of the law. Leading axes of
+    plant and law are batches.
     """
     A, B, C = sampled_plant(plant, loop, extra)
     k = A.shape[-1]
@@ -286,7 +288,7 @@ def closed_loop(
 
 
 def spectral_radius(matrix: FloatArray) -> float:
-    """Return the largest magnitude of an eigenvalue."""
+    """Return the largest magnitude of an eigenvalue of a matrix."""
     return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
 
 

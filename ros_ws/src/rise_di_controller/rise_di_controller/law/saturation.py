@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Saturation of u: magnitude and rate limits, and the anti-windup of an integral."""
+"""Saturate u by magnitude and rate limits, with the anti-windup of an integral."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ LEAST_DIVISOR = 2.0**-126
 class Limits(NamedTuple):
     """Saturation limits, as deviations from trim in units of u.
 
-    A limit is infinite if there is none.
+    If there is no limit, the value is infinite.
 
     Attributes:
         lower: Least u, shape (m,).
@@ -56,7 +56,7 @@ def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
 
 
 def bounds(u_before: Array, dt: Array, limits: Limits) -> tuple[Array, Array]:
-    """Return the least and the largest u of `saturate`, shapes (m,)."""
+    """Return the least and the largest u that `saturate` allows, each with the shape (m,)."""
     xp = array_namespace(u_before)
     reach = limits.rate * dt
     low = xp.maximum(xp.minimum(limits.lower, u_before + reach), u_before - reach)
@@ -74,7 +74,7 @@ def limited_integral(before: Array, after: Array, change: Array, beyond: Array) 
 
     u then ends at the limit, or moves at the rate if a rate limit acts.
     Source: conditional integration, K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5; the
-    reduced increment is this project's.
+    reduced increment is of this project.
 
     Args:
         before: Integral before the tick, shape (m,).

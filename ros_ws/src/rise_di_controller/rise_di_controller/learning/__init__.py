@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Models learned in flight, on the side of the controller: taken, refused, or given up."""
+"""Take, refuse or give up models that are learned in flight, on the controller's side."""

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tests whether a law with a learned model diverges or oscillates.
+"""Test whether a law with a learned model diverges or oscillates.
 
-The error is compared with the error under the law of the start.
+The error is compared with the error under the first law, which is the law with which the flight
+started.
 """
 
 from collections import deque
@@ -13,34 +14,35 @@ from numpy.typing import NDArray
 
 from flight_core.vectors import FloatArray
 
-# s, time constant of the mean square of e: a few periods of the slowest oscillation that servos
-# allow
+# Time constant of the mean square of e, s, which is a few periods of the slowest oscillation that
+# servos allow.
 MEMORY = 1.0
-# an output diverges above this multiple of its largest rms error under the first law; later gusts
-# are up to twice as strong
+# An output diverges above this multiple of its largest rms error under the first law. Later gusts
+# can be twice as strong.
 FACTOR = 3.0
-LEAST = {"V": 1.0}  # m/s, rms error that does not yet count as a divergence
-# rad/s, the same limit of every other output: five times the rms error of the law alone in moderate
-# turbulence
+LEAST = {"V": 1.0}  # rms error of V that does not yet count as a divergence, m/s
+# The same limit for every other output, rad/s. It is five times the rms error of the law alone in
+# moderate turbulence.
 LEAST_RATE = 0.1
 
-# s, length of the record of e, and time over which each value in it is averaged: no loop with
-# servos oscillates so fast
+# Length of the record of e, and the time over which each of its values is averaged, s. No loop with
+# servos oscillates so fast.
 WINDOW = 10.0
 STEP = 0.02
-TEST = 50  # means between two tests for an oscillation, 1 s
-# correlation of e with e a period later: 0.9 in a limit cycle, at most 0.5 in turbulence and gusts
+TEST = 50  # number of averaged values between two tests for an oscillation, 1 s
+# Correlation of e with e a period later. It is 0.9 in a limit cycle, and at most 0.5 in turbulence
+# and gusts.
 LIKENESS = 0.7
-# factor on the largest rms error over a WINDOW under the first law: if the error has grown by less,
-# this law is not clearly better
+# Factor on the largest rms error over a WINDOW under the first law. If the error has grown by less,
+# the first law is not clearly better.
 GROWN = 1.5
 HARMLESS = 0.2  # fraction of LEAST or LEAST_RATE below which an oscillation does not count
 
 
 class Errors(NamedTuple):
-    """Mean squares of e = y - y_m, (m,).
+    """Mean squares of e = y - y_m, each with the shape (m,).
 
-    One is the running mean, the other the largest mean under the first law.
+    `now` is the running mean, and `largest` is its largest value under the first law.
     """
 
     now: FloatArray
@@ -48,7 +50,7 @@ class Errors(NamedTuple):
 
 
 def least(outputs: tuple[str, ...]) -> FloatArray:
-    """Return the mean squares below which nothing counts as a divergence, (m,)."""
+    """Return the mean square below which the error of each output is no divergence, (m,)."""
     return np.array([LEAST.get(name, LEAST_RATE) for name in outputs]) ** 2
 
 
@@ -69,7 +71,8 @@ def diverging(
     An output diverges if its rms error is above FACTOR times its largest under the first law, and
     above `least`.
 
-    Only outputs with a learned model count, mask (m,), because the others still fly the first law.
+    Only outputs with a learned model count, as `is_learned` (m,) says, because the others still fly
+    the first law.
     """
     return is_learned & (errors.now > np.maximum(FACTOR**2 * errors.largest, least))
 
@@ -79,13 +82,13 @@ class Oscillations:
 
     An output counts only if it oscillates more than under the first law.
 
-    A limit cycle repeats itself: over the whole window e resembles e a period earlier. Under wind
-    and single commands it does not.
+    In a limit cycle, e resembles e a period earlier over the whole window. Under wind and single
+    commands it does not.
     """
 
     def __init__(self, least: FloatArray) -> None:
-        """Take the mean squares below which nothing counts as a divergence, (m,)."""
-        # s, periods of the oscillations at the last test, (m,); 0 for none
+        """Take the mean square below which the error of each output is no divergence, (m,)."""
+        # Period of each output's oscillation at the last test, s, (m,), or 0 for none.
         self.periods = np.zeros_like(least)
         self._least = HARMLESS**2 * least
         self._largest = np.zeros_like(least)
@@ -108,7 +111,7 @@ class Oscillations:
         self._sum = self._sum + e
         self._count = self._count + 1
         self._time = self._time + dt
-        if self._time < 0.99 * STEP:  # dt is rounded
+        if self._time < 0.99 * STEP:  # 0.99 because dt is rounded
             return
         self._record.append(self._sum / self._count)
         spacing = self._time
@@ -135,7 +138,8 @@ class Oscillations:
 def oscillating(y: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
     """Return which outputs, (m,), oscillate over a record y, (N, m).
 
-    They must move by more than HARMLESS of `least`. Repeated commands count too.
+    They must move by more than the fraction HARMLESS of `least`. Repeated commands count as an
+    oscillation, too.
     """
     is_moving = np.var(y, axis=0) > HARMLESS**2 * least
     return np.array(

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Channels of a controller with a learned model, and those that fly the law of the start."""
+"""Combine channels with a learned model and channels that fly the first law.
+
+The first law is the law with which the flight started.
+"""
 
 from collections.abc import Collection, Sequence
 from typing import Any
@@ -20,17 +23,17 @@ def with_channels_of(
 ) -> RiseDiConfig:
     """Give a designed controller the gains of `start` in the channels `bare`, without checks.
 
-    These channels get neither feedforward nor observer.
+    These channels get no feedforward and no observer.
 
-    A gain K below that of the last channel is written as the gain of the last channel with a
-    smaller input scale, which is the same loop. A dead input gets the least input scale, so that
-    the law holds it still.
+    The K of equation (22) cannot be below that of the last channel. Such a K is replaced by the
+    last channel's K together with a smaller input scale, which gives the same loop. The inputs
+    `dead` have no effect, and get the least input scale, so that the law does not move them.
     """
     law = start.law_params()
     design = designed.law_params()
     last = design.K[-1]
     channels = np.array(bare)
-    # Write a K below the last one as the last one with a smaller input scale.
+    # Replace a K below the last K by the last K and a smaller input scale.
     K = np.where(channels, np.maximum(law.K, last + MIN_GAIN), design.K)
     K[-1] = last
     share = np.where(channels, law.K / K, 1.0)
@@ -93,7 +96,7 @@ def authority_names(outputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
-    """Compute the y_dot that each input can at least give to its output, (2m,), units of y / s.
+    """Compute the y_dot that each input can give to its output for sure, (2m,), units of y / s.
 
     The first m values hold for a falling output, the others for a rising output:
 
@@ -103,7 +106,7 @@ def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
     s_i is the standard deviation of Omega_ii divided by abs(Omega_ii). For a small s_i the factor
     subtracts two deviations, and for any s_i it stays above 0. If there are models at other speeds,
     the least value over the speeds counts. The result is 0 for an input without effect. It is
-    UNKNOWN if the input has no limit, or if the output flies the law of the start.
+    UNKNOWN if the input has no limit, or if the output flies the first law.
     """
     m = len(parameters.outputs)
     model = parameters.feedforward
@@ -132,9 +135,9 @@ def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
 def with_fallback(
     start: RiseDiConfig, parameters: RiseDiConfig, bare: Sequence[bool]
 ) -> RiseDiConfig:
-    """Return the parameters that fly if more channels fall back to the law of the start.
+    """Return the parameters with which further channels, `bare`, fall back to the first law.
 
-    This is the start itself if no channel keeps a model.
+    If no channel keeps a model, the result is `start` itself.
     """
     acting = acting_inputs(parameters)
     is_first = parameters.models() == start.models()
@@ -149,7 +152,7 @@ def with_fallback(
 
 
 def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
-    """Return the outputs that have no model until the engagement ends, by `learn.without`."""
+    """Return the outputs in `learn.without`, which have no model until the engagement ends."""
     learn = parameters.learn if isinstance(parameters, RiseDiConfig) else None
     return () if learn is None else learn.without or ()
 
@@ -157,9 +160,9 @@ def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
 def without_models(
     start: RiseDiConfig, parameters: RiseDiConfig, outputs: Collection[str]
 ) -> RiseDiConfig:
-    """Return the parameters that fly if some outputs fall back to the law of the start.
+    """Return the parameters with which some outputs give up their model and fly the first law.
 
-    They keep this law until the engagement ends, and are added to `learn.without`.
+    These outputs keep the first law until the engagement ends, and are added to `learn.without`.
     """
     fallen = with_fallback(start, parameters, [name in outputs for name in start.outputs])
     assert start.learn is not None  # noqa: S101 - a controller that learns
@@ -172,7 +175,7 @@ def without_models(
 
 
 def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
-    """Mask the outputs that the model of the feedforward couples with the named ones, (m,)."""
+    """Return a mask, (m,), of the outputs that the feedforward's model couples with `names`."""
     model = parameters.feedforward
     assert model is not None  # noqa: S101 - a learned model flies
     n = len(model.states)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Models learned in flight, on the side of the controller.
+"""Handle the models that are learned in flight, on the side of the controller.
 
 This module decides when identifications begin, which proposals fly, and when to fall back. It has
 no side effects, so the node and the loop in one process both use it.
@@ -51,31 +51,32 @@ with its model."""
 
 
 class EventKind(StrEnum):
-    """What happened in the learning, also in the messages of the topic `learning`."""
+    """What happened in the learning, as in the messages of the topic `learning`."""
 
     FLIES = "flies"  # the controller has taken a proposal
     REFUSED = "refused"  # a proposal fails a check of the controller
     NO_MODEL = "no model"  # the learner has refused what it identified
-    FALLBACK = "fallback"  # to the law of the start, in all parts or in some
-    # the law was deactivated, and begins again with the parameters of the start
+    FALLBACK = "fallback"  # all or some parts of the model fall back to the first law
+    # the law was deactivated, and begins again with its first parameters
     RESTART = "restart"
 
 
 class Proposal(NamedTuple):
     """What a learner found in its window, as the controller receives it."""
 
-    stamp_ns: int  # the end of the window: the instant of its last tick
-    start: int  # digest of the parameters of the start, for which the learner was started
+    stamp_ns: int  # the end of the window, which is the instant of its last tick
+    start: int  # digest of the first parameters, with which the learner was started
     flown: int  # digest of the parameters that flew at the end of the window
-    # all of DESIGNED by dotted name, None for what is gone; empty where no model is proposed
+    # all parameters of DESIGNED by dotted name, None for one that is removed; empty if no model is
+    # proposed
     change: Mapping[str, Any]
-    sentence: str | None  # what was learned, or why there is no model; None if nothing was due
+    sentence: str | None  # what was learned, or why not; None if nothing was due
 
 
 class Event(NamedTuple):
-    """What became of a proposal, or a fallback.
+    """The result of a proposal, or a fallback.
 
-    It carries a change of the parameters by dotted name, which may be empty, and the reason.
+    It has the change of the parameters by dotted name, which may be empty, and the reason.
     """
 
     stamp_ns: int
@@ -96,16 +97,16 @@ AUTHORITY_TICKS = 10
 
 
 class Fallback(NamedTuple):
-    """A fallback to the law of the start in all parts."""
+    """A fallback of all parts of the model to the law with which the flight started."""
 
     flown: int  # digest of the parameters before
-    input_scale: tuple[float, ...]  # of the parameters before
+    input_scale: tuple[float, ...]  # input_scale of the parameters before
     fallen: int  # digest of the parameters after
 
     def outlived_by(self, proposal: Proposal, digest: int) -> bool:
         """Return whether a proposal that was made before the fallback still holds after it.
 
-        It does if it holds another input still, because this input has no effect.
+        It holds if it stops the use of a further input that has no effect.
         """
         scale = proposal.change.get("input_scale")
         if (proposal.flown, digest) != (self.flown, self.fallen) or not isinstance(scale, Sequence):
@@ -114,11 +115,11 @@ class Fallback(NamedTuple):
 
 
 class Updates:
-    """Decides when proposals are due: at the first tick, and at given times counted from it.
+    """Decides when proposals are due, at the first tick and at given times after it.
 
-    At the first tick the rough model is proposed as it is. From the first given time on, the
-    aircraft is also tested every `learn.check`. A test is left out if a given time follows it
-    within less than one `learn.check`.
+    At the first tick the rough model is proposed unchanged. From the first given time on, the
+    aircraft is also tested at intervals of `learn.check`. A test is left out if a given time
+    follows in less than `learn.check`.
     """
 
     def __init__(self, settings: LearnConfig) -> None:
@@ -126,7 +127,7 @@ class Updates:
         self._times_ns = deque(map(nanoseconds, (0.0, *settings.updates)))
         self._begin_ns = nanoseconds(settings.updates[0])  # before this time there is no test
         self._first_ns: int | None = None
-        self._last_ns = 0  # time of the last identification or test, from the first tick on
+        self._last_ns = 0  # time of the last identification or test after the first tick
 
     def due(self, now_ns: int) -> bool:
         """Return whether an identification or a test begins at this tick.
@@ -153,35 +154,35 @@ class Learning:
     """The proposals of a flight and the fallback, stepped between two ticks of the controller.
 
     In simulated time a proposal acts `learn.latency` after the end of its window, and the flight
-    waits for it. In real time it acts as soon as it is certified; each step does a part of the
-    certificate, so that no tick has to wait.
+    waits for it. In real time a proposal acts as soon as it is certified. Each step does a part of
+    the certification, so that no tick has to wait.
     """
 
     def __init__(
         self, parameters: RiseDiConfig, announce: Callable[[Event], None], *, simulated: bool
     ) -> None:
-        assert parameters.learn is not None  # noqa: S101 - the caller makes none without it
+        assert parameters.learn is not None  # noqa: S101 - only a controller that learns has one
         self.start = parameters
         self._digest = parameters.digest()
         self._settings = parameters.learn
         self._announce = announce
         self._simulated = simulated
         self._updates = Updates(parameters.learn)
-        # ends of the windows whose proposals have not acted, in simulated time
+        # ends of the windows whose proposals have not acted yet, in simulated time
         self._due = deque[int]()
-        self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
+        self._received: dict[int, Proposal] = {}  # by end of the window, in simulated time
         self._certificate: tuple[Proposal, Generator[None, None, Prepared]] | None = None
         self._spacing_ns = nanoseconds(min(parameters.learn.spacing(), parameters.learn.check)) // 2
         # end of the window of the last proposal that was not refused at once
         self._last_ns: int | None = None
-        # when the law was last inactive: an earlier window is of another engagement
+        # when the law was last inactive; a window before this belongs to an earlier engagement
         self._since_ns: int | None = None
-        self._fallback: Fallback | None = None  # the last one
-        self._fallbacks = Counter[str]()  # of this engagement, by output
+        self._fallback: Fallback | None = None  # the last fallback
+        self._fallbacks = Counter[str]()  # number of fallbacks of each output in this engagement
         self._diverged = set[int]()  # digests of the parameters that diverged in this engagement
 
     def authority(self, controller: Controller) -> FloatArray:
-        """Return the `authority` of what flies."""
+        """Return the `authority` of the parameters in force."""
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - proposals keep the law of the start
         return authority(parameters, self.start)
@@ -189,7 +190,7 @@ class Learning:
     def ticked(self, controller: Controller, now_ns: int) -> bool:
         """Note a tick, and return whether an identification or a test begins at it.
 
-        None begins while the law is deactivated.
+        Neither begins while the law is deactivated.
         """
         due = controller.mode is not Mode.INACTIVE and self._updates.due(now_ns)
         if due and self._simulated:
@@ -205,7 +206,7 @@ class Learning:
     def receive(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         """Take a proposal, or refuse it with an event."""
         if not (self._simulated or proposal.change) and proposal.sentence is None:
-            return  # a test without a change: nothing to certify or to say
+            return  # a test without a change has nothing to certify or report
         if refusal := self._reason_against(proposal, now_ns, controller):
             self._refuse(refusal, proposal, now_ns)
         elif self._simulated:
@@ -217,9 +218,9 @@ class Learning:
     def step(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
         """Certify, let due proposals act, and fall back if the law diverges.
 
-        A deactivated law begins again with the parameters of the start, because its model may have
-        been the reason to deactivate it. Returns the parameters that the controller has taken, or
-        None if it keeps its own.
+        A deactivated law begins again with its first parameters, because its model may have been
+        the reason to deactivate it. Returns the parameters that the controller has taken, or None
+        if it keeps the present ones.
         """
         if controller.mode is Mode.INACTIVE:
             return self._begin_again(controller, now_ns)
@@ -240,9 +241,9 @@ class Learning:
     def _end_divergence(
         self, diverging: Collection[str], controller: Controller, now_ns: int
     ) -> RiseDiConfig:
-        """Fall back to the law of the start in the parts of the model that diverge.
+        """Fall back to the first law in the parts of the model that diverge.
 
-        A part with FALLBACKS fallbacks keeps this law until the engagement ends.
+        A part with FALLBACKS fallbacks keeps the first law until the engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -267,9 +268,9 @@ class Learning:
     def _end_oscillations(
         self, periods: Mapping[str, float], controller: Controller, now_ns: int
     ) -> RiseDiConfig:
-        """Fall back to the law of the start in the parts of the model whose outputs oscillate.
+        """Fall back to the first law in the parts of the model whose outputs oscillate.
 
-        These parts keep it until the engagement ends.
+        These parts keep the first law until the engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -293,7 +294,7 @@ class Learning:
         return fallen
 
     def _begin_again(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
-        """Forget what is under way, and return the start's parameters if a learned model flew."""
+        """Forget all proposals and fallbacks, and return the first parameters if a model flew."""
         self._updates = Updates(self._settings)
         self._certificate = None
         self._last_ns = None
@@ -316,9 +317,9 @@ class Learning:
     def _reason_against(
         self, proposal: Proposal, now_ns: int, controller: Controller
     ) -> Refusal | None:
-        """Refuse a proposal that is not even worth certifying.
+        """Return why a proposal is refused before it is certified, or None.
 
-        This costs microseconds, whatever the proposal.
+        The check takes only microseconds for any proposal.
         """
         window = f"a window that ends {seconds(now_ns - proposal.stamp_ns):.3g} s ago"
         if proposal.start != self._digest:
@@ -357,9 +358,9 @@ class Learning:
             self._announce(Event(now_ns, EventKind.NO_MODEL, {}, f"no model: {proposal.sentence}"))
 
     def _certify(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
-        """Do one step of the certificate, or all of them in simulated time.
+        """Do one step of the certification, or all steps in simulated time.
 
-        Returns the parameters that are taken at the end.
+        Returns the parameters that are taken if the certification is complete, else None.
         """
         if self._certificate is None:
             return None
@@ -386,9 +387,7 @@ class Learning:
                 f"found numbers too large or too small ({error.args[-1]}), expected those "
                 "of a flight"
             )
-        except (
-            ValueError
-        ) as error:  # ParameterError, or a matrix of which LAPACK finds no eigenvalues
+        except ValueError as error:  # ParameterError, or LAPACK finds no eigenvalues of a matrix
             refusal = Refusal(str(error))
         else:
             return None
@@ -397,11 +396,11 @@ class Learning:
         return None
 
     def _reason_against_change(self, proposal: Proposal, controller: Controller) -> Refusal | None:
-        """Refuse a proposal that the law cannot take.
+        """Return why the law cannot take a certified proposal, or None.
 
-        Either the law is not engaged, or another change overtook the proposal. A proposal that only
-        holds an input without effect still counts after a fallback: the input has no effect then
-        either, and its loss may have caused the fallback.
+        It cannot if the law is not engaged, or if another change of the parameters came first. A
+        proposal that stops the use of an input without effect still counts after a fallback,
+        because the loss of this input may have caused the fallback.
         """
         if controller.mode is not Mode.ENGAGED:
             return Refusal(
@@ -425,7 +424,7 @@ class Learning:
         self._announce(Event(now_ns, kind, change, sentence))
 
     def _refuse(self, refusal: Refusal, proposal: Proposal, now_ns: int) -> None:
-        # the sentence may say which input has no effect, and this is true in spite of the refusal
+        # The sentence may say which input has no effect, which is true in spite of the refusal.
         proposed = "" if proposal.sentence is None else f"; proposed: {proposal.sentence}"
         self._announce(Event(now_ns, EventKind.REFUSED, {}, f"refused: {refusal}{proposed}"))
 
@@ -433,9 +432,9 @@ class Learning:
 def _certificate(
     parameters: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig
 ) -> Generator[None, None, Prepared]:
-    """Apply a change to the parameters in force, and check them as when they are loaded.
+    """Apply a change to the parameters in force, and check the result like loaded parameters.
 
-    The checks come in parts of at most about 1 ms. Raises ParameterError.
+    The generator yields after at most about 1 ms. Raises ParameterError if a check fails.
     """
     foreign = sorted(name for name in change if name.split(".")[0] not in DESIGNED)
     require(
@@ -489,7 +488,7 @@ def _certificate(
 
 
 def _speeds(parameters: RiseDiConfig) -> str:
-    """Describe the speeds of the models, and how the schedule follows; "" without a schedule."""
+    """Describe the speeds of the models and the schedule as text, or return ""."""
     schedule = parameters.schedule
     if schedule is None:
         return ""
@@ -500,8 +499,8 @@ def _speeds(parameters: RiseDiConfig) -> str:
 def design_changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
     """Return the values of all DESIGNED parameters of a new set, by dotted name.
 
-    The value is None for each parameter that the new set lacks, although the old set has it or the
-    parameters in force may have it.
+    The value is None for each parameter that the new set lacks, but that the old set has or the
+    parameters in force may have.
     """
     before = _designed_values(old)
     after = _designed_values(new)
@@ -509,15 +508,15 @@ def design_changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, An
 
 
 def _designed_values(parameters: ControllerConfig) -> dict[str, Any]:
-    """Return the parameters that a design sets, those in DESIGNED, by dotted name."""
+    """Return the parameters that a design sets, which are those in DESIGNED, by dotted name."""
     values = flatten(parameters.model_dump())
     return {name: value for name, value in values if name.split(".")[0] in DESIGNED}
 
 
 def changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
-    """Return what differs between two parameter sets, by dotted name.
+    """Return the values of the new set that differ from the old set, by dotted name.
 
-    The value is None for a parameter that is gone.
+    The value is None for a parameter that the new set lacks.
     """
     before = dict(flatten(old.model_dump()))
     after = dict(flatten(new.model_dump()))
