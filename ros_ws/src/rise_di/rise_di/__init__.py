@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The Python interface of the RISE-DI flight stack, in one import.
 
-A name loads its module when it is first used, and none needs ROS.
+Each name loads its module when it is first used, and no module needs ROS.
 
     import rise_di
 
@@ -10,7 +10,7 @@ A name loads its module when it is first used, and none needs ROS.
     tape = rise_di.simulate(scenario)
     q, t = tape["y"]["q"], tape.time("y")
 
-The names keep their meaning within a minor version; see CHANGELOG.md.
+The names keep their meaning within a minor version (see CHANGELOG.md).
 """
 
 import ast
@@ -21,7 +21,7 @@ from pathlib import Path
 
 
 def _homes() -> Iterator[tuple[str, tuple[str | None, str]]]:
-    """Yield each name of the interface with its module and its name there, from __init__.pyi."""
+    """Yield each name of the interface in __init__.pyi, with its module and its name in there."""
     stub = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
     for statement in ast.parse(stub).body:
         if isinstance(statement, ast.ImportFrom):
@@ -36,7 +36,7 @@ __all__ = sorted(_HOME)  # noqa: PLE0605 - the names of the stub
 def __getattr__(name: str) -> object:
     """Load the module of a name at the first use of the name."""
     if name == "__version__":
-        from importlib.metadata import version  # noqa: PLC0415 - needs as long as all else here
+        from importlib.metadata import version  # noqa: PLC0415 - takes as long as all else here
 
         value: object = version("rise-di")
     elif name in _HOME:
@@ -52,8 +52,8 @@ def __dir__() -> list[str]:
     return [*__all__, "__version__"]
 
 
-# gymnasium takes longer to load than everything else here. Whoever makes environments by name has
-# loaded it.
+# gymnasium takes longer to load than everything else here. A program that makes environments by
+# name has loaded it already.
 if "gymnasium" in sys.modules:
     from rise_di.environment_ids import register
 

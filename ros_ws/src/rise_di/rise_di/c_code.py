@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller of a scenario as C99 with its proof, as `rise-di export` writes it."""
+"""Write the controller of a scenario as C99 with a proof, as `rise-di export` does."""
 
 import hashlib
 import math
@@ -43,17 +43,17 @@ from flight_log.tape_reader import RecordedRun, read_run
 from rise_di_controller.guard.guard import SAMPLE_BUFFER_SIZE
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-PART = 50_000  # drawn steps in a recording
-RATES = (1.0, 1000.0)  # Hz, the lowest and the highest rate
-LONGEST = 20.0  # s, the longest flight if no duration is given
+PART = 50_000  # number of drawn steps in a recording
+RATES = (1.0, 1000.0)  # the lowest and the highest rate, Hz
+LONGEST = 20.0  # longest flight if no duration is given, s
 
 
 class Material(NamedTuple):
-    """What a proof compares."""
+    """The parameters and recordings with which a proof compares C and Python."""
 
-    sets: list[RiseDiConfig]  # the parameters; the first are those of the code
+    sets: list[RiseDiConfig]  # parameter sets, of which the first is that of the code
     recordings: Iterator[Recording]
-    line: str  # a line for the report
+    line: str  # a line for the report of the proof
 
 
 class Exported(NamedTuple):
@@ -93,24 +93,24 @@ def export(
 
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
-        folder: Where the code and the report of the proof go.
-        run: A recorded flight whose ticks are the proof, in place of flights and drawn inputs. If
+        folder: Folder for the code and the report of the proof.
+        run: A recorded flight, whose ticks replace the flights and drawn inputs of the proof. If
             the scenario learns, the last model of this flight is exported.
-        float32: Whether to compute in single precision; the proof then bounds the difference of u.
-        duration: Duration of each flight of the proof, s; None takes that of the scenario, at most
-            20 s.
+        float32: Whether to compute in single precision. The proof then bounds the difference of u.
+        duration: Duration of each flight of the proof, s. If None, it is that of the scenario, at
+            most 20 s.
         drawn: Number of drawn steps in the proof.
         seed: Seed of the drawn inputs.
         compiler: Commands of C compilers; if empty, gcc and clang.
         runner: Command that starts a program of the compiler, such as qemu-aarch64 for a cross
             compiler.
         fmu: Whether to write a co-simulation unit of FMI 2.0, too.
-        autopilot: "px4" or "ardupilot", to write the code as a part of this autopilot.
-        samples: Number of samples of y and of y_m that the controller keeps, 4 or more; None takes
-            8 inside an autopilot, else 100.
+        autopilot: "px4" or "ardupilot" to write the code as a part of this autopilot, or None.
+        samples: Number of samples of y and of y_m that the controller keeps, 4 or more. If None, it
+            is 8 inside an autopilot, else 100.
         rate: Rate of the law, the reference model and y, Hz, in place of the scenario's. The
             observer is discretised for it.
-        proof: Whether to prove.
+        proof: Whether to compile and prove the code.
 
     Returns:
         The files, the proof and the text of the report. `proof.holds` says whether the proof holds.
@@ -127,7 +127,7 @@ def export(
     source = find_scenario(scenario)
     if run is not None and source.learns():
         source = with_last_model(source, run if isinstance(run, RecordedRun) else read_run(run))
-        run = None  # several models flew in its ticks, and the proof needs the last one alone
+        run = None  # several models flew in its ticks, but only the last one is exported
     if rate is not None:
         source = at_rate(source, rate)
     folder = as_path(folder, "c", "the path of a folder")
@@ -166,14 +166,14 @@ def export(
 def at_rate(scenario: Scenario, rate: float) -> Scenario:
     """Return a scenario with the law, the reference model and y at another rate, Hz.
 
-    Raises ParameterError if the observer has less than its delay margin at that rate.
+    Raises ParameterError if the observer has less than the required delay margin at this rate.
     """
     rate = as_number(rate, "rate", *RATES, "Hz")
     controller = exportable(scenario.controller)
     changes: dict[str, Any] = {"rate": rate}
     if controller.observer is not None:
         nominal = controller.nominal()
-        assert nominal is not None  # noqa: S101 - beside an observer
+        assert nominal is not None  # noqa: S101 - an observer needs it
         changes["observer"] = controller.observer.at_rate(rate, nominal).model_dump()
     period = period_ns(rate, "rate")
     fewest = math.ceil(seconds(period) / scenario.aircraft.step)
@@ -186,18 +186,17 @@ def at_rate(scenario: Scenario, rate: float) -> Scenario:
 
 
 class CertificateSources(NamedTuple):
-    """What the loop of a certificate was made from."""
+    """The files from which the loop of a certificate was built."""
 
-    texts: dict[str, str]  # SHA-256 of "airframe" and "scenario"; text of "constants"
-    without: str = ""  # why there are no constants, a sentence
+    texts: dict[str, str]  # SHA-256 of "airframe" and "scenario", and text of "constants"
+    without: str = ""  # a sentence on why there are no constants
 
 
 def certificate_sources(airframe: Airframe, scenario: FilePath | Scenario) -> CertificateSources:
-    """Find what the loop of a certificate was made from.
+    """Return the sources from which the loop of a certificate was built.
 
-    The constants are the text of rise_di_parameters.h as `export` writes it by default. There are
-    none for a law that C cannot express. There are none either for a section controller alone,
-    which has no scenario.
+    The constants are the text of rise_di_parameters.h as `export` writes it by default. They are
+    missing for a law that C cannot express, and for a section `controller` without a scenario.
     """
     texts = {"airframe": _sha256(as_yaml(airframe))}
     if controller_alone(scenario) is not None:
@@ -223,7 +222,7 @@ def _sha256(text: str) -> str:
 
 
 def _certified(scenario: Scenario, constants: Path) -> tuple[str, str] | None:
-    """Return the certificate of the guarantee that was computed for a loop, and what it states.
+    """Return the certificate of the guarantee kept for a scenario's loop, and its statement.
 
     Returns None if there is no guarantee.
     """
@@ -244,7 +243,7 @@ def _write(
 ) -> tuple[Path, list[Path], int]:
     """Write the code, alone or for an autopilot.
 
-    Return the folder of the code, all files, and how many samples are kept.
+    Returns the folder of the code, all files, and the number of samples that the code keeps.
     """
     if autopilot is None:
         buffer_size = samples or SAMPLE_BUFFER_SIZE
@@ -268,7 +267,7 @@ def _units(scenario: Scenario, controller: RiseDiConfig) -> Units:
 
 
 def _logged(run: FilePath | RecordedRun, controller: RiseDiConfig, title: str) -> Material:
-    """Return the parameters and the ticks of a flight, and a line on their u.
+    """Return the parameters and the ticks of a recorded flight, with a line on equal u.
 
     Raises ParameterError if the flight had other parameters.
     """
@@ -288,9 +287,9 @@ def _flights(scenario: Scenario, drawn: int, seed: int, samples: int) -> Materia
 def _recordings(
     scenario: Scenario, sets: Sequence[RiseDiConfig], drawn: int, seed: int, samples: int
 ) -> Iterator[Recording]:
-    """Yield flights and drawn commands, then `drawn` steps and a tenth as many calls.
+    """Yield recordings of flights, drawn commands, drawn calls and `drawn` single steps.
 
-    They come in parts that fit into memory.
+    There are a tenth as many calls as steps. The recordings are parts that fit into memory.
     """
     yield from flight_recordings(scenario, sets, samples)
     yield drawn_commands(scenario.reference_model, max(drawn // 10, 1000), seed)

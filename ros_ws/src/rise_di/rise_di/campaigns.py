@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo campaigns, as `rise-di campaign` flies them on the cores of this machine."""
+"""Fly Monte Carlo campaigns on the cores of this machine, as `rise-di campaign` does."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -44,10 +44,10 @@ class CampaignResult(NamedTuple):
     def rows(self) -> "pl.DataFrame":
         """Return a table with a row for each aircraft, SI.
 
-        The columns are the seed, the number, the factor of the sweep, divergence, loss of track,
-        the figures and the drawn entries. The entries have names such as "A[q,alpha]",
-        "B[V,thrust]", "lag[elevator]", "noise[q]" and "delay". The figures of a diverged aircraft
-        are null.
+        The columns are the seed, the number of the aircraft, the factor of the sweep, divergence,
+        loss of track, the metrics and the drawn entries. The entries have names such as
+        "A[q,alpha]", "B[V,thrust]", "lag[elevator]", "noise[q]" and "delay". The metrics of a
+        diverged aircraft are null.
         """
         return MonteCarlo.resume(self.folder).rows().collect()
 
@@ -71,38 +71,38 @@ def fly_campaign(
 ) -> CampaignResult:
     """Fly thousands of uncertain aircraft around the airframe of a scenario.
 
-    The report of the campaign is written, too. After Ctrl-C, `resume_campaign` continues.
+    This also writes the report of the campaign. After Ctrl-C, `resume_campaign` continues it.
 
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
         aircraft: Number of uncertain aircraft.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
-        entries: Entries that have their own deviation: {"A[q,alpha]": 0.6, "lag[elevator]": 0.5,
-            "noise[q]": 0.5}; "lag" and "noise" mean all that have no entry of their own. {"delay":
-            0.02} is the largest delay of u beyond the scenario's, s. Lags, noise and delay without
-            an entry are those of the scenario.
+        entries: Deviation by entry, as in {"A[q,alpha]": 0.6, "lag[elevator]": 0.5, "noise[q]":
+            0.5}. "lag" and "noise" stand for all lags and noises that are not named. {"delay":
+            0.02} adds a delay of u of up to 0.02 s. Lags, noise and delay without an entry are
+            those of the scenario.
         distribution: Distribution of the deviations: "uniform", "normal" with three standard
             deviations at the limit, or "corners".
-        score: Units of the rms errors in the score by output, SI: {"q": 0.02}.
-        wind: Whose A the wind acts through: "air_relative", that of each aircraft, or "published",
-            that of the airframe; None takes the scenario's.
+        score: Units of the rms errors in the score by output, SI, as in {"q": 0.02}.
+        wind: The A through which the wind acts: that of each aircraft for "air_relative", or that
+            of the airframe for "published". If None, the scenario decides.
         seed: Seed of the aircraft.
-        sweep: A parameter of the controller, or its value in one channel, and its factors:
+        sweep: A parameter of the controller, or its value in one channel, and factors for it, as in
             {"beta[V]": [0.5, 1.0, 2.0]}.
-        duration: Duration of each flight, s; None takes that of the scenario.
-        chunk: Aircraft computed at once; None takes 1000, on a GPU as many as its memory holds, and
-            4 with a learner or a route.
-        workers: Number of threads, or of processes with a learner or a route; None takes one per
-            core. A script with processes must call this function under `if __name__ ==
+        duration: Duration of each flight, s. If None, it is that of the scenario.
+        chunk: Number of aircraft computed at once. If None, it is 4 with a learner or a route, on a
+            GPU as many as fit into its memory, and otherwise 1000.
+        workers: Number of threads, or of processes with a learner or a route. If None, there is one
+            for each core. A script with processes must call this function under `if __name__ ==
             "__main__":`.
-        runs: Folder in which the folder of the campaign is made.
-        progress: Called with the flights so far and all flights, after each chunk.
+        runs: Folder in which the folder of the campaign is created.
+        progress: Called after each chunk with the number of flights so far and in total.
 
     Returns:
-        The folder, the report and the figures of the campaign.
+        The folder, the report and the metrics of the campaign.
 
     Raises:
-        ParameterError: A campaign cannot fly the scenario, or cannot have these arguments.
+        ParameterError: A campaign cannot fly the scenario, or an argument is invalid.
 
     Examples:
         >>> scenario = rise_di.find_scenario("osprey_servo", duration=0.1)
@@ -136,12 +136,12 @@ def resume_campaign(
 
     Args:
         folder: The folder of the campaign.
-        workers: Number of threads, or of processes with a learner or a route; None takes one per
-            core.
-        progress: Called with the flights so far and all flights, after each chunk.
+        workers: Number of threads, or of processes with a learner or a route. If None, there is one
+            for each core.
+        progress: Called after each chunk with the number of flights so far and in total.
 
     Returns:
-        The folder, the report and the figures of the campaign.
+        The folder, the report and the metrics of the campaign.
 
     Raises:
         ParameterError: The folder has no campaign.
@@ -158,7 +158,7 @@ def resume_campaign(
 
 
 def _engine(definition: Definition, workers: int | None) -> engines.Engine:
-    """Return threads of this process, or processes of this machine with a learner or a route."""
+    """Return the engine, which uses processes with a learner or a route, and threads otherwise."""
     count = None if workers is None else as_count(workers, "workers", 1)
     is_single = flies_alone(definition.scenario())
     return engines.dask(count, on_devices=False) if is_single else engines.threads(count)

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The identifiers of the environments. gymnasium has had no entry point for them since 1.0."""
+"""Register the environments with gymnasium, which has no entry point for them since 1.0."""
 
 ID = "rise_di/Flight-v0"
 
 
 def register() -> None:
-    """Register the environments once."""
+    """Register the identifiers of the environments once."""
     import gymnasium  # noqa: PLC0415 - an extra
 
     if ID not in gymnasium.registry:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The aircraft of a scenario as environments of gymnasium.
+"""Offer the aircraft of a scenario as environments of gymnasium.
 
-The agent takes the place of the controller, and a step is a tick.
+The agent takes the place of the controller, and a step is a tick of it.
 """
 
 from dataclasses import dataclass
@@ -35,21 +35,22 @@ from rise_di.environment_ids import register
 require_package("gymnasium")
 import gymnasium  # noqa: E402 - an extra
 
-# Bound of an action that the controller does not limit, SI: 57 deg, or the weight as thrust.
+# Bound of an action that the controller does not limit, SI. It is 57 deg, or a thrust equal to the
+# weight.
 UNLIMITED = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Channels:
-    """The spaces of an aircraft, and the units of the score by output."""
+    """The spaces of actions and observations of an aircraft, and the units of the score."""
 
     action: gymnasium.spaces.Space[FloatArray]
     observation: gymnasium.spaces.Space[FloatArray]
-    units: FloatArray  # (m,)
+    units: FloatArray  # unit of the error of each output, (m,)
 
 
 def _channels(scenario: Scenario) -> _Channels:
-    """Return the space of u within the controller's limits, and the space of y, then y_m.
+    """Return the space of u within the controller's limits, and that of y followed by y_m.
 
     The bounds of y and y_m are those beyond which an aircraft counts as lost.
     """
@@ -68,9 +69,9 @@ def _channels(scenario: Scenario) -> _Channels:
 
 
 def _without_models(scenario: Scenario) -> Scenario:
-    """Return the scenario with the bare law alone, which the agent replaces.
+    """Return the scenario with only the law itself, which the agent replaces.
 
-    Feedforward, observer, schedule and learner are left out: they say nothing to an agent.
+    Feedforward, observer, schedule and learner are left out, because an agent does not use them.
     """
     models = ("feedforward", "observer", "schedule", "learn")
     return scenario.vary(
@@ -105,8 +106,8 @@ the samples before that tick were measured."""
 def _is_newest_last(scenario: Scenario) -> bool:
     """Return whether the last sample of a tick is the newest y in every tick.
 
-    If so, earlier samples need not be measured. With any key outside BY_TICK, each sample is
-    measured.
+    In this case, earlier samples need not be measured. If the aircraft has any key outside BY_TICK,
+    the result is False, and each sample is measured.
     """
     aircraft = scenario.aircraft
     return not unknown_keys(aircraft, BY_TICK) and not scenario.controller.vanes
@@ -115,7 +116,7 @@ def _is_newest_last(scenario: Scenario) -> bool:
 def _actions(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     """Return the inputs of a step as an array.
 
-    Raises ParameterError if the shape is another one, or if a value is not finite.
+    Raises ParameterError if the shape is wrong, or if a value is not finite.
     """
     expected = f"finite numbers of shape {shape}"
     u = as_array(values, "action", expected)
@@ -124,28 +125,28 @@ def _actions(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
 
 
 class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
-    """The simulator and the reference model of a scenario; the agent gives u.
+    """The simulator and the reference model of a scenario, for an agent that gives u.
 
-    Observation: y then y_m, shape (2 m,), SI, as deviations from trim, with the outputs in the
-    order of the controller. y is the newest that has arrived.
+    The observation is y followed by y_m, shape (2 m,), as deviations from trim in SI. The outputs
+    are in the order of the controller, and y is the newest sample that has arrived.
 
-    Action: u, shape (p,), SI, as a deviation from trim, in the order of the controller's inputs, or
-    of the effectors of its allocation, within their limits.
+    The action is u, shape (p,), as a deviation from trim in SI. It is in the order of the
+    controller's inputs, or of the effectors of its allocation, and within their limits.
 
-    Reward of a step: -T sum_i abs(y_i - y_m_i) / unit_i, with the period T of the controller and
-    the unit unit_i of the score, 10 mrad/s (p 20) or 0.1 m/s. If the aircraft diverges, the episode
-    terminates and costs LOSS_OF_TRACK_SCORE for each second that is left. The end of the flight's
-    duration truncates the episode.
+    The reward of a step is -T sum_i abs(y_i - y_m_i) / unit_i, with the period T of the controller.
+    The unit unit_i of the score is 10 mrad/s (20 mrad/s for p) or 0.1 m/s. If the aircraft
+    diverges, the episode terminates and costs LOSS_OF_TRACK_SCORE for each second that is left. The
+    end of the flight's duration truncates the episode.
 
-    `info` has the error y - y_m, shape (m,), and at the end the outcome, a sentence.
+    `info` has the error y - y_m, shape (m,). At the end it also has the outcome, as a sentence.
 
     Args:
         scenario: The aircraft, the reference model, and the rate, the channels and the limits of
             the controller. Guidance is left out.
-        uncertainty: With a fraction, 0 to 1, every reset draws noise, turbulence, and an aircraft
-            whose A and B are off by up to this fraction, with the entries and the distribution of
-            `aircraft.uncertainty`. With None, every episode has the aircraft, the noise and the
-            turbulence of the scenario.
+        uncertainty: A fraction, 0 to 1, or None. With a fraction, every reset draws noise,
+            turbulence, and an aircraft whose A and B are off by up to this fraction. The entries
+            and the distribution come from `aircraft.uncertainty`. With None, every episode has the
+            aircraft, the noise and the turbulence of the scenario.
         render_mode: With "ansi", `render` returns a line of t, y and y_m. With None, it returns
             nothing.
 
@@ -208,11 +209,11 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         The same seed gives the same aircraft, noise and turbulence.
 
         Args:
-            seed: Seed of the draws; with None the draws go on.
-            options: Unused; gymnasium has the argument.
+            seed: Seed of the draws. With None the draws go on.
+            options: Not used, but required by gymnasium.
 
         Returns:
-            The observation, shape (2 m,), SI, and the facts of `step`.
+            The observation, shape (2 m,), SI, and `info`.
         """
         super().reset(seed=seed, options=options)
         self._y = np.zeros(len(self.outputs))
@@ -229,7 +230,7 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         return self._observed(), {"error": self._error()}
 
     def render(self) -> str | None:
-        """Return a line of t, and of y and y_m by output, SI, in the mode "ansi"; else None."""
+        """Return a line of text with t, y and y_m, SI, in the mode "ansi", else None."""
         if self.render_mode is None:
             return None
         rows = zip(self.outputs, self._y, self._y_m, strict=True)
@@ -249,8 +250,8 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
             action: u, shape (p,), SI, deviation from trim.
 
         Returns:
-            The observation (2 m,), the reward, whether terminated, whether truncated, and more
-            facts.
+            The observation (2 m,), the reward, whether the episode is terminated or truncated, and
+            `info`.
 
         Raises:
             ParameterError: No episode runs, or the action is not p finite numbers.
@@ -282,7 +283,7 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         return self._observed(), reward, False, is_over, info
 
     def _error(self) -> FloatArray:
-        """Return y - y_m, (m,)."""
+        """Return the error y - y_m, (m,)."""
         return self._y - self._y_m
 
     def _drawn(self) -> Scenario:
@@ -307,17 +308,17 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
 
 
 class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
-    """N uncertain aircraft of a scenario on one course, compiled.
+    """N uncertain aircraft of a scenario that follow the same commands, in compiled code.
 
     Observations have the shape (N, 2 m), actions (N, p) and rewards (N,), with rows like those of
-    FlightEnv. The aircraft share the commands, the wind and the noise of the sensors, and end
-    together. Every `reset` draws N aircraft. If an aircraft diverges, it terminates. The next step
-    then starts the same aircraft from trim, at the present time of the course. The step after the
-    end of the flight draws N aircraft again: `AutoresetMode.NEXT_STEP`.
+    FlightEnv. The aircraft share the commands, the wind and the noise of the sensors, and their
+    flights end together. Every `reset` draws N aircraft. If an aircraft diverges, it terminates.
+    The next step then starts the same aircraft from trim, at the present time of the flight. The
+    step after the end of the flight draws N aircraft again, as in `AutoresetMode.NEXT_STEP`.
 
     Args:
-        scenario: As for FlightEnv, but of an airframe with matrices.
-        num_envs: N.
+        scenario: As for FlightEnv, but the airframe must have matrices.
+        num_envs: Number N of aircraft.
         uncertainty: Largest relative deviation of the entries of A and B of an aircraft, 0 to 1.
 
     Raises:
@@ -374,8 +375,8 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         """Draw N aircraft in trim at t = 0. The same seed draws the same aircraft.
 
         Args:
-            seed: Seed of the draws; with None the draws go on.
-            options: Unused; gymnasium has the argument.
+            seed: Seed of the draws. With None the draws go on.
+            options: Not used, but required by gymnasium.
 
         Returns:
             The observations, shape (N, 2 m), SI, and an empty mapping.
@@ -396,7 +397,8 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
             actions: u, shape (N, p), SI, deviations from trim.
 
         Returns:
-            Observations (N, 2 m), rewards (N,), terminated (N,), truncated (N,), and more facts.
+            The observations (N, 2 m), the rewards (N,), which flights are terminated (N,) or
+            truncated (N,), and `info`.
 
         Raises:
             ParameterError: The shape is wrong, or a value is not finite.
@@ -424,7 +426,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         return self._observed(y, y_m), reward, self._ended, truncated, info
 
     def _begin(self) -> FloatArray:
-        """Draw N aircraft."""
+        """Draw N aircraft, put them into trim, and return the observations."""
         aircraft = self.scenario.aircraft
         part = self._uncertainty
         airframe = aircraft.nominal_airframe()
@@ -448,7 +450,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         return self._y, np.broadcast_to(self._course.segments.y_m[self._k][:, None], y.shape)
 
     def _observed(self, y: FloatArray, y_m: FloatArray) -> FloatArray:
-        # The nan of a diverged aircraft counts as its bound.
+        # The NaN of a diverged aircraft is replaced by the bound.
         known = np.nan_to_num(np.concatenate([y, y_m]), nan=np.inf)
         beyond = np.tile(self._largest, (2, 1))
         return np.asarray(np.clip(known, -beyond, beyond).T)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight in memory with the outcome that `rise-di fly` reports."""
+"""Simulate a flight in memory, with the outcome that `rise-di fly` reports."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,19 +28,19 @@ def simulate(
     learn: Learn | None = None,
     announce: Callable[[Event], None] = lambda event: None,
 ) -> Tape:
-    """Fly a scenario in memory. The flight ends early if it diverges or is interrupted (Ctrl-C).
+    """Simulate a scenario in memory. The flight ends early if it diverges or at Ctrl-C.
 
     Args:
-        scenario: The flight.
+        scenario: The scenario to fly.
         progress: Called with the flight time, s, once per simulated second.
-        guide: Makes the guidance of a scenario that has guidance.
-        control: Makes the controller from the parameters.
-        learn: Makes the learner of a scenario that learns, as `learner` returns it.
+        guide: Makes the guidance from its parameters, if the scenario has guidance.
+        control: Makes the controller from its parameters.
+        learn: Makes the learner if the scenario learns, as the result of `learner` does.
         announce: Takes the events of the learning.
 
     Returns:
-        The tape: signals of shape (N, k), SI and radians. `outcome` is that of `rise-di fly`: how
-        the flight ended, and what it falls short of.
+        The tape, with signals of shape (N, k) in SI and radians. As in `rise-di fly`, its `outcome`
+        says how the flight ended, and in what it falls short.
 
     Raises:
         ParameterError: `scenario` is no Scenario, or it learns and `learn` is None.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An airframe of the user's own, with a scenario that flies.
+"""Write an airframe of the user, with a scenario that flies it.
 
 `rise-di airframes --write` writes the same two files.
 """
@@ -31,24 +31,24 @@ from flight_design.gains.effectors import lags_by_input
 from flight_design.gains.first_scenario import LICENCE
 from flight_design.gains.gain_design import select_gains
 
-SIZES = (1.0, 0.5, 0.25, 0.125)  # of the commands; the first that keeps off the stops is taken
+SIZES = (1.0, 0.5, 0.25, 0.125)  # of the commands; the first that avoids the stops is used
 CLEAR = 0.9  # largest fraction of an end stop that u may reach
-ANGLE_OF_GUST = {"lateral": "sideslip", "vertical": "angle of attack"}  # that a gust over V0 is
-SAMPLES = 20  # uncertain airframes for the bounds of the theorem
+ANGLE_OF_GUST = {"lateral": "sideslip", "vertical": "angle of attack"}  # gust over V0
+SAMPLES = 20  # number of uncertain airframes for the bounds of the theorem
 
 
 @dataclass(frozen=True, kw_only=True)
 class NewAirframe:
-    """An airframe that was written.
+    """An airframe and its scenario, as written to files.
 
     Attributes:
         airframe_file: Path of the airframe file.
         scenario_file: Path of the scenario file.
         airframe: The airframe.
-        note: Sentences on the source of the airframe, and on the pairing of inputs and outputs if
-            it is not their order.
-        shortfall: What the first flight lacks, as the first line of the scenario file says; None if
-            the flight ends as planned, clear of the end stops.
+        note: Sentences on the source of the airframe, and on the pairs of inputs and outputs if
+            these are not in order.
+        shortfall: What is wrong with the first flight, as in the first line of the scenario file.
+            It is None if the flight ends as planned, clear of the end stops.
     """
 
     airframe_file: Path
@@ -73,30 +73,30 @@ def new_airframe(
     replace: bool = False,
     **body: str | float,
 ) -> NewAirframe:
-    """Write NAME.yaml, an airframe, and NAME_flight.yaml, a scenario.
+    """Write the airframe NAME.yaml, and a scenario for it, NAME_flight.yaml.
 
-    The scenario has selected gains and has been flown once.
+    The gains of the scenario are selected for the airframe, and the scenario is flown once.
 
     Args:
         source: A state space of python-control or SciPy, or the path of a MATLAB file (.mat), of an
             airframe file (.yaml), or of a text of AVL (system matrix, or stability derivatives) or
             XFLR5 (state matrices).
         folder: Folder of both files.
-        name: Name of the airframe; if empty, that of the file.
-        speed: Trim speed, a number in m/s or with a unit: "176 ft/s".
-        states: Names of the states in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s,
-            theta: rad".
-        inputs: Names of the inputs in the order of B, with units and effects: "elevator: rad nose
-            down, thrust: 1 more thrust".
-        outputs: Outputs, at most as many as inputs: names of states, of rows of C with units ("V:
-            ft/s"), or sums: "q, V = 0.987 u + 0.163 w". If empty, they are q, V, p, r by elevator,
-            thrust, aileron, rudder.
+        name: Name of the airframe. If empty, it is the name of the file.
+        speed: Trim speed, as a number in m/s or with a unit, such as "176 ft/s".
+        states: Names of the states in the order of A, with units, as in "u: ft/s, w: ft/s, q:
+            rad/s, theta: rad".
+        inputs: Names of the inputs in the order of B, with units and effects, as in "elevator: rad
+            nose down, thrust: 1 more thrust".
+        outputs: Outputs, at most as many as inputs. Each is the name of a state, or of a row of C
+            with its unit ("V: ft/s"), or a sum of states ("V = 0.987 u + 0.163 w"). If empty, they
+            are q, V, p and r, paired with elevator, thrust, aileron and rudder.
         thrust: Whether to add an input thrust in units of the weight along the flight path, for a
             model without a thrust.
-        text: Where the figures come from.
-        lag: Lags of the actuators in s, one for all or one for each input; None takes 0.05 s for a
-            control surface and 0.3 s for an engine.
-        replace: Whether files of these names may be replaced.
+        text: Text on the source of the numbers.
+        lag: Lags of the actuators in s, one for all inputs or one for each. If None, it is 0.05 s
+            for a control surface and 0.3 s for an engine.
+        replace: Whether existing files with these names may be replaced.
         body: mass, Ixx, Iyy, Izz, Ixz and density, which the derivatives of AVL need, and AVL's
             unit of length, `length`.
 
@@ -179,7 +179,7 @@ def _require_free(files: Sequence[Path], *, replace: bool) -> None:
 
 
 def _pairing_sentence(airframe: Airframe) -> str | None:
-    """Say how inputs and outputs pair, if an output does not have the input of its place."""
+    """Return a sentence on how inputs and outputs are paired, if not in their order."""
     places = first_flight.pairing(airframe)
     if len(airframe.inputs) != len(airframe.outputs) or places == tuple(range(len(places))):
         return None
@@ -191,11 +191,12 @@ def _pairing_sentence(airframe: Airframe) -> str | None:
 def _flying(
     airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequence[float]
 ) -> tuple[str, Refusal | None]:
-    """Write a scenario with selected gains whose flight ends as planned.
+    """Return the text of a scenario with selected gains whose flight ends as planned.
 
-    The flight keeps clear of the end stops. If there is no such flight, return the scenario with
-    the smallest commands, and what its flight lacks. `trial` is the airframe's file for the trial
-    flights. `files` are airframe and scenario as the text names them.
+    The flight must stay clear of the end stops. If there is no such flight, the scenario has the
+    smallest commands, and the second result says what is wrong with its flight. `trial` is the file
+    of the airframe for the trial flights. `files` are the paths of airframe and scenario that the
+    text names.
     """
     shortfall = None
     scenario = ""
@@ -225,17 +226,17 @@ def _flying(
 
 
 def _stop_shares(flight: Scenario, tape: Tape) -> dict[str, float]:
-    """Return the largest command of each input over its end stop."""
+    """Return the largest command of each input as a fraction of its end stop."""
     stops = zip(flight.aircraft.channels().inputs, flight.aircraft.actuators.upper, strict=True)
     return {key: float(abs(tape["u"][key]).max()) / stop for key, stop in stops}
 
 
 def _shortfall(flight: Scenario, tape: Tape, hardest: str) -> Refusal:
-    """Say what the flight of a scenario lacks.
+    """Return what is wrong with the flight of a scenario, as a sentence.
 
-    The sentence names the input that is at a stop, whether commands or gusts ask for the travel,
-    the state or gust that has the largest share in it, and this share. The input that holds y is u
-    = -Omega^+ C (A x + f), where f includes the gusts.
+    The sentence names the input at a stop, and whether commands or gusts require its travel. It
+    also names the state or gust with the largest share of this travel, and the share. The input
+    that holds y is u = -Omega^+ C (A x + f), where f includes the gusts.
     """
     airframe = flight.aircraft.load()[0]
     calm = simulate(flight.vary(aircraft={"gusts": {}}))

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller in a loop of the user's own, tick by tick.
+"""Use the controller in a loop of the user, tick by tick.
 
-The loop is around a plant that is a function, or in python-control.
+The plant of the loop is a function, or a system of python-control.
 """
 
 import warnings
@@ -44,7 +44,7 @@ deviations from trim."""
 class Loop:
     """The controller behind its guard, with a call for each tick.
 
-    The node runs the same `Controller`, so that u has the same bits.
+    The ROS 2 node runs the same `Controller`, so that u has the same bits.
 
     Args:
         controller: Parameters of the controller, or a mapping of them as in the section
@@ -69,15 +69,16 @@ class Loop:
         self.measured = self.config.measured
         self.period = seconds(self._controller.period_ns)
         self._now_ns = -1  # instant of the last tick
-        # Output of the last tick; None if nothing is to be sent.
+        # Output of the last tick, or None if no u is to be sent.
         self.output: ControlOutput | None = None
-        self.lost: Refusal | None = None  # why a sample of the last tick is lost, if one is
+        self.lost: Refusal | None = None  # why a sample of the last tick is lost, if any is
 
     @property
     def mode(self) -> Mode:
         """Mode of the guard.
 
-        It is WAITING until y and y_m are fresh, then ENGAGED, and a failsafe if they are old.
+        It is WAITING until y and y_m are fresh, then ENGAGED, and a failsafe mode if y or y_m is
+        too old.
         """
         return self._controller.mode
 
@@ -89,20 +90,20 @@ class Loop:
     def step(self, t: float, y: ArrayLike | None, y_m: ArrayLike | None) -> FloatArray:
         """Compute u of a tick at t.
 
-        A sample that no aircraft can give is lost, and so is None. `lost` then has the reason, and
-        the first of several in a row also gives a RuntimeWarning. y and y_m belong to t, which may
-        jitter but never goes back. The failsafe of the guard starts when samples are older than
-        `max_age`.
+        A sample that no aircraft can give is lost. None stands for a sample that is missing. In
+        both cases `lost` has the reason, and the first of several such samples in a row also gives
+        a RuntimeWarning. y and y_m belong to t, which may jitter but must not go back. The failsafe
+        of the guard starts if samples are older than `max_age`.
 
         Args:
             t: Instant of the tick, s.
-            y: Outputs, shape (m,), SI, deviations from trim, in the order of `outputs`; if the
-                observer has vanes, in the order of `measured`. None is a lost sample.
+            y: Outputs, shape (m,), SI, as deviations from trim in the order of `outputs`. If the
+                observer has vanes, the order is that of `measured`. None is a lost sample.
             y_m: Reference, shape (m,), SI, in the order of `outputs`. None is a lost sample.
 
         Returns:
-            u, shape (m,), or (p,) with an allocation, SI, deviation from trim, in the order of
-            `inputs`; 0 before the engagement.
+            u, shape (m,), or (p,) with an allocation, as a deviation from trim in SI. It is in the
+            order of the inputs, or of the effectors, and 0 before the engagement.
 
         Raises:
             ParameterError: t goes back, a length is wrong, or a value is not finite.
@@ -153,7 +154,7 @@ class Loop:
 
         Args:
             value: The sample, shape (k,), SI.
-            key: Name of the sample, for the sentence.
+            key: Name of the sample for the error message.
             names: The k channels.
 
         Returns:
@@ -176,15 +177,16 @@ def fly_plant(
     reference_model: ReferenceModelConfig | Mapping[str, Any],
     duration: float,
 ) -> Tape:
-    """Fly a plant of the user's own under the controller and return the tape.
+    """Fly a plant of the user under the controller, and return the tape.
 
-    `plant(t, u, dt)` advances by dt with u held and returns y; the first call has t = dt = 0.
+    `plant(t, u, dt)` advances by dt with u held, and returns y. The first call has t = dt = 0.
     Outputs and inputs have the order of the controller. If the plant raises FlightEnded, the flight
-    ends early and `outcome` of the tape has the reason. It also says whether errors are larger than
-    the linear loop of y_dot = Omega u allows.
+    ends early, and the `outcome` of the tape has the reason. The outcome also says whether errors
+    are larger than the linear loop around y_dot = Omega u allows.
 
     Args:
-        plant: plant(t, u, dt) -> y: t, dt in s, u (p,), y (m,), SI, deviations from trim.
+        plant: Function (t, u, dt) -> y, with t and dt in s. u has the shape (p,) and y has (m,), as
+            deviations from trim in SI.
         controller: Parameters of the controller, or a mapping as in a scenario.
         reference_model: Parameters of the reference model, or a mapping as in a scenario.
         duration: Duration of the flight, s.
@@ -193,7 +195,8 @@ def fly_plant(
         The tape with y, y_m, u and internals, SI.
 
     Raises:
-        ParameterError: Parameters or y are invalid, or outputs or rates do not fit together.
+        ParameterError: Parameters or y are invalid, or the outputs or rates of the sections do not
+            fit together.
 
     Examples:
         >>> scenario = rise_di.find_scenario("osprey_servo")
@@ -227,7 +230,7 @@ def fly_plant(
 
 
 class _PlantStation:
-    """A plant of the user's own: it publishes y, and holds the last u."""
+    """A plant of the user, which publishes y and holds the last u."""
 
     def __init__(self, plant: Plant, loop: Loop, topics: stations.Topics) -> None:
         self._plant = plant
@@ -242,7 +245,7 @@ class _PlantStation:
         self._u = sample.value
 
     def step(self, t_ns: int) -> None:
-        """See Station."""
+        """Advance the plant to flight time t, and publish y."""
         dt = self._loop.period if t_ns else 0.0
         y = self._plant(seconds(t_ns) - dt, self._u.copy(), dt)
         value = self._loop.vector(y, "y of the plant", self._loop.measured)
@@ -250,7 +253,7 @@ class _PlantStation:
 
 
 class _LoopStation:
-    """A `Loop` that steps with the y and y_m of its instant, and publishes u and internals."""
+    """A `Loop` that steps with y and y_m of the same instant, and publishes u and internals."""
 
     def __init__(self, loop: Loop, topics: stations.Topics) -> None:
         self._loop = loop
@@ -267,7 +270,7 @@ class _LoopStation:
         self._samples[topic] = sample.value
 
     def step(self, t_ns: int) -> None:
-        """See Station."""
+        """Step the loop with the last y and y_m, and publish u and internals."""
         u = self._loop.step(seconds(t_ns), self._samples["y"], self._samples["y_m"])
         if self._loop.output is not None:
             self._topics.publish("u", StampedVector(t_ns, u), t_ns)
@@ -278,9 +281,9 @@ class _LoopStation:
 def _reference_model(
     config: ReferenceModelConfig | Mapping[str, Any], loop: Loop
 ) -> ReferenceModelConfig:
-    """Return the parameters of a reference model with the outputs of a loop.
+    """Return the validated parameters of a reference model for the outputs of a loop.
 
-    Raises ParameterError.
+    Raises ParameterError if they are invalid or have other outputs.
     """
     if not isinstance(config, ReferenceModelConfig):
         config = ReferenceModelConfig.validate_mapping(config, "reference_model")
@@ -292,25 +295,25 @@ def _reference_model(
 def as_control(
     controller: ControllerConfig | Mapping[str, Any], *, linear: bool = False
 ) -> "control.NonlinearIOSystem":
-    """Return the engaged law for python-control, discrete: `y_NAME`, `y_m_NAME` -> `u_NAME`.
+    """Return the engaged law as a discrete system of python-control.
 
-    The law has its limits, its anti-windup and the period of the controller. The state is that of
-    the law, then u and y_m of the last tick; from 0, the flight starts in trim. With an allocation
-    the outputs are the effectors, which are also at the end of the state.
+    The inputs are `y_NAME` and `y_m_NAME`, and the outputs `u_NAME`. The system has limits and
+    anti-windup. Its state is that of the law, then u and y_m of the last tick, and 0 is the
+    engagement in trim. With an allocation the outputs are the effectors, which also end the state.
 
-    If `linear`, the result is the law near e = 0 as a StateSpace from `y_NAME`, for Bode plots and
-    margins. Inside the limits, the effectors are then T u.
+    If `linear`, the result is the law near e = 0 without limits, for Bode plots and margins. It is
+    a StateSpace from `y_NAME`, and the effectors are T u.
 
     Args:
         controller: Parameters of the controller, or a mapping as in a scenario.
-        linear: Whether to return the law near e = 0 as a StateSpace.
+        linear: Whether to return the linear law as a StateSpace.
 
     Returns:
         The system, with inputs and outputs in SI and the period of the controller.
 
     Raises:
-        ParameterError: python-control is missing, the controller has a feedforward, whose model is
-            not part of the law, or `linear` meets the literal sign.
+        ParameterError: python-control is missing, the controller has a feedforward, which is no
+            part of the law, or `linear` is given for the literal sign.
 
     Examples:
         >>> law = rise_di.as_control(rise_di.find_scenario("osprey_servo").controller, linear=True)
@@ -373,7 +376,7 @@ def as_control(
 
 
 def _linear_matrices(config: ControllerConfig) -> tuple[FloatArray, ...]:
-    """Return A, B, C, D of the law near e = 0, from y to the effectors T u."""
+    """Return A, B, C and D of the law near e = 0, from y to the effectors T u."""
     m = len(config.outputs)
     near = linear_law(config.tuned_law(), m, 1.0 / config.rate)
     allocation = config.guard().allocation

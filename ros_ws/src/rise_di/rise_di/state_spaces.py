@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The aircraft of a scenario and its whole loop as state spaces of python-control."""
+"""Return the aircraft of a scenario and its whole loop as state spaces of python-control."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 class LinearSystems(NamedTuple):
-    """The linear loop of a scenario in parts, as discrete systems with the period of the law.
+    """The parts of a scenario's linear loop, as discrete systems with the period of the law.
 
     Attributes:
-        plant: `u_NAME` -> `y_NAME`, SI: the nominal aircraft with the lags and the delay of the
-            controller, exact between the ticks.
-        law: `y_NAME` -> `u_NAME`: the law near e = 0, at y_m = 0.
-        loop: `d_NAME`, added to u, and `n_NAME`, added to the measured y, -> `y_NAME` and
-            `u_NAME`, the u of the law. From n_q to u_elevator it is the law in the loop.
+        plant: The nominal aircraft from `u_NAME` to `y_NAME`, SI. It has the lags and the delay
+            that the controller was told, and is exact between the ticks.
+        law: The law near e = 0 at y_m = 0, from `y_NAME` to `u_NAME`.
+        loop: The closed loop from `d_NAME`, which is added to u, and `n_NAME`, which is added to
+            the measured y, to `y_NAME` and to the u of the law, `u_NAME`.
     """
 
     plant: "control.StateSpace"
@@ -32,9 +32,9 @@ class LinearSystems(NamedTuple):
 
 
 def linear_systems(scenario: Scenario) -> LinearSystems:
-    """Return the linear loop of a scenario for python-control: plant, law, and both closed.
+    """Return plant, law and closed loop of a scenario as linear systems of python-control.
 
-    The margins of `margins` and of `rise-di gains check` are those of this loop, at y_m = 0 and
+    `margins` and `rise-di gains check` compute the margins of this loop. It holds at y_m = 0 and
     inside all limits. With an allocation, `u_NAME` are the channels of the law.
 
     Args:
@@ -59,7 +59,7 @@ def linear_systems(scenario: Scenario) -> LinearSystems:
     linear = scenario_loop(flight, controller)
     A, B, C = sampled_plant(linear.nominal, linear.loop, np.zeros(len(linear.inputs)))
     law = linear.law
-    # With vanes, the law has more measurements.
+    # With vanes, the law has further measurements.
     measured = [*controller.outputs, *controller.vanes][: len(C)]
     y = [f"y_{name}" for name in measured]
     u = [f"u_{name}" for name in linear.inputs]
