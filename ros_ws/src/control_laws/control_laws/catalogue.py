@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Catalogue of the compared laws.
+"""List the compared control laws in a catalogue.
 
-Each row has the measurements, the model data, the tuned gains, and the initial gains of a search.
+For each law it has the measurements, the model data, the tuned gains, and the initial gains of a
+search.
 """
 
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from rise_di_controller.law import law as rise
 from rise_di_controller.law.control_law import ControlLaw
 from rise_di_controller.law.law import Sign
 
-Gains = dict[str, FloatArray]  # gains by name, shape (m, N), or (1, N) for all channels; positive
+Gains = dict[str, FloatArray]  # positive gains by name, (m, N), or (1, N) for all channels
 
 INITIAL_CROSSOVER_LAG_PRODUCT = 0.4
 """Bandwidth times the lag of the loop at the start of a search, rad. The lag then costs 23 degrees
@@ -60,18 +61,18 @@ INTEGRATORS = "integrators"
 
 
 class Law(NamedTuple):
-    """A law."""
+    """A law of the catalogue, with functions that make it and its parameters."""
 
     title: str
-    law: str  # as a scenario names it in controller.law
-    measurements: str  # what it measures of the aircraft; y_m is always known
-    model_data: str  # what it knows of the nominal aircraft; D is always known
+    law: str  # its name in `controller.law` of a scenario
+    measurements: str  # what the law measures of the aircraft; y_m is always known
+    model_data: str  # what the law knows of the nominal aircraft; D is always known
     control_law: Callable[[NominalModel], ControlLaw]
     params: Callable[[Gains, NominalModel], Any]
     tuned: tuple[str, ...]  # names of the gains
     feedforward: str = NONE  # model of the feedforward
-    # gains at which a search begins; None: they follow from the lag of the loop and the constants
-    # above
+    # gains at which a search begins; if None, they follow from the lag of the loop and the
+    # constants above
     initial: Gains | None = None
     linear: bool = True  # whether the law is linear near e = 0
 
@@ -79,13 +80,13 @@ class Law(NamedTuple):
     def has_margins(self) -> bool:
         """Whether the law has a linear loop from y to u.
 
-        A law with more measurements or with the implicit sign has none.
+        A law that measures more than y, or has the implicit sign, has no such loop.
         """
         return self.linear and self.measurements == "y"
 
 
 def initial_gains(law: Law, model: NominalModel) -> Gains:
-    """Return the initial gains of the search, shapes (m, 1) and (1, 1)."""
+    """Return the gains at which the search begins, with the shapes (m, 1), (G, 1) or (1, 1)."""
     if law.initial is not None:
         return law.initial
     K = INITIAL_CROSSOVER_LAG_PRODUCT / model.total_lag[:, None]
@@ -101,10 +102,9 @@ def initial_gains(law: Law, model: NominalModel) -> Gains:
 def _over(
     law_params: Callable[[Gains, NominalModel], Any], part: float = observed.PART
 ) -> Callable[[Gains, NominalModel], ObserverParams]:
-    """Return the function for the parameters of an observer over a law.
+    """Return a function that makes the parameters of an observer that extends a law.
 
-    The observer has the aircraft's model. `law_params` is the function for the law's own
-    parameters.
+    The observer uses the aircraft's model. `law_params` makes the parameters of the law.
     """
     return lambda gains, model: observed.observer_params(
         observed.aircraft_design(gains, model), law_params(gains, model), model, part
@@ -118,7 +118,7 @@ def _extended_state(gains: Gains, model: NominalModel) -> ObserverParams:
 
 
 def _fixed(law: ControlLaw) -> Callable[[NominalModel], ControlLaw]:
-    """Return a function that gives a law for any model."""
+    """Return a function that returns the same law for any model."""
     return lambda _: law
 
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Excitation of the inputs one after the other, in open loop.
+"""Excite the inputs one after the other, in open loop, for an identification.
 
-Doublets and a multisine excite each input for an identification.
+Each input is excited by doublets and a multisine.
 """
 
 from functools import cached_property
@@ -17,26 +17,26 @@ from rise_di_controller.law.control_law import ControlLaw, Measurements, without
 from rise_di_controller.law.saturation import Limits, saturate
 from rise_di_controller.params import ControllerConfig
 
-DOUBLETS = 8.0  # widths in total: a doublet of 2, a gap of 1, the opposite doublet of 4, a gap of 1
+DOUBLETS = 8.0  # total length in widths: doublet 2, gap 1, opposite doublet 4, gap 1
 
 
 class ExcitationParams(NamedTuple):
-    """Timetable over m inputs, (m,), and the harmonics of the multisines, (h, m)."""
+    """The timetable of the m inputs, (m,), and the harmonics of their multisines, (h, m)."""
 
     amplitude: Array  # units of u
     width: Array  # s
-    begin: Array  # s after engagement, when the doublets of an input begin
-    period: Array  # s, period of the multisine, which lasts for one period
-    harmonic: Array  # multiples of 1 / period
+    begin: Array  # time after engagement at which the doublets of an input begin, s
+    period: Array  # period of the multisine, which lasts for one period, s
+    harmonic: Array  # frequencies as multiples of 1 / period
     phase: Array  # rad
-    part: Array  # fraction of the amplitude in each harmonic; 0 for harmonics that an input lacks
+    part: Array  # fraction of the amplitude in each harmonic; 0 if an input lacks it
 
 
 class ExcitationState(NamedTuple):
-    """State between two ticks, (m,)."""
+    """State of the excitation between two ticks, each field with the shape (m,)."""
 
-    e: Array  # y - y_m, for the log; this law does not correct it
-    elapsed: Array  # s since engagement, the same for every input
+    e: Array  # y - y_m for the log, which this law does not correct
+    elapsed: Array  # time since engagement, s, the same for every input
 
 
 def signal(elapsed: Array, params: ExcitationParams) -> Array:
@@ -48,8 +48,8 @@ def signal(elapsed: Array, params: ExcitationParams) -> Array:
         sum_k part_k sin(2 pi harmonic_k (tau - 8) w / period + phase_k) in [8, 8 + period / w)
             a multisine
 
-    A doublet and the multisine have the mean 0, so that a rate proportional to u does not change
-    the attitude in the end.
+    Each doublet and the multisine have the mean 0, so that a rate proportional to u leaves the
+    attitude unchanged in the end.
     """
     xp = array_namespace(params.amplitude)
     since = elapsed - params.begin
@@ -66,11 +66,11 @@ def signal(elapsed: Array, params: ExcitationParams) -> Array:
 def multisine(
     period: float, lowest: float, highest: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return harmonics of 1 / period from `lowest` to `highest`, Hz, their phases and sizes.
+    """Return the harmonics of a multisine, with their phases and sizes, each (h,).
 
-    All have the shape (h,). The sizes are equal, and give the sum a peak of 1. The phases
-    phase_k = -pi k (k - 1) / h keep the peak low. Source: M. R. Schroeder, IEEE Trans. Information
-    Theory 16(1), 1970.
+    The harmonics are all multiples of 1 / period from `lowest` to `highest`, Hz. The sizes are
+    equal, and give the sum a peak of 1. The phases phase_k = -pi k (k - 1) / h keep the peak low.
+    Source: M. R. Schroeder, IEEE Trans. Information Theory 16(1), 1970.
     """
     harmonic = np.arange(
         max(round(lowest * period), 1), max(int(highest * period), 1) + 1, dtype=np.float64
@@ -133,7 +133,7 @@ class ExcitationConfig(ControllerConfig):
         return frozenset()
 
     def check_law(self) -> None:
-        """Check that there is a value per input, inside the limits of u."""
+        """Check that there is a value for each input, and that u stays inside its limits."""
         for key in ("amplitude", "width", "period", "lowest", "highest"):
             require_length(key, getattr(self, key), self.inputs)
         nyquist = self.rate / 2.0
@@ -170,14 +170,14 @@ class ExcitationConfig(ControllerConfig):
 
     @cached_property
     def _each(self) -> list[float]:
-        """Times of the inputs, pause included, s."""
+        """Return the time for each input, including the pause, s."""
         return [
             DOUBLETS * width + period + self.pause
             for width, period in zip(self.width, self.period, strict=True)
         ]
 
     def control_law(self) -> ControlLaw:
-        """Return the excitation."""
+        """Return the excitation as a control law."""
         return EXCITATION
 
     def law_params(self) -> Any:

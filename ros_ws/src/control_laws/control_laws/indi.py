@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Incremental nonlinear dynamic inversion (INDI).
+"""Implement incremental nonlinear dynamic inversion (INDI).
 
 The law takes y, y_m, the measured actuator positions and the nominal Omega.
 """
@@ -20,15 +20,15 @@ from rise_di_controller.params import ControllerConfig
 
 
 class IndiParams(NamedTuple):
-    """Gains over m channels, (m,)."""
+    """Gains of INDI over m channels, each with the shape (m,)."""
 
     K: Array  # 1/s
-    bandwidth: Array  # of both filters, rad/s
-    share: Array  # factor of Omega^-1 in an increment, 1 in the textbook
+    bandwidth: Array  # bandwidth of both filters, rad/s
+    share: Array  # factor of Omega^-1 in an increment, 1 in the literature
 
 
 class IndiState(NamedTuple):
-    """State of the law between two ticks, (m,)."""
+    """State of INDI between two ticks, each field with the shape (m,)."""
 
     y: Array
     y_dot: Array  # difference of y after the filter, units of y / s
@@ -36,15 +36,16 @@ class IndiState(NamedTuple):
 
 
 def control_law(model: NominalModel) -> ControlLaw:
-    """Invert only the increment of y_dot at a tick; the measured y_dot contains the model error.
+    """Return INDI, which inverts only the increment of y_dot at a tick.
 
         y_dot_f    += a ((y - y_p) / dt - y_dot_f),  position_f += a (position - position_f),
             a = 1 - exp(-bandwidth dt)
         u           = position_f + share Omega^-1 (y_m_dot - K e - y_dot_f)
 
-    Both filters are equal, so y_dot_f and position_f belong to the same instant. The law has no
-    integral and so no windup. Source: S. Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6), 2010; E.
-    J. J. Smeur, Q. P. Chu, G. C. H. E. de Croon, JGCD 39(3), 2016, for the filters.
+    The measured y_dot already contains the model error. The two filters are equal, so y_dot_f and
+    position_f belong to the same instant. The law has no integral, so it cannot wind up. Source: S.
+    Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6), 2010; E. J. J. Smeur, Q. P. Chu, G. C. H. E. de
+    Croon, JGCD 39(3), 2016, for the filters.
     """
     inverse = model.inverse
 
@@ -70,7 +71,7 @@ def control_law(model: NominalModel) -> ControlLaw:
 
 
 def indi_params(gains: dict[str, FloatArray], _: NominalModel) -> IndiParams:
-    """Compute parameters from the gains, shapes (m, N)."""
+    """Return the parameters for gains of the shapes (m, N)."""
     return IndiParams(**gains)
 
 

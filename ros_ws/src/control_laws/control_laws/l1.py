@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""L1 adaptive output control from y, y_m and the nominal Omega."""
+"""Implement L1 adaptive output control from y, y_m and the nominal Omega."""
 
 from typing import Any, NamedTuple
 
@@ -21,26 +21,26 @@ ADAPTATION_POLE = 1.0
 
 
 class L1Params(NamedTuple):
-    """Gains over m channels, (m,), and the nominal Omega."""
+    """Gains of L1 over m channels, (m,), and the nominal Omega."""
 
     K: Array  # 1/s
-    bandwidth: Array  # of the low-pass filter C(s), rad/s
+    bandwidth: Array  # bandwidth of the low-pass filter C(s), rad/s
     Omega: Array  # (m, m)
-    inverse: Array  # (m, m), of Omega
+    inverse: Array  # inverse of Omega, (m, m)
 
 
 class L1State(NamedTuple):
-    """State of L1 between two ticks, (m,)."""
+    """State of L1 between two ticks, each field with the shape (m,)."""
 
     e: Array
-    y_before: Array  # y of this tick, for the prediction of the next tick
+    y_before: Array  # y of this tick, from which the next tick predicts
     y_dot_u: Array  # Omega u, with u after saturation
     sigma_hat: Array  # estimate of y_dot - Omega u
     sigma_f: Array  # sigma_hat - sigma_r after the low-pass filter
 
 
 def _control_law(*, feedforward: bool) -> ControlLaw:
-    """Make L1 with piecewise-constant adaptation.
+    """Return the L1 law with piecewise-constant adaptation.
 
         y_hat     = y_p + dt Omega u_p  u_p, y_p of the previous tick
         sigma_hat = -Phi^-1 exp(-a dt) (y_hat - y),  Phi = (1 - exp(-a dt)) / a  a = ADAPTATION_POLE
@@ -49,10 +49,11 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
 
     y_hat is a step of the predictor y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat. This
     sigma_hat cancels the rest of y_hat - y in a tick. The reference input is u_r = u_trim +
-    Omega^-1 y_m_dot; with `feedforward` it is u_trim, which then contains it. u_r already cancels
-    sigma_r, a part of sigma. At engagement sigma_f = -K e, so that u = u_r (bumpless transfer); if
-    y_m_dot = 0, retuning keeps u, too. As anti-windup, the predictor takes u after saturation.
-    Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
+    Omega^-1 y_m_dot. With `feedforward`, u_r = u_trim, which then contains the feedforward. u_r
+    already cancels sigma_r, a part of sigma. At engagement sigma_f = -K e, so that u = u_r
+    (bumpless transfer). If y_m_dot = 0, retuning also keeps u. As anti-windup, the predictor takes
+    u after saturation. Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010,
+    section 3.3.
     """
 
     def engage(measurements: Measurements, params: L1Params) -> L1State:
@@ -111,7 +112,7 @@ CONTROL_LAWS = {feedforward: _control_law(feedforward=feedforward) for feedforwa
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> L1Params:
-    """Return parameters from gains K and bandwidth, shapes (m, N)."""
+    """Return the parameters for the gains K and bandwidth, each (m, N)."""
     return L1Params(gains["K"], gains["bandwidth"], model.Omega, model.inverse)
 
 
@@ -125,7 +126,7 @@ class L1Config(ControllerConfig):
     Omega: Numbers = Field(description="nominal Omega = C B, one row per output")
 
     def check_law(self) -> None:
-        """Check that there is a value per channel, and an Omega with the controller's D."""
+        """Check that there is a value for each channel, and that Omega has the controller's D."""
         for key in ("K", "bandwidth"):
             require_length(key, getattr(self, key), self.outputs)
         m = len(self.outputs)
@@ -149,7 +150,7 @@ class L1Config(ControllerConfig):
         )
 
     def control_law(self) -> ControlLaw:
-        """Return L1, with the feedforward if there is one."""
+        """Return the L1 law, in the form for a feedforward if there is one."""
         return CONTROL_LAWS[self.feedforward is not None]
 
     def law_params(self) -> Any:

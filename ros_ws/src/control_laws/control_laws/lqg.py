@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Linear-quadratic Gaussian control (LQG).
+"""Implement linear-quadratic Gaussian control (LQG).
 
 The observer corrects the trim, and there is no other feedback.
 """
@@ -16,17 +16,17 @@ from rise_di_controller.params import ControllerConfig
 
 
 class LqgParams(NamedTuple):
-    """Empty, because the law has no parameters beside the observer's."""
+    """Parameters of LQG, which are empty because all parameters belong to the observer."""
 
 
 class LqgState(NamedTuple):
-    """Empty, because the law has no state beside the observer's."""
+    """State of LQG, which is empty because the whole state belongs to the observer."""
 
 
 def _limited(
     state: LqgState, measurements: Measurements, dt: Array, params: LqgParams, limits: Limits
 ) -> tuple[LqgState, Array, Array]:
-    """Saturate u = u_trim, shape (m,); u_trim contains u_o of the observer."""
+    """Saturate u = u_trim, shape (m,). u_trim contains u_o of the observer."""
     u, _ = saturate_with_excess(measurements.u_trim, measurements, dt, limits)
     return state, measurements.u_trim, u
 
@@ -41,7 +41,7 @@ CONTROL_LAW = ControlLaw(
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> LqgParams:
-    """Return no parameters, because the law has no gains beside the observer's."""
+    """Return the empty parameters, because all gains belong to the observer."""
     return LqgParams()
 
 
@@ -49,7 +49,7 @@ class LqgConfig(ControllerConfig):
     """The controller under LQG."""
 
     def check_law(self) -> None:
-        """Require an observer, which is the law."""
+        """Check that there is an observer, because it is the whole feedback."""
         require(
             self.observer is not None,
             "observer",
@@ -58,7 +58,7 @@ class LqgConfig(ControllerConfig):
         )
 
     def control_law(self) -> ControlLaw:
-        """Return the law, which the observer extends."""
+        """Return the law u = u_trim, which the observer extends."""
         return CONTROL_LAW
 
     def law_params(self) -> LqgParams:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""LQI: model following by linear-quadratic design with integral action.
+"""Implement LQI, which is model following by linear-quadratic design with integral action.
 
-The law takes the full state x (or x_air) and y_m.
+The law takes y_m and the full state x, or x_air with vanes.
 """
 
 from typing import NamedTuple
@@ -31,17 +31,17 @@ that the cost does not contain must be stable there."""
 
 
 class LqiParams(NamedTuple):
-    """The gain over z = [x, y_m, y_m_dot, integral of e]."""
+    """The gain of LQI on z = [x, y_m, y_m_dot, integral of e]."""
 
     gain: Array  # (m, n + 3 m, 1) or (m, n + 3 m, N)
 
 
 def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
-    """Feed back state and integral: u = -gain [x, y_m, y_m_dot, integral of e].
+    """Return the law u = -gain [x, y_m, y_m_dot, integral of e].
 
-    With `vanes`, x is relative to the air. The integral is a trapezoid with conditional integration
-    (anti-windup): channel i does not integrate while u_i is saturated and the increment has the
-    sign of the excess.
+    With `vanes`, x is relative to the air. The integral uses the trapezoidal rule. As anti-windup
+    by conditional integration, channel i does not integrate while u_i is saturated and the
+    increment has the sign of the excess.
     """
 
     def limited(
@@ -55,7 +55,7 @@ def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
         e = measurements.y - measurements.y_m
         increment = dt * (e + state.e) / 2.0
         integral_e = state.integral_e + increment
-        # This addend gives y_m and y_m_dot a column for each aircraft.
+        # Adding this gives y_m and y_m_dot a column for each aircraft.
         zeros = xp.zeros_like(e)
         z = xp.concat(
             [
@@ -88,7 +88,7 @@ class LqiConfig(ControllerConfig):
 
 
 def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Build the nominal aircraft with the reference and the integral of e: F, G and E.
+    """Return F, G and E of the nominal aircraft with the reference and the integral of e.
 
         z+ = F z + G u
         x_dot   = (A + gravity) x + B u
@@ -97,8 +97,8 @@ def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, Fl
     F is (n + 3 m, n + 3 m), G (n + 3 m, m) and E (2 m, n + 3 m). The model is sampled with u held
     over a period, and the cost is on E z, which is e and the integral of e. In this model an
     angle only decays, angle_dot = -LEAK angle, so that the design takes the angles as measured
-    disturbances. In truth they integrate the controlled rates, but with those rows the integral of
-    e would not be controllable.
+    disturbances. In reality the angles integrate the controlled rates, but with the true rows the
+    integral of e would not be controllable.
     """
     n, m = model.B.shape
     free = 1.0 - model.kinematic[:, None]
@@ -127,8 +127,8 @@ def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:
         Q = 1 / size^2,  Q_i = integral^2 / size^2,  R = (effort / input_scale)^2 / size^2,
             q the integral of e
 
-    `integral` (m, N) is in 1/s; `effort` (m, N) is in s: an input that moves y at the rate a costs
-    as much as an error of `effort` a. `fade` (1, N) is in 1/s. Source: E. Kreindler, D. Rothschild,
+    `integral` (m, N) and `fade` (1, N) are in 1/s, and `effort` (m, N) is in s. An input that moves
+    y at the rate a costs as much as an error of `effort` a. Source: E. Kreindler, D. Rothschild,
     AIAA J. 14(7), 1976, for model following; B. D. O. Anderson, J. B. Moore, "Optimal Control", ch.
     9.
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The acceleration-based RISE inversion of MacKunis et al.
+"""Implement the acceleration-based RISE inversion of MacKunis et al.
 
 The law takes y, y_m, the nominal Omega, and optionally a perfect y_dot.
 """
@@ -21,17 +21,17 @@ from rise_di_controller.params import ControllerConfig
 
 
 class MacKunisParams(NamedTuple):
-    """Gains over m channels, (m,)."""
+    """Gains of the law over m channels, each with the shape (m,)."""
 
     K: Array  # 1/s
     Lambda: Array  # 1/s
     beta: Array  # units of y / s^2
     eps: Array  # half-width of the softened sign, units of y / s
-    bandwidth: Array  # of the filter of the difference, rad/s; unused with a perfect y_dot
+    bandwidth: Array  # bandwidth of the filter of e_dot, rad/s; unused with a perfect y_dot
 
 
 class MacKunisState(NamedTuple):
-    """State of the law between two ticks, (m,)."""
+    """State of the law between two ticks, each field with the shape (m,)."""
 
     e_0: Array
     e: Array
@@ -41,7 +41,7 @@ class MacKunisState(NamedTuple):
 
 
 def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
-    """Make the law with e_dot in the sign term.
+    """Return the law, which has e_dot in the sign term.
 
         r          = e_dot + Lambda e
         Pi        += dt beta clip(r / eps, -1, 1)  the sign, softened: measured r is noisy
@@ -99,10 +99,10 @@ class MacKunisConfig(ControllerConfig):
 
 
 def mackunis_params(gains: dict[str, FloatArray], model: NominalModel) -> MacKunisParams:
-    """Return parameters from the gains of a search.
+    """Return the parameters for the gains of a search.
 
-    The gains are K, Lambda, beta (m, N), softening (1, N) and, without ideal y_dot, filter (1, N),
-    rad/s. eps = beta / K softening: inside eps the sign adds K / softening to K.
+    The gains are K, Lambda and beta (m, N), softening (1, N) and, without a perfect y_dot, filter
+    (1, N), rad/s. With eps = beta / K softening, the sign adds K / softening to K inside eps.
     """
     K = gains["K"]
     beta = gains["beta"]

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The nominal model of a model-based law, and what several laws share.
+"""Define the nominal model of a model-based law, and functions that several laws share.
 
-They share the saturation of u and the anti-windup of integrals. Channels are in the law's order,
-states in the airframe's.
+The functions saturate u, and prevent the windup of integrals. Channels are in the law's order, and
+states are in the airframe's order.
 """
 
 from collections.abc import Callable
@@ -27,19 +27,19 @@ class NominalModel(NamedTuple):
     B: FloatArray  # (n, m)
     C: FloatArray  # (m, n), picks the outputs
     gravity: FloatArray  # (n, n), f(x) = gravity @ sin(x)
-    wind: FloatArray  # (n, G), x_dot for 1 m/s of wind along each axis
-    # (m,) noise of the measured outputs, rms per sample; if they have none, a tenth of the unit of
-    # the score
+    wind: FloatArray  # x_dot for 1 m/s of wind along each of G axes, (n, G)
+    # rms noise of the measured outputs per sample, (m,); if an output has none, a tenth of its unit
+    # in the score
     noise: FloatArray
-    kinematic: FloatArray  # (n,) 1 for an angle that integrates rates, e.g. theta, else 0
-    size: FloatArray  # (n,) unit of a state in adaptation and weights: 1 m/s or 0.1 rad (/s)
-    input_scale: FloatArray  # (m,) u per scaled input
+    kinematic: FloatArray  # 1 for an angle that integrates rates, such as theta, else 0, (n,)
+    size: FloatArray  # unit of each state in weights, (n,): 1 m/s, 0.1 rad or 0.1 rad/s
+    input_scale: FloatArray  # u per scaled input, (m,)
     D: FloatArray  # (m,) +1 or -1
-    lag: FloatArray  # (m,) time constants of the actuators, s
-    total_lag: FloatArray  # (m,) lag of the loop: actuator + 1.5 periods + delay, s
-    period: float  # of the law, s
-    lower: FloatArray  # (m,) limits of u, deviations from trim; infinite without a limit
-    upper: FloatArray  # (m,)
+    lag: FloatArray  # time constants of the actuators, (m,), s
+    total_lag: FloatArray  # lag of the loop, (m,), s: actuator + 1.5 periods + delay
+    period: float  # period of the law, s
+    lower: FloatArray  # least u from trim, (m,); infinite without a limit
+    upper: FloatArray  # largest u from trim, (m,)
 
     @property
     def Omega(self) -> FloatArray:  # noqa: N802 - the paper's name
@@ -54,7 +54,7 @@ class NominalModel(NamedTuple):
 
     @property
     def limits(self) -> Limits:
-        """Limits of u as a law takes them, shape (m, 1); the rate of u is not limited."""
+        """Limits of u for a law, shape (m, 1). The rate of u is not limited."""
         return Limits(
             self.lower[:, None], self.upper[:, None], np.full((len(self.lower), 1), np.inf)
         )
@@ -65,9 +65,9 @@ def campaign_law(
     engage: Callable[[Measurements, Any], Any],
     limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]],
 ) -> ControlLaw:
-    """Make a control law that only campaigns fly, because no topic has its measurements.
+    """Return a control law that only campaigns fly, because no topic has its measurements.
 
-    It cannot be retuned in flight.
+    The law cannot be retuned in flight.
     """
 
     def retune(state: Any, old: Any, new: Any) -> Any:
@@ -79,20 +79,20 @@ def campaign_law(
 
 
 class ErrorIntegral(NamedTuple):
-    """State of a law with an integral of the error between two ticks, (m,)."""
+    """State of a law with an integral of the error, each field with the shape (m,)."""
 
     e: Array
     integral_e: Array
 
 
 def start_integral(measurements: Measurements, _: Any) -> ErrorIntegral:
-    """Return the state at engagement."""
+    """Return the state at engagement, with the present e and an integral of 0."""
     e = measurements.y - measurements.y_m
     return ErrorIntegral(e, array_namespace(e).zeros_like(e))
 
 
 def state_of(measurements: Measurements, *, vanes: bool = False) -> Array:
-    """Return the full state, shape (n, N), with `vanes` relative to the air.
+    """Return the full state, shape (n, N). With `vanes`, it is relative to the air.
 
     Raises ValueError if x is not measured.
     """
@@ -107,14 +107,14 @@ def saturate_with_excess(
 ) -> tuple[Array, Array]:
     """Saturate u, shape (m,).
 
-    Returns the commanded u inside the limits, and the excess of the requested u.
+    Returns the commanded u inside the limits, and how much the given u exceeds it.
     """
     commanded = saturation.saturate(u, measurements.u_before, dt, limits)
     return commanded, u - commanded
 
 
 def conditional_integration(before: Array, after: Array, effect: Array, excess: Array) -> Array:
-    """Choose `before` if effect * excess > 0, else `after`: anti-windup by conditional integration.
+    """Return `before` if effect * excess > 0, else `after`, which is conditional integration.
 
     `effect` is the change of u (or of the scaled input) by the increment. `excess` is the part of u
     beyond the limit, in the same units and channels. Source: K. J. Astrom, T. Hagglund, "Advanced
@@ -126,6 +126,6 @@ def conditional_integration(before: Array, after: Array, effect: Array, excess: 
 def filter_gain(rate: Array, dt: Array) -> Array:
     """Compute 1 - exp(-rate dt), the gain of a first-order low-pass filter in a tick.
 
-    It is exact for a held input.
+    This gain is exact for an input that is held over the tick.
     """
     return -array_namespace(rate).expm1(-rate * dt)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Observers over any law, for many sets of weights at once.
+"""Extend any law by observers, for many sets of weights at once.
 
-Their parameters come from the gains of a search.
+The parameters of the observers come from the gains of a search.
 """
 
 from typing import Any
@@ -32,9 +32,10 @@ s, and time of the fade-in, s. They are the defaults of `ObserverConfig`."""
 def observer_params(
     design: ObserverDesign, law_params: Any, model: NominalModel, part: float = PART
 ) -> ObserverParams:
-    """Make the parameters of an observer over the law of `law_params`, from N designs.
+    """Return the parameters of an observer that extends a law, from N designs.
 
-    u_o is within `part` of the limits.
+    `law_params` has the parameters of the law. u_o stays within the fraction `part` of the limits
+    of u.
     """
 
     def aircraft_last(matrices: FloatArray) -> FloatArray:
@@ -61,7 +62,7 @@ def observer_params(
 def aircraft_design(
     gains: dict[str, FloatArray], model: NominalModel, names: Names | None = None
 ) -> ObserverDesign:
-    """Design observers with the aircraft's model from the gains of a search.
+    """Design observers with the aircraft's model, with weights from the gains of a search.
 
     The gains are effort, drift (m, N), gust, wind_time (G, N) and loose (1, N) or (n, N).
     """
@@ -72,7 +73,7 @@ def aircraft_design(
 def extended_state_design(
     gains: dict[str, FloatArray], model: NominalModel, names: Names | None = None
 ) -> ObserverDesign:
-    """Design observers from Omega and the lags alone.
+    """Design observers that know only Omega and the lags, for the gains of a search.
 
     The gains are effort, drift, rate_drift and decay, each (m, N).
     """

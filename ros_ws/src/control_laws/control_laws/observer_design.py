@@ -1,13 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Design of the observer, for many models and weights at once.
+"""Design the observer, for many models and weights at once.
 
-A design is a model in discrete time with two linear-quadratic gains.
+A design is a model in discrete time with two linear-quadratic gains, that of the estimates and that
+of the feedback.
 
-There are two models: `aircraft_observer` knows A, B, f, wind and lags of an airframe,
-`extended_state_observer` only Omega and lags. A, B, wind and the weights may have leading axes,
-which are broadcast together: N aircraft, or N sets of weights, are N designs. Phi, Gamma, H, L, F
-are the matrices of the observer of `rise_di_controller.extensions.observer`.
+There are two models. `aircraft_observer` knows A, B, f, wind and lags of an airframe, and
+`extended_state_observer` knows only Omega and lags. A, B, wind and the weights may have leading
+axes, which are broadcast together, so that N aircraft or N sets of weights give N designs. Phi,
+Gamma, H, L and F are the matrices of the observer of `rise_di_controller.extensions.observer`.
 """
 
 from collections.abc import Callable
@@ -24,53 +25,53 @@ from rise_di_controller.law.linear_loop import zero_order_hold
 Correction = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
 """A function that computes the gain of `riccati.correction_of`, which is one of them."""
 
-# 1/s, decay of the angles and the disturbances in the model, so that every mode is observable or
+# decay of the angles and the disturbances in the model, 1/s, so that every mode is observable or
 # stable
 LEAK = 0.01
-MIN_LAG = 1e-4  # s, lag of an ideal actuator in the model
-ACTUATOR_NOISE = 1e-6  # rad or 1 per root s, noise of the actuators' positions: negligible
+MIN_LAG = 1e-4  # lag of an ideal actuator in the model, s
+ACTUATOR_NOISE = 1e-6  # negligible noise of the actuators' positions, rad or 1 per root s
 
 
 class Names(NamedTuple):
     """Names of the channels of a model, in the order of the arrays."""
 
-    states: tuple[str, ...]  # n
-    inputs: tuple[str, ...]  # m, in the order of the columns of B
-    outputs: tuple[str, ...]  # m, in the order of the rows of C
-    winds: tuple[str, ...]  # G, axes of the wind
+    states: tuple[str, ...]  # n states
+    inputs: tuple[str, ...]  # m inputs, in the order of the columns of B
+    outputs: tuple[str, ...]  # m outputs, in the order of the rows of C
+    winds: tuple[str, ...]  # G axes of the wind
 
 
 class Weights(NamedTuple):
     """Weights of the design with the aircraft's model.
 
-    The units of the states are `NominalModel.size`, "sizes" below.
+    "sizes" below are the units of the states, `NominalModel.size`.
     """
 
-    effort: FloatArray  # (.., m) error that costs as much as an input of unit response, s
-    drift: FloatArray  # (.., m) noise of the disturbances, sizes/s per root s
-    gust: FloatArray  # (.., G) noise of the wind, m/s per root s
-    wind_time: FloatArray  # (.., G) time constants of the wind, s
-    # (.., n), or (.., 1) for every state: noise of the states that stands for the model error,
-    # sizes per root s
+    effort: FloatArray  # error that costs as much as an input of unit response, (.., m), s
+    drift: FloatArray  # noise of the disturbances, (.., m), sizes/s per root s
+    gust: FloatArray  # noise of the wind, (.., G), m/s per root s
+    wind_time: FloatArray  # time constants of the wind, (.., G), s
+    # noise of the states, which stands for the model error, sizes per root s, (.., n), or (.., 1)
+    # if equal for every state
     loose: FloatArray
 
 
 class ExtendedStateWeights(NamedTuple):
     """Weights of the design without the aircraft's A."""
 
-    effort: FloatArray  # (.., m) as in `Weights`, s
-    drift: FloatArray  # (.., m) noise of the disturbances, sizes/s per root s
-    rate_drift: FloatArray  # (.., m) noise of the disturbances' rates, sizes/s^2 per root s
-    decay: FloatArray  # (.., m) decay of these rates, 1/s
+    effort: FloatArray  # as in `Weights`, (.., m), s
+    drift: FloatArray  # noise of the disturbances, (.., m), sizes/s per root s
+    rate_drift: FloatArray  # noise of the disturbances' rates, (.., m), sizes/s^2 per root s
+    decay: FloatArray  # decay of these rates, (.., m), 1/s
 
 
 class ObserverModel(NamedTuple):
-    """A model of the deviation from the reference, u held over a period.
+    """A model of the deviation from the reference, with u held over a period.
 
     z+ = Phi z + Gamma (u - u_ff), e = H z.
     """
 
-    # names of z, e.g. x.alpha, position.elevator, wind.vertical, disturbance.q
+    # names of the values of z, such as x.alpha, position.elevator, wind.vertical, disturbance.q
     states: tuple[str, ...]
     Phi: FloatArray  # (.., s, s)
     Gamma: FloatArray  # (.., s, m)
@@ -78,7 +79,7 @@ class ObserverModel(NamedTuple):
 
 
 class ObserverDesign(NamedTuple):
-    """A model with gains: z_hat = z + L (e - H z), u - u_ff = -F z_hat.
+    """A model with the gains L and F, z_hat = z + L (e - H z), u - u_ff = -F z_hat.
 
     z+ = Phi z_hat + Gamma (u - u_ff).
     """
@@ -92,15 +93,15 @@ class ObserverDesign(NamedTuple):
 
 
 def aircraft_model(model: NominalModel, names: Names, wind_time: FloatArray) -> ObserverModel:
-    """Model the aircraft around the reference, with actuators, wind and a disturbance per output.
+    """Model the aircraft around the reference, with actuators, wind and output disturbances.
 
         z = [x, position, w, d]
         x_dot        = (A + gravity) x + B position + wind w + C' d
         position_dot = (u - u_ff - position) / lag,  w_dot = -w / wind_time,  d_dot = -LEAK d
 
-    Angles decay with LEAK too. u_ff produces the motion along the reference, so the model holds for
-    small deviations from this motion. s = n + m + G + m. A, B and wind of the model and
-    `wind_time`, (.., G), may have leading axes.
+    Angles also decay with LEAK. u_ff produces the motion along the reference, so the model holds
+    for small deviations from this motion. z has n + m + G + m values. A, B and wind of the model
+    and `wind_time`, (.., G), may have leading axes.
     """
     A, (n, m), G = (
         model.A + model.gravity - LEAK * np.diag(model.kinematic),
@@ -128,15 +129,17 @@ def aircraft_model(model: NominalModel, names: Names, wind_time: FloatArray) -> 
 
 
 def extended_state_model(model: NominalModel, names: Names, decay: FloatArray) -> ObserverModel:
-    """Model outputs as integrals of Omega times the actuators and a second-order disturbance.
+    """Model each output as the integral of Omega times the actuators, plus a disturbance.
+
+    The disturbances are of second order:
 
         z = [x, position, d, d_dot]
         x_dot        = Omega position + d,  position_dot = (u - u_ff - position) / lag
         d_dot        = disturbance_rate - LEAK d,  disturbance_rate_dot = -decay disturbance_rate
 
-    x are the outputs, and s = 4 m. Of the model only Omega, the lags and the period are used.
-    `decay` (.., m) is in 1/s. Source: J. Han, "From PID to Active Disturbance Rejection Control",
-    IEEE Trans. Industrial Electronics 56(3), 2009.
+    x are the outputs, and z has 4 m values. Only Omega, the lags and the period of `model` are
+    used. `decay` (.., m) is in 1/s. Source: J. Han, "From PID to Active Disturbance Rejection
+    Control", IEEE Trans. Industrial Electronics 56(3), 2009.
     """
     m = len(model.C)
     x, p, d, rate = np.split(np.arange(4 * m), 4)
@@ -164,9 +167,9 @@ def _sampled(
     C: FloatArray,
     model: NominalModel,
 ) -> ObserverModel:
-    """Sample a model.
+    """Sample a model in continuous time over a period.
 
-    The states with the numbers p are the positions of the actuators. The outputs are C times the
+    The states with the indices p are the positions of the actuators. The outputs are C times the
     first states.
     """
     lag, (m, n) = np.maximum(model.lag, MIN_LAG), C.shape
@@ -184,10 +187,10 @@ def _sampled(
 def aircraft_observer(model: NominalModel, names: Names, weights: Weights) -> ObserverDesign:
     """Design the observer over `aircraft_model`, with the gains of two Riccati equations.
 
-    F minimises the sum of (e / size)^2 + (effort (u - u_ff) / (input_scale size))^2. L minimises
-    the variance of the estimate. White noise drives the wind (`gust`), the disturbances (`drift`)
-    and the states (`loose`), and e has the noise of the model. Source: H. Kwakernaak, R. Sivan,
-    "Linear Optimal Control Systems", ch. 5 and 6.
+    F minimises the sum of (e / size)^2 + (effort (u - u_ff) / (input_scale size))^2, and L
+    minimises the variance of the estimate. White noise drives the wind (`gust`), the disturbances
+    (`drift`) and the states (`loose`), and e has the noise of the model. Source: H. Kwakernaak, R.
+    Sivan, "Linear Optimal Control Systems", ch. 5 and 6.
     """
     model_by_tick = aircraft_model(model, names, weights.wind_time)
     return ObserverDesign(
@@ -221,12 +224,12 @@ def vane_correction(
     row: FloatArray,
     noise: float,
 ) -> FloatArray:
-    """Compute the gains of a vane that are added to L of `aircraft_correction`, (s, m + 1).
+    """Compute the gains that a vane adds to L of `aircraft_correction`, (s, m + 1).
 
-    They are the gains of the filter of y and the vane, minus those of the filter of y alone. The
-    last column acts on the vane. The reading of the vane minus that of the reference motion is
-    `row` z, with `row` (s,), plus white noise with the rms `noise`. `weights` are those without and
-    with the vane.
+    They are the gains of the observer of y and the vane, minus those of the observer of y alone.
+    The last column acts on the vane. The reading of the vane, minus the reading in the reference
+    motion, is `row` z plus white noise with the rms `noise`. `row` has the shape (s,). `weights`
+    has the weights without the vane, and then those with the vane.
     """
     without_vane = aircraft_correction(model_by_tick, model, weights[0])
     with_vane = model_by_tick._replace(H=np.vstack([model_by_tick.H, row]))
@@ -272,9 +275,10 @@ def _correction(
     intensities: list[FloatArray],
     correction: Correction = correction_of,
 ) -> FloatArray:
-    """Compute L for white noise of these intensities, shapes (.., k).
+    """Compute L for white noise that acts on the states.
 
-    The noise acts on the states in their order, SI per root s.
+    `intensities` has the noise of groups of k states, (.., k), in the order of the states, SI per
+    root s.
     """
     batch = np.broadcast_shapes(*(intensity.shape[:-1] for intensity in intensities))
     process = np.concatenate(

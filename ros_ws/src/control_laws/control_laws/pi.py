@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""PI control of the outputs: RISE-DI without the sign term."""
+"""Implement PI control of the outputs, which is RISE-DI without the sign term."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from rise_di_controller.params import ControllerConfig
 
 
 class PiParams(NamedTuple):
-    """Parameters over m channels, (m,)."""
+    """Parameters of PI control over m channels, each with the shape (m,)."""
 
     K: Array  # 1/s
     Lambda: Array  # 1/s
@@ -25,15 +25,15 @@ class PiParams(NamedTuple):
 
 
 class PiState(NamedTuple):
-    """State of the law between two ticks, (m,)."""
+    """State of PI control between two ticks, each field with the shape (m,)."""
 
-    e_0: Array  # e at engagement, changed by a retuning
+    e_0: Array  # e at engagement, which a retuning changes
     e: Array
     integral_e: Array
 
 
 def _u(state: PiState, params: PiParams) -> Array:
-    """Compute u from trim, shape (m,): -input_scale D K (e - e_0 + Lambda integral of e)."""
+    """Compute u - u_trim, shape (m,), as -input_scale D K (e - e_0 + Lambda integral of e)."""
     return (
         -params.input_scale
         * params.D
@@ -50,9 +50,9 @@ def _engage(measurements: Measurements, params: PiParams) -> PiState:
 def _limited(
     state: PiState, measurements: Measurements, dt: Array, params: PiParams, limits: Limits
 ) -> tuple[PiState, Array, Array]:
-    """Compute PI: u = u_trim - input_scale D K (e - e_0 + Lambda integral of e).
+    """Advance the law by a tick: u = u_trim - input_scale D K (e - e_0 + Lambda integral of e).
 
-    The integral is a trapezoid with anti-windup (`limited_integral`).
+    The integral uses the trapezoidal rule, with the anti-windup of `limited_integral`.
     """
     e = measurements.y - measurements.y_m
     after = PiState(state.e_0, e, state.integral_e + dt * (e + state.e) / 2.0)
@@ -75,9 +75,9 @@ def _limited(
 
 
 def _retune(state: PiState, old: PiParams, new: PiParams) -> PiState:
-    """Keep u with new parameters (bumpless transfer).
+    """Return the state for new parameters, without a jump of u (bumpless transfer).
 
-    e_0 takes the difference, so that Lambda may be 0.
+    e_0 takes up the change, so that Lambda may be 0.
     """
     start_error = -new.D * _u(state, old) / (new.input_scale * new.K)
     return state._replace(e_0=state.e + new.Lambda * state.integral_e - start_error)
@@ -89,7 +89,7 @@ CONTROL_LAW = ControlLaw(
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> PiParams:
-    """Return parameters from gains K and Lambda, shapes (m, N)."""
+    """Return the parameters for the gains K and Lambda, each (m, N)."""
     return PiParams(gains["K"], gains["Lambda"], model.D[:, None], model.input_scale[:, None])
 
 
@@ -100,12 +100,12 @@ class PiConfig(ControllerConfig):
     Lambda: NonNegatives = Field(description="integral gains over proportional ones, 1/s")
 
     def check_law(self) -> None:
-        """Check that there is a value per channel."""
+        """Check that each parameter has a value for each channel."""
         for key in ("K", "Lambda"):
             require_length(key, getattr(self, key), self.outputs)
 
     def control_law(self) -> ControlLaw:
-        """Return PI control."""
+        """Return PI control as a control law."""
         return CONTROL_LAW
 
     def law_params(self) -> PiParams:

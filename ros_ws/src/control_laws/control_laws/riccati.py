@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Linear-quadratic design for many models and sets of weights at once.
+"""Solve linear-quadratic designs for many models and sets of weights at once.
 
-It solves the discrete Riccati equation.
+The discrete Riccati equation is solved by doubling.
 
 In each function the leading axes of the arguments are broadcast together.
 """
@@ -11,19 +11,19 @@ import numpy as np
 
 from flight_core.vectors import FloatArray
 
-MAX_DOUBLINGS = 40  # a horizon of 2^40 steps: enough for a mode that decays within 1e9 steps
+MAX_DOUBLINGS = 40  # 2^40 steps are enough for a mode that decays within 1e9 steps
 
 
 def riccati(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
-    """Solve for the stabilising P = F'P F - F'P G (R + G'P G)^-1 G'P F + Q, shape (.., s, s).
+    """Find the stabilising P = F'P F - F'P G (R + G'P G)^-1 G'P F + Q, shape (.., s, s).
 
-    A doubling squares the transition over the horizon. With W = I + G_k P_k,
+    Each iteration doubles the horizon. With W = I + G_k P_k,
 
         P+ = P + F'P W^-1 F,  G+ = G + F W^-1 G F',  F+ = F W^-1 F,  from G R^-1 G', Q and F
 
     scipy.linalg.solve_discrete_are solves a single equation at a time and is eight times slower.
-    Shapes: F, Q (.., s, s), G (.., s, m), R (.., m, m). Source: E. K.-W. Chu, H.-Y. Fan, W.-W. Lin,
-    C.-S. Wang, Int. J. Control 77(8), 2004.
+    F and Q have the shape (.., s, s), G has (.., s, m), and R has (.., m, m). Source: E. K.-W. Chu,
+    H.-Y. Fan, W.-W. Lin, C.-S. Wang, Int. J. Control 77(8), 2004.
     """
     batch = np.broadcast_shapes(*(matrix.shape[:-2] for matrix in (F, G, Q, R)))
     F, G, P, R = (np.broadcast_to(matrix, (*batch, *matrix.shape[-2:])) for matrix in (F, G, Q, R))
@@ -45,19 +45,19 @@ def riccati(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> Float
 
 
 def transpose(matrix: FloatArray) -> FloatArray:
-    """Transpose matrices (.., n, m), shape (.., m, n)."""
+    """Transpose matrices (.., n, m). The result has the shape (.., m, n)."""
     return np.swapaxes(matrix, -1, -2)
 
 
 def diagonal(values: FloatArray) -> FloatArray:
-    """Make diagonal matrices, (.., s, s), of diagonals (.., s)."""
+    """Return diagonal matrices, (.., s, s), with the diagonals `values`, (.., s)."""
     return np.asarray(values[..., :, None] * np.eye(values.shape[-1]))
 
 
 def gain_of(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
     """Compute the gain (R + G'P G)^-1 G'P F of u = -gain z, shape (.., m, s).
 
-    It minimises the sum of z'Q z + u'R u.
+    This u minimises the sum of z'Q z + u'R u for z+ = F z + G u.
     """
     P = riccati(F, G, Q, R)
     return np.asarray(np.linalg.solve(R + transpose(G) @ P @ G, transpose(G) @ P @ F))
@@ -80,9 +80,9 @@ def correction_of(
 def corrections_near(
     F: FloatArray, H: FloatArray, process: FloatArray, noise: FloatArray
 ) -> FloatArray:
-    """Compute the gains of `correction_of` for models close to the first model.
+    """Compute the gains of `correction_of` for models that are close to the first model.
 
-    The gains are exact to first order in the difference.
+    The gains are exact to first order in the difference from the first model.
 
     With the gain K of the first model and A = F (I - K H), the covariance of a model with F_i is S
     + dS,
@@ -90,7 +90,7 @@ def corrections_near(
         dS = A dS A' + F_i (I - K H) S (I - K H)'F_i' + F_i K noise K'F_i' + process_i - S
 
     because S is the minimum over the gains, so a change of the gain has only an effect of second
-    order. The first axis of F and process is that of the models. Source: D. L. Kleinman, IEEE TAC
+    order. F and `process` have the models in their first axis. Source: D. L. Kleinman, IEEE TAC
     13(1), 1968.
     """
     S = riccati(transpose(F[:1]), transpose(H), process[:1], noise)

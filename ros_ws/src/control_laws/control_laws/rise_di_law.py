@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of RISE-DI for many aircraft or many sets of gains."""
+"""Compute the parameters of RISE-DI for many aircraft or many sets of gains."""
 
 import numpy as np
 
@@ -10,10 +10,10 @@ from rise_di_controller.law.law import LawParams
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> LawParams:
-    """Compute parameters from the gains of a search, in scaled inputs.
+    """Return the parameters of RISE-DI for the gains of a search, in scaled inputs.
 
-    The gains are K, Lambda, beta (m, N) and softening, (m, N) or (1, N), or omega (1, N). eps =
-    beta / K softening total_lag.
+    The gains are K, Lambda, beta (m, N) and either softening, (m, N) or (1, N), or omega (1, N).
+    With softening, eps = beta / K softening total_lag.
     """
     K = gains["K"]
     beta = gains["beta"]
