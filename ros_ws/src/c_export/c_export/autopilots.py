@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller of body rates inside an autopilot.
+"""Write a controller of body rates that runs inside an autopilot.
 
 It has three parts: the exported C code, source/rates, which decides which controller flies, and the
 shell for the autopilot, source/px4 or source/ardupilot.
@@ -20,10 +20,10 @@ from flight_core.parameters import require
 AXES: Mapping[str, int] = MappingProxyType({"p": 0, "q": 1, "r": 2})
 """Channels of y, and the axes of autopilots that they are: roll, pitch, yaw."""
 
-# number of samples that are kept. y_m is stepped past each y, so a tick only needs the newest y and
+# Number of samples that are kept. y_m is stepped past each y, so a tick only needs the newest y and
 # two samples of y_m.
 SAMPLES = 8
-# speeds in units of the trim speed. The dynamic pressure is clipped to its values at these speeds.
+# Speeds in units of the trim speed. The dynamic pressure is clipped to its values at these speeds.
 SLOWEST, FASTEST = 0.6, 1.6
 
 HOOKS = """ArduPlane/Plane.h, in class Plane, beside void stabilize();
@@ -50,7 +50,7 @@ float64 y_m_offset       # [s] of the newest y_m after y
 float32 rate             # [Hz] of the samples of the rates, measured; 0: not yet
 """
 
-# PX4 logs these topics in place of its default ones, each with its least interval in ms.
+# PX4 logs these topics instead of its default topics, each with its least interval in ms.
 TOPICS = """rise_di_status
 vehicle_angular_velocity
 vehicle_torque_setpoint
@@ -177,7 +177,8 @@ def write_module(
     """Write the module of an autopilot to a folder.
 
     For PX4 the folder is EXTERNAL_MODULES_LOCATION. For ArduPlane it has files for the source tree,
-    and hooks.txt with two lines to add to the tree. Raises ParameterError.
+    and hooks.txt with two lines to add to the tree. Raises ParameterError if the scenario does not
+    suit the autopilot, or if a file cannot be written.
 
     The outputs are body rates. A u at the upper end stop of its actuator is a torque of 1 with the
     sign of D, and in ArduPlane a deflection of 45 degrees. In PX4, the controller that stands by is
@@ -212,7 +213,7 @@ def write_module(
 
 
 def _words_of_vehicle(autopilot: str, scenario: Scenario) -> Mapping[str, str]:
-    """Return words of the shell to replace: those of a multicopter, or none for a fixed wing.
+    """Return the words to replace in the shell, for a multicopter, or none for a fixed wing.
 
     A fixed wing has a trim speed. A multicopter has none, and its inputs are torques about the
     axes. Raises ParameterError if the aircraft is neither.
@@ -236,14 +237,14 @@ def _words_of_vehicle(autopilot: str, scenario: Scenario) -> Mapping[str, str]:
 
 
 def _with_words(text: str, words: Mapping[str, str]) -> str:
-    """Replace words in a text."""
+    """Replace each word of `words` in a text by its value."""
     for word, replacement in words.items():
         text = text.replace(word, replacement)
     return text
 
 
 def _axes(scenario: Scenario, suffix: str) -> str:
-    """Write rise_di_axes.h: the axes, the torque per unit of u, and the speed for this torque."""
+    """Write rise_di_axes.h, with the axes, the torque per unit of u, and the speed for it."""
     controller = scenario.controller
     channels = scenario.aircraft.channels()
     upper = dict(zip(channels.inputs, scenario.aircraft.actuators.upper or (), strict=False))

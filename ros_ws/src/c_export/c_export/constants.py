@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of the controller and the reference model in C.
+"""Write the parameters of the controller and the reference model in C.
 
-They become rise_di_parameters.h, or the bytes of struct rise_di_parameters.
+The result is rise_di_parameters.h, or the bytes of struct rise_di_parameters.
 """
 
 import math
@@ -37,7 +37,7 @@ SCALARS = frozenset(
 """Reals that are not lists."""
 
 LEAST, LARGEST = -math.inf, math.inf
-POSITIVE = float(np.finfo(np.float32).tiny)  # positive in float32, and so in float64
+POSITIVE = float(np.finfo(np.float32).tiny)  # positive in float32, and therefore also in float64
 TABLE: Mapping[str, tuple[str, float, float]] = MappingProxyType(
     dict.fromkeys(("period", "dt_least", "dt_largest", "time"), ("s", POSITIVE, LARGEST))
     | dict.fromkeys(("K", "Lambda"), ("1/s", POSITIVE, LARGEST))
@@ -85,7 +85,7 @@ REALS: Mapping[str, float] = MappingProxyType(
 class Constant(NamedTuple):
     """A member of struct rise_di_parameters.
 
-    Its value is one or more whole numbers (int, tuple), or reals (array). A matrix is stored row by
+    Its value is one or several integers (int, tuple), or reals (array). A matrix is stored row by
     row.
     """
 
@@ -124,9 +124,10 @@ IN_C = frozenset(
 
 IDLE_IN_C = frozenset(
     {
-        # These say how the node runs. The caller of the C code configures and activates it.
+        # These keys say how the node runs. In C, the caller of the code configures and activates
+        # it.
         *("lockstep", "y_rate", "autostart", "start_active"),
-        # Only a learner reads how well the model is known.
+        # Only a learner reads these keys, which say how well the model is known.
         "feedforward.deviation",
     }
 )
@@ -198,7 +199,7 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
     }
     reals |= {"y_max": guard.samples.largest, "y_reach": guard.samples.reach}
     reals |= _limits("limits", guard.limits)
-    # The extensions, if there are any.
+    # Add the extensions, if there are any.
     if (allocation := guard.allocation) is not None:
         integers["order"] = allocation.order
         reals |= {name: getattr(allocation, name) for name in ("T", "effect", "exchange")}
@@ -218,7 +219,7 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
     if isinstance(law_params, ObserverParams):
         reals |= {name: getattr(law_params, name) for name in ("Phi", "Gamma", "H", "L", "F")}
         reals |= _limits("observer_limits", law_params.limits) | {"fade_rate": law_params.fade_rate}
-    # Whole numbers come first.
+    # Integers come first.
     arrays = [
         Constant(name, np.array(value, dtype=np.float64).ravel()) for name, value in reals.items()
     ]
@@ -232,7 +233,7 @@ def _limits(name: str, limits: Limits) -> dict[str, FloatArray]:
 def packed(controller: RiseDiConfig, *, float32: bool) -> bytes:
     """Return the bytes of struct rise_di_parameters.
 
-    The struct has whole numbers of 64 bits, then the reals without a gap, and is padded to 8 bytes.
+    The struct has integers of 64 bits, then the reals without a gap, and is padded to 8 bytes.
     """
     real = np.float32 if float32 else np.float64
     content = b"".join(
@@ -272,7 +273,7 @@ def header(
     float32: bool,
     samples: int = SAMPLE_BUFFER_SIZE,
 ) -> str:
-    """Write rise_di_parameters.h. If `reference` is None, it has no reference model.
+    """Return the text of rise_di_parameters.h, without reference model if `reference` is None.
 
     The code keeps `samples` samples of y, and as many of y_m.
     """
@@ -328,7 +329,7 @@ def header(
 
 
 def _names_and_sizes(controller: RiseDiConfig, r: int, samples: int, *, float32: bool) -> list[str]:
-    """Write the lines with the names of the channels, the dimensions, and what is compiled."""
+    """Return the lines with the channel names, the dimensions, and the switches for compilation."""
     dimensions = sizes(controller)
     m, p, n, s = dimensions.m, dimensions.p, dimensions.n, dimensions.s
     effectors = [f"#define RISE_DI_EFFECTORS {_strings(controller.effectors)}"] if p else []
@@ -360,7 +361,7 @@ def _macro(name: str, parts: list[str], *, braces: bool = True) -> list[str]:
 
 
 def _rows(members: list[Constant], numbers: Callable[[FloatArray], str]) -> list[str]:
-    """Return the initialisers of the parameter table, in the order of the reals of the struct."""
+    """Return the rows of the parameter table in C, in the order of the reals of the struct."""
     rows = []
     place = 0
     for name, value in members:
@@ -375,7 +376,7 @@ def _rows(members: list[Constant], numbers: Callable[[FloatArray], str]) -> list
 def _initialiser(
     name: str, value: int | tuple[int, ...] | FloatArray, numbers: Callable[[FloatArray], str]
 ) -> str:
-    """Write a number, or a list in braces, as C initialises it.
+    """Return the C initialiser of a number, or of a list in braces.
 
     The first and the last list of a nested struct also open and close the braces of the struct.
     """
@@ -391,7 +392,7 @@ def _initialiser(
 
 
 def _strings(names: tuple[str, ...]) -> str:
-    """Write string literals of C.
+    """Return names as string literals of C.
 
     If a character is not a letter, a digit or one of "_. ", each of its bytes becomes an octal
     escape. The names of a parameter set have no such characters.
@@ -407,5 +408,5 @@ def _octal(character: str) -> str:
 
 
 def _comment(names: tuple[str, ...]) -> str:
-    """Write names for a comment in C. Because of the escapes of `_strings`, no name can end it."""
+    """Return names for a comment in C. The escapes of `_strings` keep a name from ending it."""
     return ", ".join("".join(map(_octal, name)) for name in names)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Drawn inputs for the proof.
+"""Draw random inputs for the proof.
 
 They are calls of a controller with any timing, and single steps from any state.
 """
@@ -38,7 +38,7 @@ from rise_di_controller.law.control_law import Measurements, fields, restored
 from rise_di_controller.law.saturation import saturate
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# Start of the drawn stamps. At this size float64 does not resolve 1 ns.
+# Start of the drawn stamps, which is so large that float64 does not resolve 1 ns.
 EPOCH_NS = 1_795_000_000_000_000_000
 
 
@@ -79,7 +79,7 @@ def drawn_calls(
             if draw[4] < 0.92 and not silence:
                 late = rng.uniform(-0.1, 0.4 * draw[6])
                 first = 2 - int(3.0 * draw[5])
-                for distance in (0.3, 0.02, 0.0)[first:]:  # also closer than a slope of y_m allows
+                for distance in (0.3, 0.02, 0.0)[first:]:  # some too close for a slope
                     stamp_m_ns = now_ns - round(period_ns * (late + distance))
                     recorder.take_y_m(
                         StampedVector(stamp_m_ns, y_m * rng.uniform(0.9, 1.1)), now_ns
@@ -91,7 +91,7 @@ def drawn_calls(
                 stamp_ns = stamp_m_ns if draw[8] < 0.1 else now_ns - round(period_ns * late)
                 y = y_m + size * rng.normal(size=m) + airspeed * rng.uniform(-1.0, 1.0)
                 recorder.take_y(StampedVector(stamp_ns, y + next(jumps)), now_ns)
-        # Draw new parameters, an engagement, a new begin, or a deactivation.
+        # Draw new parameters, a new engagement, a new controller, or a deactivation.
         if draw[9] < 0.01:
             recorder.retune_to(int(rng.integers(len(sets))))
         elif draw[9] < 0.02:
@@ -109,8 +109,8 @@ def drawn_calls(
 def _interval_ns(kind: float, size: float, period_ns: int) -> int:
     """Return the time to the next tick, ns.
 
-    This time is a period with jitter, a time far from a period, or a long pause. `kind` and `size`
-    are drawn from 0 to 1.
+    The time is a period with jitter, or far from a period, or a long pause. `kind` and `size`,
+    which are drawn from 0 to 1, determine it.
     """
     if kind < 0.9:
         return round(period_ns * (1.0 + 0.2 * (size - 0.5)))
@@ -123,8 +123,8 @@ def _interval_ns(kind: float, size: float, period_ns: int) -> int:
 def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
     """Yield the jumps that are added to samples of y, (m,).
 
-    A jump begins at one sample in 50 and lasts for some samples. It is up to 10^5 units, so that
-    these samples are lost.
+    A jump begins at one sample in 50 and lasts for some samples. It is up to 10^5 units large, so
+    that these samples are lost.
     """
     m = len(unit)
     offset = np.zeros_like(unit)
@@ -141,7 +141,7 @@ def drawn_standstill(
 ) -> Recording:
     """Draw samples of y with noise, and stretches of up to twelve equal samples.
 
-    The samples come at the ticks and half a period before them.
+    The samples arrive at the ticks and half a period before the ticks.
     """
     rng = np.random.default_rng(seed)
     period_ns = sets[0].guard().period_ns
@@ -162,11 +162,11 @@ def drawn_standstill(
 
 
 def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int) -> Recording:
-    """Draw single steps of an engaged controller from any state, and compute them at once.
+    """Draw single steps of an engaged controller from any state, and compute all at once.
 
     The parameters are those at `index` in `sets`. Errors are 0.001 to 300 widths of the softened
-    sign. dt is 0.2 to 10 periods, so that up to 9 samples are missing. It is at most so long that
-    the law does not engage again.
+    sign. dt is 0.2 to 10 periods, so that up to 9 samples are missing. It is always short enough
+    that the law does not engage again.
     """
     rng = np.random.default_rng(seed)
     guard = sets[index].guard()
@@ -251,14 +251,14 @@ def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Re
 
 
 def _rows(values: Mapping[str, FloatArray], groups: Sequence[str]) -> FloatArray:
-    """Return the values of groups (values, steps) as rows (steps, w), in the groups' order."""
+    """Return the values of groups, each (values, steps), as rows (steps, w), in that order."""
     return np.ascontiguousarray(np.vstack([values[name] for name in groups]).T)
 
 
 def _drawn_states(
     controller: RiseDiConfig, rng: np.random.Generator, dt_ns: NDArray[np.int64]
 ) -> tuple[dict[str, FloatArray], FloatArray, FloatArray]:
-    """Draw states by group, y and y_m, each of shape (values, steps)."""
+    """Draw states by group, y and y_m, each with the shape (values, steps)."""
     m = len(controller.outputs)
     steps = len(dt_ns)
     eps = controller.law_params().eps[:, None]
@@ -303,7 +303,7 @@ def _states_after(
     y_m: FloatArray,
     dt_ns: NDArray[np.int64],
 ) -> dict[str, FloatArray]:
-    """Return the states after a step of the guard, by its functions over all columns."""
+    """Return the states after a step, computed by the guard's functions for all columns at once."""
     guard = controller.guard()
     law = controller.tuned_law()
     period = seconds(guard.period_ns)
@@ -337,7 +337,7 @@ def _states_after(
         state, measurements, dt, params, limits
     )
     u, effectors = _effector_values(np.where(is_limited, u_limited, u), last, dt, guard.allocation)
-    # Collect the state afterwards, and the output of the tick.
+    # Collect the state after the step, and the output of the tick.
     after = {
         **before,
         "u": u,
@@ -362,7 +362,7 @@ def _feedforward_step(
     y_m: FloatArray,
     dt: FloatArray,
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return u_ff after a step of the feedforward, and the states of its model, by column."""
+    """Return u_ff after a step of the feedforward, and its states by name, column by column."""
     if nominal is None:
         return before["u_ff"], {}
     x, u, dt_before, ticks, u_0 = (
@@ -381,7 +381,7 @@ def _feedforward_step(
 def _effector_values(
     u: FloatArray, before: FloatArray | None, dt: FloatArray, params: Allocation | None
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Return the u of the effectors for a u, and the effectors, by column.
+    """Return the u that the effectors give for a demanded u, and the effectors, by column.
 
     Without an allocation, these are u and None.
     """
@@ -401,7 +401,7 @@ def _columns(params: Any) -> Any:
 
 
 def _where(mask: NDArray[np.bool_], here: Any, otherwise: Any) -> Any:
-    """Choose, for each step, the state `here` if the mask is true, else `otherwise`."""
+    """Return, for each step, the state `here` if the mask is true, else `otherwise`."""
     if hasattr(here, "_asdict"):
         return type(here)(*(_where(mask, *pair) for pair in zip(here, otherwise, strict=True)))
     return np.where(mask, here, otherwise)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Calls of a controller in order, as events, with the state after each tick.
+"""Record the calls of a controller as events, with the state after each tick.
 
-They come from flights with faults, or from a log.
+The calls come from flights with faults, or from a log.
 """
 
 from collections import deque
@@ -35,7 +35,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 START, TAKE_Y, TAKE_Y_M, TICK, RETUNE, RESTART, GUARD_TICK, LOAD, TAKE_U_M, STEP_REFERENCE = range(
     10
 )
-REFUSALS = 1 << 20  # a bit for each of 20 samples since the last tick
+REFUSALS = 1 << 20  # 20 bits, one for each sample since the last tick
 INTEGERS = (
     "published",
     "refused",
@@ -53,17 +53,17 @@ NOTHING = np.zeros(0)
 
 
 class Recording(NamedTuple):
-    """Events, and the state after each of the T ticks of a controller or a reference model.
+    """The events of a controller or a reference model, and its state after each of T ticks.
 
-    The states are those of the Python code.
+    The states are computed by the Python code.
     """
 
     name: str
     names: tuple[str, ...]  # names of the integers and the reals
-    events: NDArray[np.void]  # of `event_type`
+    events: NDArray[np.void]  # events, of the type `event_type`
     integers: NDArray[np.int64]  # (T, i)
-    reals: FloatArray  # (T, w); the first reals are u or y_m
-    loaded: FloatArray = NOTHING  # reals of the states before the ticks, which the event LOAD loads
+    reals: FloatArray  # (T, w), of which the first are u or y_m
+    loaded: FloatArray = NOTHING  # states before the ticks, which the event LOAD loads
 
     @property
     def ticks(self) -> int:
@@ -101,7 +101,7 @@ def state_names(controller: RiseDiConfig) -> tuple[str, ...]:
 
 
 def numbered(groups: Mapping[str, int]) -> Iterator[str]:
-    """Yield the names of the values of groups: u[0], u[1], ..."""
+    """Yield a name for each value of the groups, such as u[0], u[1], ..."""
     for group, count in groups.items():
         yield from (f"{group}[{i}]" for i in range(count))
 
@@ -109,9 +109,10 @@ def numbered(groups: Mapping[str, int]) -> Iterator[str]:
 class Recorder(Controller):
     """A controller that records its calls and its states.
 
-    `sets` are the parameter sets that `retune_to` can take. The recorder starts with the first one.
-    `before_tick` is called with the recorder and the instant before each tick, and returns whether
-    the controller is active. `samples` samples of y, and as many of y_m, are kept.
+    `sets` are the parameter sets that `retune_to` can choose, and the recorder starts with the
+    first set. `before_tick` is called before each tick with the recorder and the instant. It
+    returns whether the controller is active. `samples` is the number of samples of y, and of y_m,
+    that are kept.
     """
 
     def __init__(
@@ -124,7 +125,7 @@ class Recorder(Controller):
         self._reset(sets[0])
         self.sets = sets
         self._before_tick = before_tick
-        self.silent: frozenset[str] = frozenset()  # topics whose samples get lost: y, y_m
+        self.silent: frozenset[str] = frozenset()  # topics, y or y_m, whose samples get lost
         self._events: list[tuple[Any, ...]] = []
         self._integers: list[tuple[int, ...]] = []
         self._reals: list[FloatArray] = []
@@ -158,14 +159,14 @@ class Recorder(Controller):
         self._add(START)
 
     def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """Take y as the controller does, unless y is silent."""
+        """Take y as the controller does, or lose the sample if y is silent."""
         if "y" in self.silent:
             return None
         self._add(TAKE_Y, now_ns, sample.stamp_ns, y=sample.value)
         return self._note_refusal(super().take_y, sample, now_ns)
 
     def take_y_m(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """Take y_m as the controller does, unless y_m is silent."""
+        """Take y_m as the controller does, or lose the sample if y_m is silent."""
         if "y_m" in self.silent:
             return None
         self._add(TAKE_Y_M, now_ns, sample.stamp_ns, y_m=sample.value)
@@ -192,12 +193,12 @@ class Recorder(Controller):
         self.retune(self.sets[index])
 
     def restart(self) -> None:
-        """Restart as the controller does."""
+        """Restart as the controller does, and record it."""
         self._add(RESTART)
         super().restart()
 
     def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
-        """Compute a tick, after `before_tick`."""
+        """Call `before_tick`, then compute and record a tick."""
         active = self._before_tick(self, now_ns) and active
         self._add(TICK, now_ns, flag=int(active))
         output = super().tick(now_ns, late_ns, active=active)
@@ -207,10 +208,10 @@ class Recorder(Controller):
     def guard_tick(
         self, now_ns: int, sample: tuple[int, FloatArray, FloatArray, int] | None, *, active: bool
     ) -> None:
-        """Record a tick with a sample: its stamp, y, y_m at the stamp, and an offset.
+        """Compute a tick of the guard with a given sample, and record it.
 
-        The offset is the stamp of the newest y_m minus the stamp of the sample, ns. `sample` is
-        None if there are no samples.
+        `sample` has a stamp, y, y_m at this stamp, and an offset. The offset is the stamp of the
+        newest y_m minus that of the sample, ns. `sample` is None if there are no samples.
         """
         y = None
         y_m = []
@@ -259,7 +260,7 @@ class Recorder(Controller):
         self._reals.append(row)
 
     def recording(self, name: str) -> Recording:
-        """Return the events and states so far."""
+        """Return the events and states so far as a recording with a name."""
         events = np.array(self._events, dtype=event_type(len(self._none)))
         integers = np.array(self._integers, dtype=np.int64).reshape(-1, len(INTEGERS))
         reals = np.array(self._reals).reshape(len(integers), -1)
@@ -269,7 +270,7 @@ class Recorder(Controller):
 
 
 def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
-    """Return the controller, then valid changes of its parameters.
+    """Return the given parameters, followed by sets with valid changes of them.
 
     The changes concern gains, limits, signs, times, the schedule, the observer and stops.
     """
@@ -294,7 +295,7 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
     ]
     # Change the extensions.
     if controller.schedule is not None:
-        # make the time constant shorter than the longest dt
+        # Make the time constant shorter than the longest dt.
         changes.append({"schedule.time": 5.0 / controller.rate})
     if controller.observer is not None:
         changes.append({"observer.F": tuple(0.9 * value for value in controller.observer.F)})
@@ -314,7 +315,7 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
 def flight_recordings(
     scenario: Scenario, sets: Sequence[RiseDiConfig], samples: int = SAMPLE_BUFFER_SIZE
 ) -> Iterator[Recording]:
-    """Fly in one process: as the scenario says, with a tenth of y lost, and with faults.
+    """Yield recordings of flights in one process: undisturbed, with a tenth of y lost, and faulty.
 
     The faults are new parameters, deactivation, engagement and tight limits, and losses of y or y_m
     that end within the hold, within the ramp, and after the ramp.
@@ -399,7 +400,8 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
                 recorder.restart()
             sample = (int(log.stamp_ns[k]), groups["y"][k], groups["y_m"][k], offset_ns)
         elif log.stamp_ns[k] == recorder.state.stamp_ns:
-            # If the stamp stays the same, y came from before it, and the law did not engage.
+            # The stamp stayed the same, so the last y is older than the stamp, and the law did not
+            # engage.
             sample = (int(log.stamp_ns[k]) - 1, groups["y"][k], groups["y_m"][k], 0)
         recorder.guard_tick(int(now_ns[k]), sample, active=log["mode"][k] != Mode.INACTIVE)
         equal += recorder.state.command.tobytes() == groups[command][k].tobytes()

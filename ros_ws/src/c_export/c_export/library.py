@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The exported code as a shared library for Python, and as a co-simulation unit of FMI 2.0."""
+"""Build the exported code as a library for Python, or as a co-simulation unit of FMI 2.0."""
 
 import ctypes
 import shutil
@@ -24,13 +24,13 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 _POINTER = ctypes.c_void_p
-MOST = float(np.finfo(np.float64).max)  # this number stands for infinity, as in the C code
+MOST = float(np.finfo(np.float64).max)  # number that stands for infinity in the C code
 
 
 class CController:
     """A controller in C with the methods of `rise_di_controller.controller.Controller`.
 
-    u has p values.
+    Its u has p values.
     """
 
     def __init__(self, library: Path, p: int) -> None:
@@ -67,7 +67,7 @@ class CController:
         return self._u.copy(), mode
 
     def replay(self, recording: Recording) -> FloatArray:
-        """Return the u of each tick of a log, see `events.run_recording`, (T, p)."""
+        """Return the u of each tick of a log, (T, p), given the recording of `run_recording`."""
         events = recording.events
         ticks = events[events["kind"] == GUARD_TICK]
         before = np.zeros(len(events), dtype=np.int64)  # code of the event before each tick
@@ -87,7 +87,7 @@ class CController:
 def build_library(code: Path, compiler: Sequence[str], path: Path) -> Path:
     """Compile exported code of float64 to a shared library for CController.
 
-    Raises ParameterError.
+    Raises ParameterError if the compiler fails.
     """
     return _shared(code, compiler, "library.c", path)
 
@@ -155,7 +155,7 @@ def _power(name: str, exponent: int) -> str:
 
 
 def _definitions(units: Units) -> list[str]:
-    """Write the UnitDefinitions of the units."""
+    """Return the lines of UnitDefinitions in modelDescription.xml."""
     lines = []
     for name in sorted({*units.outputs, *units.commands}):
         dimension = quantity(name).dimension
@@ -166,7 +166,7 @@ def _definitions(units: Units) -> list[str]:
 
 
 def _channels(controller: RiseDiConfig, units: Units) -> list[str]:
-    """Write the variables of y, y_m, u, the flags and the mode."""
+    """Return the lines with the variables of y, y_m, u, the flags and the mode."""
     groups = {
         "y": (controller.outputs, units.outputs),
         "y_m": (controller.outputs, units.outputs),
@@ -192,7 +192,7 @@ def _channels(controller: RiseDiConfig, units: Units) -> list[str]:
 
 
 def _parameters(controller: RiseDiConfig) -> list[str]:
-    """Write the variables of the parameters in TUNABLE, one for each channel."""
+    """Return the lines with a variable for each channel of each parameter in TUNABLE."""
     variables = []
     place = VALUE_REFERENCES["parameter"]
     for member in constants(controller):
@@ -246,10 +246,10 @@ DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 def model_description(controller: RiseDiConfig, scenario: str, units: Units) -> str:
-    """Write modelDescription.xml of the unit.
+    """Return the text of modelDescription.xml.
 
-    Its inputs are y, y_m, active, y_new and y_m_new. Its outputs are u and mode, and its parameters
-    are those in TUNABLE. A step is a tick.
+    The inputs of the unit are y, y_m, active, y_new and y_m_new. The outputs are u and mode, and
+    the parameters are those in TUNABLE. A step is a tick.
     """
     variables = _channels(controller, units)
     begin = 2 * len(controller.outputs) + 1
@@ -275,7 +275,8 @@ def build_fmu(
 ) -> Path:
     """Compile exported code to a co-simulation unit of FMI 2.0 for this machine (linux64).
 
-    The unit also contains the sources, for other machines. Raises ParameterError.
+    The unit also contains the sources, for other machines. Raises ParameterError if the compiler
+    fails.
     """
     with tempfile.TemporaryDirectory(prefix="rise_di_fmu_") as name:
         library = _shared(code, compiler, "fmu.c", Path(name) / "rise_di.so")

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compile the exported C code, and compare it with the controller in Python.
 
-Every u and every state is compared bit by bit.
+Every u and every state of C is compared bit by bit.
 """
 
 import json
@@ -30,7 +30,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 SOURCE = Path(str(files("c_export"))) / "source"
 CODE = ("rise_di.h", "rise_di.c", "rise_di_table.c")
 PARAMETERS = "rise_di_parameters.h"
-# Files that are written with the code.
+# Files that are written together with the code.
 REPORT = "proof.txt"
 FMU = "rise_di.fmu"
 CERTIFICATE = "certificate.json"  # certificate of the guarantee of the loop
@@ -46,23 +46,23 @@ FLOAT32_BOUND = 2.0**-10
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """The first value of a recording that differs."""
+    """The first value of a recording that differs between C and Python."""
 
-    tick: int  # counts from 0
+    tick: int  # number of the tick, from 0
     channel: str
     python: float
     c: float
 
 
 class Comparison(NamedTuple):
-    """Comparison of the states that C computes for a recording of T ticks with those of Python."""
+    """The result of comparing C with Python over a recording of T ticks."""
 
     name: str
     ticks: int
-    values: int  # how many were compared
-    differing: int  # how many differ
+    values: int  # number of compared values
+    differing: int  # number of values that differ
     first: Difference | None
-    deviation: float  # largest difference of u of all inputs, as a share of the range of u
+    deviation: float  # largest difference of any u, as a fraction of its range
     modes_equal: bool  # whether all modes and times are equal
 
     def holds(self, *, float32: bool) -> bool:
@@ -87,8 +87,9 @@ def write_code(
 ) -> list[Path]:
     """Write the C code of a controller and of a reference model to a folder.
 
-    The report and the FMI unit of earlier code are removed. The controller keeps `samples` samples
-    of y, and as many of y_m. Raises ParameterError.
+    The report and the FMI unit of earlier code in the folder are removed. The controller keeps
+    `samples` samples of y, and as many of y_m. Raises ParameterError if the files cannot be
+    written.
     """
     require(samples >= LEAST_SAMPLES, "samples", samples, f"{LEAST_SAMPLES} or more")
     with writing("c", folder, "a folder that can"):
@@ -142,7 +143,7 @@ def words(
 
 
 class Program:
-    """proof.c and the exported code, compiled in a folder of its own."""
+    """A program of proof.c and the exported code, compiled in a separate folder."""
 
     def __init__(
         self, code: Path, compiler: Sequence[str], sets: Sequence[RiseDiConfig], folder: Path, *,
@@ -151,8 +152,8 @@ class Program:
     ) -> None:  # fmt: skip
         """Compile the program.
 
-        `source` replaces the text of rise_di.c, and `runner` starts the program. Raises
-        ParameterError.
+        `source` replaces the text of rise_di.c, and `runner` is a command that starts the program.
+        Raises ParameterError if the compiler fails.
         """
         self._folder = folder
         self._runner = runner
@@ -170,21 +171,22 @@ class Program:
         build([*compiler, *flags, "-o", "proof", "proof.c"], folder)
 
     def take(self, sets: Sequence[RiseDiConfig]) -> None:
-        """Replace the parameter sets. The first one stays that of the exported header."""
+        """Replace the parameter sets. The first set stays that of the exported header."""
         self._sets = sets
         content = b"".join(packed(controller, float32=self._float32) for controller in sets)
         (self._folder / "sets").write_bytes(content)
 
     def run(self, recording: Recording) -> tuple[np.ndarray, FloatArray, Mapping[str, int]]:
-        """Return the integers and the reals of the states of C, in the form of the recording.
+        """Run the program, and return the integers and the reals of its states.
 
-        The third result is what the program prints.
+        They have the form of the recording. The third result has the numbers that the program
+        prints, by name.
         """
         (self._folder / "events").write_bytes(recording.events.tobytes())
         (self._folder / "loaded").write_bytes(recording.loaded.tobytes())
         command = [*self._runner, "./proof", "sets", "events", "loaded", "states"]
         try:
-            process = subprocess.run(  # noqa: S603 - built here
+            process = subprocess.run(  # noqa: S603 - a program built here
                 command, cwd=self._folder, capture_output=True, text=True, check=False
             )
         except OSError as error:
@@ -241,16 +243,16 @@ class Program:
 
 
 class Proof(NamedTuple):
-    """The results of a proof: what was compiled, compared and measured."""
+    """The results of a proof, with compilers, comparisons and measured numbers."""
 
     compilers: tuple[str, ...]  # versions of the compilers
-    comparisons: tuple[Comparison, ...]  # comparisons of all recordings, compiler by compiler
+    comparisons: tuple[Comparison, ...]  # comparisons of all recordings for each compiler
     figures: Mapping[str, int]  # numbers of bytes and of operations, by name
     float32: bool
 
     @property
     def holds(self) -> bool:
-        """Whether every comparison holds."""
+        """Whether C agrees with Python in every comparison."""
         return all(comparison.holds(float32=self.float32) for comparison in self.comparisons)
 
 
@@ -267,7 +269,7 @@ def prove(
 
     Every state of the C code is compared with the recorded state of the Python code. `runner`, such
     as qemu, starts the programs of a compiler for another machine. If g++ is installed, a further
-    program counts the operations on reals, and so gives the largest number of them in one call.
+    program counts the operations on reals, which gives their largest number in one call.
     """
     comparisons: list[Comparison] = []
     with tempfile.TemporaryDirectory(prefix="rise_di_export_") as name:
@@ -306,7 +308,7 @@ FIGURES = {
 
 
 def proof_report(proof: Proof, scenario: str) -> str:
-    """Write the proof as text."""
+    """Return the report of a proof as text."""
     precision = "float32" if proof.float32 else "float64"
     lines = [
         f"C code of the controller of {scenario}, {precision}, beside the controller in Python",
@@ -342,7 +344,7 @@ def proof_report(proof: Proof, scenario: str) -> str:
 
 
 def build(command: Sequence[str], folder: Path) -> None:
-    """Run a compiler in a folder. Raises ParameterError with what the compiler says."""
+    """Run a compiler in a folder. Raises ParameterError with the compiler's message if it fails."""
     process = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603 - the user's compiler
     if process.returncode:
         said = (process.stderr or process.stdout).strip() or f"exit status {process.returncode}"
@@ -350,16 +352,16 @@ def build(command: Sequence[str], folder: Path) -> None:
 
 
 def version(compiler: Sequence[str]) -> str:
-    """Return the first line of what a compiler says of itself."""
+    """Return the first line of a compiler's version text."""
     process = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=False)  # noqa: S603 - as above
     return (process.stdout or process.stderr).partition("\n")[0].strip()
 
 
 def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, int]:
-    """Return the bytes of machine code and constants, and of the stack: the sum of all frames.
+    """Return the numbers of bytes of machine code, of constants, and of the stack.
 
-    A figure that is unknown is left out. No function calls itself, so that no chain of calls needs
-    more stack than this sum.
+    The stack is the sum of all frames. No function calls itself, so no chain of calls needs more
+    than this sum. An unknown number is left out.
     """
     for name in (*CODE, PARAMETERS):
         shutil.copyfile(code / name, folder / name)
@@ -376,7 +378,7 @@ def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, in
         process = subprocess.run(  # noqa: S603 - of binutils
             [size, "rise_di.o"], cwd=folder, capture_output=True, text=True, check=False
         )
-        if not process.returncode:  # `size` fails for a file for another machine
+        if not process.returncode:  # `size` fails for files of another machine
             text, data, bss = (int(word) for word in process.stdout.splitlines()[1].split()[:3])
             sizes |= {"code_bytes": text, "data_bytes": data + bss}
     return sizes
