@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Basics of the RISE-DI flight stack without ROS.
+"""Basics of the RISE-DI flight stack, without ROS.
 
-Parameters, named vectors, rates, integrators, scenario files, outcomes and the tape.
+They are parameters, named vectors, rates, integrators, scenario files, outcomes and the tape.
 """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Arguments of public functions: conversion, or refusal in one sentence."""
+"""Convert the arguments of public functions, or refuse them in one sentence."""
 
 import math
 import os
@@ -40,7 +40,7 @@ def as_number(
 
 
 def as_count(value: object, key: str, least: int, most: float = math.inf) -> int:
-    """Return an integer from `least` to `most`, or raise ParameterError."""
+    """Return the value if it is an integer from `least` to `most`, or raise ParameterError."""
     bounds = f"of {least} or more" if most == math.inf else f"from {least} to {most:g}"
     return int(_bounded(int, value, key, least, most, f"an integer {bounds}"))
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Arithmetic of law, observer and feedforward with a stated order of operations.
+"""Compute law, observer and feedforward with a fixed order of arithmetic operations.
 
 Every operation is rounded once to float64. u therefore does not depend on the BLAS or the libm of a
 host, and C code without libraries gives the same bits. NumPy keeps this order to the bit. XLA, the

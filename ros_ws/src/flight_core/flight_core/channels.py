@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Names of the channels that several nodes share, as docs/topics.md lists them."""
+"""The names of the channels that several nodes share, as listed in docs/topics.md."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ the channel is 1 m/s."""
 
 
 def vertical(names: Sequence[str]) -> str:
-    """Return the channel of VERTICAL among names, or "" if there is none, as for an airplane."""
+    """Return the name that is in VERTICAL, or "" if there is none, as for an airplane."""
     return next((name for name in names if name in VERTICAL), "")
 
 
@@ -42,9 +42,9 @@ surface still has 0.44 at two thirds of the trim speed."""
 
 
 def reason_against_inputs(names: Sequence[str], effects: Sequence[float]) -> Refusal | None:
-    """Return a reason against the inputs that are below LEAST_EFFECT in a sample of `effects`.
+    """Return a sentence on the inputs whose measured effect is below LEAST_EFFECT.
 
-    Returns None if there is no such input.
+    `effects` is a sample of the topic with this name. Returns None if there is no such input.
     """
     stuck = [
         f"{name} does not answer the probe: it has at most {100.0 * effect:.0f} % of its effect"

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Confinement of a process by the Linux kernel: no network, and files only in one folder.
+"""Confine a process by the Linux kernel to one folder for files, without network.
 
 Sources: unshare(2), landlock(7); include/uapi/linux/landlock.h.
 """
@@ -53,7 +53,7 @@ def confine(folder: Path) -> list[str]:
 def _write_beneath(folder: Path) -> bool:
     """Restrict changes of files to `folder` and /dev/null.
 
-    Returns whether the kernel does so.
+    Returns whether the kernel supports this.
     """
     version = _LIBC.syscall(CREATE_RULESET, None, 0, VERSION_FLAG)
     if version < 1:

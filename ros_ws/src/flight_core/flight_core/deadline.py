@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A deadline for a process, which holds even while a call into a library blocks the interpreter.
+"""Set a deadline for a process that holds even if a library call blocks the interpreter.
 
 During such a call neither a Python thread nor a signal handler of Python runs. The default action
 of a signal would end the process, but without the exit status. A timer of the kernel therefore
@@ -18,7 +18,7 @@ from typing import Self
 from flight_core.rates import NANOSECONDS
 
 SIGEV_THREAD = 2  # linux/bits/sigevent-consts.h
-SIGEVENT_SIZE = 64  # bytes, of struct sigevent
+SIGEVENT_SIZE = 64  # size of struct sigevent, bytes
 TOLD_AT = 0.9  # fraction of the deadline after which the stacks of the threads go to stderr
 
 
@@ -44,15 +44,15 @@ class _TimerTimes(ctypes.Structure):
 
 
 class Deadline:
-    """Ends the process with an exit status after `duration` s, unless it is cancelled.
+    """Ends the process with an exit status after `duration` s, if it is not cancelled before.
 
-    As a context manager it is cancelled at the end of the block. When the deadline ends the
-    process, Python does not clean up. Close before what must reach a file.
+    As a context manager, the deadline is cancelled at the end of the block. When it ends the
+    process, Python does not clean up, so close files earlier if they must be complete.
     """
 
     def __init__(self, duration: float, status: int) -> None:
         for stream in filter(None, (sys.stdout, sys.stderr)):
-            with suppress(OSError):  # the reader of a pipe can have ended
+            with suppress(OSError):  # the reader of a pipe may have ended
                 stream.flush()
         library = ctypes.CDLL(None, use_errno=True)
         if not hasattr(library, "timer_create"):  # before glibc 2.34

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Check of what ROS 2 needs of the environment, before rclpy is loaded.
+"""Check that the environment has what ROS 2 needs, before rclpy is loaded.
 
 The check takes less than a millisecond. Without it, rclpy would end with a traceback, with a bus
 error or after a timeout.
@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import NoReturn
 
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
-MAX_PARTICIPANTS = 100  # largest number of participants in a domain, by `flight_ros/loopback.xml`
-SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - its free space is read, no file is made
+MAX_PARTICIPANTS = 100  # most participants in a domain, as in `flight_ros/loopback.xml`
+SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - only its free space is read
 LEAST_SHARED_MEMORY = 1 << 16  # bytes; rclpy and a flight use 12 kB
 LEAST_FILES = 128  # least number of files that a process must be able to hold open
 LAST_START = 2**31 - 86_400
@@ -29,7 +29,7 @@ MAX_DOMAIN = 232  # a higher domain has port numbers above 65535 (DDSI-RTPS 2.3,
 
 
 def require_ros_environment() -> None:
-    """Raise ParameterError, with the remedy, if no node can start here.
+    """Raise ParameterError, which states the remedy, if no node can start here.
 
     The check covers the clock, the domain, the middleware, shared memory, open files, logs and
     loopback.
@@ -64,9 +64,9 @@ def _require_domain() -> None:
 
 
 def _require_middleware() -> None:
-    """Refuse a middleware that is not installed.
+    """Raise ParameterError if the middleware is not installed.
 
-    If an installation has no index of its middlewares, any name passes.
+    If the installation of ROS 2 has no index of its middlewares, any name passes.
     """
     name = os.environ.get("RMW_IMPLEMENTATION", "")
     prefixes = [
@@ -84,7 +84,7 @@ def _require_middleware() -> None:
 
 
 def _require_shared_memory() -> None:
-    """Refuse a full file system of shared memory.
+    """Raise ParameterError if the file system of shared memory is full.
 
     rclpy writes a page of shared memory when it is loaded. If the file system is full, this write
     ends in a bus error.
@@ -103,7 +103,7 @@ def _require_shared_memory() -> None:
 
 
 def _require_files() -> None:
-    """Refuse a limit of open files below LEAST_FILES.
+    """Raise ParameterError if the limit of open files is below LEAST_FILES.
 
     A node has some 50 files and sockets open.
     """
@@ -115,7 +115,7 @@ def _require_files() -> None:
 
 
 def _require_log_settings() -> None:
-    """Refuse a setting of rcutils/logging.h that turns each line of a log into an error."""
+    """Raise ParameterError if a setting of rcutils/logging.h turns each log line into an error."""
     for variable in (
         "RCUTILS_LOGGING_USE_STDOUT",
         "RCUTILS_LOGGING_BUFFERED_STREAM",
@@ -162,7 +162,7 @@ def _require_log_folder() -> None:
 
 
 def _require_loopback() -> None:
-    """Refuse a host without loopback.
+    """Raise ParameterError if the host has no loopback.
 
     Nodes talk over 127.0.0.1, unless the user has a profile of Fast DDS.
     """
@@ -179,6 +179,6 @@ def _require_loopback() -> None:
 
 
 def _refuse(sentence: str) -> NoReturn:
-    from flight_core.parameters import ParameterError  # noqa: PLC0415 - the start of a node does without
+    from flight_core.parameters import ParameterError  # noqa: PLC0415 - a node starts without it
 
     raise ParameterError(sentence) from None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Failed steps of a node: their count, and the decision when to log a sentence."""
+"""Count the failed steps of a node, and decide when to log a sentence about them."""
 
 import math
 
@@ -11,7 +11,8 @@ DWELL = 10.0
 class Failures:
     """A count of failed steps.
 
-    A sentence is due at the first failed step, and at the next one after DWELL without any.
+    A sentence is due at the first failed step, and at the first one after a time DWELL without
+    failed steps.
     """
 
     def __init__(self) -> None:

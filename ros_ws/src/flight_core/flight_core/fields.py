@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Values of a parameter set: an annotation says what is permitted, and refusals are sentences.
+"""Check the values of a parameter set by their annotations, and refuse them in sentences.
 
 Types are strict. An int is accepted as a float, a sequence as a tuple, an array or a scalar of
-NumPy as lists and numbers, and a path as a str. Nothing else is converted. The annotations are
+NumPy as lists or a number, and a path as a str. Nothing else is converted. The annotations are
 float, int, bool, str, object, Literal, tuple, dict, unions of these, and parameter sets. Rules such
 as a limit come from `Field(...)` in Annotated.
 """
@@ -65,14 +65,14 @@ class Problems:
         return sentences
 
     def summary(self) -> str:
-        """Return the first sentence and those about missing keys, and count the others."""
+        """Return the first sentence and those about missing keys, and the number of other ones."""
         sentences = self.sentences()
         told = list(dict.fromkeys([sentences[0], *self.missing_sentences()]))
         more = len(sentences) - len(told)
         return "; ".join(told) + (f" (and {more} more)" if more else "")
 
     def lack(self, where: str, name: str, meaning: str) -> None:
-        """Add a key that a set lacks."""
+        """Note a key that a set lacks, with its meaning."""
         self.missing.setdefault(where, {})[name] = meaning
 
     def refuse(self, key: str, value: object, expected: str) -> None:
@@ -83,12 +83,12 @@ class Problems:
 class Kind(NamedTuple):
     """The values that an annotation permits, and how they are read."""
 
-    expected: str  # words for the sentence about a value of a different type
+    expected: str  # words that describe the permitted values in a sentence
     takes: Callable[[Any], bool]  # whether a value has the type
     # (value of the type, key, problems) -> the value for the parameter set
     content: Callable[[Any, str, Problems], Any]
-    # Whether all values of a list are permitted as they are. This shortcut saves time, because most
-    # values of a scenario are entries of matrices.
+    # Tells whether all values of a list are permitted as they are. This shortcut saves time,
+    # because most values of a scenario are entries of matrices.
     takes_all: Callable[[Sequence[Any]], bool] = lambda _: False
 
     def read(self, value: object, key: str, problems: Problems) -> Any:
@@ -218,7 +218,7 @@ def _values(parts: Sequence[Any], *, min_length: float = 0, max_length: float = 
 
 
 def _table(parts: Sequence[Any], *, min_length: float = 0, max_length: float = math.inf) -> Kind:
-    """Permit a dict."""
+    """Permit a dict with keys and values of two kinds."""
     keys, values = map(kind_of, parts)
 
     def content(value: Mapping[Any, Any], key: str, problems: Problems) -> dict[Any, Any]:

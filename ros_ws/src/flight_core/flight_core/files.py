@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Input and output files: existence checks, YAML, atomic replacement.
+"""Read and write files, with YAML, checks of existence and atomic replacement.
 
 If a file cannot be read or written, the functions raise ParameterError with a sentence.
 """
@@ -65,8 +65,8 @@ class _Loader(Composer, yaml.CSafeLoader):
 
     PyYAML would keep the last of several equal keys. Aliases that expand to more than
     MAX_YAML_NODES values are rejected, too. libyaml parses the text, nine times as fast as Python.
-    The nodes are composed in Python, because libyaml's binding exhausts the stack if they are
-    nested deeply.
+    The nodes of the text are composed in Python, because libyaml's binding exhausts the stack if
+    they are nested deeply.
     """
 
     def __init__(self, stream: str) -> None:
@@ -180,11 +180,11 @@ EXAMPLES = "examples/"  # a path that begins like this may also start at the roo
 
 
 def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
-    """Find the file with a name in a library, or at the path of a .yaml file.
+    """Find a file by its name in a library, or by the path of a .yaml file.
 
-    A path that begins with `examples/` is found from any working folder. Raises ParameterError with
-    the known names. `key` and `kind`, such as "scenario" and "a scenario file", go into its
-    sentence.
+    A path that begins with `examples/` is found from any working folder. Raises ParameterError,
+    with the known names, if there is no such file. `key` and `kind`, such as "scenario" and "a
+    scenario file", are words for its message.
     """
     known = names_in(library)
     path_text = f"the path of {kind} (.yaml)"
@@ -220,7 +220,7 @@ def open_nonblocking(path: str | Path) -> BinaryIO:
 def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
     """Turn an OSError inside the block into a ParameterError.
 
-    The sentence has `key`, which can be empty, the `path` that cannot be written, and `expected`.
+    Its message has `key`, which can be empty, the `path` that cannot be written, and `expected`.
     """
     try:
         yield
@@ -234,7 +234,7 @@ def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
 def read_file(path: Path, key: str, expected: str) -> bytes:
     """Read an input file of at most MAX_FILE_BYTES.
 
-    `key` names the file in the sentence, and `expected` says what it should contain. Raises
+    In an error, `key` names the file, and `expected` says what it should contain. Raises
     ParameterError if the file cannot be read or is longer.
     """
     try:
@@ -275,7 +275,7 @@ def parse_yaml(content: bytes | str, key: str, expected: str) -> Any:
 
 
 def require_no_octal(content: bytes | str, key: str) -> None:
-    """Refuse YAML with a number that begins with 0.
+    """Raise ParameterError if YAML has an integer that begins with 0.
 
     rcl reads 0100 as 64, because it calls strtoll with base 0.
     """
@@ -296,13 +296,13 @@ def require_no_octal(content: bytes | str, key: str) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Write a file atomically: what you write to the stream is at `path` when the block ends.
+    """Write a file atomically, so that it appears at `path` when the block ends.
 
-    The stream is a fresh file in the same folder, and replaces the file at `path` at the end. If
-    the block fails, the fresh file is removed. After a crash, a kill or a full disk, `path` has
-    either the new or the old content. If `path` is a link, the file replaces the link, and the
-    target of the link stays as it is. Raises OSError if the file cannot be written, or if `path`
-    exists and is no regular file, but a folder or a device.
+    The block writes to the stream of a fresh file in the same folder, which replaces the file at
+    `path` at the end. If the block fails, the fresh file is removed. After a crash, a kill or a
+    full disk, `path` has either the new or the old content. If `path` is a link, the file replaces
+    the link, and the target of the link stays as it is. Raises OSError if the file cannot be
+    written, or if `path` is a folder or a device.
     """
     with suppress(FileNotFoundError):  # also raised for a link to nothing
         mode = path.stat().st_mode
@@ -337,7 +337,7 @@ def _umask() -> int:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file atomically, as `replacing` does, with text as UTF-8. Raises OSError."""
+    """Write a file atomically, as `replacing` does, with text as UTF-8. May raise OSError."""
     with replacing(path) as stream:
         stream.write(content.encode() if isinstance(content, str) else content)
 

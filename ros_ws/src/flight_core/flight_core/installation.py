@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How to install a missing Python package.
+"""Tell how to install a missing Python package.
 
-In a checkout, make installs it. Elsewhere, pip does so with an extra of `rise-di`, from where
-`rise-di` was installed.
+In a checkout, make installs it. Elsewhere, pip installs an extra of `rise-di` from the source of
+the installed `rise-di`.
 """
 
 import json
@@ -75,10 +75,10 @@ def missing(package: str) -> str:
 
 
 def _pip_command(extra: str) -> str:
-    """Return the command that installs an extra of the stack from where the stack came.
+    """Return the command that installs an extra of the stack from the stack's own source.
 
-    The stack came from a checkout, a wheel, a repository or an index. An unreleased checkout must
-    not send its user to an index, where somebody else can have published a package of this name.
+    The source is a checkout, a wheel, a repository or an index. An unreleased checkout must not
+    send its user to an index, where somebody else can have published a package of this name.
     Source: PEP 610. An installation from an index has no direct_url.json.
     """
     try:

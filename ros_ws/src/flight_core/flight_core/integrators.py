@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Integrators with a fixed step, because a variable step could miss a gust."""
+"""Integrate with a fixed step, because a variable step could miss a gust."""
 
 from collections.abc import Callable
 from typing import Any

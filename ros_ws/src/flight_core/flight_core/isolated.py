@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Process isolation: code that reads foreign models and logs runs in a subprocess.
+"""Run code that reads foreign models and logs in an isolated subprocess.
 
 The subprocess has limited time, memory, files and network.
 """
@@ -29,8 +29,8 @@ from flight_core.parameters import ParameterError
 RESULT = "result"  # name of the file with the result, in the working folder
 # If the subprocess raises one of these errors, the caller gets it, too.
 ERRORS = MappingProxyType({"ended": FlightEnded, "refused": ParameterError})
-# Wall time that we wait at most, as a multiple of the limit of processor time. Other work can keep
-# the subprocess from the processor for so long.
+# Longest wait in wall time, as a multiple of the limit of processor time. Other work can keep the
+# subprocess from the processor for so long.
 WAIT = 20.0
 FILE_LIMIT = 1 << 30  # largest size of a file that the subprocess writes, bytes
 
@@ -61,11 +61,11 @@ def call(
     module of the function. If the function raises FlightEnded or ParameterError, so does this call.
 
     The subprocess has `memory` bytes of data, files of at most FILE_LIMIT, and `timeout` seconds of
-    processor time. It also ends after WAIT times as many seconds of wall time, so that a process
-    that waits forever ends, and a computation has enough time on a busy machine. If the kernel
-    permits, it has no network and writes only in its folder. If not, and the data are `foreign`, a
-    warning says so once. Raises IsolatedCallError if the process crashes, as by a segmentation
-    fault or an exception, or returns nothing in its time.
+    processor time. It is also ended after WAIT times as many seconds of wall time. This ends a
+    process that waits forever, but leaves a computation enough time on a busy machine. If the
+    kernel permits, the subprocess has no network and writes only in its folder. If the kernel does
+    not permit this and the data are `foreign`, one warning says so. Raises IsolatedCallError if the
+    process crashes, by a segmentation fault or an exception, or does not return in time.
     """
     call_text = json.dumps([timeout, memory, function.__module__, function.__qualname__, arguments])
     with tempfile.TemporaryDirectory() as folder:
@@ -106,7 +106,7 @@ def call(
 class _Reader(pickle.Unpickler):
     """Reads plain values, arrays, and named tuples of a module.
 
-    Raises IsolatedCallError for any other name.
+    Raises IsolatedCallError if the data name anything else.
     """
 
     def __init__(self, stream: Any, module: str) -> None:
@@ -146,7 +146,7 @@ def main() -> None:
         (resource.RLIMIT_CORE, 0),
     )
     for limit, most in limits:
-        # The user sets the hard limit, and no process can raise it.
+        # The hard limit comes from the user, and no process can raise it.
         hard = resource.getrlimit(limit)[1]
         soft = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(limit, (soft, hard))

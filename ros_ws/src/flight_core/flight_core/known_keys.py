@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The keys of a parameter set that a computation knows.
+"""Check that a computation knows every key of a parameter set that is not at its default.
 
-Some computations compute a flight without the nodes. Each states the set of keys that it knows.
-`require_known` refuses every other key whose value is not the default. A key that is added later is
-unknown until you put it into the set.
+Some functions compute a flight without the code of the nodes. Each of them states the set of keys
+that it knows. `require_known` refuses every other key whose value is not the default. A key that is
+added later is unknown until somebody adds it to this set.
 
 A key is a dotted name, such as `actuators.lag`. If sections are given by name in a mapping, they
 share their keys. For example, the `start` of every gust is `gusts.*.start`.
@@ -90,7 +90,8 @@ def _is_default(value: Any, default: Any) -> bool:
 def unknown_keys(parameters: Config, known: Set[str]) -> list[SetKey]:
     """Return the keys outside `known` whose value is not their default.
 
-    If a section is left out by default, and none of its keys is known, the section is one key.
+    If a section is left out by default and none of its keys is known, the result has the section
+    instead of its keys.
     """
     sections: dict[str, SetKey] = {}
     for each in set_keys(parameters):
@@ -101,7 +102,7 @@ def unknown_keys(parameters: Config, known: Set[str]) -> list[SetKey]:
 
 
 def _outermost(parameters: Config, found: SetKey, known: Set[str]) -> SetKey:
-    """Return the outermost optional section around a key of which no key is known.
+    """Return the outermost optional section around a key in which no key is known.
 
     Returns the key itself if there is no such section.
     """
@@ -131,8 +132,8 @@ def require_known(parameters: Config, known: Set[str], section: str, why: str) -
     Args:
         parameters: The parameter set.
         known: The keys that are known, as `keys_of` names them.
-        section: The name of the set in a scenario, for the sentence.
-        why: Who does not know the key, for the sentence.
+        section: The name of the set in a scenario, for the error message.
+        why: A text on who does not know the key, for the error message.
 
     Raises:
         ParameterError: A key outside `known` has a value that is not the default.

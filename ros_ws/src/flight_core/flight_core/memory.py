@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A limit of memory for a node.
+"""Limit the memory of a node.
 
-Without it, one packet to its middleware could take the memory of the host.
+Without a limit, one packet to its middleware could take all memory of the host.
 """
 
 import resource
@@ -15,8 +15,8 @@ of this are thread stacks."""
 def limit_memory(limit: int = DATA_LIMIT) -> None:
     """Limit the data of this process and its later children to `limit` bytes.
 
-    If the user has set a lower limit (ulimit -d), it stays. If an allocation exceeds the limit,
-    Python raises MemoryError, while the middleware does not expect the failure and ends the
+    If the user has set a lower limit (ulimit -d), this limit stays. If an allocation exceeds the
+    limit, Python raises MemoryError. The middleware does not expect a failure, and ends the
     process. The limit covers the heap and private writable mappings, including thread stacks.
     Source: getrlimit(2), RLIMIT_DATA.
     """

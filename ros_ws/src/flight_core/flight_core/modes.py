@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Mode of the controller.
+"""Define the modes of the controller.
 
-The controller publishes it in `internals`, where guidance, the log and the page read it.
+The controller publishes its mode in `internals`, where guidance, the log and the page read it.
 """
 
 from enum import IntEnum

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Notes to the user of a process, each given once.
+"""Give notes to the user of a process, each of them once.
 
 They go to the standard error if no logging is configured.
 """

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The outcome of a flight as a record of its end, its reason and its shortfalls.
+"""Record the outcome of a flight as its end, the reason for it, and the shortfalls.
 
-The sentence and the exit status follow from the record, so that nothing has to be read back from a
+The headline and the exit status follow from the record, so that nothing has to be parsed from a
 sentence.
 """
 
@@ -16,9 +16,9 @@ from flight_core.text import bounded
 
 STATUS_BAD_INPUT = 2  # exit status of a command and of a node
 STATUS_ENDED_EARLY = 3  # exit status of a command and of a node
-STATUS_SHORTFALL = 4  # the flight reached its end, but falls short of something
-STATUS_LANDED = 5  # exit status only of the node of an aircraft, which ends with the landing
-STATUS_LOST_CONTACT = 6  # exit status only of a node, which ended because another node had ended
+STATUS_SHORTFALL = 4  # the flight reached its end, but has a shortfall
+STATUS_LANDED = 5  # exit status of only the node of an aircraft, which ends with the landing
+STATUS_LOST_CONTACT = 6  # exit status of only a node that ended because another node had ended
 STATUS_HOST = 7  # nothing is wrong except that the host was too busy for a flight in real time
 STATUS_INTERRUPTED = 130
 
@@ -42,25 +42,25 @@ class End(StrEnum):
     LANDED = "landed"  # the aircraft landed softly, on its wheels
     ENDED_EARLY = "ended early"
     NEVER_FLEW = "never flew"
-    INTERRUPTED = "interrupted"  # by the user
-    HOST = "host"  # the host starved a flight in real time, which says nothing about the law
+    INTERRUPTED = "interrupted"  # the user ended the flight
+    HOST = "host"  # the host was too busy, so the flight says nothing about the law
     IMPORTED = "imported"  # a log that another program wrote
     UNKNOWN = "unknown"
 
 
 class Aim(StrEnum):
-    """What a flight can fall short of. The gravest is first, because it explains later ones."""
+    """What a flight must achieve. The gravest aim comes first, because it explains later ones."""
 
     ENGAGEMENT = "engagement"  # the law flies while it should
-    REFERENCE = "reference"  # y_m is the one of the scenario
+    REFERENCE = "reference"  # y_m is that of the scenario
     GROUND = "ground"  # the aircraft stays above the ground
     SEPARATION = "separation"  # the aircraft keeps clear of the other aircraft of a fleet
     STALL = "stall"  # the airspeed stays above the stall speed
-    FENCE = "fence"  # the aircraft stays inside
+    FENCE = "fence"  # the aircraft stays inside the fence
     ALTITUDE = "altitude"  # the aircraft stays between the least and the largest altitude
-    ERROR = "error"  # the error of an output is one that the linear loop allows
+    ERROR = "error"  # the error of each output is at most what the linear loop allows
     TOUCHDOWN = "touchdown"  # the aircraft lands in the zone of the landing
-    GUIDANCE = "guidance"  # each step gives commands
+    GUIDANCE = "guidance"  # each step of guidance gives commands
     ROUTE = "route"  # every leg is flown
     ORBIT = "orbit"  # the last orbit is joined
     LOG = "log"  # the log holds the whole flight
@@ -68,10 +68,10 @@ class Aim(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Shortfall:
-    """A shortfall of a flight as a sentence and in figures, SI.
+    """A shortfall of a flight, as a sentence and as numbers in SI.
 
     `brief` replaces the sentence in a headline if the sentence is too long. `times` is the factor
-    by which the figure exceeds what is allowed, so that the worst shortfall of an aim can be found.
+    by which a value exceeds the allowed one. It serves to find the worst shortfall of an aim.
     """
 
     aim: Aim
@@ -83,9 +83,9 @@ class Shortfall:
 
 @dataclass(frozen=True)
 class Refusal:
-    """A reason against something, such as a sample, a model or an engagement.
+    """The reason why something is refused, such as a sample, a model or an engagement.
 
-    `str` gives the sentence for the user. A function that finds no reason returns None.
+    `str` gives the reason as a sentence for the user. A function that finds no reason returns None.
     """
 
     sentence: str
@@ -96,14 +96,14 @@ class Refusal:
 
 
 def joined(refusals: Iterable[Refusal | None]) -> Refusal | None:
-    """Join all reasons that are not None into one. Returns None if there is none."""
+    """Join all refusals that are not None into one. Returns None if all are None."""
     found = [str(refusal) for refusal in refusals if refusal is not None]
     return Refusal("; ".join(found)) if found else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Allowance:
-    """A tracking error that is allowed, because noise or wind causes it in the linear loop, too."""
+    """A tracking error that is allowed because noise or wind also causes it in the linear loop."""
 
     sentence: str
     figures: Mapping[str, Any] = field(default_factory=dict)
@@ -113,8 +113,8 @@ class Allowance:
 class Outcome:
     """The outcome of a flight.
 
-    `str` is a headline of at most HEADLINE characters: how the flight ended, how many shortfalls it
-    has, and the worst one with its figure. `details` are the sentences that did not fit.
+    `str` is a headline of at most HEADLINE characters. It says how the flight ended, how many
+    shortfalls it has, and which is the worst. `details` are the sentences that did not fit into it.
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
@@ -123,9 +123,9 @@ class Outcome:
     """
 
     end: End
-    reason: str = ""  # a sentence, if the end alone does not say why
+    reason: str = ""  # a sentence on the reason, if the end alone does not show it
     shortfalls: tuple[Shortfall, ...] = ()
-    # errors that are allowed, which do not belong to how the flight ended
+    # errors that are allowed, and do not change how the flight ended
     allowances: tuple[Allowance, ...] = field(default=(), compare=False)
     # for each output, the error in the worst part of the flight and the error allowed there, SI
     errors: tuple[Mapping[str, Any], ...] = field(default=(), compare=False)
@@ -137,10 +137,10 @@ class Outcome:
 
     @property
     def status(self) -> int:
-        """Exit status: 0 for a flight that reached its end without a shortfall.
+        """Exit status, which is 0 for a flight that reached its end without a shortfall.
 
-        If the host starved a flight, it is judged outside of the starved spans, so its shortfalls
-        count.
+        If the host was too busy in some spans, the flight is judged outside of them, so its
+        shortfalls count.
         """
         if self.end is End.INTERRUPTED:
             return STATUS_INTERRUPTED
@@ -172,7 +172,7 @@ class Outcome:
         return _shortened(headline)
 
     def _begin(self) -> str:
-        """Return how the flight ended, and why."""
+        """Return the beginning of the headline, which says how the flight ended, and why."""
         if self.end in {End.NEVER_FLEW, End.UNKNOWN} and self.reason:
             return f"{self.end}: {self.reason}"
         return self.reason or self.end.value
@@ -265,7 +265,7 @@ def read_outcome(record: object) -> Outcome:
 
 
 def _of_fleet(record: Mapping[str, Any]) -> tuple[Shortfall, ...]:
-    """Read the shortfalls of a record that do not follow from the log of one aircraft."""
+    """Read the shortfalls of a record that only a fleet has, not the log of one aircraft."""
     shortfalls = []
     for each in record.get("shortfalls") or ():
         if isinstance(each, Mapping) and each.get("aim") == Aim.SEPARATION:
@@ -285,7 +285,7 @@ def parsed_outcome(text: str) -> Outcome:
 
 
 class FlightEnded(RuntimeError):  # noqa: N818 - the end of a flight is not a program error
-    """Raised if a flight ends before its duration, by a landing or for another reason.
+    """Raised if a flight ends before its duration, with a landing or for another reason.
 
     The message is a sentence for the user, printable and bounded.
     """

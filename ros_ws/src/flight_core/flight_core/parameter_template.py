@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The template of a node's parameter file: every key with its default and its meaning."""
+"""Write the template of a node's parameter file, with default and meaning of every key."""
 
 import textwrap
 from collections.abc import Iterator
@@ -17,9 +17,9 @@ LEAD = """# Parameters of {name}. Give each needed key a value.
 
 
 def parameter_template(name: str, schema: type[Config]) -> str:
-    """Write the parameter file of a node with a schema, as text.
+    """Return the text of a parameter file for the node `name`, whose parameters are `schema`.
 
-    A key without a default stands in a comment. If the key is needed, the comment says so.
+    A key without a default is written as a comment. If the key is required, the comment says so.
     """
     return LEAD.format(name=name) + "".join(f"{line}\n" for line in _lines(schema))
 

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Validated parameter sets, each with one declaration, and with one sentence for each error.
+"""Validate parameter sets that are declared once, with one sentence for each error.
 
 A set is a frozen class of annotated fields. `validate_mapping` builds it from the nested mapping of
-a scenario file or of a ROS node. The first value that is not permitted becomes a `ParameterError`
-of one sentence: the key, what was found, and what is expected.
+a scenario file or of a ROS node. The first value that is not permitted raises a `ParameterError`.
+Its message is a sentence with the key, what was found, and what is expected.
 
-Declarations and methods have the names of pydantic 2. The stack does not use pydantic itself:
-Ubuntu 24.04 has release 1.10, with a different interface and no strict types, and with pydantic 2
-the parameters of a node took twice as long to import.
+Declarations and methods have the names of pydantic 2. The stack does not use pydantic itself.
+Ubuntu 24.04 has release 1.10, with a different interface and no strict types. With pydantic 2 the
+parameters of a node took twice as long to import.
 """
 
 import difflib
@@ -24,10 +24,9 @@ from flight_core.text import bounded
 class ParameterError(ValueError):
     """An invalid parameter or parameter set.
 
-    The message is one sentence for the user, printable and bounded.
+    The message is one sentence for the user, which is printable and of limited length.
 
-    Args:
-        sentence: The key, the value that was found, and the expected value.
+    Args: sentence: The key, the value that was found, and the expected value.
 
     Examples:
         >>> rise_di.find_scenario("osprey_servo", duration=-1.0)
@@ -41,9 +40,9 @@ class ParameterError(ValueError):
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))
 class Config:
-    """Base of every parameter set: frozen, finite, strictly typed, without unknown keys.
+    """Base of every parameter set, which is frozen, finite and strictly typed.
 
-    An int is accepted as a float.
+    A set has no unknown keys. An int is accepted as a float.
     """
 
     model_fields: ClassVar[dict[str, FieldInfo]] = {}
@@ -99,7 +98,7 @@ class Config:
         problems = Problems()
         try:
             parameters = cls.read(values, where, problems, check=check)
-        except ArithmeticError as error:  # a check that combines several keys overflows
+        except ArithmeticError as error:  # a check of several keys together overflowed
             numbers = f"numbers too large or too small ({error.args[-1]})"
             raise ParameterError(f"{where}: found {numbers}, expected those of a flight") from None
         if parameters is None:
@@ -139,14 +138,14 @@ class Config:
         try:
             if check:
                 parameters._check()
-        except ValueError as error:  # `require` gives the rest of the key, and the sentence
+        except ValueError as error:  # `require` gave the rest of the key, and the sentence
             problems.others.append(f"{key}.{error}")
             return None
         return parameters
 
     @classmethod
     def keys_beside(cls, values: Mapping[str, Any]) -> Set[str]:
-        """Return the keys that the set can have if it has these values."""
+        """Return all keys that a set with these values may have."""
         return cls.model_fields.keys()
 
     def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -185,7 +184,7 @@ class Config:
     ) -> dict[str, Any]:
         """Return the set as nested dicts, with lists in place of tuples in mode json.
 
-        `exclude` names fields of this set only, not of nested ones.
+        `exclude` names fields of this set only, not of sets nested in it.
         """
 
         def plain(value: Any) -> Any:
@@ -226,7 +225,7 @@ class Config:
     def model_validate_json(cls, text: str) -> Self:
         """Build the set from JSON.
 
-        Raises ParameterError, and ValueError if the text is not JSON.
+        Raises ParameterError if a value is not permitted, and ValueError if the text is not JSON.
         """
         try:
             values = json.loads(text)
@@ -247,7 +246,7 @@ class NodeConfig(Config):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Return the parameters that can change in flight: dotted names, or names of groups."""
+        """Return the parameters that can change in flight, as dotted names or names of groups."""
         return frozenset()
 
     @classmethod
@@ -276,16 +275,16 @@ Signs = Annotated[tuple[Literal[1, -1], ...], Field(min_length=1)]
 
 
 def require(condition: bool, key: str, actual: object, expected: str) -> None:
-    """Raise ParameterError unless the condition holds.
+    """Raise ParameterError if the condition does not hold.
 
-    The sentence names `key`, what was found and what is expected.
+    The message names `key`, what was found and what is expected.
     """
     if not condition:
         raise ParameterError(f"{key}: found {actual}, expected {expected}")
 
 
 def one_of(known: Sequence[str], name: str) -> str:
-    """Say what is expected in place of an unknown name, with the most similar name first."""
+    """Return a text that lists the known names, with the one most similar to `name` first."""
     near = difflib.get_close_matches(name, known, n=1)
     return (
         f"{near[0]} perhaps, or another of {', '.join(known)}"
@@ -295,10 +294,10 @@ def one_of(known: Sequence[str], name: str) -> str:
 
 
 def require_length(key: str, values: Sequence[object], names: Sequence[str]) -> None:
-    """Raise ParameterError unless the number of values is the number of channels.
+    """Raise ParameterError if the number of values is not the number of channels.
 
     Args:
-        key: Name of the parameter, for the sentence.
+        key: Name of the parameter, for the error message.
         values: Values of the parameter.
         names: Names of the channels.
 
@@ -322,7 +321,7 @@ def require_distinct(key: str, names: Sequence[str]) -> None:
 
 
 def require_channels(key: str, names: Sequence[str], expected: Sequence[str], owner: str) -> None:
-    """Raise ParameterError unless the names are the channels of `owner`, in any order."""
+    """Raise ParameterError if the names are not the channels of `owner`, in any order."""
     require(
         sorted(names) == sorted(expected),
         key,

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The largest plausible values of the outputs of an aircraft.
+"""Give the largest plausible values of the outputs of an aircraft.
 
-If a measured sample is beyond them, it is wrong. If a simulated aircraft is, it is lost.
+A measured sample beyond these values is wrong. A simulated aircraft beyond them is lost.
 """
 
 from collections.abc import Sequence
@@ -16,10 +16,10 @@ LARGEST_RATE = radians(2000.0)
 """Full scale of the gyros of autopilots, rad/s: ICM-42688-P (TDK InvenSense, DS-000347), BMI088
 (Bosch, BST-BMI088-DS001)."""
 
-# Largest deviation of the airspeed from trim, m/s: the speed of sound at sea level (ICAO Doc 7488,
-# standard atmosphere).
+# Largest deviation of the airspeed from trim, m/s, which is the speed of sound at sea level (ICAO
+# Doc 7488, standard atmosphere).
 LARGEST_AIRSPEED = 340.0
-LARGEST = 1e6  # bound for other outputs, SI: no state of an aircraft in flight comes near it
+LARGEST = 1e6  # bound for other outputs, SI, far above any state of an aircraft in flight
 
 BY_NAME = {"p": LARGEST_RATE, "q": LARGEST_RATE, "r": LARGEST_RATE, "V": LARGEST_AIRSPEED}
 

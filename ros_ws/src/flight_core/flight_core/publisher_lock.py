@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Publisher lock of a topic: samples of a second publisher are ignored.
+"""Lock a topic to one publisher, so that samples of a second publisher are ignored.
 
-A message names the publisher in `frame_id`, e.g. "/controller#4711".
+A message names its publisher in `frame_id`, for example "/controller#4711".
 """
 
 from collections.abc import Callable
@@ -26,15 +26,16 @@ def require_sender(sender: str, expected: str) -> None:
 class PublisherLock:
     """Locks to the first publisher of a topic, until its samples time out.
 
-    Then it locks to the next publisher. A restarted node, which has the same name, can take over
-    earlier than a different node. If the receiving node overruns, the time of the overrun does not
-    count as silence of the publisher, but the first sample after it can come from another one.
+    After the timeout, it locks to the next publisher. A restarted node, which has the same name,
+    can take over earlier than a different node. If the receiving node overruns, the time of the
+    overrun does not count as silence of the publisher, but the first sample after the overrun can
+    come from another publisher.
 
     The middleware numbers the messages of a publisher. If the numbers go back, two publishers use
-    the same name. Neither is admitted then, because either can be forged.
+    the same name. In this case neither is admitted, because either can be forged.
 
-    `timeouts_ns` returns two limits of the age of the last sample. Above the first one, the same
-    node in a new process can take over, and above the second one a different node.
+    `timeouts_ns` returns two limits of the age of the last sample. Above the first limit, the same
+    node in a new process can take over, and above the second limit a different node.
     """
 
     def __init__(self, timeouts_ns: Callable[[], tuple[int, int]]) -> None:
@@ -47,7 +48,7 @@ class PublisherLock:
         self._went_back_ns: int | None = None  # instant at which the numbers last went back
 
     def age_ns(self, now_ns: int) -> int:
-        """Return the time since the last sample of the locked publisher."""
+        """Return the time since the last sample of the locked publisher, ns."""
         return now_ns - self._received_ns
 
     def timed_out(self, now_ns: int, max_age_ns: int) -> bool:
@@ -57,12 +58,12 @@ class PublisherLock:
     def holds(self, sender: str, now_ns: int) -> bool:
         """Return whether the sender is the locked publisher and has not timed out.
 
-        It has timed out if its last sample is older than the age limit of a restart.
+        A publisher has timed out if its last sample is older than the age limit of a restart.
         """
         return sender == self.publisher and not self.timed_out(now_ns, self._timeouts_ns()[0])
 
     def overran(self, duration_ns: int) -> None:
-        """Add a time in which the node itself did not run, so that it does not count as silence."""
+        """Note a time in which this node did not run, so that it does not count as silence."""
         self._overrun_ns += duration_ns
 
     def check(self, sender: str, now_ns: int) -> None:
@@ -102,7 +103,7 @@ class PublisherLock:
         The name counts as shared for SHARED_NS after the numbers went back. `sequence` is the
         number that the middleware gave the message, or 0 if it is unknown. After a timeout, a lower
         number comes from a restarted publisher. Call this only for samples with a valid stamp and
-        content, so that a replay of old messages stops nothing.
+        content, so that a replay of old messages does not stop the flight.
         """
         if sender != self.publisher:
             return
@@ -122,7 +123,7 @@ class PublisherLock:
 class LockstepLock(PublisherLock):
     """Locks a topic of a lockstep flight to the publisher of its first message, for good.
 
-    In lockstep each message is an instant of the flight, so a message of anybody else must not
+    In lockstep each message is an instant of the flight, so a message of another publisher must not
     count. No message is lost, so the numbers of one publisher rise by one each time. Any other
     number belongs to a second publisher under the same name, and only the message with this number
     is refused. If the messages of a topic name no sender, the sender is "".
@@ -132,10 +133,10 @@ class LockstepLock(PublisherLock):
         super().__init__(lambda: (FOREVER_NS, FOREVER_NS))
 
     def require_alone(self, sender: str, sequence: int, now_ns: int) -> None:
-        """Raise ChannelError, reason "sender", unless the message is the next one by its number."""
+        """Raise ChannelError, reason "sender", if the message's number is not the next one."""
         expected = self._sequence + 1
         if self.publisher is None:
-            self._sequence = 0  # it can still be the number of a message that was refused
+            self._sequence = 0  # until now it can be the number of a refused message
         elif self._sequence and sequence not in {0, expected}:
             raise ChannelError(
                 SENDER,

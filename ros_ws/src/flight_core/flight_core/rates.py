@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rates and periods. A period is a whole number of ns, so that k periods add up exactly."""
+"""Convert rates and periods. A period is an integer in ns, so that k periods add up exactly."""
 
 from flight_core.parameters import ParameterError, require
 
@@ -20,7 +20,7 @@ def nanoseconds(time: float) -> int:
 def period_ns(rate: float, key: str) -> int:
     """Return the period of a rate in Hz, ns.
 
-    Raises ParameterError naming `key` unless 1e9 / rate is a whole number of nanoseconds.
+    Raises ParameterError, which names `key`, if 1e9 / rate is not an integer.
     """
     period = nanoseconds(1.0 / rate)
     is_whole = abs(period * rate - NANOSECONDS) < 1e-3
@@ -31,9 +31,9 @@ def period_ns(rate: float, key: str) -> int:
 def divide(whole_ns: int, part_ns: int, key: str, whole_name: str) -> int:
     """Return how often a part fits into the whole.
 
-    Raises ParameterError naming `key` unless the number is an integer.
+    Raises ParameterError, which names `key`, if this is not an integer number of times.
     """
-    # Test first, because to write the sentence takes longer than the division.
+    # The test comes first, because writing the sentence takes longer than the division.
     if part_ns <= 0 or whole_ns % part_ns:
         expected = f"a whole fraction of {whole_name} ({seconds(whole_ns):g} s)"
         raise ParameterError(f"{key}: found {seconds(part_ns):g} s, expected {expected}")

@@ -1,14 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario files: a ROS parameter file with a section per node, read without ROS by rcl's rules.
+"""Read scenario files without ROS, by rcl's rules for ROS parameter files.
 
 /**/controller:
   ros__parameters:
     rate: 100.0    # Hz
 
-rcl joins the sections that match the full name of a node, in the order of the file, so that a later
-value replaces an earlier one. In the name of a section, `**` stands for any number of names, and
-`*` for one. From a section for all nodes, a node takes only the parameters that it knows.
+A scenario file has a section for each node. rcl joins the sections that match the full name of a
+node, in the order of the file, so that a later value replaces an earlier one. In the name of a
+section, `**` stands for any number of names, and `*` for one. A node takes only the parameters that
+it knows from a section for all nodes.
 """
 
 import difflib
@@ -30,7 +31,8 @@ ROS_PARAMETERS = (SIM_TIME, "start_type_description_service", "qos_overrides")
 """Parameters that ROS gives every node."""
 
 WILDCARDS: Mapping[str, str] = {"**": "(/[^/]+)*", "*": "/[^/]+"}
-# similarity at which an unknown section counts as a missing one that is misspelt, such as recoder
+# similarity from which on an unknown section, such as recoder, counts as a missing section that is
+# misspelt
 MISTYPED = 0.8
 
 
@@ -43,13 +45,13 @@ def parse_sections(
     *,
     with_general: bool = False,
 ) -> Sections:
-    """Return the sections of a scenario file by node name, as {"controller": {"rate": 100.0, ...}}.
+    """Return the sections of a scenario file by node, as in {"controller": {"rate": 100.0, ...}}.
 
     Sections of nodes that are not among `schemas` are left out. A section in `optional` can be
-    absent or an empty mapping. Every parameter of it then has its default. Parameters of ROS itself
-    are left out, but if a node follows /clock, `use_sim_time` of the section `flight` becomes true.
-    `namespace` is the namespace of the nodes, "" for the root. If it is None, any namespace will
-    do. If `with_general` is set and a node has no section, parameters for all nodes make one up.
+    absent or an empty mapping, and then has only defaults. Parameters of ROS itself are left out,
+    but if a node follows /clock, `use_sim_time` of the section `flight` becomes true. `namespace`
+    is the namespace of the nodes, "" for the root. If it is None, any namespace is accepted. If
+    `with_general` is set, a node without a section gets one from the parameters for all nodes.
 
     Raises ParameterError with the path if the content is no scenario file or too long, has a
     duplicate key, lacks a section, or names nodes of two namespaces while `namespace` is None.
@@ -99,7 +101,7 @@ def parse_sections(
 
 
 def names_node(content: bytes, path: Path, name: str, key: str, namespace: str) -> bool:
-    """Return whether a section of this node has the parameter `key`; one for all does not count.
+    """Return whether a section of a node has the parameter `key`, except sections for all nodes.
 
     Raises ParameterError if the content is no ROS parameter file.
     """
@@ -168,7 +170,7 @@ def _is_mapping(value: object) -> bool:
 
 
 def _matches(pattern: str, name: str, namespace: str | None) -> bool:
-    """Return whether a section is for the node, in any namespace if `namespace` is None."""
+    """Return whether a section is for a node, in any namespace if `namespace` is None."""
     *_, last = pattern.split("/")
     if namespace is None:
         return last == name or last in WILDCARDS
@@ -195,7 +197,7 @@ def _require_one_namespace(own: list[str], name: str, path: Path) -> None:
 def _require_not_mistyped(
     found: Mapping[str, object], name: str, schemas: Mapping[str, object], path: Path
 ) -> None:
-    """Refuse an unknown section whose name resembles the name of the missing section."""
+    """Raise ParameterError if an unknown section has nearly the name of a missing section."""
     foreign = [pattern.rpartition("/")[2] for pattern in found]
     foreign = [other for other in foreign if other not in schemas]
     near = difflib.get_close_matches(name, foreign, n=1, cutoff=MISTYPED)
@@ -206,7 +208,7 @@ def _require_not_mistyped(
 
 
 def _nested(values: Mapping[Any, Any]) -> dict[Any, Any]:
-    """Turn dotted names of parameters into groups."""
+    """Return the parameters with nested groups in place of dotted names."""
     tree: dict[Any, Any] = {}
     for key, value in values.items():
         name, dot, rest = key.partition(".") if isinstance(key, str) else (key, "", "")
@@ -217,7 +219,7 @@ def _nested(values: Mapping[Any, Any]) -> dict[Any, Any]:
 
 
 def join_parameters(values: dict[Any, Any], further: Mapping[Any, Any]) -> None:
-    """Merge further parameters into `values`, where they replace those of the same name."""
+    """Merge further parameters into `values`, where they replace parameters of the same name."""
     for key, value in further.items():
         before = values.get(key)
         if isinstance(before, dict) and isinstance(value, Mapping):

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Requests of a node to Linux's scheduler, so that fewer ticks are late.
+"""Make requests to Linux's scheduler, so that fewer ticks of a node are late.
 
-A request needs no privilege. If Linux refuses it, ticks are as late as without it.
+No request needs a privilege. If Linux refuses a request, ticks are as late as without it.
 """
 
 import ctypes
@@ -15,20 +15,21 @@ from pathlib import Path
 TIMER_SLACK = Path("/proc/self/timerslack_ns")  # timer slack of the main thread, on Linux
 THREADS = Path("/proc/self/task")
 REAL_TIME = (os.SCHED_FIFO, os.SCHED_RR)
-SLICE_NS = 100_000  # the shortest slice of Linux, which has 0.7 ms (1 + log2(cores)) by default
-# numbers of the system call; glibc has no function for the call before 2.41
+SLICE_NS = 100_000  # the shortest slice of Linux; its default is 0.7 ms (1 + log2(cores))
+# numbers of the system call, for which glibc has no function before 2.41
 SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
-# struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
+# members of struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
 ATTRIBUTES = "=IIQiIQQQ"
 
 
 def compute_in_one_thread() -> None:
     """Let the linear algebra of this process, and of those that it starts, use one thread.
 
-    Call it before NumPy is imported, because OpenBLAS reads the number once. Our matrices have at
-    most some hundred rows. On them two threads take longer than one, because each waits for the
-    other, and on a busy host they take several times as long. With one thread, the last bits of a
-    result do not depend on the number of processors either. A number that the user has set is kept.
+    Call this before NumPy is imported, because OpenBLAS reads the number of threads only once. The
+    matrices here have at most some hundred rows. For such matrices two threads take longer than
+    one, because each waits for the other, and on a busy host they take several times as long. With
+    one thread, the last bits of a result also do not depend on the number of processors. A number
+    of threads that the user has set is kept.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -36,11 +37,11 @@ def compute_in_one_thread() -> None:
 def lower_real_time_priority(levels: int) -> None:
     """Lower the real-time priority (chrt) of every thread of this process, if it has one.
 
-    It falls by `levels`, but not below 1. Threads started later inherit it. Processes of equal
-    priority do not preempt each other: compression in the recorder would delay a tick of the law by
-    milliseconds, and a tick of the law takes up to 3 ms, by which it would delay y_m.
-    Rate-monotonic priorities, lower for longer periods, are the optimal fixed priorities. Source:
-    sched(7); C. L. Liu and J. W. Layland, Journal of the ACM 20(1), 1973, theorem 2.
+    The priority falls by `levels`, but not below 1. Threads that are started later inherit it.
+    Processes of equal priority do not preempt each other. Compression in the recorder would
+    therefore delay a tick of the law by milliseconds, and a tick of the law would delay y_m by up
+    to 3 ms. Rate-monotonic priorities, lower for longer periods, are the optimal fixed priorities.
+    Source: sched(7); C. L. Liu and J. W. Layland, Journal of the ACM 20(1), 1973, theorem 2.
     """
     if (policy := os.sched_getscheduler(0)) in REAL_TIME:
         _schedule_threads(
@@ -53,7 +54,7 @@ def leave_real_time_priority() -> None:
     """Give every thread of this process that has a real-time priority (chrt) the default policy.
 
     A command that starts and watches nodes of real-time priority calls this, so that its wake-ups
-    and garbage collections delay no tick.
+    and garbage collections do not delay ticks.
     """
     if os.sched_getscheduler(0) in REAL_TIME:
         _schedule_threads(os.SCHED_OTHER, 0)

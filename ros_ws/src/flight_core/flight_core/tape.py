@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The tape: the in-memory log of a flight.
+"""Define the tape, which is the log of a flight in memory.
 
-A tape comes from a flight in a single process, from a flight over topics, or from a bag.
+A tape comes from a flight in a single process, from a flight over topics, or from a bag, which is a
+log of ROS 2.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,7 @@ from flight_core.vectors import FloatArray
 
 @dataclass(frozen=True)
 class Signal:
-    """A topic: N samples of k named channels, SI units and radians.
+    """The N samples of a topic in k named channels, in SI units and radians.
 
     Attributes:
         stamp_ns: Instants of the samples, shape (N,), int64, ns, ascending.
@@ -75,7 +76,7 @@ class Signal:
         return Signal(self.stamp_ns[keep], self.names, self.values[keep], sender)
 
     def after(self, earlier: "Signal | None") -> "Signal":
-        """Return the signal with the samples of an earlier signal, if any, put before its own.
+        """Return the signal with the samples of an earlier signal, if any, in front.
 
         Args:
             earlier: A signal with the same channels, or None.
@@ -116,7 +117,7 @@ class Signal:
         """
         columns = [i for i, name in enumerate(self.names) if name.startswith(prefix + ".")]
         names = tuple(self.names[i].removeprefix(prefix + ".") for i in columns)
-        # if the channels are adjacent, a slice selects them without a copy
+        # If the channels are adjacent, a slice selects them without a copy.
         adjacent = bool(columns) and columns[-1] - columns[0] < len(columns)
         return Signal(
             self.stamp_ns,
@@ -141,14 +142,14 @@ class Recording(NamedTuple):
     left_out: int = 0  # number of messages after the step
     # number of messages that the publisher's numbering shows as lost, or None without numbers
     lost: int | None = None
-    # The last stamp before each pause in which nothing was received either. It is no step of the
-    # clock.
+    # The last stamp before each pause in which nothing was received, either. Such a pause is no
+    # step of the clock.
     pauses_ns: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Process:
-    """A process of a flight. A stamp is in ns, or None if it is unknown or has no sample."""
+    """A process of a flight. Stamps are in ns, and None if unknown or if there is no sample."""
 
     ready_ns: int | None  # instant at which its event loop began
     first_ns: int | None  # stamp of its first sample
@@ -167,14 +168,15 @@ class LostPart:
 
 @dataclass(frozen=True)
 class Tape:
-    """A flight: signals by topic name.
+    """The log of a flight in memory, which has signals by topic name.
 
     `start_ns` is the stamp of flight time t = 0, and `outcome` comes from flight_core.outcome. A
     flight of `simulate` also has its `scenario`, and the `changes` of the controller's parameters
-    in flight. A log has the `recording` by topic, the `duration` of the whole flight, s, if it is
-    known, the `processes` by name, how many samples of a topic were `refused`, whether the flight
-    followed the simulated time of /clock (`is_by_clock`), the `lost_parts`, of which the `notes`
-    tell as well, and the `account` of `rise_di.read_run`.
+    in flight. The tape of a log also has the `recording` by topic, the `duration` of the whole
+    flight, s, if it is known, the `processes` by name, and how many samples of a topic were
+    `refused`. `is_by_clock` says whether the flight followed the simulated time of /clock.
+    `lost_parts` are parts that the log lost, which the `notes` mention as well. `account` is what
+    `rise_di.read_run` found in the log, and what it lacks.
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
@@ -224,7 +226,7 @@ class Tape:
 
 
 def refusal_note(topic: str, count: int) -> str:
-    """Write the note about refused samples of a topic."""
+    """Return the note about refused samples of a topic."""
     return f"{topic}: {count} samples refused: damaged, not finite, or of other channels"
 
 

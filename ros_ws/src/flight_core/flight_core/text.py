@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Makes text from samples, logs and files safe to show to a user.
+"""Make text from samples, logs and files safe to show to a user.
 
-The result has no terminal control code and a bounded length.
+The result has no terminal control code, and a limited length.
 """
 
 MAX_LENGTH = 1000  # characters of a sentence, however long the bad input is

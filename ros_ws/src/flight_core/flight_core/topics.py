@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 EXTERNAL = "external"  # publishers and subscribers that do not belong to the stack
 NODES = ("aircraft", "reference_model", "guidance", "controller", "learner", "recorder", "bridge")
-LOG = "log"  # as a subscriber: the recorder
+LOG = "log"  # stands for the recorder among the subscribers
 HISTORY = "2 s"  # a publisher keeps the samples of two seconds for a late subscriber
 LAST = "last"  # a publisher keeps the last message for a late subscriber
 NOTHING = "-"  # a publisher keeps nothing, and nothing is sent again
@@ -25,12 +25,12 @@ PLAN = "nav_msgs/msg/Path"
 
 
 class Topic(NamedTuple):
-    """A topic by its relative name."""
+    """A topic, with its name relative to the namespace."""
 
     name: str
-    message: str | type  # name, such as "sensor_msgs/msg/JointState", or class of the message
-    # publishers -> subscribers, such as "aircraft, bridge -> controller, log", where "nodes" stands
-    # for all NODES
+    message: str | type  # class of the message, or its name, such as "sensor_msgs/msg/JointState"
+    # publishers and subscribers, such as "aircraft, bridge -> controller, log", where "nodes"
+    # stands for all NODES
     ends: str = "->"
     meaning: str = ""  # channels, units and use, in Markdown
     keeps: str = HISTORY  # what a publisher keeps for a late subscriber
@@ -48,7 +48,7 @@ class Topic(NamedTuple):
 
     @property
     def foreign(self) -> bool:
-        """Whether foreign programs publish the topic, possibly at another quality of service."""
+        """Whether programs outside of the stack publish the topic, possibly at another QoS."""
         return EXTERNAL in self.publishers
 
     @property

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Units of airframe files.
+"""Convert the units of airframe files.
 
-Values are converted once, when they are loaded. The code then uses only SI and radians.
+Values are converted once, when they are loaded. After that, the code uses only SI and radians.
 """
 
 import re
@@ -45,7 +45,7 @@ LENGTH = (0, 1, 0, 0)
 SPEED = (0, 1, -1, 0)
 ANGULAR_RATE = (1, 0, -1, 0)
 
-SIZES = {SPEED: 1.0, LENGTH: 1.0}  # m/s, m: the "sizes" in which weights measure states
+SIZES = {SPEED: 1.0, LENGTH: 1.0}  # m/s and m, the "sizes" in which weights measure states
 ANGLE_SIZE = 0.1  # size of an angle, rad, of a rate, rad/s, and of a value without a dimension
 
 BASE_UNITS: Mapping[str, Quantity] = MappingProxyType(

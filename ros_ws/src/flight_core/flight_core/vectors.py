@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Named vectors: values with their channel names.
+"""Handle named vectors, which are values with channel names.
 
 Channels are matched by name, never by position.
 """
@@ -99,7 +99,7 @@ def as_array(value: Any, key: str, expected: str) -> FloatArray:
 
 
 class StampedVector(NamedTuple):
-    """The values of a sample, shape (m,), the instant of the values, and the publisher.
+    """A sample with the instant of its values, shape (m,), and its publisher.
 
     Attributes:
         stamp_ns: Instant, ns.
@@ -119,7 +119,8 @@ class StampedVector(NamedTuple):
 class ChannelError(ValueError):
     """An invalid sample.
 
-    `reason` is a short word for counters; the message is a sentence, printable and bounded.
+    `reason` is a short word for counters. The message is a sentence, printable and of limited
+    length.
     """
 
     def __init__(self, reason: str, sentence: str) -> None:
@@ -128,7 +129,7 @@ class ChannelError(ValueError):
 
 
 def require_newer(stamp_ns: int, last_ns: int, what: str = "sample") -> None:
-    """Raise ChannelError, reason "order", unless a stamp is newer than the last stamp.
+    """Raise ChannelError, reason "order", if a stamp is not newer than the last stamp.
 
     `what` names the sample.
     """
@@ -173,7 +174,7 @@ def select(
         vector = np.array(values, dtype=np.float64)
     else:
         vector = np.asarray(values, dtype=np.float64)[_places(tuple(channels), tuple(names))]
-    # For a few channels, this loop takes a third of the time of np.isfinite.
+    # For few channels, this loop takes a third of the time of np.isfinite.
     if not all(map(math.isfinite, vector.tolist())):
         raise ChannelError("finite", f"{', '.join(channels)} = {vector.tolist()} is not finite")
     return vector
