@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rise-di command of the RISE-DI flight stack. Each command has a file of its own."""
+"""The `rise-di` command of the RISE-DI flight stack, with a module for each subcommand."""

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di airframes`: check the assumptions of the theorem on any airframe.
 
-The airframe is one of the library or your own. The command can also write a new one.
+The airframe comes from the library or from the user. The command can also write a new airframe.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,8 @@ from flight_design.gains.airframe_properties import (
 from rise_di.own_airframe import NewAirframe, new_airframe
 
 ROOTS = "Poles and zeros in 1/s, leading minors of C B in SI"
-# Exit status: in the first flight an input was at its stop, or it did not end as planned.
+# Exit status if an input was at its stop in the first flight, or if this flight did not end as
+# planned.
 FALLS_SHORT = 3
 
 
@@ -103,7 +104,7 @@ class Airframes:
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Write a new airframe, or show airframes by name."""
+        """Write a new airframe, or show the airframes that the user names."""
         if self.write is not None:
             self._make(self.write)
             return
@@ -135,7 +136,7 @@ class Airframes:
 
 
 def _show(console: Console, facts: Sequence[AirframeFacts]) -> None:
-    """Print the assumptions of the theorem, one table for each group of them."""
+    """Print the assumptions of the theorem, with a table for each group of assumptions."""
     for title, headings, cells in (
         ("Signs and pairing", ("D", "for D = I", "coupling"), _signs),
         ("Assumptions 1 and 3", ("n, m", "controllable", "zeros", "integrated"), _assumptions),
@@ -157,7 +158,7 @@ def _show(console: Console, facts: Sequence[AirframeFacts]) -> None:
 
 
 def _show_draft(draft: NewAirframe) -> None:
-    """Show what was read, and which files were written."""
+    """Print what was read, and which files were written."""
     frame = draft.airframe
     print(f"read:     {draft.note}")
     effects = (
@@ -191,7 +192,7 @@ def _roots(facts: AirframeFacts) -> tuple[str, str, str]:
 
 
 def _format_roots(roots: ComplexArray) -> str:
-    """Write roots as text: a conjugate pair once, and a root that is zero to rounding as 0."""
+    """Return roots as text, with a conjugate pair once, and a root at zero to rounding as 0."""
     texts = []
     for root in roots:
         real, imaginary = (

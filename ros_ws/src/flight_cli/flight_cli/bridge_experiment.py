@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What `rise-di identify bridge` does: excite the aircraft behind a channel map.
+"""Excite the aircraft behind a channel map, as `rise-di identify bridge` does.
 
-It writes a scenario that flies this aircraft.
+The result is a scenario that flies this aircraft. A channel map assigns the channels to messages of
+an autopilot.
 """
 
 import shlex
@@ -61,24 +62,25 @@ from flight_design.identification.response_identification import Response, ident
 from flight_design.identification.sign_check import OPEN_LOOP
 from flight_log.tape_reader import read_run
 
-GUIDED = 600.0  # s, the duration of a flight under guidance
+GUIDED = 600.0  # duration of a flight under guidance, s
 
 
 @dataclass(frozen=True, kw_only=True)
 class BridgeExperiment:
-    """An experiment on the aircraft behind a channel map, or the log of one.
+    """An experiment on the aircraft behind a channel map, which is flown or read from its log.
 
     The files that fly the aircraft are written to `folder`. If the log was imported, the gains
-    allow for `link_delay`, s, beyond the delay in the log; None takes the delay of the map.
+    allow for `link_delay`, s, in addition to the delay in the log. If it is None, the delay of the
+    map is taken.
     """
 
     map_name: str
-    speed: float | None  # m/s in trim; None takes the airspeed of the map, or hover
+    speed: float | None  # trim speed, m/s; if None, that of the map, or hover
     folder: Path
     amplitude: float  # as a fraction of each input's limit
-    log: Path | None  # None flies the experiment
+    log: Path | None  # log of an experiment; if None, it is flown
     needed: Requirement
-    accept: bool  # also gains whose margins fall short
+    accept: bool  # whether gains with too small margins are accepted
     link_delay: float | None
 
     def identify(self, *, as_json: bool) -> None:
@@ -97,7 +99,7 @@ class BridgeExperiment:
         for sentence in narrower:
             say(console, sentence)
         flyable = self._flyable(channel_map, channels)
-        # The name of the run, not `latest`.
+        # Take the name of the run, not `latest`.
         written_map = map_text(channel_map, trims, run.resolve().name)
         files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
         guidance_scenario = guided_scenario(flyable.scenario, channel_map, self.speed)
@@ -162,7 +164,7 @@ class BridgeExperiment:
         *,
         imported: bool,
     ) -> IdentifiedChannels:
-        """Add the delay of the link to the channels if the log was imported."""
+        """Add the delay of the link to the channels, if the log was imported."""
         expected = "a log of rise-di import: an experiment over the link contains its delay"
         require(imported or self.link_delay is None, "link_delay", self.link_delay, expected)
         if not imported:
@@ -172,7 +174,7 @@ class BridgeExperiment:
         return over_link(channels, later or 0.0)
 
     def _flyable(self, channel_map: ChannelMap, channels: IdentifiedChannels) -> Flyable:
-        """Make the airframe and the scenario with gains.
+        """Return the airframe and the scenario with gains.
 
         Raises ParameterError if the margins fall short.
         """
@@ -184,7 +186,7 @@ class BridgeExperiment:
 
 
 def guided_scenario(scenario: str, channel_map: ChannelMap, speed: float | None) -> str | None:
-    """Write the scenario with guidance in place of its commands.
+    """Return the text of the scenario with guidance in place of its commands.
 
     Returns None if guidance cannot fly it, because the map lacks the pose, the rates or the
     airspeed.
@@ -210,7 +212,7 @@ def _identified(
     spans: list[tuple[int, int]],
     speed: float | None,
 ) -> tuple[dict[str, float], Response, IdentifiedChannels]:
-    """Show the trims, the step responses and the channels of an experiment, and return them.
+    """Find the trims, the step responses and the channels of an experiment, and print them.
 
     Raises ParameterError if a channel is not certain.
     """
@@ -238,7 +240,7 @@ def _write(folder: Path, files: Mapping[str, str]) -> None:
 
 
 def _announce(console: Console, plan: Experiment, duration: float, *, hovers: bool) -> None:
-    """Show the whole experiment before it begins."""
+    """Print the plan of the experiment before it begins."""
     controller = plan.controller
     table = new_table(
         f"Excitation, {controller.duration:.0f} s open loop after engagement, one input after "
@@ -268,10 +270,10 @@ def _announce(console: Console, plan: Experiment, duration: float, *, hovers: bo
 def _engaged(
     run: Path, channel_map: ChannelMap
 ) -> tuple[Tape, list[tuple[int, int]], Refusal | None]:
-    """Return the tape of an experiment, the engaged spans, ns, and why the bridge ended it early.
+    """Return the tape of an experiment, the engaged spans, ns, and why it ended early, if so.
 
-    A log of `rise-di import` is one single span. Raises ParameterError if the log has no
-    engagement, or if the flight had feedback, because u then follows y.
+    A log of `rise-di import` is a single span. Raises ParameterError if the log has no engagement,
+    or if the flight had feedback, because u then follows y.
     """
     recorded_run = read_run(run)
     warn_of_lacks(recorded_run)
@@ -308,9 +310,9 @@ def _engaged(
 
 
 def _digits(value: float, digits: int) -> str:
-    """Write a value with its leading digits, and without an exponent up to 1e6.
+    """Write a value with so many leading digits, without an exponent if it is below 1e6.
 
-    A narrow column would cut an exponent off.
+    A narrow column would cut off the exponent.
     """
     return f"{float(f'{value:.{digits}g}'):g}"
 
@@ -374,7 +376,7 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
             )
     print_table(console, table)
     print_table(console, loop)
-    # A channel without a certain model flies by its step response.
+    # If the model of a channel is not certain, the channel flies by its step response.
     uncertain = [
         name
         for name, model in zip(response.outputs, models, strict=True)
@@ -391,7 +393,7 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
 
 
 def _show_link(console: Console, channel_map: ChannelMap, link_delay: float | None) -> None:
-    """Say for which link the gains hold if the log is of the autopilot's own board."""
+    """Print for which link the gains hold, if the log was written on the autopilot's board."""
     if link_delay is None:
         sentence = (
             f"The map {channel_map.name} states no link_delay. Gains and margins are without the "

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di campaign`: fly a Monte Carlo campaign.
+"""Implement `rise-di campaign`, which flies a Monte Carlo campaign.
 
-Thousands of uncertain aircraft fly one scenario.
+In a campaign, thousands of uncertain aircraft fly one scenario.
 """
 
 import math
@@ -77,7 +77,7 @@ OF_DEFINITION = (
 
 
 class EngineName(StrEnum):
-    """Where the chunks of a campaign are computed."""
+    """The engine that computes the chunks of a campaign."""
 
     THREADS = "threads"
     DASK = "dask"
@@ -150,7 +150,7 @@ class Campaign:
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Begin or continue the campaign, fly what is missing, and show the figures."""
+        """Begin or continue the campaign, fly the missing aircraft, and print the results."""
         engines.require_jax(shared=self.engine is EngineName.DASK)
         if self.engine is not EngineName.DASK:
             require_unused(self, ["scheduler"], "--engine dask with it")
@@ -181,7 +181,7 @@ class Campaign:
         )
 
     def _continued(self) -> MonteCarlo:
-        """Load the campaign of a folder, and refuse options that define a new campaign."""
+        """Load the campaign in a folder. Raises ParameterError if options define a new one."""
         for name in OF_DEFINITION:
             source = self.context.get_parameter_source(name)
             is_default = source is None or source.name != "COMMANDLINE"
@@ -213,7 +213,7 @@ class Campaign:
         return MonteCarlo.begin(new_run(scenario, self.runs, "campaign-"), definition)
 
     def _engine(self, *, is_single: bool) -> engines.Engine:
-        """Return the engine that was named, or dask for aircraft that fly one by one."""
+        """Return the engine that the user named, or dask if aircraft fly one by one."""
         engine_name = self.engine or (EngineName.DASK if is_single else EngineName.THREADS)
         if engine_name is EngineName.THREADS:
             return engines.threads(self.workers)
@@ -223,7 +223,7 @@ class Campaign:
 def _show_cases(
     console: Console, monte_carlo: MonteCarlo, cases: Sequence[dict[str, Any]], results: MetricTable
 ) -> None:
-    """Print the figures and the influences of each case, and the table of all cases."""
+    """Print the results and the influences of each case, and the table of all cases."""
     definition = monte_carlo.definition
     for case, figures in enumerate(cases):
         _show(console, definition, case, monte_carlo.tally(case), figures)
@@ -250,9 +250,10 @@ def _parse_sweep(text: str) -> Sweep:
 def _fly_missing(
     monte_carlo: MonteCarlo, engine: engines.Engine, place: str, *, quiet: bool
 ) -> float | None:
-    """Fly the chunks that are missing, and return how many aircraft-seconds were flown per second.
+    """Fly the missing chunks, and return the speed in seconds of flight of all aircraft per second.
 
-    Returns None if no chunk was missing. `place` says where it computes, such as " on NVIDIA H200".
+    Returns None if no chunk was missing. `place` is a text on where the campaign is computed, such
+    as " on NVIDIA H200".
     """
     definition = monte_carlo.definition
     total = definition.aircraft * definition.cases

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di check`: compare a channel map with the D of the controller.
+"""Implement `rise-di check`, which compares a channel map with the D of the controller.
 
-It also checks a map against a recorded flight and against releases of an autopilot.
+It also checks a map against a recorded flight, and against releases of an autopilot.
 """
 
 from collections.abc import Sequence
@@ -44,7 +44,7 @@ from flight_design.identification.sign_check import (
 )
 
 CONTRADICTS = 1
-INSTALLED = "installed"  # a word in place of a folder: the message packages of this host
+INSTALLED = "installed"  # stands for the message packages of this host, in place of a folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +83,7 @@ class Check:
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Compare signs, or rows with releases, and show what contradicts."""
+        """Compare signs, or the rows of the map with releases, and print what contradicts."""
         channel_map = load_map(self.map_name)
         if self.definitions:
             _check_rows(channel_map, self.definitions, self.as_json)
@@ -143,7 +143,7 @@ def _show(console: Console, channel_map: ChannelMap, sign_check: SignCheck, airf
             )
         table.add_row(*cells)
     print_table(console, table)
-    # The second table shows the fields of the map and their topics.
+    # A second table has the fields of the map and their topics.
     headings = ("channel", "raw value", "topic")
     fields = new_table("", headings, left_aligned=headings)
     for channel in sign_check.channels:
@@ -171,9 +171,9 @@ def _format_field(row: OutputRow | InputRow) -> str:
 
 
 def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: bool) -> None:
-    """Compare the rows of a map with the message definitions of releases.
+    """Compare the rows of a map with message definitions, and print which rows do not hold.
 
-    Show the rows that do not hold.
+    The definitions are those of releases of an autopilot.
     """
     kinds = list(dict.fromkeys(kind for _, _, kind, *_ in channel_map.used_fields()))
     installed = installed_definitions(kinds)
@@ -211,7 +211,7 @@ def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: b
 
 
 def _row_as_json(row: CheckedRow) -> dict[str, object]:
-    """Return a row with a sentence a release, which is empty if the row holds."""
+    """Return a row for JSON, with a sentence for each release, which is empty if the row holds."""
     return row._asdict() | {"faults": [str(fault or "") for fault in row.faults]}
 
 

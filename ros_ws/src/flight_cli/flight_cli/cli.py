@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The `rise-di` command and what it can do.
+"""Run the `rise-di` command, and list its subcommands.
 
 The module of a command is imported only when the command runs, so that --help is quick.
 """
 
 import signal
 
-# Until the command runs, Ctrl-C ends it without a word: its imports may take a second.
+# Until the command runs, Ctrl-C ends it without a message, because its imports may take a second.
 signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import errno
@@ -30,12 +30,12 @@ from flight_core.scheduling import compute_in_one_thread
 FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
-NICE = 10  # niceness of a command that may run beside a flight
+NICE = 10  # niceness of a command that may run during a flight
 CONTROLS = frozenset({"--control", "--real"})  # options with which a page commands the flight
-# Number of new objects before Python collects garbage, by default 700. A flight keeps what it
-# makes, so that frequent collections find nothing.
+# Number of new objects before Python collects garbage, which is 700 by default. A flight keeps the
+# objects that it makes, so frequent collections would find nothing.
 GARBAGE_THRESHOLD = 100_000
-REPEATED_AFTER = 0.01  # s, after which an interrupt that Python ignored is repeated
+REPEATED_AFTER = 0.01  # time after which an interrupt that Python ignored is repeated, s
 
 GROUPS = MappingProxyType(
     {
@@ -109,7 +109,7 @@ COMMANDS = MappingProxyType(dict(ChainMap(*GROUPS.values())))
 
 def _show_version(is_set: bool) -> None:
     if is_set:
-        from importlib.metadata import version  # noqa: PLC0415 - --help does without
+        from importlib.metadata import version  # noqa: PLC0415 - --help does not need it
 
         print(f"rise-di {version('rise-di')}")
         raise typer.Exit
@@ -127,7 +127,7 @@ def _options(
 
 
 def _group(**rules: Any) -> typer.Typer:
-    """Make a group of commands."""
+    """Return an empty group of commands for Typer."""
     return typer.Typer(
         cls=RiseDiGroup,
         no_args_is_help=True,
@@ -138,9 +138,9 @@ def _group(**rules: Any) -> typer.Typer:
 
 
 def application(words: Collection[str]) -> typer.Typer:
-    """Build the command line with those commands that occur among the words.
+    """Build the command line with the commands that occur among the words.
 
-    All other commands only get their name and their help.
+    All other commands only get a name and a help text.
     """
     app = _group(
         epilog="rise-di help COMMAND and rise-di COMMAND -h show the options of a command."
@@ -150,10 +150,10 @@ def application(words: Collection[str]) -> typer.Typer:
         for name, sentence in commands.items():
             module = f"{name}_" if iskeyword(name) else name
             verbs = VERBS.get(name, {})
-            # A command without verbs is itself what the module has.
+            # For a command without verbs, the module has the command itself.
             target = _group() if verbs else app
             for verb, meaning in (verbs or {name: sentence}).items():
-                command: Callable[..., None] = lambda: None  # noqa: E731 - for one that does not run
+                command: Callable[..., None] = lambda: None  # noqa: E731 - not called
                 if name in words:
                     command = as_function(resolve_name(f"flight_cli.{module}:{verb.capitalize()}"))
                 target.command(
@@ -170,7 +170,7 @@ def application(words: Collection[str]) -> typer.Typer:
 def _repeat_interrupt(ignored: "sys.UnraisableHookArgs") -> None:
     """Repeat a Ctrl-C that came inside a destructor or a callback of a weak reference.
 
-    There, Python only prints it and goes on.
+    In such places, Python only prints the interrupt and goes on.
     """
     if issubclass(ignored.exc_type, KeyboardInterrupt):
         signal.signal(signal.SIGALRM, signal.default_int_handler)
@@ -180,22 +180,22 @@ def _repeat_interrupt(ignored: "sys.UnraisableHookArgs") -> None:
 
 
 def _looks_on(words: Sequence[str]) -> bool:
-    """Return whether a command only looks at a flight. It then gives way to the flight.
+    """Return whether a command only looks at a flight. Such a command yields its CPU time.
 
-    A page that can deactivate and hold does not give way, because it has to answer when the host is
-    busy.
+    A page that can deactivate the law or hold does not yield, because it has to answer when the
+    host is busy.
     """
     return words[:1] == ["watch"] and CONTROLS.isdisjoint(words)
 
 
 def main() -> None:
-    """Run a command. Bad input ends in one sentence and exit status 2; Ctrl-C is quiet."""
+    """Run a command. Bad input ends with a sentence and exit status 2. Ctrl-C is quiet."""
     gc.set_threshold(GARBAGE_THRESHOLD)
     compute_in_one_thread()
     if _looks_on(sys.argv[1:]):
         with suppress(OSError):
             os.nice(NICE)
-            # A batch process does not interrupt a node when it wakes up.
+            # Run as a batch process, which does not interrupt a node when it wakes up.
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     words = [
         *without_help_word(sys.argv[1:])[:1],
@@ -205,7 +205,7 @@ def main() -> None:
         app = application(words)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.unraisablehook = _repeat_interrupt
-        # Not at the top of the file: --help needs neither of them.
+        # These imports are not at the top of the file, because --help does not need them.
         from flight_core.outcome import FlightEnded  # noqa: PLC0415
         from flight_core.parameters import ParameterError  # noqa: PLC0415
 
@@ -227,14 +227,15 @@ def main() -> None:
     except OSError as error:
         if error.errno not in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
             raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # where Python writes the rest when it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for the output that Python writes at its end
         print(
             f"error: output: cannot be written ({error.strerror}), expected a disk with space",
             file=sys.stderr,
         )
         sys.exit(FAILED)
     except Exception as error:
-        # A module in C turns Ctrl-C into an ImportError while it loads, pybind11 into a TypeError.
+        # While it loads, a module in C turns Ctrl-C into an ImportError, and pybind11 into a
+        # TypeError.
         if not isinstance(error.__cause__, KeyboardInterrupt):
             raise
         sys.exit(INTERRUPTED)

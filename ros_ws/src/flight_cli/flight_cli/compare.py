@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di compare`: compare RISE-DI with other control laws on the same aircraft.
+"""Implement `rise-di compare`, which compares RISE-DI with other laws on the same aircraft.
 
 The same procedure tunes every law.
 """
@@ -80,23 +80,23 @@ Gains = dict[str, dict[str, TuningResult]]
 
 
 class Contest(NamedTuple):
-    """The laws of a comparison, and the file that holds their tuned gains."""
+    """The laws of a comparison, and the file with their tuned gains."""
 
     scenario: Scenario
     names: Sequence[str]
-    aims: Sequence[str]  # objectives that the gains are tuned on
+    aims: Sequence[str]  # objectives for which the gains are tuned
     controllers: Mapping[str, ControllerConfig | None]  # None for a law that is tuned
     entries: Mapping[str, Law]
     path: Path
 
     def untuned(self) -> list[tuple[str, str]]:
-        """List the pairs of law and objective for which the file has no gains."""
+        """Return the pairs of law and objective for which the file has no gains."""
         tunings = tuned_gains.load(self.path)
         pairs = product(self.names, self.aims)
         return [(name, aim) for name, aim in pairs if aim not in tunings.get(name, {})]
 
     def tune(self, command: str, bar: Progress) -> None:
-        """Tune each law for each objective, and write the file after every law."""
+        """Tune each law for each objective, and write the file after each law."""
         benchmark = self.benchmark()
         for name, aim in self.untuned():
             law = self.entries[name]
@@ -117,14 +117,14 @@ class Contest(NamedTuple):
             tuned_gains.save(self.path, tunings, list(gain_tuning.OBJECTIVES), command)
 
     def benchmark(self, *seed: int) -> Benchmark:
-        """Build winds and aircraft; a seed replaces the seed of the tuning's turbulence."""
+        """Build winds and aircraft. A seed replaces the seed of the turbulence for the tuning."""
         build = gain_tuning.build_benchmark(self.scenario, *seed)
         return registered_laws.with_courses(build, self.controllers)
 
     def tuned(self) -> Gains:
-        """Return the gains by law and objective: found by a search, or else those of a controller.
+        """Return the gains by law and objective, from a search or else from a controller.
 
-        Raises ParameterError if there are none at all.
+        Raises ParameterError if there are no gains at all.
         """
         tunings = tuned_gains.load(self.path)
         gains: Gains = {}
@@ -186,7 +186,7 @@ class Compare:
     to_json: Path | None = option("File to write the figures to, in SI.", "--json")
 
     def execute(self) -> None:
-        """Tune what has no gains, fly every law, show the figures and write them."""
+        """Tune laws without gains, fly every law, and print and write the results."""
         engines.require_jax()
         names = list(LAWS) if self.laws is None else self.laws.split(",")
         aims = self.tuning.split(",")
@@ -218,7 +218,7 @@ class Compare:
             write_text("--json", self.to_json, self._as_json(contest, results))
 
     def _contest(self, names: Sequence[str], aims: Sequence[str]) -> Contest:
-        """Define the laws; the law of a scenario file has the name of the file."""
+        """Return the laws to compare. The law of a scenario file has the name of the file."""
         scenario = find_scenario(self.scenario)
         if self.wind is not None:
             uncertainty = scenario.aircraft.uncertainty.model_dump() | {"wind": self.wind}
@@ -239,7 +239,7 @@ class Compare:
         )
 
     def _command(self) -> str:
-        """Return the command that tunes again, which the file of gains states."""
+        """Return the command that repeats the tuning, for a comment in the file of gains."""
         wind = "" if self.wind is None else f" --wind {self.wind}"
         return f"rise-di compare {self.scenario} --tune{wind}"
 
@@ -251,7 +251,7 @@ class Compare:
         benchmark: Benchmark,
         gains: Gains,
     ) -> None:
-        """Print a table for each objective, and say what the words mean."""
+        """Print a table for each objective, and explain the words."""
         scenario = contest.scenario
         for aim in contest.aims:
             if results_of_aim := [result for result in results if result.objective == aim]:
@@ -273,7 +273,7 @@ class Compare:
             console.print(f"without tuned gains (--tune finds them): {missing}")
 
     def _as_json(self, contest: Contest, results: Sequence[LawResult]) -> str:
-        """Write the figures of all laws as JSON, SI."""
+        """Return the results of all laws as JSON, SI."""
         scenario = contest.scenario
         figures = {
             "scenario": scenario.name,
@@ -315,7 +315,7 @@ def _require_one_law(names: Sequence[str], aims: Sequence[str]) -> None:
 
 
 def _write(path: Path, name: str, aim: str, result: TuningResult, benchmark: Benchmark) -> None:
-    """Write the gains of a law as a section of a scenario."""
+    """Write the gains of a law to a file, as a section of a scenario."""
     controller = tuned_controller.tuned_controller(name, result, benchmark)
     airframe, _ = benchmark.scenario.aircraft.load()
     origin = f"by rise-di compare: law {name}, tuned on {aim} in {benchmark.scenario.name}"
@@ -379,7 +379,7 @@ def _format_margins(margins: Margins) -> str:
 def _notes(
     scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], aims: Iterable[str]
 ) -> str:
-    """Say what the words of the table mean."""
+    """Return a text on what the words of the table mean."""
     units = display_units(scenario)
     controller = scenario.controller
     errors = zip(controller.outputs, benchmark.unit.tolist(), strict=True)
@@ -413,9 +413,9 @@ def _notes(
 
 
 def _as_json(result: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
-    """Return the figures of a law for JSON, in SI.
+    """Return the results of a law for JSON, in SI.
 
-    An infinite figure is null, and so is the cost of gains that no search found.
+    An infinite value is null, and so is the cost of gains that do not come from a search.
     """
     controller = scenario.controller
     levels = []
@@ -441,7 +441,7 @@ def _as_json(result: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
 
 
 def _margins_as_json(margins: Margins) -> dict[str, Any]:
-    """Return the least margins of a stable loop in SI: phase in rad, gain as a factor."""
+    """Return the least margins of a stable loop in SI, with phase in rad and gain as a factor."""
     least = {
         "phase": margins.phase.min(),
         "gain": margins.gain.min(),

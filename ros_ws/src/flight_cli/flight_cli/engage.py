@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di engage`: engage the autopilot behind a running bridge without a jump.
-
-It also disengages.
-"""
+"""Implement `rise-di engage`, which engages or disengages the autopilot behind a bridge."""
 
 from dataclasses import dataclass
 
@@ -34,7 +31,7 @@ class Engage:
     namespace: str = namespace_option()
 
     def execute(self) -> None:
-        """Ask the bridge, and say what it did."""
+        """Send the request to the bridge, and print its answer."""
         require_ros_environment()
         from autopilot_bridge.client import EngagementClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 

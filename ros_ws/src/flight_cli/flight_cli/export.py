@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di export`: write the controller of a scenario as C99.
+"""Implement `rise-di export`, which writes the controller of a scenario as C99.
 
 A proof shows that C and Python give the same bits.
 """
@@ -85,7 +85,7 @@ class Export:
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Write the code, prove it, and show the proof."""
+        """Write the code, prove it, and print the proof."""
         folders = {None: self.folder, "px4": self.px4, "ardupilot": self.ardupilot}
         folder_of = {autopilot: path for autopilot, path in folders.items() if path is not None}
         if len(folder_of) != 1:
@@ -115,7 +115,7 @@ class Export:
 
 
 def _as_json(exported: Exported) -> dict[str, Any]:
-    """Return the files and the figures of the proof."""
+    """Return the files and the results of the proof for JSON."""
     proof = exported.proof
     files = {"files": [str(path) for path in exported.files]}
     if proof is None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The flight of several aircraft at once by `rise-di fly`."""
+"""Fly several aircraft at once, as `rise-di fly` does with a fleet file."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -30,16 +30,16 @@ from flight_core.parameters import ParameterError
 
 
 def open_fleet(file: str, duration: float | None, *, use_sim_time: bool) -> Fleet:
-    """Read the fleet of a file. Raises ParameterError if it cannot be flown here."""
+    """Read a fleet from a file. Raises ParameterError if it cannot be flown on this host."""
     require_package("rclpy", "")
     require_ros_environment()
     return read_fleet(file, duration, use_sim_time=use_sim_time)
 
 
 def fly_fleet_file(fleet: Fleet, runs: Sequence[Path], *, as_json: bool) -> int:
-    """Fly a fleet: each aircraft has a namespace, nodes, a log and a report of its own.
+    """Fly a fleet, and return the severest exit status of its aircraft.
 
-    Return the severest exit status.
+    Each aircraft has a separate namespace, and separate nodes, log and report.
     """
     totals = {member.name: member.scenario.flight.duration for member in fleet.members}
     with progress_bar(NAME_COLUMN, *CLOCK_COLUMNS, quiet=as_json) as bar:
@@ -73,7 +73,8 @@ def fly_fleet_file(fleet: Fleet, runs: Sequence[Path], *, as_json: bool) -> int:
 class _AircraftResult:
     """The summary of an aircraft, and the share of its ticks with the controller ENGAGED.
 
-    The share is None without ticks. `track` is where the aircraft was, or None without a pose.
+    The share `engaged` is None if there are no ticks. `track` is where the aircraft was, or None
+    without a pose.
     """
 
     summary: dict[str, Any]
@@ -84,7 +85,7 @@ class _AircraftResult:
 def _separated(
     fleet: Fleet, flights: Sequence[MemberFlight], reported: Mapping[str, _AircraftResult]
 ) -> dict[str, _AircraftResult]:
-    """Rewrite the reports of those aircraft that violated the separation of their fleet."""
+    """Rewrite the reports of the aircraft that violated the separation of the fleet."""
     tracks = {name: result.track for name, result in reported.items() if result.track is not None}
     shortfalls = separation_shortfalls(tracks, fleet.separation)
     return {
@@ -97,7 +98,7 @@ def _separated(
 
 
 def _unreported(flight: MemberFlight) -> _AircraftResult:
-    """Return what is known of an aircraft before its report is written."""
+    """Return the result of an aircraft as known before its report is written."""
     outcome = flight.outcome.as_json()
     outcome["sentence"] = f"{flight.outcome}, no report: rise-di report writes it"
     return _AircraftResult(
@@ -106,7 +107,7 @@ def _unreported(flight: MemberFlight) -> _AircraftResult:
 
 
 def _report(member_flight: MemberFlight) -> _AircraftResult:
-    """Write the report of an aircraft."""
+    """Write the report of an aircraft, and return its result."""
     try:
         flight = write_report(member_flight.run, member_flight.outcome).flight
     except UnwrittenReportError as error:
@@ -138,7 +139,7 @@ def _report(member_flight: MemberFlight) -> _AircraftResult:
 def _show(
     name: str, flights: Sequence[MemberFlight], results: Mapping[str, _AircraftResult]
 ) -> None:
-    """Print a line for each aircraft, the folders of the runs, and what a busy host withheld."""
+    """Print a line for each aircraft, the folders of the runs, and effects of a busy host."""
     headings = ("aircraft", "flown (s)", "ticks", "engaged", "outcome")
     table = new_table(f"Fleet {name}", headings, ("aircraft", "outcome"), ("outcome",))
     lines = []
@@ -167,9 +168,10 @@ def _show(
 
 
 def foreign_samples(summaries: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Say how many samples on an aircraft's topics came from nodes outside its namespace.
+    """Return sentences on the samples on an aircraft's topics that came from foreign nodes.
 
-    There are no sentences if the log has no account of processes.
+    A foreign node is outside the aircraft's namespace. The result is empty if the log has no
+    account of processes.
     """
     sentences = []
     total = 0

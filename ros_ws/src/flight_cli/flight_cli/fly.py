@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di fly`: fly a scenario over topics or in one process, then show its figures."""
+"""Implement `rise-di fly`, which flies a scenario over topics or in one process."""
 
 import os
 import sys
@@ -65,7 +65,7 @@ from flight_core.parameters import ParameterError, require
 from flight_guidance.routes.route_file import ENDINGS, read_fence_file
 from flight_guidance.routes.route_formats import FENCES
 
-SPARE_CORES = 4  # with two, a browser that draws without a GPU costs the flight samples
+SPARE_CORES = 4  # with only two, a browser without a GPU costs the flight samples
 # Options that only a flight of one aircraft can have.
 OF_AIRCRAFT = (
     "settings",
@@ -153,7 +153,7 @@ class Fly(RouteWords):
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Fly, write the report, and show the figures."""
+        """Fly, write the report, and print the results."""
         if is_fleet(self.scenario):
             expected = "a scenario, or the key in the file of the fleet"
             require_unused(self, OF_AIRCRAFT, expected, "a fleet beside it")
@@ -197,7 +197,7 @@ class Fly(RouteWords):
                     announce=announce,
                 )
             if outcome.end is End.COMPLETED:
-                # The report says whether this is a success, and it is not written yet.
+                # Only the report says whether the flight is a success, and it is not written yet.
                 progress(scenario.flight.duration, "flown")
         status = _report(
             scenario,
@@ -228,10 +228,10 @@ class Fly(RouteWords):
         return scenario if files is None else self._with_files(scenario)
 
     def _may_choose(self, scenario: Scenario) -> bool:
-        """Return whether the host decides between real time and lockstep.
+        """Return whether the load of the host decides between real time and lockstep.
 
-        It does not if an autopilot or a simulator has its own time, or if a user activates the
-        controller.
+        It does not decide if an autopilot or a simulator has its own time, or if a user activates
+        the controller.
         """
         by_clock = self.use_sim_time or scenario.flight.use_sim_time
         has_own_time = by_clock or self.bridge is not None
@@ -240,12 +240,12 @@ class Fly(RouteWords):
         return begins and not (self.real_time or self.in_process or has_own_time)
 
     def _require_one_length(self) -> None:
-        """Raise ParameterError if the answer would have two lengths at once."""
+        """Raise ParameterError if --quiet is given together with --verbose or --json."""
         if self.quiet:
             require_unused(self, ["verbose", "as_json"], "one of the two", "--quiet beside it")
 
     def _require_one_way(self, *, stepping: bool) -> None:
-        """Raise ParameterError if there are two ways to fly at once."""
+        """Raise ParameterError if options ask for two ways to fly at once."""
         other = self.in_process or self.use_sim_time or stepping
         contradiction = "a flight in lockstep, in one process or by /clock"
         require(not (self.real_time and other), "--real-time", contradiction, "one of the two")
@@ -264,9 +264,9 @@ class Fly(RouteWords):
         )
 
     def _autopilot(self, *, stepping: bool) -> Autopilot | None:
-        """Return the autopilot that replaces the aircraft, if there is one.
+        """Return the autopilot that replaces the aircraft, if any.
 
-        Raises ParameterError if it cannot fly.
+        Raises ParameterError if the autopilot cannot fly.
         """
         if self.bridge is None:
             expected = "the channel map of an autopilot: --bridge MAP"
@@ -283,7 +283,7 @@ class Fly(RouteWords):
         return autopilot
 
     def _with_files(self, scenario: Scenario) -> Scenario:
-        """Add the route and the fence of the files to the scenario. Raises ParameterError."""
+        """Add the route and the fence from files to a scenario. May raise ParameterError."""
         above_sea = scenario.aircraft.is_jsbsim
         sections: dict[str, Any] = {}
         if self.fence is not None:
@@ -318,7 +318,7 @@ class Fly(RouteWords):
         raise typer.Exit(fly_fleet_file(fleet, runs, as_json=self.as_json))
 
     def _watch(self, *runs: Path, fleet: bool = False) -> None:
-        """Serve the page of the runs while the command lasts, if there is --watch."""
+        """With --watch, serve the page of the runs while the command lasts."""
         if not self.watch:
             return
         from flight_cli.watch import watched  # noqa: PLC0415 - loads the server, which few flights need
@@ -328,9 +328,10 @@ class Fly(RouteWords):
 
 
 def _falls_back(lack: Refusal | None, *, can_step: bool = True) -> bool:
-    """Tell the user if the host lacks what real time needs, and return whether to fly in lockstep.
+    """Return whether to fly in lockstep because the host lacks something, and tell the user.
 
-    If the flight cannot be in lockstep, it stays in real time and the sentence is a warning.
+    `lack` is what the host lacks for real time, or None. If `can_step` is False, the flight stays
+    in real time, and the user gets a warning.
     """
     if lack is None:
         return False
@@ -342,7 +343,7 @@ def _falls_back(lack: Refusal | None, *, can_step: bool = True) -> bool:
 
 
 def _as_host_allows(fleet: Fleet) -> Fleet:
-    """Return the fleet as this host can fly it: in real time, or in lockstep and composed."""
+    """Return the fleet unchanged, or in lockstep and composed if the host lacks something."""
     scenarios = [member.scenario for member in fleet.members]
     lack = shortage(scenarios, cores_given, composed=fleet.composed)
     has_common_time = any(member.delay > 0.0 for member in fleet.members)
@@ -352,7 +353,7 @@ def _as_host_allows(fleet: Fleet) -> Fleet:
 
 
 def _warn_of_browser() -> None:
-    """Warn what a browser beside the flight takes, if the host has no cores to spare."""
+    """Warn that a browser takes cores from the flight, if the host has no cores to spare."""
     cores = len(os.sched_getaffinity(0))
     if cores < SPARE_CORES:
         warn(
@@ -375,7 +376,7 @@ def _report(
     try:
         result = write_report(run, outcome)
     except UnwrittenReportError as error:
-        # The flight is over, so that its outcome comes first.
+        # The flight is over, so its outcome is printed first.
         result = error.result
         unwritten = str(error)
     except ParameterError:
@@ -408,7 +409,7 @@ def _report(
 
 
 def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_process: bool) -> None:
-    """Raise ParameterError if the flight would fail, before anything is written."""
+    """Raise ParameterError if the flight would fail. This comes before anything is written."""
     if not in_process:
         require_package("rclpy", "; without ROS fly with --in-process")
         require_ros_environment()
@@ -421,16 +422,16 @@ def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_proc
 
 
 def _that_learns(scenario: Scenario) -> Scenario:
-    """Return the scenario with a learner. Raises ParameterError if it has a model."""
+    """Return the scenario with a learner. Raises ParameterError if it already has a model."""
     from flight_design.learning.scenario_learner import that_learns  # noqa: PLC0415 - loads SciPy, which few flights need
 
     return that_learns(scenario)
 
 
 def _learner(scenario: Scenario) -> Learn | None:
-    """Make the learner of a scenario, for a flight in one process.
+    """Return the learner of a scenario for a flight in one process, or None.
 
-    Raises ParameterError for one that cannot learn.
+    Raises ParameterError if the scenario cannot learn.
     """
     if not scenario.learns():
         return None

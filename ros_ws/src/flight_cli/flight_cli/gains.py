@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di gains`: select gains, check those of a scenario, or bound them for every aircraft."""
+"""Implement `rise-di gains`, which selects gains, checks them, or bounds them for a box."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -82,7 +82,7 @@ SELECTION = (
 
 @dataclass(frozen=True, kw_only=True)
 class _Gains:
-    """The words that the verbs of `rise-di gains` share."""
+    """The options and arguments that the verbs of `rise-di gains` share."""
 
     airframe: str = argument(
         "Name or file (.yaml) of an airframe.",
@@ -106,7 +106,7 @@ class _Gains:
     as_json: bool = json_option()
 
     def _require_airframe(self) -> None:
-        """Refuse the name of a scenario in place of the airframe's."""
+        """Raise ParameterError if the name of a scenario is given in place of an airframe's."""
         is_scenario = self.airframe in set(scenarios()) - set(airframes())
         require(
             not is_scenario,
@@ -119,10 +119,7 @@ class _Gains:
         return Console(quiet=self.as_json).status(text)
 
     def _show(self, sets: GainSets, sentences: Sequence[str], **files: Path | None) -> None:
-        """Write the page, and print the tables, the sentences and the paths of the files.
-
-        With --json, print JSON instead.
-        """
+        """Write the page, and print tables, sentences and paths, or JSON with --json."""
         if self.page is not None:
             _write_page(self.page, sets.last)
         if self.as_json:
@@ -198,7 +195,7 @@ class Select(_Gains):
     )
 
     def execute(self) -> None:
-        """Select gains, write them, and show them."""
+        """Select gains, write them to a file, and print them."""
         self._require_airframe()
         require(
             not self.theorem or (self.write is not None and not self.observer),
@@ -254,7 +251,7 @@ class Check(_Gains):
     )
 
     def execute(self) -> None:
-        """Check the gains, and show them."""
+        """Check the gains, and print the result."""
         self._require_airframe()
         warn_of_controller_alone(self.scenario)
         with self._status("checking the gains on uncertain airframes"):
@@ -297,7 +294,7 @@ class Guarantee(Check):
     )
 
     def execute(self) -> None:
-        """Check the gains, bound them, write what was asked for, and show it all."""
+        """Check and bound the gains, write the files that options name, and print the results."""
         self._require_airframe()
         warn_of_controller_alone(self.scenario)
         require_guarantee(
@@ -330,7 +327,7 @@ class Guarantee(Check):
         self._exit(sets)
 
     def _bound_limited(self, answer: GainAssessment[Any], loop: LinearLoop) -> None:
-        """Bound the loop with limits of one input, write the certificate, and show it."""
+        """Bound the loop with limits of one input, write the certificate, and print the result."""
         name = self.saturation or ""
         require_linear(loop)
         promise = guarantee_with_limit(loop, name)
@@ -348,9 +345,9 @@ class Guarantee(Check):
 def _loop_of_px4(
     px4: Path | None, rate: float | None, delay: float | None
 ) -> tuple[float | None, float | None, str]:
-    """Return the rate and the delay, and where they come from.
+    """Return the rate and the delay of the loop, and a text on their source.
 
-    They are as given or, if there is one, from a parameter file.
+    They come from the arguments, or from a parameter file of PX4 if there is one.
     """
     if px4 is None:
         return rate, delay, ""
@@ -370,7 +367,7 @@ def _write_page(path: Path, answer: GainAssessment[Any]) -> None:
 
 
 def _require_margins(selection: Selection, *, theorem: bool) -> None:
-    """Refuse gains whose margins fall short of the requirement."""
+    """Raise ParameterError if the margins of the gains fall short of the requirement."""
     assessment = selection.theorem if theorem else selection.engineering
     outputs = assessment.controller.outputs
     lack = joined(Refusal(row.sentence(outputs)) for row in assessment.unmet)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What `rise-di gains guarantee` shows and writes."""
+"""Compute, print and write what `rise-di gains guarantee` proves."""
 
 import math
 import os
@@ -37,12 +37,12 @@ from flight_design.gains.gain_selection import GainAssessment, loop_with_box
 from rise_di.c_code import certificate_sources
 from rise_di_controller.params import ControllerConfig
 
-FARTHER = 1.2  # times the deviations of the first unstable aircraft, so that its loop diverges
+FARTHER = 1.2  # factor on the deviations of the first unstable aircraft that makes it diverge
 FORMS = (".3f", ".1f", ".1f", ".3f")  # formats of the columns of a guarantee
 
 
 def warn_of_controller_alone(scenario: str) -> None:
-    """Say which aircraft is taken beside a file that has a controller alone."""
+    """Print which aircraft is assumed if a file has only a controller."""
     if controller_alone(scenario) is not None:
         others = f"commands and gusts of {COMMANDED}, lags and delay as it was told"
         warn(f"note: {scenario} has a controller alone: {others}")
@@ -56,7 +56,7 @@ def require_guarantee(
     worst: Path | None,
     certificate: Path | None,
 ) -> None:
-    """Raise ParameterError for options that exclude each other, or that cannot be met."""
+    """Raise ParameterError for options that contradict each other, or that cannot be met."""
     as_number(late, "late", 0.0, MAX_DELAY_MARGIN, "s")
     if controller_alone(scenario) is not None:
         require(worst is None, "worst", f"no aircraft in {scenario}", "a scenario that flies one")
@@ -64,7 +64,7 @@ def require_guarantee(
     require(
         late == 0.0 or not is_certified, "certificate", f"--late {late:g} beside it", "u in time"
     )
-    # These come before the proof, which can take minutes.
+    # These checks come before the proof, which can take minutes.
     _require_worst(worst, airframe, scenario)
     fits = certificate is None or (
         os.access(certificate.parent, os.W_OK) and not is_folder(certificate)
@@ -75,8 +75,9 @@ def require_guarantee(
 def proved(answer: GainAssessment[ControllerConfig], late: float) -> Guarantee:
     """Return the guarantee of a loop, and keep it for the pages of its flights.
 
-    If the entries that are 0 in the file are not in its box, it also says how far they may go
-    beside exact others. Raises ParameterError before the proof if the aircraft has no linear loop.
+    If the box leaves out the entries that are 0 in the file, the guarantee also says how far they
+    may deviate while the others are exact. Raises ParameterError before the proof if the aircraft
+    has no linear loop.
     """
     loop = answer.loop_with_box()
     require_linear(loop)
@@ -99,7 +100,7 @@ def require_linear(loop: LinearLoop) -> None:
 def write_certificate(
     path: Path | None, loop: LinearLoop, promise: Guarantee, airframe: str, scenario: str
 ) -> list[str]:
-    """Write the certificate of a guarantee, if a path is named.
+    """Write the certificate of a guarantee, if a path is given.
 
     Returns a sentence if the law has no C constants from which a checker could compute the loop.
     """
@@ -115,7 +116,7 @@ def write_certificate(
 
 
 def _require_worst(folder: Path | None, airframe: str, scenario: str) -> None:
-    """Raise ParameterError unless the scenario flies the airframe whose variants are written."""
+    """Raise ParameterError if the scenario does not fly the airframe whose variants are written."""
     if folder is None:
         return
     base = find_scenario(scenario)
@@ -128,10 +129,10 @@ def _require_worst(folder: Path | None, airframe: str, scenario: str) -> None:
 def write_unstable(
     folder: Path | None, promise: Guarantee, airframe: str, scenario: str
 ) -> list[str]:
-    """Write the first unstable aircraft, and one that is FARTHER off, if a folder is named.
+    """Write the first unstable aircraft, and one that is FARTHER off, if a folder is given.
 
-    Each is an airframe and a scenario that flies it. Return a sentence about each: how far off it
-    is, and whether that is inside `--uncertainty`.
+    Each is written as an airframe and a scenario that flies it. Returns a sentence about each, on
+    how far off it is, and whether this is inside `--uncertainty`.
     """
     if folder is None:
         return []
@@ -175,7 +176,7 @@ def write_unstable(
 def show_guarantee(
     console: Console, promise: Guarantee | None, checked: GainAssessment[ControllerConfig]
 ) -> None:
-    """Show how the aircraft differs, the guarantee, and a table of the disk margins."""
+    """Print how the aircraft differs, the guarantee, and a table of the disk margins."""
     for difference in checked.study.differences:
         say(console, difference)
     if promise is None:

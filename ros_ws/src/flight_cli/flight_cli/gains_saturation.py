@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What `rise-di gains guarantee --saturation INPUT` shows and writes."""
+"""Print and write what `rise-di gains guarantee --saturation INPUT` proves."""
 
 import math
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ def require_saturation(
     entries: Sequence[str],
     worst: Path | None,
 ) -> None:
-    """Raise ParameterError for an unknown input, or options without a meaning beside it."""
+    """Raise ParameterError if the input is unknown, or if options do not fit --saturation."""
     if saturation is None:
         return
     inputs = scenario_to_check(scenario).controller.inputs
@@ -42,7 +42,7 @@ def write_limit_certificate(
     airframe: str,
     scenario: str,
 ) -> list[str]:
-    """Write the certificate of a guarantee with a limit, if a path is named.
+    """Write the certificate of a guarantee with a limit of one input, if a path is given.
 
     Returns a sentence if the law has no C constants from which a checker could compute the loop.
     """
@@ -57,7 +57,7 @@ def write_limit_certificate(
 
 
 def limit_text(name: str, promise: LimitGuarantee | None, certificate: str) -> list[str]:
-    """Say a guarantee with a limit of one input in sentences."""
+    """Return a guarantee with a limit of one input as sentences."""
     if promise is None:
         least = f"{100.0 * TRIED[-1]:g} % of this box"
         return [f"guarantee: none with any limits of {name}: no taps prove as much as {least}"]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The tables and the JSON of gain sets with their margins and conditions."""
+"""Show gain sets with their margins and conditions, as tables or as JSON."""
 
 import math
 from itertools import chain
@@ -58,37 +58,37 @@ Assessment = GainAssessment[Any]
 
 
 class GainSets(NamedTuple):
-    """Gain sets by name with their conditions: one that was checked, or a selection."""
+    """Gain sets by name with their conditions, which were checked or selected."""
 
     answers: dict[str, Assessment]
     selection: Selection | None = None
-    checked: str = ""  # name of the scenario that was checked
+    checked: str = ""  # name of the scenario that was checked, if any
     promise: Guarantee | None = None
     limited: LimitGuarantee | None = None
 
     @property
     def titles(self) -> dict[str, Assessment]:
-        """Gain sets by the names that are shown; that of a check has the scenario's name."""
+        """The gain sets by shown name. A gain set that was checked has the scenario's name."""
         return {self.checked: self.first} if self.checked else self.answers
 
     @property
     def first(self) -> Assessment:
-        """Return the first gain set. After a check, it is the one that was checked."""
+        """The first gain set. After a check, it is the checked one."""
         return next(iter(self.answers.values()))
 
     @property
     def last(self) -> Assessment:
-        """Return the last gain set: of a selection, that of the engineering procedure."""
+        """The last gain set. In a selection, it is that of the engineering procedure."""
         return [*self.answers.values()][-1]
 
     @property
     def study(self) -> Study:
-        """Return what the gain sets were studied on."""
+        """The study, with aircraft and loop, in which the gain sets were assessed."""
         return self.first.study
 
 
 def show_gains(console: Console, sets: GainSets) -> None:
-    """Print gains, margins, the guarantee, the verdicts, and the trade of a selection."""
+    """Print gains, margins, guarantee and verdicts, and for a selection its trade-off."""
     _show_margins(console, sets.study, sets.titles)
     show_guarantee(console, sets.promise, sets.first)
     _show_verdicts(console, sets)
@@ -102,13 +102,13 @@ def show_gains(console: Console, sets: GainSets) -> None:
 
 
 def _show_trade(console: Console, selection: Selection) -> None:
-    """Show how the error of the linear loop along the manoeuvre trades against the phase margin."""
+    """Print how the linear loop's error in the manoeuvre trades against the phase margin."""
     controller = selection.chosen
     frame = selection.study.airframe
     outputs = controller.outputs
     output_units = frame.units_of_outputs()
     unit_texts = [display_unit(output_units[name]) for name in outputs]
-    # A height has no unit of the score.
+    # An altitude has no unit in the score.
     have_scores = all(quantity(unit).dimension in SCORE_UNIT for unit in output_units.values())
     units = score_units(outputs, output_units) if have_scores else np.full(len(outputs), np.nan)
     headings = (f"{name},\n{unit.unit}" for name, unit in zip(outputs, unit_texts, strict=True))
@@ -154,7 +154,7 @@ def _show_margins(console: Console, study: Study, answers: dict[str, Assessment]
 
 
 def _show_verdicts(console: Console, result: GainSets) -> None:
-    """Print the conditions part by part, each with its verdict. That on the loop decides."""
+    """Print the conditions in parts, each with a verdict. The verdict on the loop decides."""
     answers = result.titles
     first = result.first
     for part, heading in HEADINGS.items():
@@ -176,7 +176,7 @@ def _show_verdicts(console: Console, result: GainSets) -> None:
 
 
 def _condition_table(answers: dict[str, Assessment], part: str, title: str) -> Table:
-    """Make a table of the conditions of a part, with one condition in each row."""
+    """Return a table of the conditions of a part, with one condition in each row."""
     headings = ["condition"]
     for name in answers:
         headings += [f"{name}\nvalue and bound", "\nmargin"]
@@ -189,7 +189,7 @@ def _condition_table(answers: dict[str, Assessment], part: str, title: str) -> T
 
 
 def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
-    """Make a table of K, Lambda and beta of RISE-DI, with one channel in each row."""
+    """Return a table of K, Lambda and beta of RISE-DI, with one channel in each row."""
     headings = []
     for name in answers:
         headings += [f"{name}\nK", "\nLambda", "\nbeta"]
@@ -214,7 +214,7 @@ def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
 
 
 def _own_gains(controller: ControllerConfig, aircraft: str) -> Table:
-    """Make a table of the parameters of a law other than RISE-DI."""
+    """Return a table of the parameters of a law other than RISE-DI."""
     table = new_table(
         f"Law {controller.law} for {aircraft}",
         ("parameter", "value"),
@@ -242,7 +242,7 @@ def _format_delay_margin(study: Study, answer: Assessment) -> str:
 
 
 def speed_of_margin(study: Study, answer: Assessment) -> str:
-    """Say up to which speed a positive delay margin lasts if the gains stay fixed."""
+    """Return a sentence on the speed up to which the delay margin of fixed gains is positive."""
     if study.airframe.speed == 0.0:
         return "the airframe has no trim speed"
     ratio = gain_selection.stable_speed_ratio(study, answer.controller)
@@ -255,7 +255,7 @@ def speed_of_margin(study: Study, answer: Assessment) -> str:
 
 
 def _stable_speed_ratio(study: Study, answer: Assessment) -> float | None:
-    """Return up to which multiple of the trim speed the loop is stable.
+    """Return the multiple of the trim speed up to which the loop is stable.
 
     Returns None if there is no limit, or if the literal sign has no linear loop.
     """
@@ -266,7 +266,7 @@ def _stable_speed_ratio(study: Study, answer: Assessment) -> float | None:
 
 
 def gains_as_json(result: GainSets, seed: int) -> dict[str, Any]:
-    """Return the study, each gain set with its conditions, and the guarantee, if there is one."""
+    """Return the study, gain sets with conditions, and the guarantee, if any, for JSON."""
     study = result.study
     promise = result.promise
     inputs = list(study.airframe.inputs)

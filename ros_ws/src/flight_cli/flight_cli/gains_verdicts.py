@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Verdicts on the conditions of a gain set. The loop decides; the rules and the theorem do not."""
+"""Judge the conditions of a gain set. Only the verdict on the loop decides.
+
+The verdicts on the rules of the procedure and on the theorem do not decide.
+"""
 
 import math
 from typing import Any, NamedTuple
@@ -11,19 +14,19 @@ from flight_design.gains.gain_selection import GainAssessment
 
 
 def milliseconds(margin: float) -> str:
-    """Write a delay margin, s, in milliseconds."""
+    """Return a delay margin, given in s, as text in milliseconds."""
     return f"{1e3 * margin:.0f} ms" if math.isfinite(margin) else "over 500 ms"
 
 
 class Verdict(NamedTuple):
-    """What a part of the conditions comes to. A part without conditions has an empty sentence."""
+    """The verdict on a part of the conditions. Its sentence is empty if there are none."""
 
     holds: bool
     sentence: str
 
 
 def loop_verdict(answer: GainAssessment[Any], promise: Guarantee | None) -> Verdict:
-    """Judge whether a loop is stable with the margins and the guarantee that are asked of it."""
+    """Judge whether a loop is stable with the required margins and the required guarantee."""
     is_guaranteed = promise is None or promise.holds
     holds = answer.is_stable and not failing(answer.loop) and is_guaranteed
     margins = answer.margins
@@ -56,7 +59,7 @@ def loop_verdict(answer: GainAssessment[Any], promise: Guarantee | None) -> Verd
 
 
 def rules_verdict(answer: GainAssessment[Any], _: Guarantee | None) -> Verdict:
-    """Count how many rules of the engineering procedure a gain set keeps."""
+    """Return the verdict that counts which rules of the engineering procedure a gain set meets."""
     rules = answer.rules
     if not rules:
         return Verdict(True, "")
@@ -69,7 +72,7 @@ def rules_verdict(answer: GainAssessment[Any], _: Guarantee | None) -> Verdict:
 
 
 def theorem_verdict(answer: GainAssessment[Any], _: Guarantee | None) -> Verdict:
-    """Count how many of the sufficient conditions of Theorem 1 a gain set meets."""
+    """Return the verdict that counts which sufficient conditions of Theorem 1 a gain set meets."""
     conditions = answer.theorem
     if not conditions:
         return Verdict(True, "")
@@ -92,7 +95,7 @@ VERDICTS = {"loop": loop_verdict, "rules": rules_verdict, "theorem": theorem_ver
 
 
 def condition_name(row: tuple[GainCondition, ...], outputs: tuple[str, ...]) -> str:
-    """Name a row of conditions, with the channel if it is the same in every gain set."""
+    """Return the name of a row of conditions, with the channel if all gain sets share it."""
     where = {None if condition.channel is None else outputs[condition.channel] for condition in row}
     channel = where.pop() if len(where) == 1 else None
     return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")
@@ -102,7 +105,7 @@ SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 
 
 def condition_cells(condition: GainCondition) -> tuple[str, str]:
-    """Return what was found beside its bound, and the margin, which is red if it fails."""
+    """Return two cells: the value beside its bound, and the margin, which is red if it fails."""
     margin = "" if math.isnan(condition.margin) else f"{condition.margin:.2g}"
     side = SIDES[condition.side]
     return (

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di guide`: change what a guided flight holds from now on.
+"""Implement `rise-di guide`, which changes what a guided flight holds from now on.
 
-It also calls the services of guidance, keeps the operator's link and sends a route.
+The command also calls the services of guidance, keeps the operator's link alive and sends a route.
 """
 
 import math
@@ -59,7 +59,7 @@ class Guide(RouteWords):
     namespace: str = namespace_option()
 
     def execute(self) -> None:
-        """Send what is asked, and print what holds from then on."""
+        """Send the request, and print what guidance holds from then on."""
         command = self.commands[0]
         is_service = command in {*SERVICES, LINK}
         points: list[tuple[float, float, float]] = []
@@ -85,7 +85,7 @@ class Guide(RouteWords):
         values: dict[str, float],
         points: list[tuple[float, float, float]],
     ) -> Refusal | None:
-        """Send targets, a route or a service, and return why guidance refuses."""
+        """Send targets, a route or a service call, and return why guidance refuses it, if so."""
         from flight_guidance.client import GuidanceClient, TargetClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
         if values or command == LINK:
@@ -98,9 +98,9 @@ class Guide(RouteWords):
             return client.send_route(points) if points else client.call(command)
 
     def _points(self, file: str) -> list[tuple[float, float, float]]:
-        """Read a route file for a flight and return its waypoints: north, east, altitude in m.
+        """Read a route file, and return its waypoints as north, east and altitude in m.
 
-        Raises ParameterError.
+        Raises ParameterError if the file is invalid.
         """
         expected = f"NAME=VALUE, {', '.join((*SERVICES, LINK))} or a route file"
         require(Path(file).suffix != "", "guide", repr(file), expected)
@@ -118,7 +118,7 @@ class Guide(RouteWords):
 
 
 def _parse(text: str) -> tuple[str, float]:
-    """Return a channel of `guide` and its value in SI from NAME=VALUE."""
+    """Parse NAME=VALUE into a channel of `rise-di guide` and its value in SI."""
     name, _, number = text.partition("=")
     require(name in TARGETS, "guide", repr(text), f"NAME=VALUE with one of {', '.join(TARGETS)}")
     try:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of an aircraft of JSBSim that `rise-di identify jsbsim` has linearised."""
+"""Print tables of an aircraft of JSBSim that `rise-di identify jsbsim` has linearised."""
 
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from flight_cli.output import new_table, print_table, say
 from flight_core.units import si_per_unit
 from flight_design.identification.jsbsim_identification import IdentifiedAircraft
 
-# If the smallest effect of an input is below this share of its largest, it is not linear.
+# An input is not linear if its smallest effect is below this share of its largest effect.
 LINEAR = 0.8
 
 
@@ -33,7 +33,7 @@ def show_identified(console: Console, aircraft: IdentifiedAircraft) -> None:
         + f"; largest residual acceleration {np.max(np.abs(trim.residuals[:3])):.1g} m/s^2,"
         f" {np.max(np.abs(trim.residuals[3:])):.1g} rad/s^2",
     )
-    # Two tables with one row for each input: its stops, and its effects on the outputs.
+    # Print two tables with a row for each input, of its stops, and of its effects on the outputs.
     stops = new_table(
         "\nCommands: trim, and range down and up from trim", ("input", "trim", "down", "up")
     )
@@ -59,7 +59,7 @@ def show_identified(console: Console, aircraft: IdentifiedAircraft) -> None:
         )
     console.print(stops)
     console.print(responses)
-    # Name the inputs that are not linear, and those that move nothing.
+    # Name the inputs that are not linear, and those without an effect.
     for name, spread in zip(inputs, linear.spread, strict=True):
         if spread < LINEAR:
             differ = f"the effects of its steps differ by a factor of {1.0 / spread:.2g}"
@@ -131,7 +131,7 @@ def _show_flights(console: Console, aircraft: IdentifiedAircraft) -> None:
 
 
 def identified_as_json(aircraft: IdentifiedAircraft, path: Path) -> dict[str, Any]:
-    """Return what the identification gave, in SI."""
+    """Return the result of the identification for JSON, in SI."""
     linear = aircraft.linear
     trim = linear.trim
     outputs = aircraft.condition.paired_outputs()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables, files and flights of a model that `rise-di identify log` has found."""
+"""Print, write and fly a model that `rise-di identify log` has found."""
 
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
@@ -51,19 +51,19 @@ def write_model(console: Console, identification: Identification, log: Path, pat
 
 @dataclass(frozen=True, kw_only=True)
 class Reflight:
-    """Rms errors of a recorded flight and of the same flight with another model, SI, by output.
+    """Rms errors by output, SI, of a recorded flight and of a simulation with another model.
 
-    The second flight has the feedforward and the observer of that model.
+    The simulation has the feedforward and the observer of this model.
     """
 
-    origin: str  # where the observer's gains come from
+    origin: str  # source of the observer's gains
     recorded: dict[str, float]
     again: dict[str, float]
     outcome: str
 
 
 def fly_again(scenario: Scenario, tape: Tape, model: Airframe, margin: float) -> Reflight:
-    """Fly a log's scenario again in this process, with the feedforward and observer of a model."""
+    """Simulate a log's scenario in this process, with the feedforward and observer of a model."""
     selected = selected_observer(scenario.rise_di(), scenario, model, margin)
     again = simulate(replace(scenario, controller=selected.controller))
     return Reflight(
@@ -116,9 +116,10 @@ def _units(identification: Identification) -> dict[str, DisplayUnit]:
 
 
 def _innovation_page(identification: Identification, name: str) -> Page:
-    """Make a page of the innovations of the nominal and of the identified model over the flight.
+    """Return a page with the innovations of the nominal and of the identified model.
 
-    The held-out seconds are shaded.
+    They are drawn over the time of the flight. The seconds that the identification did not use are
+    shaded.
     """
     t = identification.recorded.t - identification.recorded.t[0]
     before, after = (
@@ -161,7 +162,7 @@ def _innovation_page(identification: Identification, name: str) -> Page:
 def model_as_json(
     identification: Identification, path: Path | None, again: Reflight | None
 ) -> dict[str, Any]:
-    """Return the model, where it is written, and the flight with it, if there is one, in SI."""
+    """Return the model, its file, and the flight with it, if any, for JSON in SI."""
     outputs = identification.airframe.outputs
     return {
         "airframe": identification.airframe.name,

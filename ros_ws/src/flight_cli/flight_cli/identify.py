@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di identify`: identify an aircraft of JSBSim, one behind a bridge, or one from a log."""
+"""Implement `rise-di identify`, for an aircraft of JSBSim, behind a bridge, or in a log."""
 
 import math
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ from flight_log.tape_reader import RecordedRun, read_run
 from rise_di_controller.params import ControllerConfig
 
 CANNOT_FLY = 3
-REFLY_MARGIN = 0.03  # s
+REFLY_MARGIN = 0.03  # delay margin, s, of a flight that is flown again
 
 
 def _phase_margin_option() -> Any:
@@ -111,7 +111,7 @@ class Jsbsim:
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Identify the aircraft, write its scenario and show both."""
+        """Identify the aircraft, write its scenario, and print both."""
         observes = self.observer or self.learn
         expected = "--observer or --learn beside it"
         require(self.margin is None or observes, "margin", self.margin, expected)
@@ -129,8 +129,8 @@ class Jsbsim:
         identified_aircraft = self._identified_aircraft(name, console)
         lack = None
         if not self.accept and not identified_aircraft.failure:
-            # It takes as long as everything before. If it came after the tables, one would think
-            # that the command has ended.
+            # This takes as long as everything before it. If it came after the tables, users would
+            # think that the command has ended.
             with console.status("what would meet the margins"):
                 lack = reason_against_gains(identified_aircraft.selection)
         write_text("write", path, identified_aircraft.text)
@@ -148,7 +148,7 @@ class Jsbsim:
             raise ParameterError(f"identify: {lack}; the gains are in {where}")
 
     def _scenario_path(self, name: str) -> Path:
-        """Return the path of the scenario, which may replace a file only if --write names it."""
+        """Return the path for the scenario. Only a path that --write names may already exist."""
         path = self.write or Path(f"jsbsim_{Path(name).stem}.yaml")
         expected = "a file to write over, or another"
         is_new = self.write is not None or not path.exists()
@@ -216,7 +216,7 @@ class Log:
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Identify the model, show it and write it.
+        """Identify the model, print it and write it.
 
         Raises ParameterError if the model is refused.
         """
@@ -328,12 +328,12 @@ def _jsbsim_name(aircraft: str) -> str:
     try:
         return require_aircraft(aircraft)
     except ParameterError as error:
-        # The key of a scenario is `airframe`, but the argument is `aircraft`.
+        # The key in a scenario is `airframe`, but the argument is called `aircraft`.
         raise ParameterError(f"aircraft{str(error).removeprefix('airframe')}") from None
 
 
 def _actuation(controller: ControllerConfig, nominal: Airframe, delay: float) -> Actuation:
-    """Return the lags and the delay of a controller's loop, in the order of the airframe."""
+    """Return the lags and the delay of a controller's loop, with inputs in the airframe's order."""
     require(0.0 <= delay < math.inf, "--delay", delay, "0 s or more")
     for key, names, expected in (
         ("controller.outputs", controller.outputs, nominal.outputs),

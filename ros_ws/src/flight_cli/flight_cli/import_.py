@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di import`: make a bag of y, u and pose from the log of an autopilot."""
+"""Implement `rise-di import`, which makes a bag of y, u and pose from an autopilot's log."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -78,7 +78,7 @@ class Import:
     )
 
     def execute(self) -> None:
-        """Read the log, write the bag, and show its topics."""
+        """Read the log, write the bag, and print its topics."""
         for name, value in (("from", self.start), ("until", self.stop)):
             require(value is None or value >= 0.0, name, value, "0 s or more")
         if (self.map_name is None) == (self.scenario is None):
@@ -124,7 +124,7 @@ class Import:
 
 
 def _show_agreement(console: Console, rows: list[Agreement]) -> None:
-    """Show what the log and the channel map each say about the same settings."""
+    """Print the settings that both the log and the channel map state, side by side."""
     headings = ("", "what the log says", "what the map says")
     table = new_table("", headings, headings, headings)
     for row in rows:
@@ -134,7 +134,7 @@ def _show_agreement(console: Console, rows: list[Agreement]) -> None:
 
 
 def _import_module(log: Path, scenario: Scenario, folder: Path) -> None:
-    """Write the ticks of a module of PX4 as a run of its scenario."""
+    """Write the ticks of the module in a PX4 log as a run of the module's scenario."""
     module_log = read_foreign_log(log)
     flight = module_flight(module_log, scenario.controller)
     with writing("--output", folder, "a folder that can"):
@@ -155,7 +155,7 @@ def _import_module(log: Path, scenario: Scenario, folder: Path) -> None:
 
 
 def _show_topics(console: Console, title: str, tape: Tape) -> None:
-    """Show the number, the rate and the longest gap of the samples of each topic."""
+    """Print the number, the rate and the longest gap of the samples of each topic."""
     table = new_table(title, ("topic", "samples", "Hz", "longest gap, s"))
     for topic, signal in tape.signals.items():
         gaps = np.diff(signal.stamp_ns) / NANOSECONDS
@@ -166,7 +166,7 @@ def _show_topics(console: Console, title: str, tape: Tape) -> None:
 
 
 def _numbers(instances: list[str]) -> dict[str, int]:
-    """Parse texts such as MESSAGE=NUMBER into numbers by message.
+    """Parse texts of the form MESSAGE=NUMBER into numbers by message.
 
     Raises ParameterError if a text has another form.
     """

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di learn`: run the learner again on the log of a flight, and write the model.
+"""Implement `rise-di learn`, which runs the learner again on the log of a flight.
 
-The learner may have other settings than in the flight.
+The learner may have other settings than in the flight. The command can also write the model.
 """
 
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ class Learn:
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Learn again, show the steps, and write the model."""
+        """Learn again, print the steps, and write the model."""
         if self.write is not None:
             require_yaml("--write", self.write)
         recorded_run = read_run(self.run, self.namespace, scenario_file(self.scenario))

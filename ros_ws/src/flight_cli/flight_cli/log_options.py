@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the commands that read a log share.
+"""Options and warnings that the commands that read a log share.
 
-They need a scenario if the log has none, one aircraft if the log has several, and a word on what
-the log lacks.
+Options name a scenario if the log has none, or one aircraft if the log has several. Warnings say
+what the log lacks.
 """
 
 from contextlib import suppress
@@ -35,7 +35,7 @@ def log_scenario() -> Any:
 
 
 def remaps_of(words: list[str] | None) -> dict[str, str]:
-    """Return the topics of a log by their names in the stack. Raises ParameterError."""
+    """Parse the topics of a log by their names in the stack. Raises ParameterError if invalid."""
     remaps = [word.partition(":=") for word in words or ()]
     for name, _, topic in remaps:
         require(
@@ -48,7 +48,7 @@ def remaps_of(words: list[str] | None) -> dict[str, str]:
 
 
 def scenario_file(name: str | None) -> Path | None:
-    """Find the file of a scenario or of a controller alone, by name or path.
+    """Find the file of a scenario, or of only a controller, by name or path.
 
     Returns None without a name. Raises ParameterError if the scenario is invalid.
     """
@@ -65,7 +65,7 @@ def scenario_file(name: str | None) -> Path | None:
 def warn_of_lacks(recorded_run: RecordedRun) -> None:
     """Print a warning on standard error for everything that a log lacks.
 
-    Nobody then takes a result for more than was recorded.
+    This keeps users from believing that a result covers more than was recorded.
     """
     account = log_account(recorded_run)
     import_note = recorded_run.metadata.get(IMPORTED, {}).get(COMPARED, "")
@@ -78,6 +78,6 @@ def warn_of_lacks(recorded_run: RecordedRun) -> None:
 
 
 def warn_of_lacks_in(run: Path, namespace: str | None) -> None:
-    """Do as `warn_of_lacks` does, for a log that need not hold a flight."""
+    """Print the warnings of `warn_of_lacks` for a log that need not have a flight."""
     with suppress(ParameterError):
         warn_of_lacks(read_run(run, namespace))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di network`: write the profile of the middleware for nodes on several hosts.
+"""Implement `rise-di network`, which writes the middleware's profile for several hosts.
 
 It can also check the network between the hosts.
 """
@@ -45,7 +45,7 @@ class Network:
     )
 
     def execute(self) -> None:
-        """Write the profile, and check the network if the user asks for it."""
+        """Write the profile and, with --check, check the network."""
         require_package("rclpy", "")
         require_ros_environment()
         from flight_bringup.client import write_profile  # noqa: PLC0415 - loads rclpy
@@ -61,7 +61,7 @@ class Network:
             self._exchange(own_host, hosts)
 
     def _exchange(self, own_host: str, hosts: Sequence[str]) -> None:
-        """Wait for the other hosts, and say for each whether both receive."""
+        """Wait for the other hosts, and print for each host whether both sides receive."""
         from flight_bringup.client import NetworkClient, domain_ports  # noqa: PLC0415 - loads rclpy
 
         others = [address for address in hosts if address != own_host]

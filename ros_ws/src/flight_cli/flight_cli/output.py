@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the commands share: tables, JSON, paths and exit statuses."""
+"""Print tables and JSON, and write files, in the way that all commands share."""
 
 import json
 import os
@@ -37,23 +37,23 @@ from flight_core.parameters import require
 if TYPE_CHECKING:
     from flight_analysis.report.tables import MetricTable as PageTable
 
-# Exit status. That of bad input is 2 (`flight_cli.cli`).
+# Exit statuses. The exit status of bad input is 2 (`flight_cli.cli`).
 INTERRUPTED = 130
-# The head of each file that a command writes.
+# First lines of each file that a command writes.
 LICENCE = (
     "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
 )
-LATEST = Path("runs/latest")  # the run that a command takes if it is given none
+LATEST = Path("runs/latest")  # the run that a command takes if the user names none
 
 
 def has_desktop() -> bool:
-    """Return whether somebody at a terminal can see a browser on this machine."""
+    """Return whether the user at the terminal can see a browser of this machine."""
     has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
     return sys.stdout.isatty() and (has_display or sys.platform in {"darwin", "win32"})
 
 
 def show_outcome(console: Console, outcome: Mapping[str, Any]) -> None:
-    """Print the headline of an outcome, and below it the details that are not in it."""
+    """Print the headline of an outcome, followed by the details that it lacks."""
     style = {0: "bold", STATUS_HOST: "bold yellow"}.get(outcome["status"], "bold red")
     say(console, f"outcome: {outcome['sentence']}", style=style)
     for detail in outcome["details"]:
@@ -61,7 +61,7 @@ def show_outcome(console: Console, outcome: Mapping[str, Any]) -> None:
 
 
 def show_errors(console: Console, flight: RecordedFlight) -> None:
-    """Print the first table of a flight: its errors or, of an imported log, its outputs."""
+    """Print the first table of a flight, with its errors, or the outputs of an imported log."""
     first, *_ = _tables(flight)
     print_table(console, grouped_table(first.caption, first.columns, first.rows))
 
@@ -90,7 +90,7 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
 
 
 def _show_margins(console: Console, flight: RecordedFlight, scenario: Scenario) -> None:
-    """Print the margins under the parameters that flew, if they changed in flight."""
+    """Print the margins for each set of parameters that flew, if they changed in flight."""
     from flight_analysis.report import margin_figures  # noqa: PLC0415 - loads SciPy
 
     flown = flown_loops(flight.tape, scenario, flight.controllers, flight.later_aircraft)
@@ -99,14 +99,14 @@ def _show_margins(console: Console, flight: RecordedFlight, scenario: Scenario) 
 
 
 def show_table(console: Console, table: "PageTable") -> None:
-    """Print a table of the page with its legend."""
+    """Print a table of the report page with its legend."""
     print_table(console, grouped_table(table.caption, table.columns, table.rows))
     if table.legend:
         say(console, table.legend, style="dim")
 
 
 def entry_table(title: str, entries: Iterable[Entry]) -> Table:
-    """Make a table of entries of A and B: nominal, identified, and how far they changed."""
+    """Return a table of entries of A and B, with nominal and identified values and changes."""
     headings = ("entry", "nominal", "identified", "change %", "deviation %")
     table = new_table(f"{title}, SI; deviation: standard deviation of the change", headings)
     for entry in entries:
@@ -114,17 +114,17 @@ def entry_table(title: str, entries: Iterable[Entry]) -> Table:
         if entry.nominal:
             percent = f"{100 * entry.error:+.1f}", f"{100 * entry.deviation:.1f}"
         else:
-            # The nominal entry is zero, so that there is no change in %.
+            # The nominal entry is zero, so there is no change in %.
             percent = "", f"{100 * entry.deviation / abs(entry.error or 1.0):.1f}"
         table.add_row(escape(entry.name), *values, *percent)
     return table
 
 
 def entries_as_json(entries: Iterable[Entry]) -> dict[str, dict[str, float]]:
-    """Return entries of A and B by name, nominal and identified, in SI.
+    """Return the nominal and the identified values of entries of A and B by name, in SI.
 
-    The change and its deviation are fractions of the nominal entry. If that is zero, they are in
-    SI.
+    The change and its standard deviation are fractions of the nominal entry. If this is zero, they
+    are in SI.
     """
     return {
         entry.name: {
@@ -146,8 +146,8 @@ def new_table(
 ) -> Table:
     """Return an empty table.
 
-    Columns are aligned right, except those in `left_aligned`, by default the first. Columns keep to
-    one line, except those in `wrapped`.
+    Columns are aligned right, except those in `left_aligned`, which is the first by default. Cells
+    have one line, except in the columns in `wrapped`.
     """
     left_columns = headings[:1] if left_aligned is None else left_aligned
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
@@ -158,7 +158,7 @@ def new_table(
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Print a table as wide as its figures need.
+    """Print a table as wide as its content.
 
     A narrow terminal folds the lines, but no cell is cut.
     """
@@ -179,7 +179,7 @@ def _plain(cell: RenderableType) -> str:
     return Text.from_markup(cell).plain if isinstance(cell, str) else str(cell)
 
 
-WIDEST = 10_000  # characters, more than any table has
+WIDEST = 10_000  # width in characters, larger than that of any table
 
 
 NAME_COLUMN = TextColumn("{task.description}")
@@ -203,10 +203,10 @@ def clock(t: float, duration: float) -> str:
 def flight_progress(
     duration: float, *, quiet: bool
 ) -> Iterator[tuple[Callable[[float, str], None], Callable[[str], None]]]:
-    """Show the progress bar of a flight of `duration`, s.
+    """Show the progress bar of a flight of `duration` s.
 
-    Yields two functions: one takes the flight time and the text beside it, the other prints a line
-    above the bar.
+    Yields two functions. The first takes the flight time and the text beside it. The second prints
+    a line above the bar.
     """
     with progress_bar(*CLOCK_COLUMNS, quiet=quiet) as bar:
         task = bar.add_task("flight", total=duration, clock="", shown="")
@@ -238,7 +238,7 @@ def grouped_table(title: str, columns: Sequence[Column], rows: Iterable[Sequence
 
 
 def parse_numbers(text: str) -> list[float]:
-    """Parse numbers that commas separate; return an empty list if one of them is none."""
+    """Parse numbers that commas separate, or return [] if a part is not a number."""
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
@@ -246,7 +246,7 @@ def parse_numbers(text: str) -> list[float]:
 
 
 def named_numbers(option: str, texts: Sequence[str], example: str) -> dict[str, float]:
-    """Parse texts such as NAME=NUMBER into numbers by name."""
+    """Parse texts of the form NAME=NUMBER into numbers by name."""
     numbers = {}
     for text in texts:
         name, _, value = text.rpartition("=")
@@ -264,7 +264,7 @@ def named_numbers(option: str, texts: Sequence[str], example: str) -> dict[str, 
 
 
 def parse_lags(text: str) -> list[float]:
-    """Parse lags from "0.02,0.1", or one value for all. Raises ParameterError."""
+    """Parse lags such as "0.02,0.1", or one value for all. Raises ParameterError if invalid."""
     values = parse_numbers(text)
     require(bool(values), "--lag", repr(text), "seconds separated by commas")
     return values
@@ -284,14 +284,14 @@ STDOUT = Path("-")
 
 
 def stdout_for(file: Path | None) -> AbstractContextManager[object]:
-    """Keep standard output free for a file that is "-": the block prints on standard error."""
+    """Let a block print on standard error if `file` is "-", which stands for standard output."""
     return redirect_stdout(sys.stderr) if file == STDOUT else nullcontext()
 
 
 def write_text(option: str, path: Path, text: str) -> None:
-    """Write a file that an option names; "-" stands for standard output.
+    """Write a file that an option names, where "-" stands for standard output.
 
-    Raises ParameterError if it cannot be written.
+    Raises ParameterError if the file cannot be written.
     """
     if path == STDOUT:
         print(text, end="")
@@ -301,6 +301,6 @@ def write_text(option: str, path: Path, text: str) -> None:
 
 
 def require_yaml(option: str, path: Path) -> None:
-    """Raise ParameterError unless a path is that of a .yaml file in a folder that exists."""
+    """Raise ParameterError if a path is not that of a .yaml file in an existing folder."""
     require(path.suffix == ".yaml", option, path, "a name that ends in .yaml")
     require(path.parent.is_dir(), option, path, "a file in a folder that exists")

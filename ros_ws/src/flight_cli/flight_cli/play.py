@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di play`: publish the topics of a recorded flight again with their timing.
+"""Implement `rise-di play`, which publishes the topics of a recorded flight again.
 
-A node under test can then receive them.
+They keep their timing, so that a node under test can receive them as in the flight.
 """
 
 import math
@@ -21,7 +21,7 @@ from flight_log.tape_reader import topics_text
 
 
 class Stamps(StrEnum):
-    """The stamps that the messages get."""
+    """How the stamps of the messages are set."""
 
     NOW = "now"
     RECORDED = "recorded"
@@ -54,7 +54,7 @@ class Play:
     def execute(self) -> None:
         """Play until the end of the log, or until Ctrl-C."""
         for name, value in (("--rate", self.rate), ("--start", self.start)):
-            # The ranges above do not refuse NaN.
+            # The ranges of the options do not refuse NaN.
             require(math.isfinite(value), name, value, "a number")
         names = [name.strip() for name in self.topics.split(",") if name.strip()]
         playback = read_playback(self.run, names, self.start, self.namespace)
@@ -82,9 +82,9 @@ class Play:
                     break
 
     def _sendable(self, playback: Playback, *, every: bool) -> dict[str, str]:
-        """Return the message types of the topics that can be sent; warn which topics are skipped.
+        """Return the message types of the topics that can be sent, and warn of the others.
 
-        Raises ParameterError if none can be sent.
+        Raises ParameterError if no topic can be sent.
         """
         from flight_bringup.player import unsendable  # noqa: PLC0415 - as above
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The repair of `rise-di report`: rebuild a log whose recorder was killed.
+"""Rebuild a log whose recorder was killed, as `rise-di report --repair` does.
 
 Every rosbag2 reader accepts the result.
 """
@@ -40,9 +40,9 @@ def repair_log(run: Path) -> None:
 
 
 def _missing_at_end(run: Path, last: FileRepair) -> str:
-    """Say how much time is missing at the end of the log.
+    """Return a text on the time that is missing at the end of the log.
 
-    The files say when they end. If they do not, the duration of the scenario does.
+    The end of the flight comes from the files or, if they lack it, from the scenario's duration.
     """
     if (missing := seconds(last.known_end_ns - last.last_ns)) > 0:
         return f"{missing:.3f} s are missing at its end"

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di replay`: compute a recorded flight again and compare it bit by bit.
+"""Implement `rise-di replay`, which computes a recorded flight again, bit by bit.
 
 With other gains, it computes the flight in open loop.
 """
@@ -68,7 +68,7 @@ class Replay:
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Compute every tick again, show what differs, and exit with the status."""
+        """Compute every tick again, print what differs, and exit with the status."""
         changes = parse_settings(self.settings, "controller")
         controller_changes = {
             name.removeprefix("controller."): value for name, value in changes.items()
@@ -117,18 +117,18 @@ class Replay:
 
 
 class Shown(NamedTuple):
-    """The ticks that were computed again, and the steps of guidance of a guided flight."""
+    """What the command prints: the ticks that were computed again, and steps of guidance."""
 
     result: ReplayResult
     inputs: tuple[str, ...]
-    ticks: int  # that were flown; the log may lack some of them
-    open_loop: bool  # u was computed with other parameters
+    ticks: int  # number of ticks that were flown; the log may lack some
+    open_loop: bool  # whether u was computed with other parameters
     guided: GuidanceReplay | None
-    promise: Guarantee | None  # if one was computed for the loop of the flight
-    differences: tuple[str, ...] = ()  # how the aircraft differs from what the controller was told
+    promise: Guarantee | None  # guarantee that was kept for the loop of the flight, if any
+    differences: tuple[str, ...] = ()  # how the aircraft differs from what the controller knew
 
     def notes(self) -> list[str]:
-        """Return notes on the computation, and on ticks with other parameters than the log's."""
+        """Return notes on the computation, and on ticks that flew with other parameters."""
         result = self.result
         notes = [*result.notes, *(() if self.guided is None else self.guided.notes)]
         rows = np.flatnonzero(result.other_parameters)
@@ -153,10 +153,10 @@ class Shown(NamedTuple):
 
 
 def _claims_of(run: RecordedRun) -> tuple[Guarantee | None, tuple[str, ...]]:
-    """Return the guarantee of the loop of a flight, and how its aircraft differs.
+    """Return the guarantee of a flight's loop, and sentences on how its aircraft differs.
 
-    The guarantee is None if there is none, if there is no linear model, if the parameters changed
-    in flight, or if it does not hold for the aircraft that flew.
+    The guarantee is None if none was computed, if there is no linear model, if the parameters
+    changed in flight, or if it does not hold for the aircraft that flew.
     """
     if len({span.digest for span in parameter_spans(run.tape)}) > 1:
         return None, ()
@@ -251,7 +251,7 @@ def _count_by_group(result: ReplayResult) -> dict[str, int]:
 
 
 def _u_figures(result: ReplayResult, inputs: tuple[str, ...]) -> dict[str, dict[str, float]]:
-    """Return figures of the computed u minus the recorded u for each input, in its unit.
+    """Return metrics of the computed u minus the recorded u, by input, in the input's unit.
 
     They are the rms, the largest difference, its time, and the rms of the recorded u. They are NaN
     if there is no u.
@@ -300,9 +300,10 @@ def _as_json(answer: Shown, notes: Sequence[str], settings: list[str]) -> dict[s
 
 
 def _write_csv(path: Path, result: ReplayResult, inputs: tuple[str, ...]) -> None:
-    """Write a row for each tick: its number, t, then each input as recorded and as computed.
+    """Write a CSV file with a row for each tick.
 
-    The digits are enough to restore every bit.
+    A row has the number of the tick, t, and each input as recorded and as computed. The numbers
+    have enough digits to restore every bit.
     """
     columns = [result.names.index(f"u.{name}") for name in inputs]
     text = io.StringIO(newline="")

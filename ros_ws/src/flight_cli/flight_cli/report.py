@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di report`: write tables, the report page, figures and data of recorded runs."""
+"""Implement `rise-di report`, which writes tables, pages, figures and data of recorded runs."""
 
 import webbrowser
 from collections.abc import Sequence
@@ -130,7 +130,7 @@ class Report:
 
 
 def _show(flights: Sequence[RecordedFlight]) -> None:
-    """Print the tables of a flight, or a comparison."""
+    """Print the tables of a flight, or a comparison of several."""
     if len(flights) > 1:
         show_comparison(Console(), flights)
         return

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The options of the commands that read a route file."""
+"""Declare the options of the commands that read a route file."""
 
 import math
 from dataclasses import dataclass

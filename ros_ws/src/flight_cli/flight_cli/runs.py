@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di runs`: list the recorded flights in a folder."""
+"""Implement `rise-di runs`, which lists the recorded flights in a folder."""
 
 import json
 from contextlib import suppress
@@ -55,10 +55,10 @@ class Runs:
 
 
 def _row(run: Path) -> dict[str, Any]:
-    """Return what the report of a run says about it or, without a report, how to write one."""
+    """Return the row of a run from its report or, without a report, how to write it."""
     name = display_path(run)
     row = {"run": name, "scenario": "", "duration": None, "outcome": NO_REPORT.format(run=name)}
-    # A killed flight has no summary, and that of another version may lack a key.
+    # A killed flight has no summary, and a summary of another version may lack a key.
     with suppress(OSError, ValueError, KeyError, TypeError):
         summary = json.loads((run / SUMMARY).read_text(encoding="utf-8"))
         sentence = summary["outcome"]["sentence"]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di scenarios`: list the scenarios by name."""
+"""Implement `rise-di scenarios`, which lists the scenarios by name."""
 
 from dataclasses import dataclass
 from itertools import dropwhile, takewhile
@@ -15,7 +15,7 @@ from flight_cli.words import argument, json_option, scenario_names
 def first_sentences(text: str) -> str:
     """Return the first sentences of the comment at the head of a file.
 
-    They end at the first line that ends with a full stop, or with the paragraph.
+    The text ends at the first line that ends with a full stop, or at the end of the paragraph.
     """
     head = takewhile(lambda line: line.startswith("#") or not line.strip(), text.splitlines())
     comment = (line.removeprefix("#").strip() for line in head)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The option --set, which changes parameters of a scenario by their keys."""
+"""Implement the option --set, which changes parameters of a scenario by their keys."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -14,13 +14,13 @@ from flight_core.parameters import Config, flatten, nest, one_of, require
 
 
 def settings_option() -> Any:
-    """Declare the option --set, which sets parameters by key."""
+    """Declare the option --set of a command."""
     text = "Parameter to change, as in controller.k_g=2.0; may be repeated."
     return option(text, "--set", metavar="KEY=VALUE", autocompletion=setting_names)
 
 
 def setting_names(incomplete: str) -> list[str]:
-    """Complete a key of --set, when the shell asks for it, from the shipped scenarios."""
+    """Return completions of a key of --set for the shell, from the shipped scenarios."""
     keys: set[str] = set()
     for path in LIBRARY.glob("*.yaml"):
         scenario = find_scenario(path.stem)
@@ -38,9 +38,9 @@ def parse_settings(
 ) -> dict[str, Any]:
     """Parse the words of --set into values by key, for example controller.k_g.
 
-    `owner` is the only section to which a key can belong; "scenario" allows every section. If the
-    user left the section out, the error names the sections that `sections_with` returns for the
-    key. Raises ParameterError.
+    `owner` is the only section to which a key can belong. "scenario" allows every section. Raises
+    ParameterError for an invalid setting. If the user left out the section, the error names the
+    sections that `sections_with` returns for the key.
     """
     changes: dict[str, Any] = {}
     for text in settings or ():
@@ -64,7 +64,7 @@ def parse_settings(
 
 
 def with_settings(scenario: Scenario, settings: Sequence[str] | None) -> Scenario:
-    """Return the scenario with the parameters of --set changed. Raises ParameterError."""
+    """Return the scenario with the changes of --set. Raises ParameterError if they are invalid."""
     sections: dict[str, dict[str, Any]] = defaultdict(dict)
     for name, value in parse_settings(settings, "scenario", scenario.sections_with).items():
         section, _, key = name.partition(".")

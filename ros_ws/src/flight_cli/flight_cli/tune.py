@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di tune`: from the log of an autopilot, make a module that flies better.
+"""Implement `rise-di tune`, which makes a better module from the log of an autopilot.
 
-It imports, identifies, selects gains, compares, bounds and exports, as the commands of these names
-do.
+It imports, identifies, selects gains, compares, bounds and exports, as the commands with these
+names do.
 """
 
 from collections.abc import Callable, Mapping
@@ -114,7 +114,7 @@ class Tune:
     )
 
     def execute(self) -> None:
-        """Identify, select, bound, export and show."""
+        """Identify the aircraft, select and bound gains, export the module, and print results."""
         autopilot, folder = self._target()
         console = Console()
         try:
@@ -142,9 +142,9 @@ class Tune:
             raise typer.Exit(UNPROVED)
 
     def _target(self) -> tuple[str, Path]:
-        """Return the autopilot that was named, and its folder.
+        """Return the autopilot that an option names, and the folder for its module.
 
-        Raises BadParameter unless exactly one is named.
+        Raises BadParameter if not exactly one autopilot is named.
         """
         folders = {"px4": self.px4, "ardupilot": self.ardupilot}
         named = {name: path for name, path in folders.items() if path is not None}
@@ -156,7 +156,7 @@ class Tune:
         return autopilot, folder
 
     def _tuned(self, console: Console, autopilot: str, folder: Path) -> Tuned:
-        """Identify, select the gains and bound them: the whole command except the export."""
+        """Do everything except the export: identify, select the gains and bound them."""
         scenario = find_scenario(self.scenario)
         nominal = load_airframe(scenario.aircraft.airframe)
         scenario = self._with_lags(scenario, nominal)
@@ -214,10 +214,10 @@ class Tune:
     def _in_time(
         self, console: Console, scenario: Scenario, of_log: RatesLog, autopilot: str
     ) -> tuple[Scenario, float]:
-        """Give the loop of a scenario the delay of the log, and return that of the gyro's filter.
+        """Return the scenario with the delay of the log, and the delay of the gyro's filter.
 
-        For PX4 it follows from the gyro's rate and filters, and for ArduPlane from the filter. If
-        the log has none, it is that of the scenario.
+        For PX4 the delay follows from the gyro's rate and filters, and for ArduPlane from the
+        filter. If the log does not have it, it is the delay of the scenario.
         """
         controller = scenario.rise_di()
         if autopilot != "px4":
@@ -235,7 +235,7 @@ class Tune:
     def _with_lags(self, scenario: Scenario, nominal: Airframe) -> Scenario:
         """Return the scenario with the lags of --lag, in the aircraft and in the controller.
 
-        Raises ParameterError.
+        Raises ParameterError if the lags are invalid.
         """
         if self.lag is None:
             return scenario
@@ -269,7 +269,7 @@ def _with_lead(controller: RiseDiConfig) -> RiseDiConfig:
 
 
 def _promise(scenario: Scenario, airframe: Airframe, entries: Mapping[str, float]) -> Guarantee:
-    """Return the guarantee for A and B within their errors; LEAST for an entry without one."""
+    """Return the guarantee for A and B within their errors, or within LEAST without an error."""
     answer = check_gains(
         airframe, scenario, uncertainty=LEAST, samples=SAMPLES, entries=entries, as_told=True
     )
@@ -283,7 +283,7 @@ def _identified(
     of_log: RatesLog,
     actuation: Actuation,
 ) -> Identification:
-    """Search for the model on the log, and show a progress bar."""
+    """Search for the model that fits the log, and show a progress bar."""
     length = len(of_log.recorded.t) * of_log.recorded.period
     say(console, f"searching for A and B in {length:.0f} s of flight")
     controller = scenario.rise_di()
@@ -312,7 +312,7 @@ def _require_shown(
 ) -> None:
     """Raise ParameterError, before any search, if a log does not show the aircraft.
 
-    It has too many holes, too few samples of u, or an input that does not move its output.
+    Such a log has too many gaps, too few samples of u, or an input that does not move its output.
     """
     tape = of_log.taken.tape
     holes = [name for name in ("y", "u") if lost_share(tape[name].stamp_ns) > MOST_LOST]
@@ -335,7 +335,7 @@ def _require_shown(
 
 
 def _what_to_fly(identification: Identification, scenario: Scenario, log: Path) -> str:
-    """Say why the model is refused, and which doublets would show what is missing."""
+    """Return a sentence on why the model is refused, and which doublets to fly."""
     parts = identification.parts
     y = identification.recorded.y
     fly = to_fly(factors_of(parts), scenario, identification.airframe, y)
@@ -343,9 +343,10 @@ def _what_to_fly(identification: Identification, scenario: Scenario, log: Path) 
 
 
 def _kept(nominal: Airframe, identification: Identification) -> Airframe | None:
-    """Put the identified parts into the airframe, or return None if one of them must not be used.
+    """Return the airframe with the identified parts, or None if a part must not be used.
 
-    If the nominal model of a part explains the log better, this part stays nominal.
+    A part is a group of entries that are identified together. If its nominal model explains the log
+    better, the part stays nominal.
     """
     used = []
     for part in identification.parts:
@@ -361,16 +362,17 @@ def _is_better(part: Part) -> bool:
 
 
 def _kept_model(part: Part) -> str:
-    """Say which model of a refused part is used."""
+    """Return a text on which model of a refused part is used."""
     kept = "is taken, as the likelier one" if _is_better(part) else "stays nominal"
     return f"the model {kept}"
 
 
 def _uncertainty(identification: Identification) -> float:
-    """Return twice the largest deviation of the best known effects, from LEAST to MOST.
+    """Return twice the largest standard deviation of the best known effects, in LEAST to MOST.
 
-    The deviation of an effect is a fraction of the value that was found. An uncertain delay does
-    not count: if it is wrong, A and B are wrong with it, and the loop is still that of the log.
+    The deviation of an effect is a fraction of the identified value. An uncertain delay does not
+    count. If the delay is wrong, A and B are wrong as well, in such a way that the loop is still
+    that of the log.
     """
     relative = [
         effect.deviation * abs(effect.nominal / effect.value)
@@ -381,10 +383,10 @@ def _uncertainty(identification: Identification) -> float:
 
 
 def _box(identification: Identification, airframe: Airframe) -> dict[str, float]:
-    """Return twice the standard deviation of each entry, by name, as a fraction of its value.
+    """Return the uncertainty of each entry by name, as a fraction of its value in the airframe.
 
-    The values are those of the airframe. If an axis stays nominal, each of its entries has at least
-    the change that the identification found.
+    It is twice the standard deviation. If a part stays nominal, it is at least the change of the
+    entry that the identification found.
     """
     A, B = airframe.matrix_a(), airframe.matrix_b()
     inputs = list(airframe.inputs)
@@ -409,7 +411,7 @@ def _box(identification: Identification, airframe: Airframe) -> dict[str, float]
 def _on_airframe(scenario: Scenario, airframe: Path, noise: FloatArray) -> Scenario:
     """Return the scenario on the identified airframe.
 
-    Its sensors have the noise of the gyro in the log, rad/s rms.
+    The sensors have the noise of the gyro in the log, rad/s rms.
     """
     changes = {"airframe": str(airframe.resolve()), "sensors": {"noise": noise.tolist()}}
     return scenario.vary(aircraft=changes)

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controllers that `rise-di tune` compares on the identified aircraft, and the best of them.
+"""Compare controllers on the identified aircraft for `rise-di tune`, and find the best.
 
-Each flies the commands of the scenario in calm air and in gusts. The autopilot's own loop flies
-beside them.
+Each controller flies the commands of the scenario in calm air and in gusts. The autopilot's loop
+flies them as well, for comparison.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,40 +31,41 @@ TURBULENCE: Mapping[str, float] = MappingProxyType({"altitude": 5.0, "wind": 5.0
 """Near the ground the gusts of a wind of 5 m/s have 0.5 m/s rms along the vertical axis."""
 ROLLING = {"amplitude": 0.7, "frequency": 5.0}
 """A gust that turns about the roll axis, rad/s and rad/s: 0.5 rad/s rms, with a time of 0.2 s."""
-SAMPLES = 60  # uncertain aircraft
-DELAY_MARGIN = 0.01  # s, with the observer, as in examples/px4_airplane/rates_observer.yaml
+SAMPLES = 60  # number of uncertain aircraft
+DELAY_MARGIN = 0.01  # with the observer, s, as in examples/px4_airplane/rates_observer.yaml
 FORMER = "as in the scenario"
 Report = Callable[[str], None]
 
 
 class Candidate(NamedTuple):
-    """A controller beside others."""
+    """A controller that competes to become the module."""
 
     name: str
-    scenario: Scenario  # with the identified aircraft
-    origin: str  # where the gains come from; "" if that is the scenario
-    shortfall: str  # margins that the loop lacks, in a sentence; "" if there are none
-    rms: Mapping[str, FloatArray]  # of y - y_m, by air, (m,); infinite if the flight ends early
+    scenario: Scenario  # scenario with this controller and the identified aircraft
+    origin: str  # source of the gains; "" for the scenario
+    shortfall: str  # a sentence on margins that fall short; "" if none do
+    rms: Mapping[str, FloatArray]  # rms of y - y_m by air, (m,); infinite if the flight ends early
 
     @property
     def score(self) -> float:
-        """Return the geometric mean over the outputs of the rms over all airs, rad/s.
+        """The geometric mean over the outputs of the rms error over all airs, rad/s.
 
-        A share of the error counts the same in each output, and an air by the size of its errors.
+        A relative change of the error counts the same in each output. An air counts by the size of
+        its errors.
         """
         in_all = np.sqrt(np.mean(np.square(list(self.rms.values())), axis=0))
         return float(np.exp(np.mean(np.log(in_all))))
 
 
 class Selectors(NamedTuple):
-    """How the candidates are found and judged."""
+    """The data and options with which candidates are selected and judged."""
 
-    airframe: Airframe  # the identified one
-    flight: Scenario  # that of the log, with the identified aircraft
-    uncertainty: float  # of A and B, for the margins
+    airframe: Airframe  # the identified airframe
+    flight: Scenario  # scenario of the log, with the identified aircraft
+    uncertainty: float  # uncertainty of A and B, for the margins
     lead: Callable[[RiseDiConfig], RiseDiConfig]  # gives a feedforward the lead of the module
     calm: bool  # whether calm air counts alone, without an observer
-    accept: bool  # whether weights are taken as they are
+    accept: bool  # whether gains with too small margins are accepted
     weights: Path | None
     report: Report
 
@@ -75,7 +76,7 @@ class Selectors(NamedTuple):
         if self.airframe.gusts and not self.calm:
             airs[GUSTS] = {"turbulence": dict(TURBULENCE)}
             if "p" in self.airframe.states:
-                # The air turns, and so p_dot changes by A[p, p] times less the rate of the air.
+                # The air rotates, so p_dot changes by -A[p, p] times the rate of the air.
                 row = self.airframe.index("p")
                 damping = abs(float(self.airframe.matrix_a()[row, row]))
                 rolling = ROLLING | {"amplitude": damping * ROLLING["amplitude"]}
@@ -84,7 +85,7 @@ class Selectors(NamedTuple):
 
 
 def candidates(selectors: Selectors) -> list[Candidate]:
-    """Return the scenario's own controller first, then those that were selected.
+    """Return the candidates, first the scenario's controller and then selected ones.
 
     A selection that fails is reported and left out. Raises ParameterError if all of them fail.
     """
@@ -99,7 +100,7 @@ def candidates(selectors: Selectors) -> list[Candidate]:
     if not selectors.calm:
         options["observer by a rule"] = observer
         if selectors.weights is not None:
-            # as they are: the margins are judged below, beside those of the others
+            # The gains are accepted here, because the margins of all candidates are judged below.
             as_read = {"weights": selectors.weights, "accept": True}
             options[f"observer of {selectors.weights.name}"] = observer | as_read
     reasons = []
@@ -127,9 +128,9 @@ def candidates(selectors: Selectors) -> list[Candidate]:
 
 
 def best_of(found: Sequence[Candidate], *, accept: bool) -> Candidate:
-    """Return the candidate of the least score whose margins suffice, or are accepted as they are.
+    """Return the candidate with the least score whose margins suffice, or any with `accept`.
 
-    Raises ParameterError, with the shortfall of the best one, if none has the margins.
+    Raises ParameterError, with the shortfall of the best candidate, if no margins suffice.
     """
     by_score = sorted(found, key=lambda candidate: candidate.score)
     enough = [candidate for candidate in by_score if accept or not candidate.shortfall]
@@ -141,7 +142,7 @@ def best_of(found: Sequence[Candidate], *, accept: bool) -> Candidate:
 
 
 def rms_of_own_loop(own: OwnLoop, selectors: Selectors) -> dict[str, FloatArray]:
-    """Return the rms of y - y_m of the autopilot's own loop by air, (m,)."""
+    """Return the rms of y - y_m of the autopilot's loop, by air, each with the shape (m,)."""
     flight, airframe = selectors.flight, selectors.airframe
     controller = flight.rise_di()
     errors = {}
@@ -187,7 +188,7 @@ def _judged(selectors: Selectors, name: str, controller: RiseDiConfig, origin: s
 
 
 def _error(tape: Tape, airframe: Airframe) -> FloatArray:
-    """Return the rms of y - y_m of a flight, (m,), of the true y; infinite if it ended early."""
+    """Return the rms of the true y - y_m of a flight, (m,), or infinity if it ended early."""
     truth, y_m = tape["truth"], tape["y_m"]
     rows = [airframe.outputs.index(name) for name in y_m.names]
     if tape.outcome != COMPLETED:

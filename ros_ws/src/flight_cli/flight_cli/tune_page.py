@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What `rise-di tune` shows: the aircraft, the controllers beside each other, what to do next."""
+"""Show the results of `rise-di tune`: the aircraft, the controllers, and what to do next."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -55,15 +55,15 @@ STEPS = {
 
 
 class OwnFlight(NamedTuple):
-    """The autopilot's own loop on the identified aircraft."""
+    """A simulated flight of the autopilot's loop on the identified aircraft."""
 
     loop: OwnLoop
-    rms: Mapping[str, FloatArray]  # of y - y_m, by air, (m,)
+    rms: Mapping[str, FloatArray]  # rms of y - y_m by air, (m,)
     margins: LoopMargins
 
     @classmethod
     def of(cls, loop: OwnLoop, selectors: Selectors, uncertainty: float) -> "OwnFlight":
-        """Fly the loop in the airs of the candidates."""
+        """Simulate the autopilot's loop in the airs in which the candidates fly."""
         flight = selectors.flight
         return cls(
             loop=loop,
@@ -77,14 +77,14 @@ class Tuned(NamedTuple):
 
     identification: Identification
     best: Candidate
-    candidates: Sequence[Candidate]  # the first one is that of the scenario
+    candidates: Sequence[Candidate]  # the first is that of the scenario
     promise: Guarantee
-    margins: LoopMargins  # of the best one
-    own: OwnFlight | None  # None if the log has no parameters of it
+    margins: LoopMargins  # margins of the best candidate
+    own: OwnFlight | None  # None if the log lacks the autopilot's parameters
 
 
 def error_rows(tuned: Tuned) -> list[list[str]]:
-    """Return a row for each controller in each air: its name, and the rms of the errors, mrad/s."""
+    """Return a row for each controller in each air, with its name and the rms errors, mrad/s."""
     loops = [(each.name, each.rms, each is tuned.best) for each in tuned.candidates]
     if tuned.own is not None:
         loops.append((OWN, tuned.own.rms, False))
@@ -98,7 +98,7 @@ def error_rows(tuned: Tuned) -> list[list[str]]:
 
 
 def verdict(tuned: Tuned) -> list[str]:
-    """Say which controller became the module, and why a better one did not."""
+    """Return sentences on which controller became the module, and why a better one did not."""
     best, former = tuned.best, tuned.candidates[0]
     ratio = f"{best.score / former.score:.2g} times the error"
     if best is former:
@@ -118,7 +118,7 @@ def verdict(tuned: Tuned) -> list[str]:
 
 
 def guaranteed(promise: Guarantee) -> str:
-    """Say how many of the stated deviations of A and B the guarantee covers."""
+    """Return a sentence on how much of the stated deviations of A and B the guarantee covers."""
     holds = "every aircraft is stable" if promise.holds else "an aircraft may be unstable"
     covered = 2.0 * promise.stable / promise.uncertainty
     return (
@@ -128,7 +128,7 @@ def guaranteed(promise: Guarantee) -> str:
 
 
 def show_tuning(console: Console, tuned: Tuned) -> None:
-    """Print what was identified, the errors that are predicted, and what is guaranteed."""
+    """Print the identified model, the predicted errors, and the guarantee."""
     identification = tuned.identification
     title = f"A and B of {identification.airframe.name}"
     print_table(console, entry_table(title, identification.entries))
@@ -147,7 +147,7 @@ def show_tuning(console: Console, tuned: Tuned) -> None:
 
 
 def tuning_page(tuned: Tuned, log: str, autopilot: str) -> Page:
-    """Make the page: what was identified, predicted and bounded, and what the pilot does next."""
+    """Return the page with model, predictions, guarantee, and the pilot's next steps."""
     identification = tuned.identification
     entries = MetricTable(
         f"Identified from {log}",

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di watch`: see a flight on a page or in the terminal, live or recorded."""
+"""Implement `rise-di watch`, which shows a flight on a page or in the terminal."""
 
 import subprocess
 import sys
@@ -82,7 +82,7 @@ class Watch:
     runs: Path = rare_option("Folder of the runs.", default=Path("runs"))
 
     def execute(self) -> None:
-        """Serve the page, or show the flight elsewhere, until its end."""
+        """Serve the page, or show the flight in another way, until its end."""
         self._require_one_view()
         remaps = remaps_of(self.remap)
         file = scenario_file(self.scenario)
@@ -135,19 +135,19 @@ class Watch:
             require(not twice, f"--{name}", "--control beside it", "one of the two")
 
     def _runs_in_progress(self) -> list[Path]:
-        """Return the runs to watch if the user named no RUN."""
+        """Return the runs to watch if the user did not name a run."""
         return _in_progress(self.runs) if self.fleet else [_newest(self.runs, self.namespace)]
 
 
 def _in_progress(runs: Path) -> list[Path]:
-    """Return the runs that are being recorded, by name. Raises ParameterError without any."""
+    """Return the runs that are being recorded, by name. Raises ParameterError if there are none."""
     recording = runs_in_recording(runs)[::-1]
     require(bool(recording), f"--fleet: {runs}", "no run in recording", "each RUN by its name")
     return recording
 
 
 def _newest(runs: Path, namespace: str | None) -> Path:
-    """Return the newest run, and note which other aircraft fly."""
+    """Return the newest run, and print which other aircraft fly."""
     run = newest_run(runs, namespace)
     others = [display_path(folder) for folder in runs_in_recording(runs) if folder != run]
     if others and namespace is None:
@@ -184,7 +184,7 @@ def _serve_with_control(
     require_ros_environment()
     from flight_view.control_client import ControlClient  # noqa: PLC0415 - loads rclpy, which a page without control lacks
 
-    # The aircraft behind a bridge is not the one in the scenario.
+    # The aircraft behind a bridge is not that of the scenario.
     assess = partial(delay_margins, flight=FlightFacts(is_simulated=not real))
     with ControlClient(namespace) as client:
         key = new_key()
@@ -200,7 +200,7 @@ def _serve_with_control(
 def watched(*runs: Path, fleet: bool = False) -> Iterator[list[str]]:
     """Serve the page of runs that another process will record during the block.
 
-    Yields the lines that the user is to see.
+    Yields the lines to print for the user.
     """
     options = ["--wait", *(["--fleet"] if fleet else [])]
     command = [
@@ -213,8 +213,8 @@ def watched(*runs: Path, fleet: bool = False) -> Iterator[list[str]]:
         *map(str, runs),
         *options,
     ]
-    # The page has a process group of its own. Ctrl-C then only reaches the flight, whose end the
-    # page still shows.
+    # The page runs in a separate process group, so that Ctrl-C only reaches the flight, and the
+    # page still shows the end of the flight.
     with subprocess.Popen(  # noqa: S603
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, process_group=0
     ) as server:

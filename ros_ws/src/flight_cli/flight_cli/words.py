@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The words of a command line: options and arguments with their help."""
+"""Declare the options and arguments of a command line, and refuse wrong ones."""
 
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -21,8 +21,8 @@ from typer.exceptions import TyperException
 from flight_core.parameters import ParameterError, require
 
 DECLARE = "declare"  # key of the function that declares a field to Typer
-ALIKE = 0.85  # of a misspelt option: --run is close to --runs, but --seed is not to --send
-ALIKE_COMMANDS = 0.6  # of a misspelt command, since a wrong suggestion flies nothing
+ALIKE = 0.85  # least similarity of a misspelt option, as of --run to --runs
+ALIKE_COMMANDS = 0.6  # the same for a command, where a wrong suggestion does no harm
 REQUIRED = MISSING
 """The default of a field that the user must give."""
 
@@ -46,12 +46,12 @@ class Executable(Protocol):
     """A command: a data class of its options, whose docstring is its help."""
 
     def execute(self) -> None:
-        """Do what the command does."""
+        """Run the command."""
 
 
 def option(text: str, *names: str, default: Any = None, **rules: Any) -> Any:
-    """Declare an option with its help; if `names` is empty, it has the name of the field."""
-    shown = escape(text)  # A[q,alpha] is not markup
+    """Declare an option with its help text. If `names` is empty, it is named like the field."""
+    shown = escape(text)  # so that A[q,alpha] is no markup
     return _field(
         lambda name: typer.Option(
             *(names or (f"--{name.replace('_', '-')}",)), help=shown, **rules
@@ -61,12 +61,12 @@ def option(text: str, *names: str, default: Any = None, **rules: Any) -> Any:
 
 
 def rare_option(text: str, *names: str, default: Any = None, **rules: Any) -> Any:
-    """Declare an option that few users need; --help lists it in a panel of its own."""
+    """Declare an option that few users need, which --help lists in a separate panel."""
     return option(text, *names, default=default, rich_help_panel="More options", **rules)
 
 
 def argument(text: str, default: Any = None, **rules: Any) -> Any:
-    """Declare an argument with its help."""
+    """Declare an argument with its help text."""
     return _field(lambda _: typer.Argument(help=escape(text), **rules), default)
 
 
@@ -101,7 +101,7 @@ def as_function(command: Callable[..., Executable]) -> Callable[..., None]:
         command(**values).execute()
 
     execute.__doc__ = command.__doc__
-    # The command's own options come before those of its base.
+    # The options of the command's class come before those of its base class.
     words = sorted(fields(command), key=lambda word: word.name not in command.__annotations__)  # type: ignore[arg-type]
     parameters = [_parameter(word, hints[word.name]) for word in words]
     execute.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
@@ -124,7 +124,7 @@ def values_of(command: Executable, *names: str) -> dict[str, Any]:
 def require_unused(
     command: Executable, names: Iterable[str], expected: str, found: str = ""
 ) -> None:
-    """Raise ParameterError for the first field that is used."""
+    """Raise ParameterError if any of the fields has been set, for the first of them."""
     for name, value in values_of(command, *names).items():
         require(value in (None, False, "", []), name, found or f"{value}", expected)
 
@@ -138,7 +138,7 @@ def _names_of(library: str) -> Callable[[str], list[str]]:
     """Return a shell completion that offers the names in a library, MODULE:FOLDER."""
 
     def complete(incomplete: str) -> list[str]:
-        from flight_core.files import names_in  # noqa: PLC0415 - --help does without
+        from flight_core.files import names_in  # noqa: PLC0415 - --help does not need it
 
         return [name for name in names_in(resolve_name(library)) if name.startswith(incomplete)]
 
@@ -180,7 +180,7 @@ EXPECTED: Mapping[str, str] = MappingProxyType(
 
 
 def refused_words(error: Any, command: str, names: Sequence[str]) -> ParameterError:
-    """Turn the refusal of a command's words into a sentence: the project's own, or Typer's."""
+    """Turn Typer's refusal of a command's words into a ParameterError with one sentence."""
     if isinstance(error, typer.BadParameter):
         return refused_value(error, command)
     option = getattr(error, "option_name", "")
@@ -192,13 +192,13 @@ def refused_words(error: Any, command: str, names: Sequence[str]) -> ParameterEr
 
 
 def _typers_sentence(error: Any, command: str) -> ParameterError:
-    """Return what Typer says about the words, in the form of the other refusals."""
+    """Return Typer's message about the words in the form of the other refusals."""
     text = error.format_message().strip().rstrip(".")
     return ParameterError(f"{command}: {text[:1].lower()}{text[1:]}; {command} --help shows more")
 
 
 def refused_value(error: typer.BadParameter, command: str) -> ParameterError:
-    """Turn the refusal of a value into a sentence: the project's own, or else Typer's."""
+    """Turn Typer's refusal of a value into a ParameterError with one sentence."""
     cause: Any = error.__cause__
     if cause is None or not hasattr(cause, "errors") or error.param is None:
         return _typers_sentence(error, command)
@@ -215,7 +215,7 @@ def refused_value(error: typer.BadParameter, command: str) -> ParameterError:
 
 
 def _path(ctx: Any) -> str:
-    """Return the command of a context as it is typed, rise-di in front."""
+    """Return the command of a context as the user types it, beginning with rise-di."""
     names = []
     while ctx.parent is not None:
         names.append(str(ctx.info_name))
@@ -227,7 +227,7 @@ class RiseDiCommand(TyperCommand):
     """A command whose refusals name the option as the user types it."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words after the name. Raises ParameterError for an unknown option."""
+        """Parse the words after the command. Raises ParameterError for an unknown option."""
         names = [name for each in self.get_params(ctx) for name in each.opts]
         words = [] if ctx.resilient_parsing else [*takewhile("--".__ne__, args)]
         for word, value in zip_longest(words, words[1:], fillvalue=""):
@@ -247,7 +247,7 @@ class RiseDiCommand(TyperCommand):
             raise refused_words(error, _path(ctx), names) from None
 
     def _mend(self, name: str, names: Sequence[str], command: str) -> str:
-        """Suggest what to type in place of an unknown option."""
+        """Return a suggestion in place of an unknown option."""
         if name[2:] in names:
             return f"give it without a name, {command} {name[2:].upper()}"
         near = [
@@ -261,7 +261,7 @@ class RiseDiCommand(TyperCommand):
         return f"{command} --help lists them{key}"
 
     def invoke(self, ctx: Any) -> Any:
-        """Call the function. A ParameterError names the option in place of the field."""
+        """Call the function. A ParameterError that it raises names the option, not the field."""
         try:
             return super().invoke(ctx)
         except ParameterError as error:
@@ -273,12 +273,12 @@ class RiseDiCommand(TyperCommand):
 
 
 def without_help_word(words: Sequence[str]) -> list[str]:
-    """Return the words with the option --help in place of a first word `help`."""
+    """Return the words, with --help in place of `help` if this is the first word."""
     return [*words[1:], "--help"] if [*words[:1]] == ["help"] else [*words]
 
 
 class RiseDiGroup(TyperGroup):
-    """The group of all commands, whose refusals have the same form as those of an option."""
+    """The group of all commands, whose refusals have the same form as those of options."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the words. Raises ParameterError if an option before the command is unknown."""
@@ -292,7 +292,7 @@ class RiseDiGroup(TyperGroup):
             raise refused_words(error, _path(ctx), names) from None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the command of a word. Raises ParameterError if there is none of that name."""
+        """Return the command with a name. Raises ParameterError if there is no such command."""
         word = args[0]
         if word not in self.commands and not ctx.resilient_parsing:
             near = get_close_matches(word, self.commands, n=1, cutoff=ALIKE_COMMANDS)
