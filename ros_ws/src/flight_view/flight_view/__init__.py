@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight on a page, live or recorded.
+"""Show a flight on a page, live or recorded.
 
-The page follows the growing log. It joins no ROS graph, except to control the flight.
+The page follows the growing log. Its server joins the ROS graph only to control the flight.
 
 | module | does |
 |---|---|
@@ -11,9 +11,9 @@ The page follows the growing log. It joins no ROS graph, except to control the f
 | `page_topics` | names the topics and channels that the page reads |
 | `server` | serves the page and the samples to browsers on this host |
 | `control` | checks and carries out commands of the page, over a link to the nodes |
-| `request_values` | refuses values of a request that are not well formed or not in range |
-| `foxglove_server` | serves a log to viewers of the Foxglove protocol, an extra |
+| `request_values` | refuses values of a request that are malformed or out of range |
+| `foxglove_server` | serves a log to viewers of the Foxglove protocol (optional) |
 | `watch` | finds the run and serves it until Ctrl-C |
 | `text` | shows a flight in a terminal |
-| `page/` | the page: markup, style, scripts |
+| `page/` | the page with markup, style and scripts |
 """

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The background of the map: the lines and points of a GeoJSON file of the user.
+"""Read the background of the map from a GeoJSON file of the user.
 
-They are in the plane of the flight.
+The background has lines and points in the plane of the flight.
 """
 
 from pathlib import Path
@@ -12,17 +12,17 @@ from flight_core.parameters import ParameterError, require
 from flight_guidance.routes.route_file import Origin, placed_lines
 from flight_guidance.steering.path import Point
 
-Line = list[Point]  # north, east, m; a single point is a mark
+Line = list[Point]  # points (north, east) in m; a line of a single point is a mark
 
 MAX_POINTS = 20_000
 """Largest number of positions in a background, because the page draws all of them each time."""
 
 
 def read_background(path: Path, origin: Origin | None) -> list[Line]:
-    """Read the lines of a GeoJSON; each ring of a polygon is one of them.
+    """Read the lines of a GeoJSON file, where each ring of a polygon is a line.
 
-    Raises ParameterError if the file is unreadable, its coordinates are not WGS84, a geometry is of
-    another type, there is no origin, or there are more than MAX_POINTS positions.
+    Raises ParameterError if the file is unreadable, its coordinates are not WGS84, a geometry has
+    an unknown type, there is no origin, or there are more than MAX_POINTS positions.
     """
     if origin is None:
         raise ParameterError(

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Control of a flight from the page: permission, range and order of commands, without ROS.
+"""Check and carry out the commands of a page to a flight, without ROS.
 
-A `FlightLink` reaches the nodes. Only one page at a time holds the lease. Requests run one after
-another on a thread of their own. A request to deactivate the controller or to disengage the bridge
-ends the running one.
+A `FlightLink` reaches the nodes. Only one page at a time has control, which it holds as a lease.
+Requests run one after another on a separate thread. A request to deactivate the controller or to
+disengage the bridge ends the request that is running.
 """
 
 import asyncio
@@ -42,56 +42,56 @@ from flight_view.request_values import (
 )
 from rise_di_controller.params import ControllerConfig
 
-LEASE = 5.0  # s for which a page has control after its last request
-RATE = 5.0  # requests per second
-BURST = 10.0  # requests at once
-KEY_PERIOD = 1.0  # s between two wrong keys
+LEASE = 5.0  # time for which a page keeps control after its last request, s
+RATE = 5.0  # permitted requests per second
+BURST = 10.0  # permitted requests at once
+KEY_PERIOD = 1.0  # least time between two wrong keys, s
 MAX_WAYPOINTS = 200
 AXES = ("north", "east", "altitude")  # coordinates of a waypoint
 GUIDED = ("hold", "skip", "resume", "home")  # services of guidance without arguments
-AT_ONCE = ("deactivate", "disengage")  # actions that do not queue
+AT_ONCE = ("deactivate", "disengage")  # actions that do not wait for other requests
 OVER = (
     "ended",
     "interrupted",
 )  # states of a recording in which the flight can no longer be commanded
-# s, from the request to the beginning of a gust. If a busy host sets the first too late, the second
-# is tried.
+# Time from the request to the beginning of a gust, s. If a busy host is too late for the first
+# value, the second is tried.
 GUST_LEADS = (0.2, 1.0)
-# Larger stamps come from the system clock. Those of a flight in lockstep begin at 0.
+# Larger stamps come from the system clock. The stamps of a flight in lockstep begin at 0.
 SYSTEM_TIME_NS = 10**17
 
 Assess = Callable[[Scenario, ControllerConfig], dict[str, Any]]
 
 
 class FlightLink(Protocol):
-    """What reaches the nodes of a flight.
+    """A link to the nodes of a flight.
 
-    Methods return why something is refused, and may raise ParameterError.
+    Its methods return why something is refused, and may raise ParameterError.
     """
 
     def nodes(self) -> list[str]:
         """Return the running nodes that can be commanded."""
 
     def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
-        """Return the values of those parameters that are set."""
+        """Return the values of the parameters of a node that are set, out of `names`."""
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> Refusal | None:
-        """Set all of these parameters, or none."""
+        """Set all of these parameters of a node, or none of them."""
 
     def activate(self, *, active: bool) -> Refusal | None:
         """Activate or deactivate the controller."""
 
     def send_target(self, values: Mapping[str, float]) -> Refusal | None:
-        """Command guidance."""
+        """Send a target to guidance, SI."""
 
     def send_route(self, points: Sequence[Sequence[float]]) -> Refusal | None:
-        """Publish a route."""
+        """Publish a route of waypoints, each with north, east and altitude in m."""
 
     def keep_link(self) -> None:
-        """Tell guidance that an operator is there."""
+        """Tell guidance that the link to an operator still exists."""
 
     def guide(self, service: str) -> Refusal | None:
-        """Call a service of guidance: one of GUIDED."""
+        """Call a service of guidance, which is one of GUIDED."""
 
     def engage(self) -> Refusal | None:
         """Engage the bridge."""
@@ -100,10 +100,10 @@ class FlightLink(Protocol):
         """Disengage the bridge."""
 
     def cancel(self) -> None:
-        """Interrupt a method that waits on the worker thread."""
+        """Interrupt the method that is waiting on the worker thread."""
 
     def resume(self) -> None:
-        """Wait again, after `cancel`."""
+        """Let methods wait again after `cancel`."""
 
     def note(self, text: str) -> None:
         """Write a line to the log of the flight."""
@@ -111,7 +111,7 @@ class FlightLink(Protocol):
 
 @contextmanager
 def _refusing() -> Iterator[None]:
-    """Turn a ParameterError of the block into a refusal."""
+    """Turn a ParameterError in a block into a RefusedError."""
     try:
         yield
     except ParameterError as error:
@@ -119,7 +119,7 @@ def _refusing() -> Iterator[None]:
 
 
 def new_key() -> str:
-    """Draw a key that can be typed by hand: eight letters and digits, 40 bits."""
+    """Return a random key that can be typed by hand, with eight letters and digits, 40 bits."""
     text = "".join(secrets.choice("ABCDEFGHJKLMNPQRSTUVWXYZ23456789") for _ in range(8))
     return f"{text[:4]}-{text[4:]}"
 
@@ -151,10 +151,10 @@ class Control:
         self._requests = BURST
         self._refilled = now()
         self._cancellations = 0
-        self._undo: list[dict[str, Any]] = []  # earlier values; those of the last change come last
-        self._digest = 0  # digest of the controller's parameters, as far as known
-        self._values: dict[str, Any] = {}  # tunable parameters of the controller that are set
-        self._faults: dict[str, Any] = {}  # parameters of the aircraft, without gusts
+        self._undo: list[dict[str, Any]] = []  # earlier values, the most recent last
+        self._digest = 0  # digest of the controller's parameters, 0 until it is known
+        self._values: dict[str, Any] = {}  # values of the controller's tunable parameters
+        self._faults: dict[str, Any] = {}  # values of the aircraft's parameters, without gusts
         self._actions: Mapping[str, Callable[[Mapping[str, Any]], Refusal | None]] = {
             "state": self._refresh,
             "gains": self._set_gains,
@@ -174,7 +174,7 @@ class Control:
         return self._link.guide(service)
 
     async def answer(self, request: Any, key: str, lease: str) -> dict[str, Any]:
-        """Carry out a request and answer with the state. Raises RefusedError."""
+        """Carry out a request and return the state. Raises RefusedError if it is refused."""
         action = request.get("do") if isinstance(request, dict) else None
         self._require_key(key, lease)
         if action not in AT_ONCE:
@@ -184,7 +184,7 @@ class Control:
                 HTTPStatus.BAD_REQUEST,
                 f"do: found {short_repr(action)}, expected one of {', '.join(self._actions)}",
             )
-        # A later flight in this domain is a new flight with a page of its own.
+        # A later flight in this domain is a new flight, which has another page.
         if action not in {"state", "check", *AT_ONCE} and self._flight.state() in OVER:
             raise RefusedError(
                 HTTPStatus.CONFLICT,
@@ -192,10 +192,10 @@ class Control:
             )
         self._take_lease(lease)
         loop = asyncio.get_running_loop()
-        # A check takes a while, but reaches no node.
+        # A check of margins takes a while, but does not reach a node.
         if action == "check":
             return await loop.run_in_executor(self._assessor, self._check, request)
-        # A request of AT_ONCE overtakes one that runs or waits for its turn.
+        # A request in AT_ONCE overtakes requests that run or wait for their turn.
         if action in AT_ONCE:
             self._cancellations += 1
             self._link.cancel()
@@ -204,7 +204,7 @@ class Control:
         )
 
     def close(self) -> None:
-        """End the running request, and take no more requests."""
+        """End the request that is running, and take no more requests."""
         self._link.cancel()
         for executor in (self._worker, self._assessor):
             executor.shutdown(cancel_futures=True)
@@ -212,7 +212,10 @@ class Control:
     # Who may command
 
     def _require_key(self, key: str, lease: str) -> None:
-        """Refuse a wrong key. For KEY_PERIOD after one, accept only the page that has control."""
+        """Raise RefusedError if the key is wrong.
+
+        For KEY_PERIOD after a wrong key, only the page that has control is accepted.
+        """
         holds = bool(self._lease) and hmac.compare_digest(lease.encode(), self._lease.encode())
         if not holds and self._now() - self._wrong_key < KEY_PERIOD:
             raise RefusedError(
@@ -253,7 +256,8 @@ class Control:
     ) -> dict[str, Any]:
         """Carry out a request and write a line to the log.
 
-        If there were cancellations after `cancellations`, the request is refused.
+        `cancellations` is the number of cancellations when the request arrived. If there are more
+        by now, the request is refused.
         """
         self._link.resume()
         self._link.keep_link()
@@ -293,7 +297,7 @@ class Control:
             "undo": len(self._undo),
             "targets": list(TARGETS),
         }
-        # Before the first refresh, the digest is 0 and no gain is known.
+        # Before the first refresh, the digest is 0 and the gains are unknown.
         are_gains_known = self._digest and "controller" in nodes
         if scenario is not None and are_gains_known and gains_of(scenario.controller):
             page_state |= {
@@ -341,9 +345,9 @@ class Control:
         return gains
 
     def _refresh(self, request: Mapping[str, Any]) -> Refusal | None:
-        """Read the faults.
+        """Read the faults from the aircraft, and if necessary the controller's parameters.
 
-        Also read the controller's parameters at first, and whenever the digest in the log differs.
+        The parameters are read at first, and whenever the digest in the log differs.
         """
         # Before the first tick, the digest of the flight is 0.
         is_stale = not self._digest or self._flight.digest not in {0, self._digest}
@@ -361,7 +365,7 @@ class Control:
         self._digest = self._with(self._values).digest()
 
     def _with(self, values: Mapping[str, Any]) -> ControllerConfig:
-        """Return the controller's parameters with new values. Raises ParameterError."""
+        """Return the controller's parameters with new values. May raise ParameterError."""
         base = self._controller()
         content = {**dict(flatten(base.model_dump(exclude_none=True))), **values}
         return type(base).validate_mapping(nest(content), "controller")
@@ -387,7 +391,7 @@ class Control:
     def _apply(
         self, request: Mapping[str, Any], values: Mapping[str, Any], *, undo: bool
     ) -> Refusal | None:
-        """Set values, unless the parameters differ from those on the page."""
+        """Set new values, or refuse if the parameters differ from those shown on the page."""
         self._require_simulated()
         self._read()
         if request.get("digest") != f"{self._digest:012x}":
@@ -406,7 +410,7 @@ class Control:
         return None
 
     def _check(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the margins of the gains in flight, with some of them changed."""
+        """Return the margins of the gains in flight with the changes of a request."""
         if self._assess is None or self._flight.scenario is None:
             return {}
         values = values_by_name(request, "values")
@@ -437,7 +441,8 @@ class Control:
     def _activate(self, *, active: bool) -> Refusal | None:
         """Activate or deactivate the controller.
 
-        With a bridge this is refused, because the bridge does it when it engages or disengages.
+        With a bridge this is refused, because the bridge itself does it when it engages or
+        disengages.
         """
         if "bridge" in self._link.nodes():
             return Refusal(
@@ -463,7 +468,7 @@ class Control:
 
     def _begin_gust(self, request: Mapping[str, Any]) -> Refusal | None:
         axis = request.get("axis")
-        # Half a surrogate pair cannot be part of a name in ROS.
+        # ROS does not accept half a surrogate pair in a name.
         require_form(
             isinstance(axis, str) and axis.isidentifier(),
             f"axis: found {short_repr(axis)}, expected the name of an axis",
@@ -524,10 +529,10 @@ def gains_of(controller: ControllerConfig) -> dict[str, Any]:
 
 
 def _channels_of(count: int, controller: ControllerConfig) -> list[str]:
-    """Name the values of a gain.
+    """Return the names of the `count` values of a gain.
 
-    A single value has no name. Several values have the names of the outputs, of all outputs but the
-    last (`k_d`), or of the inputs. Otherwise they are numbered from 1 on.
+    A single value has no name. Several values have the names of the outputs, of all outputs except
+    the last (`k_d`), or of the inputs. Otherwise they are numbered from 1.
     """
     if count == 1:
         return [""]
@@ -542,7 +547,7 @@ def _is_numeric(value: object) -> bool:
 
 
 def _faults_of(scenario: Scenario) -> list[str]:
-    """Name the parameters of the aircraft that can be tuned in flight, without gusts and drift."""
+    """Return the aircraft's parameters that can change in flight, except gusts and drift."""
     return sorted(
         name for name in scenario.aircraft.tunable() if not name.startswith(("gusts.", "drift."))
     )

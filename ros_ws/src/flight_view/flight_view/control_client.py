@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The client of all nodes of a flight, which is the link of a live page that has control."""
+"""Link a live page that has control to all nodes of a flight, as a ROS 2 client."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -21,8 +21,8 @@ STRINGS = Parameter.Type.STRING_ARRAY
 class ControlClient(Client):
     """Changes a running flight for `rise-di watch --control`.
 
-    Each method but `cancel` may wait, and is called by one thread. Methods return why something is
-    refused, or "". They raise ParameterError where a node or its answer is missing.
+    All methods are called by one thread and may wait, except `cancel`. They return why something is
+    refused, or None. They raise ParameterError if a node or its answer is missing.
     """
 
     NODES = ("aircraft", "bridge", "controller", "guidance")
@@ -33,7 +33,7 @@ class ControlClient(Client):
         self._engagement: EngagementClient | None = None
 
     def nodes(self) -> list[str]:
-        """Return the nodes of the flight that are in the graph and can be commanded."""
+        """Return the nodes of the flight that are in the ROS graph and can be commanded."""
         namespace = self._node.get_namespace()
         running = {
             name for name, where in self._node.get_node_names_and_namespaces() if where == namespace
@@ -41,12 +41,12 @@ class ControlClient(Client):
         return [name for name in self.NODES if name in running]
 
     def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
-        """Return the values of a node's parameters and groups of parameters that are set."""
+        """Return the values, out of `names`, of a node's parameters and groups that are set."""
         everything = ListParameters.Request(depth=ListParameters.Request.DEPTH_RECURSIVE)
         declared_names = self._call(
             ListParameters, f"{node}/list_parameters", everything
         ).result.names
-        # A single undeclared name would empty the answer.
+        # A single undeclared name would make the whole answer empty.
         selection = [
             name for name in declared_names if name in names or name.split(".")[0] in names
         ]
@@ -66,7 +66,7 @@ class ControlClient(Client):
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> Refusal | None:
         """Set parameters of a node together, or none of them."""
         request = SetParametersAtomically.Request()
-        # rclpy takes an empty list for bytes. The only list that may be empty is that of faults.
+        # rclpy sends an empty list as bytes. Only the list of faults may be empty.
         request.parameters = [
             Parameter(name, STRINGS if value == [] else None, value).to_parameter_msg()
             for name, value in values.items()
@@ -90,19 +90,19 @@ class ControlClient(Client):
         return self._operator().send(values)
 
     def send_route(self, points: Sequence[Sequence[float]]) -> Refusal | None:
-        """Publish a route of waypoints, each north, east and altitude in m."""
+        """Publish a route of waypoints, each with north, east and altitude in m."""
         return self._operator().send_route(points)
 
     def keep_link(self) -> None:
-        """Tell guidance, if there is one, that an operator is there.
+        """Tell guidance, if the flight has any, that the link to an operator still exists.
 
-        `guidance.home.link_timeout` counts from now on.
+        The time `guidance.home.link_timeout` begins again.
         """
         if "guidance" in self.nodes():
             self._operator().keep_link()
 
     def guide(self, service: str) -> Refusal | None:
-        """Call a service of guidance: hold, skip, resume, home."""
+        """Call a service of guidance, which is hold, skip, resume or home."""
         return self._operator().call(service)
 
     def _operator(self) -> TargetClient:
@@ -122,11 +122,11 @@ class ControlClient(Client):
         return self._engagement
 
     def cancel(self) -> None:
-        """End the wait of the method that runs, from another thread."""
+        """End the wait of the running method. Another thread calls this."""
         self._cancelled.set()
 
     def resume(self) -> None:
-        """Wait again, after `cancel`."""
+        """Let methods wait again after `cancel`."""
         self._cancelled.clear()
 
     def note(self, text: str) -> None:

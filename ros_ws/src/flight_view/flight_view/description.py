@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the page shows of a scenario apart from the samples, ready for JSON."""
+"""Describe a scenario for the page, apart from the samples, ready for JSON."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ MODES = {channel: {str(int(mode)): mode.name for mode in kind} for channel, kind
 
 
 class ParameterTicks(NamedTuple):
-    """Successive ticks under the same parameters of the controller."""
+    """Successive ticks with the same parameters of the controller."""
 
     digest: float
     start_ns: int
@@ -46,9 +46,9 @@ def rms_by_model(
     scenario: Scenario | None,
     proposed_ns: Sequence[int],
 ) -> dict[str, Any]:
-    """Return the headings and rows of the rms of the measured error by model.
+    """Return the headings and rows of a table of the rms measured error for each model.
 
-    They come from the ticks of a flight and the stamps of proposed models.
+    They follow from the ticks of a flight and the stamps at which models were proposed.
     """
     first_ns: dict[float, int] = {}
     for span in spans:
@@ -77,7 +77,7 @@ def _finite_or_none(value: float) -> float | None:
 def scenario_description(scenario: Scenario) -> dict[str, Any]:
     """Return what the page shows of a scenario.
 
-    This is its units, what a positive input does, limits, gusts, commands and route. Raises
+    The result has units, effects of positive inputs, limits, gusts, commands and the route. Raises
     ParameterError if the airframe cannot be read.
     """
     controller = scenario.controller
@@ -99,9 +99,10 @@ def scenario_description(scenario: Scenario) -> dict[str, Any]:
 
 
 def mission(guidance: GuidanceConfig, waypoints: Sequence[Waypoint]) -> dict[str, Any]:
-    """Return what the map shows of a guided route: `mission_drawing` and the waypoints.
+    """Return what the map shows of a route, which is `mission_drawing` and the waypoints.
 
-    A waypoint is north, east, altitude, m. Raises ParameterError if the route cannot be flown.
+    A waypoint has north, east and altitude in m. Raises ParameterError if the route cannot be
+    flown.
     """
     drawing = mission_drawing(guidance, [guidance.plan(waypoints)] if waypoints else [])
     return drawing | {"waypoints": [[*waypoint.point, waypoint.altitude] for waypoint in waypoints]}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The places of all aircraft of a fleet, for the map of a page.
+"""Give the places of all aircraft of a fleet, for the map of a page.
 
 The rest of the page shows the flight of one aircraft.
 """
@@ -15,7 +15,7 @@ from flight_view.series import Series
 
 
 class FleetView:
-    """The poses of several flights as topics of a single `Flight`, of which "0" is the first."""
+    """The poses of several flights, in the form of a single `Flight` with a topic for each."""
 
     def __init__(self, flights: Sequence[Flight]) -> None:
         self.flights = flights
@@ -25,7 +25,7 @@ class FleetView:
 
     @property
     def samples(self) -> dict[str, Series]:
-        """The poses by number of the aircraft."""
+        """The poses by the number of the aircraft, from "0" on."""
         return {
             str(k): flight.samples[POSE]
             for k, flight in enumerate(self.flights)
@@ -36,15 +36,15 @@ class FleetView:
     def start_ns(self) -> int:
         """Stamp of flight time 0 of the first aircraft that has begun.
 
-        All aircraft have the same clock.
+        The stamps of all aircraft are from the same clock.
         """
         return min((flight.start_ns for flight in self.flights if flight.samples), default=0)
 
     @property
     def description(self) -> dict[str, Any]:
-        """Return the name of each aircraft, and the instant of its flight time 0, s.
+        """The name of each aircraft, and the instant of its flight time 0, s.
 
-        The instant is by the clock of the stamps.
+        The instant is in the clock of the stamps.
         """
         return {
             "aircraft": [
@@ -54,13 +54,13 @@ class FleetView:
 
     @property
     def described(self) -> int:
-        """A number that changes with `description`."""
+        """A number that changes whenever `description` changes."""
         return hash(tuple(map(tuple, self.description["aircraft"])))
 
     def state(self) -> str:
-        """Return nothing, because each flight has its own state."""
+        """Return an empty text, because each flight has its own state."""
         return ""
 
     def faults(self) -> list[str]:
-        """Return nothing, because each flight has its own faults."""
+        """Return an empty list, because each flight has its own faults."""
         return []

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Follows the log of a run, live or recorded.
+"""Follow the log of a run, live or recorded.
 
-It keeps the samples by topic, the events and the state of the recording.
+A `Flight` keeps the samples by topic, the events and the state of the recording.
 """
 
 import math
@@ -65,31 +65,31 @@ SHARED = (ROSOUT, PARAMETER_EVENTS)  # topics that all aircraft share
 POSE = "pose"
 ROUTE = "route"
 ROUTE_TYPE = "nav_msgs/msg/Path"
-# Bytes of the log, about 1 s, that a busy host may leave unread. Above it the state is "reading".
+# Bytes of the log, about 1 s, that a busy host may leave unread. Above this the state is "reading".
 LIVE_BACKLOG = 200_000
 MAX_EVENTS = 5000
 MAX_NOTES = 50
 MAX_CHANNELS = 200
 MAX_SPANS = 200
 BATCH = 2000  # messages that are decoded together
-SILENT = 1.0  # s without a sample; then the state is "no data"
+SILENT = 1.0  # time without a sample after which the state is "no data", s
 
 
 @dataclass
 class _Topic:
-    name: str  # without the namespace
+    name: str  # name without the namespace
     decode: Decoder
-    messages: list[bytes] = field(default_factory=list)  # not decoded yet
+    messages: list[bytes] = field(default_factory=list)  # messages that are not decoded yet
     names: tuple[str, ...] = ()  # names of all channels
     columns: NDArray[np.intp] | None = None  # columns of the channels that are kept
 
 
 class Flight:
-    """A flight in a log. `update` reads new messages.
+    """A flight in a growing log, of which `update` reads new messages.
 
-    `namespace` selects an aircraft, by default the first in the log. `scenario` replaces the
-    scenario in the log. `background` has lines for the map, see `background.read_background`.
-    `remaps` is as in `read_run`.
+    `namespace` selects an aircraft, which is the first in the log by default. `scenario` replaces
+    the scenario in the log. `background` has lines for the map, as `read_background` returns them.
+    `remaps` has the same meaning as in `read_run`.
     """
 
     def __init__(
@@ -104,36 +104,36 @@ class Flight:
         self.run = run
         self._remaps = remaps
         self.name = printable(run.stem if run.is_file() else run.resolve().name)
-        self.samples: dict[str, Series] = {}  # by topic
+        self.samples: dict[str, Series] = {}  # samples by topic
         self.events: list[LogMessage] = []
-        # What a page shows apart from the samples, ready for JSON: the names of the modes, and the
-        # rest once the scenario is read.
+        # What a page shows apart from the samples, ready for JSON. At first it is the names of the
+        # modes, and more is added when the scenario is read.
         self.description: dict[str, Any] = {
             "name": self.name,
             "modes": MODES,
             "background": background,
         }
         self.notes: list[str] = []
-        self.described = 0  # counts the changes of `description`
+        self.described = 0  # number of changes of `description`
         self.scenario: Scenario | None = None  # None until it is read
-        self.digest = 0  # digest of the parameters in the newest tick; exact, unlike float32
+        self.digest = 0  # digest of the parameters in the newest tick, which float32 cannot hold
         self.bands: dict[str, float] = {}  # half-widths of the settling bands, SI
         self._follower = Follower(run, self._rate_of, full_names(remaps))
-        self._topics: dict[str, _Topic] = {}  # by full name
+        self._topics: dict[str, _Topic] = {}  # topics by full name
         self._asked = namespace is not None
         self._namespace = None if namespace is None else f"/{namespace.strip('/')}".rstrip("/")
         self._kinds: dict[str, str] = {}  # types of the topics of the log, by full name
         self._unreadable = 0
-        self._start_ns: int | None = None  # as `truth` tells it
+        self._start_ns: int | None = None  # stamp of flight time 0 from `truth`
         self._reference_ns: int | None = None  # stamp of the first y_m
         self._first_ns: int | None = None
         self._mode = -1
-        self._banded = 0  # rows of internals from which the bands were computed
+        self._banded = 0  # number of rows of internals from which the bands were computed
         self._flown: list[ParameterTicks] = []
         self._now = now
         self._changed = now()
-        self._behind = False  # there is more to read at once
-        self._account: Thread | None = None  # counts the samples of an ended log
+        self._behind = False  # whether there is more to read at once
+        self._account: Thread | None = None  # thread that counts the samples of an ended log
         self._lacks: list[str] = []
         self._given = scenario
         if scenario is not None:
@@ -143,8 +143,8 @@ class Flight:
     def start_ns(self) -> int:
         """Stamp of flight time 0.
 
-        It is the one that `truth` tells, else that of the first y_m, which is the origin of
-        commands, else the earliest stamp.
+        It comes from `truth`. Without `truth`, it is the stamp of the first y_m, where the commands
+        begin, and without y_m the earliest stamp.
         """
         return next(
             (
@@ -157,20 +157,20 @@ class Flight:
 
     @property
     def aircraft(self) -> str:
-        """The namespace of the aircraft; without a namespace, the name of the run."""
+        """The namespace of the aircraft, or the name of the run if there is no namespace."""
         return (self._namespace or "").strip("/") or self.name
 
     @property
     def end(self) -> float:
-        """Flight time of the newest sample, s; 0 if there are no samples."""
+        """Flight time of the newest sample, s, or 0 if there are no samples."""
         newest = [int(samples.stamp_ns[-1]) for samples in self.samples.values() if samples.count]
         return (max(newest) - self.start_ns) / NANOSECONDS if newest else 0.0
 
     def state(self) -> str:
-        """Say in a word what the recording does.
+        """Return the state of the recording as a word.
 
-        The words are "waiting", "reading" (what is there), "recording", "no data", "interrupted"
-        and "ended".
+        The words are "waiting", "reading" (of what is already recorded), "recording", "no data",
+        "interrupted" and "ended".
         """
         if self._behind:
             return "reading"
@@ -188,7 +188,7 @@ class Flight:
 
     @property
     def models(self) -> dict[str, Any]:
-        """Headings and rows of the rms of the measured error by model, as in the report.
+        """Headings and rows of the table of rms errors for each model, as in the report.
 
         They are empty without a learner.
         """
@@ -200,7 +200,7 @@ class Flight:
         return rms_by_model(self._flown, self.start_ns, self.scenario, proposed_ns)
 
     def faults(self) -> list[str]:
-        """Say what the log lacks, in sentences."""
+        """Sentences on what the log lacks."""
         follower = self._follower
         sentences = [*self.notes, *self._lacks]
         if follower.complete and not self.samples:
@@ -221,10 +221,10 @@ class Flight:
         return sentences
 
     def update(self, budget: float = math.inf) -> bool:
-        """Read for about `budget` s at most.
+        """Read new messages for at most about `budget` s.
 
-        Return whether there was anything to read; the next call goes on reading. Raises
-        ParameterError if the log cannot be read, or if the folder has several bags.
+        Returns whether there was anything to read. The next call continues. Raises ParameterError
+        if the log cannot be read, or if the folder has several bags.
         """
         deadline = time.monotonic() + budget
         news = False
@@ -261,7 +261,7 @@ class Flight:
     def _count(self) -> None:
         """Find what an ended log lacks.
 
-        The page reads only a part of the samples, but this reads the whole log.
+        The page reads only a part of the samples, but this method reads the whole log.
         """
         try:
             run = read_run(self.run, self._namespace, None, self._remaps)
@@ -273,7 +273,7 @@ class Flight:
         except (ParameterError, OSError):
             return
         except RuntimeError as error:
-            # The process is ending, so that the reader cannot have a thread of its own any more.
+            # The process is ending, so the reader cannot start a thread any more.
             if "shutdown" not in str(error):
                 raise
 
@@ -301,7 +301,7 @@ class Flight:
         return RATES[name]
 
     def _shows(self, namespace: str) -> bool:
-        """Return whether a namespace is that of the page's aircraft, or that is not known yet."""
+        """Return whether a namespace is that of the page's aircraft, or this is not known yet."""
         return self._namespace in {None, namespace}
 
     def _note(self, sentence: str) -> None:
@@ -325,7 +325,7 @@ class Flight:
             path = Path("scenario.yaml")
             self.scenario = parse_scenario(content, path)
             self.described += 1
-            # This reads the airframe, which may be a file of another machine.
+            # This reads the airframe, whose file may be missing on this machine.
             self.description |= scenario_description(self.scenario)
         except ParameterError as error:
             self._note(f"units, limits and commands are unknown: {error}")
@@ -346,7 +346,7 @@ class Flight:
             self._decode(topic)
 
     def _decode(self, topic: _Topic) -> None:
-        """Decode the messages of a topic together, because one by one would be slow."""
+        """Decode all waiting messages of a topic together, because one by one would be slow."""
         messages = topic.messages
         topic.messages = []
         for decoded in map(topic.decode, tables(messages)):
@@ -356,11 +356,11 @@ class Flight:
 
     def _take_samples(self, topic: _Topic, decoded: Samples) -> None:
         names, stamp_ns, values = decoded.names, decoded.stamp_ns, decoded.values
-        # A pose has the channels that a bridge has received so far. Poses with fewer channels than
-        # the widest pose are left out.
+        # A pose has only the channels that a bridge has received so far. Poses with fewer channels
+        # than the largest pose are left out.
         if topic.name == POSE and set(names) > set(topic.names):
             topic.columns = None
-        # A second publisher may have another order, so that values are matched by name.
+        # A second publisher may have another order, so values are matched by name.
         if names != topic.names and sorted(names) == sorted(topic.names):
             names, values = topic.names, values[:, [names.index(name) for name in topic.names]]
         if topic.columns is None:
@@ -380,7 +380,7 @@ class Flight:
             samples = self.samples[topic.name] = Series(
                 tuple(bounded(names[i]) for i in topic.columns)
             )
-            # Pages then read the topic again.
+            # After this, pages read the topic again.
             samples.thinned = 0 if narrower is None else narrower.thinned + 1
         samples = self.samples[topic.name]
         if topic.name == POSE and set(names) < set(topic.names):
@@ -485,9 +485,9 @@ class Flight:
                 self._add_event(event)
 
     def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:
-        """Replace the route by one that was received in flight.
+        """Replace the route by a route that was received in flight.
 
-        If guidance refuses the new route, the old one stays.
+        If guidance refuses the new route, the old route stays.
         """
         guidance = None if self.scenario is None else self.scenario.guidance
         if guidance is None:
@@ -495,7 +495,7 @@ class Flight:
         try:
             self.description |= mission(guidance, waypoints)
         except ParameterError:
-            # Guidance says in the log that it refuses it.
+            # If guidance refuses the route, the log has a message about it.
             return
         self.described += 1
         self._add_event(
@@ -509,7 +509,7 @@ class Flight:
             self._note(f"events after the first {MAX_EVENTS} are left out")
 
     def _update_bands(self) -> None:
-        """Update the settling bands each time the ticks have grown by a tenth."""
+        """Update the settling bands whenever the number of ticks has grown by a tenth."""
         samples = self.samples.get("internals")
         if samples is None or samples.count < 1.1 * self._banded + 2:
             return
@@ -519,7 +519,7 @@ class Flight:
         self._banded = samples.count
 
     def _ticks(self, group: str) -> Signal:
-        """Return a group of channels of the ticks."""
+        """Return a group of channels from the samples of the ticks."""
         ticks = self.samples["internals"]
         columns = [k for k, name in enumerate(ticks.names) if name.startswith(f"{group}.")]
         names = tuple(ticks.names[k].removeprefix(f"{group}.") for k in columns)

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Serves a flight in progress to viewers of the Foxglove protocol.
+"""Serve a flight in progress to viewers of the Foxglove protocol.
 
-Such viewers are Foxglove, Lichtblick and PlotJuggler. From the connection on, they get copies of
-the messages in the log, byte for byte. A viewer cannot send anything.
+Such viewers are Foxglove, Lichtblick and PlotJuggler. From the connection on, they get the messages
+in the log, byte for byte. A viewer cannot send anything.
 """
 
 import math
@@ -18,8 +18,8 @@ from flight_core.parameters import ParameterError, require
 from flight_log.follow import Follower, Messages
 from flight_view.server import ADDRESS, POLL_PERIOD
 
-DEFAULT_PORT = 8765  # that of the protocol
-BACKLOG = 4096  # messages that wait for a slow viewer; the oldest is dropped
+DEFAULT_PORT = 8765  # default port of the protocol
+BACKLOG = 4096  # most messages that wait for a slow viewer; beyond, the oldest is dropped
 
 
 def serve_foxglove(run: Path, port: int, announce: Callable[[str], None]) -> None:
@@ -81,9 +81,9 @@ def _channel(
     channels: dict[str, foxglove.Channel],
     context: foxglove.Context,
 ) -> foxglove.Channel | None:
-    """Return the channel of a topic, and advertise it with the first messages.
+    """Return the channel of a record's topic, and advertise it with the first messages.
 
-    Returns None if a record has no messages.
+    Returns None if the record has no messages.
     """
     if not isinstance(record, Messages):
         return None

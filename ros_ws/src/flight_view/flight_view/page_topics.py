@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the page reads of a log: topics with their highest rates, and the channels that it keeps."""
+"""List what the page reads of a log: topics with their highest rates, and channels."""
 
 import math
 
 LEARNED = "learned"  # entries of A and B, as identified in flight
-RATE = 50.0  # Hz
+RATE = 50.0  # highest rate of most topics on the page, Hz
 RATES = {
     "internals": math.inf,
     LEARNED: math.inf,
@@ -18,7 +18,7 @@ IN_TICKS = (
     "u",
     "y",
     "y_m",
-)  # topics that the ticks contain, so that they are not read from the first tick on
+)  # topics that are not read after the first tick, because the ticks contain them
 
 GROUPS = {
     "internals": ("mode", "late", "y", "y_m", "e", "u_free", "u", "limited"),

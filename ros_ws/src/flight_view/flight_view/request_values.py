@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Values in a request of the page that has control: refused unless well formed and in range."""
+"""Check that values in a request of a page are well formed and in range."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -14,7 +14,7 @@ RANGE = (0.5, 2.0)
 
 
 class RefusedError(Exception):
-    """A request that is refused, with the status and a sentence."""
+    """Raised if a request is refused, with the HTTP status and a sentence."""
 
     def __init__(self, status: HTTPStatus, sentence: str) -> None:
         super().__init__(sentence)
@@ -23,13 +23,13 @@ class RefusedError(Exception):
 
 
 def require_form(holds: bool, sentence: str) -> None:
-    """Refuse a request that is not well formed."""
+    """Raise RefusedError if a request is not well formed."""
     if not holds:
         raise RefusedError(HTTPStatus.BAD_REQUEST, sentence)
 
 
 def require_known(name: str, known: Collection[str], kind: str) -> None:
-    """Refuse a name that is not among the known names of a kind."""
+    """Raise RefusedError if a name is not among the known names of a kind."""
     require_form(
         name in known, f"{short_repr(name)}: no {kind}, expected one of {', '.join(known)}"
     )
@@ -41,12 +41,12 @@ def as_list(value: Any) -> Sequence[Any]:
 
 
 def permitted_range(value: float) -> list[float]:
-    """Return the least and the largest value of a gain, given its value in the scenario."""
+    """Return the least and the largest permitted value of a gain, given its scenario value."""
     return sorted(factor * value for factor in RANGE)
 
 
 def require_range(name: str, value: Any, base: Any) -> None:
-    """Refuse a gain outside `permitted_range` of `base`, the gain in the scenario."""
+    """Raise RefusedError if a gain is outside `permitted_range` of its scenario value `base`."""
     for number, middle in zip(as_list(value), as_list(base), strict=True):
         low, high = permitted_range(middle)
         require_form(
@@ -57,7 +57,7 @@ def require_range(name: str, value: Any, base: Any) -> None:
 
 
 def like_parameter(name: str, base: Any, value: Any) -> Any:
-    """Convert a value to a float or a list, by the type of the parameter."""
+    """Convert a value to a float or a list, like the parameter's present value `base`."""
     values = as_list(finite_numbers(name, value))
     expected = len(as_list(base))
     require_form(
@@ -67,7 +67,7 @@ def like_parameter(name: str, base: Any, value: Any) -> Any:
 
 
 def values_by_name(request: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """Return the mapping under a key of a request."""
+    """Return the mapping that a request has under a key."""
     values = request.get(key)
     if not isinstance(values, dict) or not values:
         raise RefusedError(HTTPStatus.BAD_REQUEST, f"{key}: expected values by name")
@@ -78,7 +78,7 @@ def finite_number(name: str, value: Any) -> float:
     """Return a finite number of a request."""
     number = math.nan
     if isinstance(value, int | float) and not isinstance(value, bool):
-        # A float cannot hold an integer of hundreds of digits.
+        # An integer with hundreds of digits is too large for a float.
         try:
             number = float(value)
         except OverflowError:
@@ -95,7 +95,7 @@ def is_sentences(value: Any) -> bool:
 
 
 def finite_numbers(name: str, value: Any) -> Any:
-    """Return a number or a list of numbers; null in a list means never, that is, infinity."""
+    """Return a number or a list of numbers, where null becomes infinity, which means never."""
     if not isinstance(value, list):
         return finite_number(name, value)
     return [math.inf if number is None else finite_number(name, number) for number in value]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The samples of a topic in bounded memory. A long flight becomes coarser, but keeps its peaks."""
+"""Keep the samples of a topic in limited memory. Long flights become coarser but keep peaks."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ DISORDER_NS = 1_000_000_000
 """When a controller recovers from an overrun, a tick may be a few ms older than the one before."""
 
 FIRST_ROWS = 4096
-BLOCK = 4096  # rows that are thinned together, in whole groups of four
+BLOCK = 4096  # number of rows that are thinned together, a multiple of four
 
 
 class Series:
@@ -24,8 +24,8 @@ class Series:
     def __init__(self, names: tuple[str, ...], max_rows: int = MAX_ROWS) -> None:
         self.names = names
         self.count = 0
-        self.thinned = 0  # how often the rows were halved
-        self.refused = 0  # rows that are too old
+        self.thinned = 0  # how often the number of rows was halved
+        self.refused = 0  # number of rows that were refused because they are too old
         self._max_rows = max_rows
         self._stamp_ns = np.zeros(FIRST_ROWS, dtype=np.int64)
         self._values = np.zeros((FIRST_ROWS, len(names)), dtype=np.float32)
@@ -44,7 +44,7 @@ class Series:
         """Append rows.
 
         If a row is up to DISORDER_NS older than an earlier row, it gets the stamp of that row. If
-        it is older still, it is refused.
+        it is even older, it is refused.
         """
         earliest = (
             self._stamp_ns[self.count - 1] if self.count else np.iinfo(np.int64).min + DISORDER_NS
@@ -71,15 +71,15 @@ class Series:
                 [self.values, np.zeros((size - self.count, len(self.names)), dtype=np.float32)]
             )
         self._stamp_ns[self.count : end] = stamp_ns
-        # A value beyond float32 is drawn as infinite.
+        # A value beyond the range of float32 is drawn as infinite.
         with np.errstate(over="ignore"):
             self._values[self.count : end] = values
         self.count = end
 
     def _thin(self) -> None:
-        """Replace each group of four rows by two: the minima and the maxima of each channel.
+        """Replace each group of four rows by two, the minima and the maxima of each channel.
 
-        So a plot keeps its peaks.
+        In this way a plot keeps its peaks.
         """
         grouped = self.count - self.count % 4
         k = len(self.names)

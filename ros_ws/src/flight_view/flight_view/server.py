@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Serves the page and the samples of flights to browsers on this host, over HTTP.
+"""Serve the page and the samples of flights to browsers on this host, over HTTP.
 
-A browser asks for news, and draws the answer before its next request, so that nothing queues up for
-a slow browser. After the first answer it asks over a WebSocket, which takes two fifths of the
-processor time of an HTTP request.
+A browser asks for new data, and draws the answer before its next request, so that no answers queue
+up for a slow browser. After the first answer the browser asks over a WebSocket, which takes two
+fifths of the processor time of an HTTP request.
 
 Only GET is answered, for a fixed list of names. The Host header must name this host, as a
-protection against DNS rebinding. The files of the page hold no flight and need no token. Samples
-need the token, as a protection against other users of this host. It comes in a header, or as the
-first message of a WebSocket, which must come from the page. A cookie would go to the servers on all
-ports of this host. With `Control` there is one single POST, which needs a second key and the origin
-of the page.
+protection against DNS rebinding. The files of the page contain no flight and need no token. Samples
+need the token, as a protection against other users of this host. The token comes in a header, or as
+the first message of a WebSocket, which must belong to the page. A cookie is not used, because it
+would go to the servers on all ports of this host. With `Control` there is a single POST request,
+which needs a second key and the origin of the page.
 """
 
 import asyncio
@@ -61,33 +61,33 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-MAX_CONNECTIONS = 64  # with the token; a browser holds up to six
-# Connections beyond these, for requests of control and for the first request of a connection.
+MAX_CONNECTIONS = 64  # connections with the token, of which a browser has up to six
+# Further connections, for requests of control and for the first request of a connection.
 RESERVED = 8
-# s that a request may take to arrive in full, the next request to begin, or the peer to take the
-# answer.
+# Time within which a request must arrive in full, the next request must begin, or the peer must
+# take the answer, s.
 REQUEST_TIMEOUT = 10.0
 MAX_REQUEST_BYTES = 8192
-MAX_WAIT = 2.0  # s for which a request waits for new samples
-MAX_ROWS = 10_000  # of a topic in one answer
-MAX_DIGITS = 18  # digits of a number of rows, which keep it below 2^63
-# Status of a closed WebSocket, RFC 6455, 7.4.1, and the registry of IANA.
+MAX_WAIT = 2.0  # longest time for which a request waits for new samples, s
+MAX_ROWS = 10_000  # largest number of rows of a topic in one answer
+MAX_DIGITS = 18  # most digits of a number of rows, which keep it below 2^63
+# Status codes of a closed WebSocket (RFC 6455, 7.4.1, and the registry of IANA).
 POLICY_VIOLATION = 1008
 TRY_AGAIN_LATER = 1013
 TOKEN_HEADER = "X-Page-Token"  # noqa: S105 - a name
 NO_TOKEN = "Open the whole address that rise-di watch printed"  # noqa: S105 - a sentence
 FULL = f"{MAX_CONNECTIONS} connections are open"
-REST = 0.09  # s of rest after a chunk; the recorder closes a chunk every 0.1 s
-POLL_PERIOD = 0.03  # s between two looks for the next chunk
-STATE_PERIOD = 0.25  # s, between two looks at the state of the recording
-BUDGET = 0.05  # s of reading between two answers
+REST = 0.09  # pause after a chunk of the log, s; the recorder writes one every 0.1 s
+POLL_PERIOD = 0.03  # time between two attempts to read the next chunk, s
+STATE_PERIOD = 0.25  # time between two checks of the state of the recording, s
+BUDGET = 0.05  # longest time of reading between two answers, s
 
 
 class Server:
-    """The server of flights, and the task that follows their logs.
+    """The server of flights, which also follows their logs.
 
-    A second flight is a ghost. If there is a `fleet`, each flight is an aircraft of it, and the
-    last number has the places of all aircraft.
+    A second flight is drawn for comparison, as a ghost. If `fleet` is given, each flight is an
+    aircraft of this fleet, and a further number stands for the places of all aircraft.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class Server:
         )
 
     def listen(self, port: int) -> None:
-        """Listen on this host alone; port 0 takes any free port.
+        """Listen for connections from this host only. Port 0 stands for any free port.
 
         Raises OSError if the port is taken.
         """
@@ -145,19 +145,19 @@ class Server:
         await self.http.close_all_connections()
 
     def knows(self, token: str | bytes) -> bool:
-        """Return whether a peer has the token."""
+        """Return whether a token is that of this server."""
         return hmac.compare_digest(
             token.encode() if isinstance(token, str) else token, self.token.encode()
         )
 
     def accepts(self, host: str) -> bool:
-        """Return whether a Host header names this server, exactly."""
+        """Return whether a Host header is exactly the name of this server."""
         return host in {f"{name}:{self.port}" for name in (ADDRESS, "localhost", "[::1]")}
 
     async def follow(self) -> None:
-        """Read the logs, and answer the WebSockets, until cancelled.
+        """Read the logs, and answer the WebSockets, until the task is cancelled.
 
-        Raises what `Flight.update` raises.
+        Raises ParameterError as `Flight.update` does.
         """
         last_look = -math.inf
         while True:
@@ -176,9 +176,9 @@ class Server:
             await asyncio.sleep(pause)
 
     async def news(self, flight: Flight | FleetView, query: Mapping[str, str]) -> bytes:
-        """Answer a browser whose `query` has the numbers of its rows by topic.
+        """Return the data that a browser lacks, and wait for it up to MAX_WAIT s.
 
-        The answer waits for news, up to MAX_WAIT s.
+        `query` has, by topic, the number of rows that the browser has.
         """
         deadline = time.monotonic() + MAX_WAIT
         while not has_news(flight, query) and (remaining := deadline - time.monotonic()) > 0.0:
@@ -187,9 +187,10 @@ class Server:
         return self.answer(flight, query)
 
     def answer(self, flight: Flight | FleetView, query: Mapping[str, str]) -> bytes:
-        """Answer at once a browser whose `query` has the numbers of its rows by topic.
+        """Return the data that a browser lacks at once.
 
-        Raises HTTPError if a number is too long.
+        `query` has, by topic, the number of rows that the browser has. Raises HTTPError if a number
+        is too long.
         """
         has_ghost = len(self.followed) > 1
         fleet = len(self.followed) if self.fleet else 0
@@ -203,15 +204,15 @@ class Server:
 
 
 def _epoch(flight: Flight | FleetView) -> str:
-    """Return a text that changes whenever rows that a browser knows have changed.
+    """Return a text that changes whenever rows change that a browser already has.
 
-    They change when they are thinned, or when the instant of flight time 0 changes.
+    Rows change when they are thinned, or when the instant of flight time 0 changes.
     """
     return f"{flight.start_ns}.{sum(samples.thinned for samples in flight.samples.values())}"
 
 
 def _first_rows(flight: Flight | FleetView, query: Mapping[str, str]) -> dict[str, int]:
-    """Return the first row a browser lacks, by topic. Raises HTTPError for too long a number."""
+    """Return the first row that a browser lacks by topic. Raises HTTPError as `Server.answer`."""
     is_same_epoch = query.get("epoch") == _epoch(flight)
     rows = {
         name: query.get(name, "") if is_same_epoch else "" for name in (*flight.samples, "events")
@@ -244,13 +245,14 @@ def answer(
     fleet: int = 0,
     control: bool = False,
 ) -> bytes:
-    """Encode the data that a browser lacks: a head, then the columns of each topic in the head.
+    """Encode the data that a browser lacks, as a head and the columns of each topic in the head.
 
-    `fleet` is the number of the flight with the places of all aircraft, or 0 without a fleet.
+    `fleet` is the number that stands for the places of all aircraft, or 0 without a fleet.
 
-    The head is its length as uint32, then JSON. It is little endian, and ends at a multiple of 8
-    bytes. The columns of a topic with `count` rows are the flight time in s as float64, then the
-    channels as float32, filled up to a multiple of 8 bytes. A topic has at most MAX_ROWS rows.
+    The head has the length of its JSON as uint32, and then the JSON. It is little endian, and ends
+    at a multiple of 8 bytes. A topic with `count` rows has as columns the flight time in s as
+    float64, then the channels as float32, filled up to a multiple of 8 bytes. A topic has at most
+    MAX_ROWS rows.
     """
     first = _first_rows(flight, query)
     topics = []
@@ -291,14 +293,15 @@ def answer(
 
 
 class _LimitedServer(HTTPServer):
-    """Holds at most MAX_CONNECTIONS connections that have the token, and RESERVED others.
+    """A server with at most MAX_CONNECTIONS connections with the token, and RESERVED others.
 
-    These include WebSockets. A new connection replaces the oldest one that has not shown the token.
+    WebSockets count as connections. A new connection replaces the oldest connection that has not
+    shown the token.
     """
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
         super().initialize(*args, **kwargs)
-        # Connections in the order of arrival, and whether each may stay.
+        # Connections in the order of arrival, with whether each has shown the token and may stay.
         self._admitted: dict[IOStream, bool] = {}
 
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
@@ -315,7 +318,7 @@ class _LimitedServer(HTTPServer):
     def admit(self, stream: IOStream) -> bool:
         """Keep a connection that has shown the token, and return whether it is kept.
 
-        If there are MAX_CONNECTIONS already, a new one is not kept.
+        If MAX_CONNECTIONS are kept already, a further connection is not.
         """
         self._leave_out_closed()
         if sum(self._admitted.values()) < MAX_CONNECTIONS:
@@ -332,8 +335,8 @@ class _Handler(RequestHandler):
     """Checks the Host header and the token of a request.
 
     If no subclass answers, the answer is 404, not found. A connection without the token, or beyond
-    MAX_CONNECTIONS, is closed after the answer. So is one whose peer does not take the answer
-    within REQUEST_TIMEOUT.
+    MAX_CONNECTIONS, is closed after the answer. A connection is also closed if its peer does not
+    take the answer within REQUEST_TIMEOUT.
     """
 
     _is_kept = False
@@ -357,7 +360,7 @@ class _Handler(RequestHandler):
         self.require_token()
 
     def require_token(self) -> None:
-        """Refuse a request without the token, or beyond MAX_CONNECTIONS."""
+        """Raise HTTPError for a request without the token, or beyond MAX_CONNECTIONS."""
         if not self.server.knows(self.request.headers.get(TOKEN_HEADER, "")):
             raise HTTPError(HTTPStatus.UNAUTHORIZED, reason=NO_TOKEN)
         self._is_kept = self.server.http.admit(self.stream)
@@ -365,7 +368,7 @@ class _Handler(RequestHandler):
             raise HTTPError(HTTPStatus.SERVICE_UNAVAILABLE, reason=FULL)
 
     def finish(self, chunk: str | bytes | dict[str, Any] | None = None) -> "Future[None]":
-        """Send the answer, and close the connection if it is not to be kept."""
+        """Send the answer, and close the connection if it must not be kept."""
         stream = self.stream
         stays_open = self._is_kept or self.get_status() == HTTPStatus.SWITCHING_PROTOCOLS
         if not stays_open:
@@ -382,7 +385,7 @@ class _Handler(RequestHandler):
         return future
 
     def require_page(self) -> None:
-        """Refuse a request that comes from another page."""
+        """Raise HTTPError if a request comes from another page."""
         if self.request.headers.get_list("Origin") != [f"http://{self.request.host}"]:
             raise HTTPError(HTTPStatus.FORBIDDEN, reason="A request of another page")
 
@@ -394,7 +397,7 @@ class _Handler(RequestHandler):
         self.finish(f"{status_code}: {self._reason}\n")
 
     def compute_etag(self) -> None:
-        """Compute no hash of an answer, because nothing is to be kept."""
+        """Compute no hash of an answer, because browsers must not cache it."""
 
     def log_exception(self, *args: Any) -> None:
         if not isinstance(args[1], HTTPError):
@@ -402,10 +405,10 @@ class _Handler(RequestHandler):
 
 
 class _File(_Handler):
-    """The page and its files, which need no token."""
+    """Answers requests for the page and its files, which need no token."""
 
     def require_token(self) -> None:
-        """Answer without the token."""
+        """Do nothing, because files need no token."""
 
     def get(self, *names: str) -> None:
         name = names[0] or "index.html"
@@ -416,9 +419,9 @@ class _File(_Handler):
 
 
 class _Data(_Handler):
-    """The samples of a flight.
+    """Answers a request for the samples of a flight.
 
-    The query holds the numbers of the rows that the browser knows, by topic.
+    The query has, by topic, the number of rows that the browser has.
     """
 
     async def get(self, *names: str) -> None:
@@ -431,20 +434,20 @@ class _Data(_Handler):
         }
         content = await self.server.news(self.server.flights[number], query)
         self.set_header("Content-Type", "application/octet-stream")
-        # The browser has left.
+        # The browser has closed the connection.
         with suppress(StreamClosedError):
             await self.finish(content)
 
 
 class _News(_Handler, WebSocketHandler):
-    """The samples of a flight, again and again.
+    """Answers requests for the samples of a flight over a WebSocket.
 
-    A message holds a query as for `_Data` and gets the same answer. The first message is the token,
+    A message has a query as for `_Data`, and gets the same answer. The first message is the token,
     because a page cannot set a header of a WebSocket.
     """
 
     def require_token(self) -> None:
-        """Leave the token to the first message."""
+        """Do nothing, because the token comes in the first message."""
 
     async def get(self, *names: str) -> None:
         self.require_page()
@@ -460,7 +463,7 @@ class _News(_Handler, WebSocketHandler):
         self._await_request()
 
     def _await_request(self) -> None:
-        self._query: dict[str, str] | None = None  # that of the request that waits for an answer
+        self._query: dict[str, str] | None = None  # query that waits for an answer
         self._since = time.monotonic()
 
     def on_message(self, message: str | bytes) -> Awaitable[None] | None:
@@ -476,14 +479,14 @@ class _News(_Handler, WebSocketHandler):
             parse_qsl(message if isinstance(message, str) else "", keep_blank_values=True)
         )
         self._since = time.monotonic()
-        # It is done once the answer is in the buffers of the network.
+        # This is done as soon as the answer is in the buffers of the network.
         self._answered = asyncio.get_running_loop().create_future()
         self.look()
-        # The next message is not read before that.
+        # The next message is not read before the answer is sent.
         return self._answered
 
     def look(self) -> None:
-        """Answer the request when there is news, or after MAX_WAIT.
+        """Answer the waiting request if there is new data, or if it has waited for MAX_WAIT.
 
         Close the connection after REQUEST_TIMEOUT without a request, or if the peer does not take
         the answer.
@@ -492,7 +495,7 @@ class _News(_Handler, WebSocketHandler):
         if self._query is None:
             if waited > REQUEST_TIMEOUT:
                 self.close()
-                # The peer does not even read the end of the answer.
+                # The peer does not read the rest of the answer, either.
                 if self._sending is not None and not self._sending.done():
                     self._peer.close()
             return
@@ -502,7 +505,7 @@ class _News(_Handler, WebSocketHandler):
             content = self.server.answer(self.flight, self._query)
         except HTTPError as error:
             self.close(POLICY_VIOLATION, error.reason)
-            content = b""  # nothing more is sent
+            content = b""  # no further content is sent
         self._await_request()
         self._sending = asyncio.ensure_future(self._send(content))
 
@@ -517,9 +520,9 @@ class _News(_Handler, WebSocketHandler):
 
 
 class _Control(_Handler):
-    """Requests of a page to command the flight.
+    """Answers requests of a page to command the flight.
 
-    They are JSON, come from the page's own origin, and have the key that the user typed.
+    They are JSON, must come from the origin of the page, and must have the key that the user typed.
     """
 
     def get(self, *_: str) -> None:
@@ -534,7 +537,7 @@ class _Control(_Handler):
         except (ValueError, RecursionError):
             raise HTTPError(HTTPStatus.BAD_REQUEST, reason="Not JSON") from None
         headers = self.request.headers
-        assert self.server.control is not None  # noqa: S101 - the route exists with control alone
+        assert self.server.control is not None  # noqa: S101 - the route exists only with control
         try:
             result = await self.server.control.answer(
                 request, headers.get("X-Control-Key", ""), headers.get("X-Control-Lease", "")

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight in the terminal.
+"""Show a flight in the terminal.
 
-It shows the state, the mode, the outputs over their references, the inputs, the attitude and the
-last events.
+The picture has the state, the mode, the outputs over their references, the inputs, the attitude and
+the last events.
 """
 
 import math
@@ -20,8 +20,8 @@ from flight_core.rates import NANOSECONDS
 from flight_view.flight import Flight
 from rise_di_controller.internals import Saturation
 
-REFRESH = 10.0  # Hz
-EVENTS = 6  # how many of the last events are shown
+REFRESH = 10.0  # rate at which the picture is drawn, Hz
+EVENTS = 6  # number of last events that are shown
 SATURATED = {float(kind): kind.name.lower() for kind in (Saturation.MAGNITUDE, Saturation.RATE)}
 STYLES = {
     "recording": "bold green",
@@ -34,7 +34,7 @@ STYLES = {
 def show(flight: Flight) -> None:
     """Show a flight until its recording ends or is interrupted, or until Ctrl-C.
 
-    Raises what `Flight.update` raises.
+    Raises ParameterError as `Flight.update` does.
     """
     with Live(picture(flight), refresh_per_second=REFRESH, transient=False) as live:
         while True:
@@ -49,7 +49,7 @@ def show(flight: Flight) -> None:
 
 
 def picture(flight: Flight) -> RenderableType:
-    """Draw a flight as text at the newest samples."""
+    """Return a picture of a flight in text, with its newest samples."""
     mode = flight.description["modes"][""].get(f"{_newest(flight, 'internals', 'mode'):.0f}", "")
     head = Text.assemble(
         (flight.name, "bold"),
@@ -117,7 +117,7 @@ def _table(first: str, *others: str) -> Table:
 
 
 def _names(flight: Flight, group: str) -> Sequence[str]:
-    """Return the names of the channels "group.name" in the ticks; without ticks, on the topic."""
+    """Return the names of a group of channels in the ticks or, without ticks, on its topic."""
     if "internals" not in flight.samples:
         return flight.samples[group].names if group in flight.samples else ()
     return [
@@ -128,7 +128,7 @@ def _names(flight: Flight, group: str) -> Sequence[str]:
 
 
 def _newest_of(flight: Flight, group: str, name: str) -> float:
-    """Return a channel's newest value in the ticks; without ticks, on the topic."""
+    """Return a channel's newest value in the ticks or, without ticks, on its topic."""
     if "internals" in flight.samples:
         return _newest(flight, "internals", f"{group}.{name}")
     return _newest(flight, group, name)
@@ -140,7 +140,7 @@ def _unit(flight: Flight, name: str) -> tuple[str, float]:
 
 
 def _newest(flight: Flight, topic: str, channel: str) -> float:
-    """Return the newest value of a channel; NaN if it is absent."""
+    """Return the newest value of a channel of a topic, or NaN if it is absent."""
     samples = flight.samples.get(topic)
     if samples is None or not samples.count or channel not in samples.names:
         return math.nan

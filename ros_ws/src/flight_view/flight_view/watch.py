@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the runs to watch, and serves flights until SIGINT or SIGTERM."""
+"""Find the runs to watch, and serve flights until SIGINT or SIGTERM."""
 
 import asyncio
 import os
@@ -30,10 +30,10 @@ DEFAULT_PORT = 8077
 def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
     """Return the runs that are being recorded, the newest first.
 
-    With a namespace, return those that have a topic in it.
+    With a namespace, only runs with a topic in this namespace are returned.
     """
     if is_folder(runs):
-        # The link `latest` points to one of them.
+        # The link `latest` points to one of the runs.
         folders = sorted(
             (folder for folder in runs.iterdir() if is_folder(folder) and not folder.is_symlink()),
             reverse=True,
@@ -55,7 +55,7 @@ def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
 def newest_run(runs: Path, namespace: str | None = None) -> Path:
     """Return the newest run that is being recorded, else the last run in the folder.
 
-    With a namespace, it is a run of that aircraft. Raises ParameterError.
+    With a namespace, it is a run with this aircraft. Raises ParameterError if there is none.
     """
     if recording := runs_in_recording(runs, namespace):
         return recording[0]
@@ -69,8 +69,8 @@ def newest_run(runs: Path, namespace: str | None = None) -> Path:
 def namespaces(run: Path) -> list[str | None]:
     """Return the namespaces of the aircraft in the log of a run.
 
-    If the log has no aircraft yet, return a list of None, which stands for the first one that
-    comes.
+    If the log has no aircraft yet, the result is [None], which stands for the first aircraft that
+    appears.
     """
     with suppress(ParameterError, OSError):
         return [*aircraft_namespaces(log_topics(run))] or [None]
@@ -78,9 +78,9 @@ def namespaces(run: Path) -> list[str | None]:
 
 
 def require_log(run: Path, namespace: str | None = None, remaps: Mapping[str, str] = {}) -> None:
-    """Raise ParameterError unless a run has the log of a flight, or is being recorded.
+    """Raise ParameterError if a run has no log of a flight and is not being recorded.
 
-    The flight is that of an aircraft in the namespace.
+    With a namespace, the flight must be that of the aircraft in it.
     """
     with suppress(OSError):
         if any(is_locked(file) for file in log_files(run)):
@@ -119,7 +119,7 @@ async def _serve(server: Server, ports: Sequence[int], announce: Callable[[str],
         try:
             server.listen(port)
         except OSError as error:
-            # The text in `strerror` may contain the address.
+            # The address may already be in the text of `strerror`.
             reason = os.strerror(error.errno or 0)
         else:
             break
