@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bag of a flight: its folder, what is attached to it, the space on the disk, and its end."""
+"""Write the bag of a flight, with its folder and attachments, and watch the disk space.
+
+A bag is the log of a flight as ROS 2 stores it.
+"""
 
 import time
 from collections.abc import Callable, Mapping
@@ -28,10 +31,10 @@ Records = Mapping[str, Mapping[str, str]]
 
 
 class FlightBag:
-    """The bag of a flight. An error or a full disk ends it, and the node goes on without it.
+    """The bag of a flight. After an error or on a full disk, the node goes on without it.
 
-    `clock` is the topic of simulated time, if there is one. `last_records` returns what the bag
-    gets at its end, and `report` takes the line that says why it ended early.
+    `clock` is the topic of simulated time, if there is one. `last_records` returns the records that
+    are written at the end of the bag. `report` takes the line that says why the bag ended early.
     """
 
     def __init__(
@@ -42,7 +45,7 @@ class FlightBag:
         last_records: Callable[[], Records],
         report: Callable[[str], object],
     ) -> None:
-        """Open the bag with its attachments. Raises ParameterError if it cannot be written."""
+        """Open the bag and write the attachments. Raises ParameterError if this fails."""
         self.end_reason: Refusal | None = None  # why recording ended
         self._parameters = parameters
         self._clock = clock
@@ -72,16 +75,16 @@ class FlightBag:
         self.add_topic = self._writer.add_topic
 
     def _free_folder(self, directory: Path) -> Path:
-        """Return the folder, or another one beside it.
+        """Return the folder for the bag, which is `directory` or a new folder beside it.
 
-        It is a new folder if this one already holds the log of a simulation that has ended.
+        It is a new folder if `directory` already has the log of a simulation that has ended.
         """
         folders = (directory.with_name(f"{directory.name}-{number}") for number in count(2))
         has_log = self._clock is not None and any(directory.glob("*.mcap"))
         return next(folder for folder in folders if not folder.exists()) if has_log else directory
 
     def _space_shortage(self, directory: Path) -> Refusal | None:
-        """Refuse a folder with too little free space."""
+        """Return a refusal if the disk of a folder has too little free space, else None."""
         free = free_bytes(directory) / MEGABYTE
         least = self._parameters.min_free
         if free >= least:
@@ -89,7 +92,7 @@ class FlightBag:
         return Refusal(f"found {free:.1f} MB free in {directory}, expected at least {least:g} MB")
 
     def write_or_end(self, write: Callable[[], None]) -> None:
-        """Write, and on an error or a full disk end the bag, unless it has ended."""
+        """Call `write` if the bag has not ended, and end the bag on an error or a full disk."""
         if self.end_reason is not None:
             return
         try:
@@ -101,7 +104,7 @@ class FlightBag:
                 self._end(f"no space left for {self.path}")
 
     def flush(self) -> None:
-        """Write to the disk what has come, or end the bag."""
+        """Write the received messages to the disk, or end the bag if this fails."""
         self.write_or_end(self._writer.flush)
 
     def check_disk(self) -> None:
@@ -119,14 +122,14 @@ class FlightBag:
             self._report(str(self.end_reason))
 
     def close(self) -> None:
-        """Finish the bag, unless it has ended."""
+        """Finish the bag if it has not ended yet."""
         if self.end_reason is None:
             self.end_reason = Refusal("recording ended")
             if fault := self._finish():
                 self._report(f"{self.end_reason}; {fault}")
 
     def message_count(self) -> int:
-        """Return how many messages the bag holds."""
+        """Return the number of messages in the bag."""
         return self._writer.contents().messages
 
     def _finish(self) -> Refusal | None:
@@ -143,7 +146,7 @@ class FlightBag:
         return None
 
     def _told_outcome(self) -> Outcome:
-        """Return the outcome that the flight left for the log; UNKNOWN if there is none."""
+        """Return the outcome that the flight left for the log, or UNKNOWN if there is none."""
         file = self._writer.directory / OUTCOME_FILE
         if not is_file(file):
             return UNKNOWN

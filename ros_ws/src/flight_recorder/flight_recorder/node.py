@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder's node: records the topics of a flight to a single MCAP bag.
+"""Record the topics of a flight to a single MCAP bag, as a ROS 2 node.
 
-The messages stay serialised.
+The messages are stored as received, without deserialisation.
 """
 
 import time
@@ -51,35 +51,37 @@ from flight_ros.topics import (
     Y,
 )
 
-# The longest loss when the recorder is killed; also the period of the graph checks.
+# The longest span that is lost when the recorder is killed. It is also the period of the graph
+# checks.
 FLUSH_PERIOD_NS = nanoseconds(0.1)
 DISK_PERIOD_NS = NANOSECONDS
-LOSS_PERIOD_NS = 2 * NANOSECONDS  # between two lines on lost messages of a topic
+LOSS_PERIOD_NS = 2 * NANOSECONDS  # time between two lines on lost messages of a topic
 
 LOOP = (Y, Y_M, U)  # every flight has these topics
-# Topics that no mode of a flight stops while the publisher runs.
+# Topics that go on in every mode of a flight while their publisher runs.
 STEADY = (Y, Y_M, U, INTERNALS, TRUTH, POSE)
 
-DRAIN_NS = 10 * NANOSECONDS  # at most, at the end, for the messages that were sent before
-QUIET_NS = NANOSECONDS // 5  # without a message: none is left
+DRAIN_NS = 10 * NANOSECONDS  # longest wait at the end for messages that were sent before
+QUIET_NS = NANOSECONDS // 5  # after this time without a message, no message is left
 
 
 @dataclass(kw_only=True)
 class _Subscribed(RecordedTopic):
-    """A recorded topic with the subscription."""
+    """A recorded topic with its subscription."""
 
     subscription: PolledSubscription
 
 
 class _RecordedTopics:
-    """The topics of a flight, and those of `names` from their first publisher on."""
+    """The recorded topics: those of a flight, and those in `names` once they have a publisher."""
 
     def __init__(self, node: Node, bag: FlightBag, names: Sequence[str]) -> None:
         self._node = node
         self._bag = bag
         self._topics: list[_Subscribed] = []
         for topic in FLIGHT:
-            # ROS 2 keeps the lines of the log
+            # ROS 2 keeps lines of the log for late subscribers, so ROSOUT is recorded like a topic
+            # of the stack.
             qos = RECORD_FOREIGN if topic.foreign and topic is not ROSOUT else RECORD
             self._record(topic, qos, [PUBLISH])
         recorded_names = {topic.name for topic in self._topics}
@@ -90,7 +92,7 @@ class _RecordedTopics:
         return iter(self._topics)
 
     def among(self, topics: Sequence[Topic], *, heard: bool = False) -> list[_Subscribed]:
-        """Return the recorded topics among `topics`; with `heard`, only those with messages."""
+        """Return the recorded topics among `topics`, and if `heard`, only those with messages."""
         selection = (topic for topic in self._topics if topic.subscription.topic in topics)
         return [topic for topic in selection if topic.channel.messages or not heard]
 
@@ -112,7 +114,7 @@ class _RecordedTopics:
         self._topics.append(subscribed)
 
     def subscribe_missing(self, now_ns: int) -> None:
-        """Subscribe to the missing topics that have a publisher now, and warn of the others."""
+        """Subscribe to the missing topics that now have a publisher, and warn of the others."""
         for name in list(self.missing):
             if offered := self._node.get_publishers_info_by_topic(name):
                 self.missing.remove(name)
@@ -153,8 +155,9 @@ class _RecordedTopics:
     def weaken_qos(self, topic: _Subscribed, drain: Callable[[], None]) -> None:
         """Subscribe again with a weaker QoS if publishers offer less than is requested.
 
-        A weaker publisher beside one of the stack does not lower the QoS; EndpointMonitor logs the
-        mismatch. `drain` writes what has come, before the subscription goes.
+        If the stack also publishes the topic, a publisher with a weaker QoS does not lower the QoS,
+        and EndpointMonitor logs the mismatch. `drain` writes the received messages before the
+        subscription is removed.
         """
         subscription = topic.subscription
         offered = self._offered(topic.name, topic.channel.type.name)
@@ -164,7 +167,7 @@ class _RecordedTopics:
         ]
         if not any(lacking) or not (topic.is_foreign or all(lacking)):
             return
-        # Volatile, because the transient-local samples have been recorded already.
+        # The QoS is volatile, because the transient-local samples have been recorded already.
         weaker = QoSProfile(
             depth=subscription.qos.depth, reliability=strongest_compatible(offered).reliability
         )
@@ -182,8 +185,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def __init__(self) -> None:
         super().__init__("recorder", RecorderConfig)
-        self.host = time  # in a pause of /clock the log is flushed too
-        self._flight_time: HostTime = self.simulated or time  # of silences: a pause is none
+        self.host = time  # host time, so that the log is also flushed in a pause of /clock
+        self._flight_time: HostTime = self.simulated or time  # for silences, without pauses
         names = [_full_name(self, name) for name in self.parameters.topics]
         logger = self.get_logger()
         self._bag = FlightBag(
@@ -212,14 +215,14 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return [topic.subscription for topic in self._topics.among(LOOP)]
 
     def runs_in_lockstep(self) -> bool:
-        # In lockstep the recorder also writes at ticks, many instants at a time, and publishes the
-        # progress.
+        # In lockstep the recorder writes at ticks as well, for many instants at a time, and
+        # publishes its progress.
         return False
 
     def advance(self) -> bool:
         """Write at ticks between the steps of the other nodes, if they share this process.
 
-        No node is delayed by this.
+        This does not delay any node.
         """
         if time.monotonic_ns() - self._drained_ns > self.period_ns():
             self._write()
@@ -229,9 +232,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self._write()
 
     def _write(self) -> None:
-        """Drain the subscriptions.
+        """Write all received messages.
 
-        Every FLUSH_PERIOD_NS also flush, and check the graph and the disk.
+        At intervals of FLUSH_PERIOD_NS, also flush the bag, and check the graph and the disk.
         """
         now_ns = self._drained_ns = time.monotonic_ns()
         self._drain_subscriptions()
@@ -256,7 +259,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _drain_subscriptions(self) -> None:
         """Write the received messages.
 
-        In lockstep publish the stamp of the newest sample of `truth` in the bag.
+        In lockstep, also publish the stamp of the newest sample of `truth` in the bag.
         """
         if self.simulated is not None and (self.simulated.restarted or not self.simulated.known()):
             return
@@ -272,7 +275,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
             self._publish_recorded(instant(stamps[-1]))
 
     def _hear(self, topic: _Subscribed, arrivals: Sequence[ReceivedMessage]) -> None:
-        """Note the time and the stamp of the newest message of a topic."""
+        """Note times and stamp of the newest message of a topic."""
         now_ns = self._flight_time.monotonic_ns()
         topic.hear(arrivals[-1].sent_ns, now_ns)
         if topic.subscription.topic in LOOP and not self.parameters.lockstep:
@@ -283,7 +286,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _publish_span(self) -> None:
         """In real time, publish the stamp up to which y, y_m and u are in the log.
 
-        A flight ends once these cover it.
+        A flight ends as soon as the log has these topics up to its end.
         """
         stamps = [topic.stamp_ns for topic in self._topics.among(LOOP)]
         if not self.parameters.lockstep and min(stamps) >= 0:
@@ -302,7 +305,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
                     self.get_logger().warning(f"{topic.name}: {count} messages lost")
 
     def _last_records(self) -> Records:
-        """Return what the bag gets at its end: losses, silences and the speed of the simulator."""
+        """Return the last records of the bag: losses, silences and the speed of the simulator."""
         records = {LOST_MESSAGES: {name: str(count) for name, count in self.lost.items()}}
         if silent := self._silences.record([*self._topics], self._flight_time.monotonic_ns()):
             records[SILENCES] = silent
@@ -316,7 +319,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _warn_of_a_part(self) -> None:
         """Warn if a log has only some of y, y_m and u.
 
-        A flight has all three, but discovery may fail on a busy domain.
+        A flight has all three topics, but discovery can fail on a busy domain.
         """
         silent = [topic for topic in self._topics.among(LOOP) if not topic.channel.messages]
         for topic in silent if len(silent) < len(LOOP) else ():
@@ -349,7 +352,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _drain(self) -> None:
         """Write the messages that were sent before the end.
 
-        This process may be seconds behind on a busy host.
+        On a busy host, this process can be seconds behind.
         """
         end_ns = time.monotonic_ns()
         sent_ns = time.time_ns()
@@ -359,7 +362,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
             if all(topic.sent_ns >= sent_ns for topic in self._topics.among(STEADY, heard=True)):
                 return
             time.sleep(QUIET_NS / 20 / NANOSECONDS)
-            # a publisher that goes on, such as an aircraft of your own, does not delay the end
+            # A publisher that goes on sending, such as an aircraft of the user, does not delay the
+            # end.
             behind = [topic for topic in self._topics if topic.sent_ns < sent_ns]
             before = [topic.sent_ns for topic in behind]
             self._drain_subscriptions()
@@ -375,7 +379,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
 
 def _full_name(node: Node, name: str) -> str:
-    """Return the full name of a topic that a node records. Raises ParameterError."""
+    """Return the full name of a topic that a node records. Raises ParameterError if invalid."""
     try:
         validate_topic_name(name)
         return str(node.resolve_topic_name(name))

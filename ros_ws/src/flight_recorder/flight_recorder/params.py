@@ -13,7 +13,7 @@ OptionalNames = tuple[str, ...]
 class RecorderConfig(NodeConfig):
     """Parameters of the recorder's node."""
 
-    # the rate of the laws, so that what one tick sends is written in one go
+    # The rate of the laws, so that all messages of one tick are written together.
     rate: Annotated[float, Field(ge=5, le=1000)] = Field(
         default=100.0, description="rate of writing, Hz"
     )

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Silences: topics of which no message comes any more, while the flight goes on or all of it."""
+"""Warn of silences, in which no message of a topic comes any more although the flight goes on.
+
+A silence can be that of a single topic, or of y, y_m and u together.
+"""
 
 import sys
 from collections import Counter
@@ -9,19 +12,19 @@ from collections.abc import Callable, Sequence
 from flight_core.rates import NANOSECONDS
 from flight_recorder.recorded_topic import RecordedTopic
 
-SILENCE_NS = 3 * NANOSECONDS  # a killed controller is back within 1 s
+SILENCE_NS = 3 * NANOSECONDS  # a killed controller is back within 1 s, so this is no restart
 
-# A topic is steady after so many messages at such intervals.
+# A topic is steady after this number of messages at intervals up to this length.
 STEADY_MESSAGES = 20
 STEADY_INTERVAL_NS = NANOSECONDS // 5
 TOPIC_SILENCE_NS = NANOSECONDS
 
 
 class Silences:
-    """The silences of a flight: each is a warning and, once it has ended, a line with its length.
+    """The silences of a flight, each with a warning and a line with its length at its end.
 
-    The instants are of the time of the flight, in which a pause of /clock is no silence. `inform`
-    and `warn` take a line of the log.
+    Instants are in the time of the flight, in which a pause of /clock is no silence. `inform` and
+    `warn` are functions that take a line for the log.
     """
 
     def __init__(
@@ -35,9 +38,9 @@ class Silences:
         self._inform = inform
         self._warn = warn
         self._count_publishers = count_publishers
-        self._lengths_ns: Counter[str] = Counter()  # of the silences that have ended, by topic
-        self._count = 0  # messages of the loop
-        self._counted_ns = now_ns  # when the last of them arrived
+        self._lengths_ns: Counter[str] = Counter()  # total length of the ended silences by topic
+        self._count = 0  # number of messages of y, y_m and u
+        self._counted_ns = now_ns  # when the last of these arrived
 
     def end(self, topic: RecordedTopic, now_ns: int) -> None:
         """End the silence of a topic, if there is one."""
@@ -49,10 +52,10 @@ class Silences:
         self._inform(f"{topic.name}: received again after {length_ns / NANOSECONDS:.1f} s")
 
     def warn_of_loop(self, loop: Sequence[RecordedTopic], now_ns: int) -> None:
-        """Warn, once, when y, y_m and u have stopped.
+        """Warn once if y, y_m and u have all stopped.
 
-        The publishers have ended, or this process receives nothing: Fast DDS can block the
-        receiving threads during the removal of a leaving participant (eProsima/Fast-DDS, issue
+        Either the publishers have ended, or this process receives nothing. Fast DDS can block the
+        receiving threads while it removes a participant that leaves (eProsima/Fast-DDS, issue
         6502).
         """
         count = sum(topic.channel.messages for topic in loop)
@@ -67,10 +70,10 @@ class Silences:
             )
 
     def warn_of_topics(self, steady: Sequence[RecordedTopic], now_ns: int) -> None:
-        """Warn of a steady topic that is silent although its publisher is there.
+        """Warn of a steady topic that is silent although its publisher still exists.
 
-        The other topics go on. A reader may miss all of a topic because of a full queue, or of a
-        forged message of the middleware.
+        This is for a silence in which the other topics go on. A reader can miss a whole topic
+        because of a full queue, or because of a forged message of the middleware.
         """
         newest_ns = max((topic.heard_ns for topic in steady), default=0)
         if now_ns - newest_ns >= TOPIC_SILENCE_NS:
@@ -87,7 +90,7 @@ class Silences:
                 self._warn(f"{topic.name}: no message for 1 s while others go on: {why}")
 
     def record(self, topics: Sequence[RecordedTopic], now_ns: int) -> dict[str, str]:
-        """Return how long each topic was silent, for the log, with silences that still last."""
+        """Return how long each topic was silent, including silences that still last."""
         lasting = {topic.name: now_ns - topic.silent_ns for topic in topics if topic.silent_ns}
         lengths_ns = Counter(self._lengths_ns)
         lengths_ns.update(lasting)
@@ -98,7 +101,7 @@ class Silences:
 
 
 def _is_steady(topic: RecordedTopic) -> bool:
-    """Return whether a topic has come often enough that a second without it is a silence."""
+    """Return whether messages of a topic came so regularly that a pause counts as a silence."""
     count = topic.channel.messages
     return (
         count >= STEADY_MESSAGES and topic.heard_ns - topic.first_ns <= count * STEADY_INTERVAL_NS
