@@ -2,5 +2,5 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reference model of the RISE-DI flight stack.
 
-Commands u_m(t) and x_m_dot = A_m x_m + B_m u_m give y_m = C x_m.
+The model x_m_dot = A_m x_m + B_m u_m, y_m = C x_m turns commands u_m(t) into the reference y_m.
 """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Commands u_m(t) with bounded derivative, as a pure function of time.
+"""Compute commands u_m(t) with bounded derivative, as a pure function of time.
 
 Equation (2) requires bounded u_m and u_m_dot, so the edges of a pulse are ramps, never steps.
 """
@@ -14,7 +14,7 @@ from flight_core.vectors import Array, FloatArray
 
 
 class Line(NamedTuple):
-    """A piecewise linear signal through points, held before the first and after the last."""
+    """A piecewise linear signal through points, held before the first and after the last point."""
 
     time: FloatArray  # (N,) s, increasing
     value: FloatArray  # (N,) in the channel's unit
@@ -28,7 +28,7 @@ class Edge(NamedTuple):
     change: float  # in the channel's unit
 
     def line(self) -> Line:
-        """Return the edge as a signal that is 0 before the edge and `change` after it."""
+        """Return the edge as a signal that is 0 before `start` and `change` after `stop`."""
         return Line(np.array([self.start, self.stop]), np.array([0.0, self.change]))
 
 
@@ -36,13 +36,13 @@ class Polyline(NamedTuple):
     """The sum of the piecewise linear signals of m channels, with K common knots."""
 
     time: FloatArray  # (K,) s, increasing
-    value: FloatArray  # (K, m) at the knots
-    slope: FloatArray  # (K, m) slope from each knot to the next, per s; 0 after the last knot
-    area: FloatArray  # (K, m) integral from the first knot
+    value: FloatArray  # values at the knots, (K, m)
+    slope: FloatArray  # slope from each knot to the next, (K, m), per s; 0 after the last
+    area: FloatArray  # integral from the first knot, (K, m)
 
     @classmethod
     def through(cls, lines: Sequence[Sequence[Line]]) -> "Polyline":
-        """Sum the lines of each channel. The first knot is at t = 0 or earlier."""
+        """Return the sum of the lines of each channel. The first knot is at t = 0 or earlier."""
         every = [line for channel in lines for line in channel]
         time = np.unique(np.concatenate([[0.0], *(line.time for line in every)]))
         value = np.zeros((len(time), len(lines)))
@@ -58,32 +58,30 @@ class Polyline(NamedTuple):
 
 
 class Chirps(NamedTuple):
-    """A linear chirp per channel; amplitude 0 on a channel without one."""
+    """A linear chirp for each channel, with amplitude 0 on a channel without a chirp."""
 
     amplitude: FloatArray  # (m,)
     start: FloatArray  # (m,) s
-    duration: FloatArray  # (m,) duration of the sweep, s, > 0
-    frequency: FloatArray  # (m,) frequency at the start, rad/s, > 0
-    sweep: FloatArray  # (m,) change of the frequency, rad/s^2, not 0
+    duration: FloatArray  # duration of the sweep, (m,), s, > 0
+    frequency: FloatArray  # frequency at the start, (m,), rad/s, > 0
+    sweep: FloatArray  # change of the frequency, (m,), rad/s^2, not 0
 
 
 class Profile(NamedTuple):
-    """Commands on m channels with at most E edges per channel; unused edges have the change 0.
+    """Commands on m channels, with at most E edges per channel.
 
-    Times are in s, values in the channel's unit.
+    Unused edges have the change 0. Times are in s, and values in the channel's unit.
     """
 
-    time: Array  # (m, E) start of each edge
-    change: (
-        Array  # (m, E) change of the command by each edge; a pulse is two edges, a doublet three
-    )
-    rise: Array  # () duration of each edge, s, > 0
-    amplitude: Array  # (m,) amplitude of the sine
-    frequency: Array  # (m,) rad/s, > 0
-    phase: Array  # (m,) rad
-    # (m,) 1 on the channel whose integral is the bank angle of a coordinated turn, else 0
+    time: Array  # start of each edge, (m, E)
+    change: Array  # change by each edge, (m, E); a pulse has two edges, a doublet three
+    rise: Array  # duration of each edge, (), s, > 0
+    amplitude: Array  # amplitude of the sine, (m,)
+    frequency: Array  # frequency of the sine, (m,), rad/s, > 0
+    phase: Array  # phase of the sine, (m,), rad
+    # 1 on the channel whose integral is the bank angle of a coordinated turn, else 0, (m,)
     bank_rate: Array
-    # (m,) g/V0 (rad/s) on the channel to which the turn rate g/V0 sin(bank) is added, else 0
+    # g/V0 (rad/s) on the channel to which the turn rate g/V0 sin(bank) is added, else 0, (m,)
     turn_rate: Array
     lines: Polyline | None = None  # ramps and recorded commands
     chirps: Chirps | None = None
@@ -96,7 +94,7 @@ def command(t: Array, profile: Profile) -> FloatArray:
         w_i = sum_k change_ik G(t - time_ik) + amplitude_i sin(frequency_i t + phase_i)
               + lines_i(t) + chirps_i(t),  G(s) = clip(s / rise, 0, 1)
 
-    The integrals of all four terms have closed forms, so the function needs no state: the integral
+    The integrals of all four terms have closed forms, so the function needs no state. The integral
     of G is r^2 / (2 rise) + max(s - rise, 0), with r = s clipped to [0, rise]. g/V0 sin(phi) is the
     turn rate of a coordinated turn.
     """
@@ -130,7 +128,7 @@ def polyline(t: FloatArray, lines: Polyline) -> tuple[FloatArray, FloatArray]:
     """Evaluate piecewise linear signals and their integrals at t, each of shape t.shape + (m,).
 
     Let s = t - time_k be the time since the last knot k. Then the signal is value_k + slope_k s,
-    and its integral area_k + value_k s + slope_k s^2 / 2.
+    and its integral is area_k + value_k s + slope_k s^2 / 2.
     """
     k = np.maximum(np.searchsorted(lines.time, t, side="right") - 1, 0)
     since = np.maximum(t - lines.time[k], 0.0)[..., None]
@@ -143,9 +141,9 @@ def linear_chirp(t: FloatArray, chirps: Chirps) -> tuple[FloatArray, FloatArray]
     """Evaluate linear chirps and their integrals at t, each of shape t.shape + (m,).
 
     amplitude sin(theta), theta = frequency s + sweep s^2 / 2, s = t - start in [0, duration].
-    Afterwards the last frequency continues until the next zero, so that no step ends the chirp.
-    With c = frequency^2 / (2 sweep) and x = (frequency + sweep s) / sqrt(pi abs(sweep)), the
-    integral is given by Fresnel's S and C:
+    After the sweep, the last frequency continues until the next zero, so that the chirp does not
+    end with a step. With c = frequency^2 / (2 sweep) and x = (frequency + sweep s) / sqrt(pi
+    abs(sweep)), the integral is given by Fresnel's S and C:
 
         sqrt(pi / abs(sweep)) (cos c (S(x) - S(x_0)) - sign(sweep) sin c (C(x) - C(x_0)))
 

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Live commands u_m: their age limit, and the commands that follow if the publisher is lost.
+"""Compute live commands u_m up to their age limit, and the ending if the publisher is lost.
 
-These final commands are the ending. Zero rates would keep the present bank, so the ending levels
-the wings first, from the attitude in u_m.
+The ending is the sequence of commands that follow the last u_m. Zero rates would keep the present
+bank, so the ending first levels the wings, beginning with the attitude in u_m.
 """
 
 from typing import NamedTuple
@@ -19,20 +19,20 @@ from flight_core.vectors import ChannelError, FloatArray
 class LiveParams(NamedTuple):
     """Limits of u_m and the gains of the ending."""
 
-    max_age_ns: int  # an older u_m has timed out
-    levelling_ns: int  # how long the ending levels the wings before all commands are zero
-    bounds: FloatArray  # (m,) largest absolute values of u_m
-    reach: FloatArray  # (m,) largest changes of u_m from step to step
-    speed: float | None  # trim speed V0, m/s; None: the ending cannot turn the aircraft level
-    # indices of q, V, p, r in u_m. That of r is None without a rudder; the whole tuple is None if
-    # another one is missing.
+    max_age_ns: int  # age above which u_m has timed out
+    levelling_ns: int  # time in which the ending levels the wings, before all commands are 0
+    bounds: FloatArray  # largest absolute values of u_m, (m,)
+    reach: FloatArray  # largest changes of u_m from step to step, (m,)
+    speed: float | None  # trim speed V0, m/s; if None, the ending cannot level the aircraft
+    # Indices of q, V, p and r in u_m. The index of r is None without a rudder. The whole tuple is
+    # None if any other is missing.
     channels: tuple[int, int, int, int | None] | None
     gain: tuple[float, float]  # gains of the bank and of the pitch, 1/s
     roll_rate: float  # largest roll rate of the ending, rad/s
 
 
 class Live(NamedTuple):
-    """The last u_m, and the attitude now, by dead reckoning from the attitude in that u_m."""
+    """The last u_m, and the present attitude, which follows by dead reckoning from that in u_m."""
 
     t_ns: int  # flight time at the stamp of u_m
     u_m: FloatArray  # (m,)
@@ -52,16 +52,16 @@ def take(t_ns: int, u_m: FloatArray, attitude: FloatArray | None, params: LivePa
 
 
 def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> FloatArray:
-    """Compute u_m at t, shape (m,): the last u_m up to the age limit, then the ending.
+    """Compute u_m at t, shape (m,), which is the last u_m up to the age limit, then the ending.
 
     If the attitude is known, the ending uses phi and theta by dead reckoning, and V = V0 + V_m.
     For `levelling_ns` it commands
 
-        phi_dot_c = -k_phi phi, at most `roll_rate`;  theta_dot_c = -k_theta theta
+        phi_dot_c = -k_phi phi, at most `roll_rate`; theta_dot_c = -k_theta theta
 
-    p, q, r follow by the inverse of Euler's equations in a coordinated turn
-    (`flight_core.kinematics`), and all other commands ramp to zero. Afterwards every command is
-    zero, and also if the attitude is not known.
+    p, q and r follow by the inverse of Euler's equations in a coordinated turn
+    (`flight_core.kinematics`), and all other commands ramp to zero. After this time every command
+    is zero. If the attitude is not known, every command is zero at once.
     """
     silent_ns = t_ns - live.t_ns - params.max_age_ns
     if silent_ns <= 0:
@@ -89,7 +89,7 @@ def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> Floa
 def dead_reckon(live: Live, y_m: FloatArray, period_ns: int, params: LiveParams) -> Live:
     """Return the state a period later, with the attitude integrated by Euler's equations.
 
-    The rates are those of the reference, which the law tracks.
+    The rates are taken from the reference y_m, which the law tracks.
     """
     if live.attitude is None or params.channels is None or params.speed is None:
         return live

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `reference_model`."""
+"""The executable `reference_model`, which starts the reference model node."""
 
 from flight_ros.startup import start_nodes
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The reference model, equation (2): x_m_dot = A_m x_m + B_m u_m, y_m = C x_m."""
+"""Compute the reference model, equation (2): x_m_dot = A_m x_m + B_m u_m, y_m = C x_m."""
 
 from typing import Any, NamedTuple
 
@@ -37,10 +37,10 @@ class Stepper(NamedTuple):
 
 
 def stepper(dt: float, params: ReferenceMatrices) -> Stepper:
-    """Build the matrices of x_m(t + dt) = Phi x_m(t) + Gamma [u_m(t), u_m(t + dt/2), u_m(t + dt)].
+    """Return the matrices of x_m(t + dt) = Phi x_m(t) + Gamma [u_m(t), u_m(t + dt/2), u_m(t + dt)].
 
-    The columns are Runge-Kutta steps that start from the unit vectors. Up to rounding, the products
-    equal the Runge-Kutta step, and take a quarter of the time.
+    Their columns are Runge-Kutta steps that start from unit vectors. Up to rounding, the products
+    with the matrices equal a Runge-Kutta step, and take a quarter of its time.
     """
     n, m = params.B_m.shape
     x = np.eye(n, n + 3 * m)
@@ -54,21 +54,21 @@ def stepper(dt: float, params: ReferenceMatrices) -> Stepper:
 
 
 def step(x_m: Array, u_m: Array, matrices: Stepper) -> Array:
-    """Advance x_m by a step, shape (n,), from x_m(t) and u_m.
+    """Advance x_m, shape (n,), by a step.
 
-    `u_m`, shape (3m,), holds u_m at t, t + dt/2 and t + dt. `product` sums in a fixed order, so
-    that exported C code gives the same bits.
+    `u_m`, shape (3m,), holds u_m at t, t + dt/2 and t + dt. The sums have a fixed order, so that
+    exported C code gives the same bits.
     """
     return product(matrices.Phi, x_m) + product(matrices.Gamma, u_m)
 
 
 def second_order(natural_frequency: FloatArray, damping: FloatArray) -> ReferenceMatrices:
-    """Build a filter of second order per channel, n = 2m.
+    """Return the matrices of a second-order filter for each channel, with n = 2m states.
 
         y_m,i'' + 2 damping_i w_i y_m,i' + w_i^2 y_m,i = w_i^2 u_m,i
 
     The states are [y_m,1, y_m,1', y_m,2, ...]. C selects the outputs, as (2) requires. The
-    arguments have shape (m,), in rad/s and 1.
+    arguments have the shape (m,). The frequency is in rad/s, and the damping has no unit.
     """
     m = len(natural_frequency)
     model = ReferenceMatrices(np.zeros((2 * m, 2 * m)), np.zeros((2 * m, m)), np.zeros((m, 2 * m)))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The reference model node: publishes y_m of equation (2) in real time or in lockstep."""
+"""Publish y_m of equation (2) as a ROS 2 node, in real time or in lockstep."""
 
 from collections import deque
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from reference_model.reference import Reference
 
 
 class LiveCommand(NamedTuple):
-    """A received u_m."""
+    """A received u_m, with the attitude of the aircraft if known."""
 
     stamp_ns: int
     u_m: FloatArray
@@ -29,19 +29,19 @@ class LiveCommand(NamedTuple):
 
 
 class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
-    """Computes x_m(k) from x_m(k-1) at tick k and publishes y_m(k).
+    """Computes x_m(k) from x_m(k-1) at tick k, and publishes y_m(k).
 
     The commands are those of the scenario's profile until the first u_m is received.
 
-    In lockstep the node publishes y_m up to the instant of clock and computes the next y_m ahead.
-    If `u_m_rate` is set, it first waits for u_m: there must be exactly one u_m at each instant of
-    its rate, which has no channels if there is no command.
+    In lockstep the node publishes y_m up to the instant of the clock, and computes the next y_m
+    ahead. If `u_m_rate` is set, the node first waits for u_m. There must be exactly one u_m at each
+    instant of this rate. It has no channels if there is no command.
     """
 
     def __init__(self) -> None:
         super().__init__("reference_model", ReferenceModelConfig)
         self._reference = Reference(self.parameters)
-        self._start_ns = 0  # clock at the start of the flight, ns; 0 in lockstep
+        self._start_ns = 0  # time of the clock at the start of the flight, ns; 0 in lockstep
         self._publish_y_m = self.advertise(Y_M)
         self._encoder = self.encoder(self.parameters.outputs)
         self._decoder = Decoder(self.parameters.outputs)
@@ -84,7 +84,8 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     def _timeouts_ns(self) -> tuple[int, int]:
         """Return the ages above which the publisher of u_m has timed out, ns.
 
-        The second age is for another node, which may take over only after the wings are levelled.
+        The first age holds for the same node in a new process. The second holds for another node,
+        which may take over only after the wings are levelled.
         """
         live = self.parameters.live
         return nanoseconds(live.max_age), nanoseconds(live.max_age + live.levelling)
@@ -135,9 +136,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             advanced = True
 
     def _commands_known(self) -> bool:
-        """In lockstep, return whether the next y_m can be computed.
+        """Return whether the next y_m can be computed in lockstep.
 
-        If a u_m is due one period earlier, it must have arrived. It is then taken.
+        If a u_m is due one period earlier, it must have arrived, and is taken.
         """
         t_ns = (self._number - 1) * self.period_ns()
         if not self._u_m_ns or t_ns < 0 or t_ns % self._u_m_ns:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the reference model.
+"""Validate the parameters of the reference model, and convert them to arrays.
 
-They are validated, and converted to the arrays of the model and the profile.
+The arrays are those of the model and of the profile of commands.
 """
 
 import math
@@ -37,7 +37,7 @@ from reference_model.stick import read_stick
 SIGNALS = ("pulses", "doublets", "ramps", "sines", "chirps", "recorded")
 """The parameters with commands by channel."""
 
-MOST_RECORDED = 10_000  # points: with more, a scenario file could exceed its largest size
+MOST_RECORDED = 10_000  # number of points; with more, a scenario file could become too large
 
 
 class Pulses(Config):
@@ -70,7 +70,7 @@ class Doublets(Config):
         _require_one_each(self.start, {"width": self.width, "value": self.value}, "doublet")
 
     def edges(self, rise: float) -> list[Edge]:
-        """Return three edges for each doublet; the middle one has twice the height."""
+        """Return three edges for each doublet. The middle edge has twice the height."""
         return [
             Edge(start + k * width, start + k * width + rise, factor * value)
             for start, width, value in zip(self.start, self.width, self.value, strict=True)
@@ -137,7 +137,7 @@ class Recorded(Config):
     def read(
         cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True
     ) -> Self | None:
-        """Build the set, from the file if there is one."""
+        """Build the parameter set, with values from the file if one is given."""
         if isinstance(file := values.get("file"), str) and file:
             try:
                 others = ", ".join(name for name in values if name != "file" and values[name])
@@ -157,7 +157,7 @@ class Recorded(Config):
             require(t > before, f"time[{k}]", t, f"later than time[{k - 1}] = {before:g} s")
 
     def line(self) -> Line:
-        """Return the command through its points."""
+        """Return the command as a line through its points."""
         return Line(np.array(self.time), np.array(self.value))
 
 
@@ -167,7 +167,7 @@ def _require_one_each(start: Numbers, others: Mapping[str, Numbers], kind: str) 
 
 
 def _require_spans(start: Numbers, stop: Numbers, value: Numbers, kind: str) -> None:
-    """Refuse different numbers of values, and a stop that is not later than its start."""
+    """Raise ParameterError if the lists differ in length, or a stop is not after its start."""
     _require_one_each(start, {"stop": stop, "value": value}, kind)
     for k, (begin, end) in enumerate(zip(start, stop, strict=True)):
         require(end > begin, f"stop[{k}]", end, f"later than start[{k}] = {begin:g} s")
@@ -340,7 +340,8 @@ class ReferenceModelConfig(NodeConfig):
         )
         with np.errstate(over="ignore", invalid="ignore"):
             Phi = stepper(1.0 / self.rate, self.model()).Phi
-        # with a damping of 1 two eigenvalues are equal, and computed to 1e-8 only: allow 1e-6
+        # With a damping of 1 two eigenvalues are equal, and are only computed to 1e-8, so 1e-6 is
+        # allowed.
         stable = (
             bool(np.isfinite(Phi).all())
             and float(np.abs(np.linalg.eigvals(Phi)).max()) < 1.0 + 1e-6
@@ -414,7 +415,7 @@ class ReferenceModelConfig(NodeConfig):
         }
 
     def profile(self) -> Profile:
-        """Return the commands u_m(t) as arrays over the outputs; the signals of a channel add up.
+        """Return the commands u_m(t) as arrays over the outputs. The signals of a channel add up.
 
         Channels with fewer edges of pulses and doublets are padded with edges of height 0.
         """
@@ -448,7 +449,7 @@ class ReferenceModelConfig(NodeConfig):
         )
 
     def _chirps(self) -> Chirps:
-        """Return the chirps; a channel without one has amplitude 0."""
+        """Return the chirps of all channels. A channel without a chirp has amplitude 0."""
         columns = [
             (0.0, 0.0, 1.0, 1.0, 1.0)
             if chirp is None

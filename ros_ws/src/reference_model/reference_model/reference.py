@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The reference model without ROS: y_m sample by sample.
+"""Compute y_m sample by sample, without ROS.
 
 The node and the simulation in a single process use it.
 """
@@ -24,7 +24,7 @@ BLOCK = 100  # number of steps for which the profile is evaluated at once
 class Reference:
     """Equation (2) with the state x_m, which is known at whole periods.
 
-    The commands are those of the profile until the first live u_m.
+    The commands come from the profile until the first live u_m.
     """
 
     def __init__(self, parameters: ReferenceModelConfig) -> None:
@@ -35,7 +35,7 @@ class Reference:
         self._x_m = np.zeros(len(self._model.A_m))  # the reference starts in trim
         self._number = 0
         self._u_m = self._block(0)
-        self._begin = 0  # number of the first step in the block _u_m
+        self._begin = 0  # number of the first step in `_u_m`, the block of commands
         self._live_params = parameters.live_params()
         self._live: Live | None = None
         self._applied = np.zeros_like(self._u_m[0])  # u_m at the end of the last step
@@ -45,7 +45,7 @@ class Reference:
     def take(self, t_ns: int, u_m: FloatArray, attitude: FloatArray | None = None) -> None:
         """Take a live u_m, shape (m,), with the flight time t_ns. It acts from the next step on.
 
-        `attitude` holds the values of `channels.ATTITUDE`; it is None if they are not known. Raises
+        `attitude` has the values of `channels.ATTITUDE`, or is None if they are not known. Raises
         ChannelError if u_m is old or out of bounds.
         """
         if self._live is not None:
@@ -58,7 +58,7 @@ class Reference:
         return self._x_m
 
     def source(self) -> str:
-        """Return where the commands come from at the last sample.
+        """Return the source of the commands at the last sample.
 
         It is "profile", "live commands", or "ending" if u_m has timed out.
         """
@@ -70,7 +70,7 @@ class Reference:
     def sample(self, number: int) -> FloatArray:
         """Compute y_m at sample `number`, shape (m,), in steps of a period.
 
-        The law tracks the last sample until this one comes, so over skipped samples the dead
+        The law tracks the last sample until the new sample comes, so over skipped samples the dead
         reckoning uses the last rates. If a step raises an exception or gives a value that is not
         finite, the state stays and the last y_m is repeated.
         """
@@ -78,7 +78,7 @@ class Reference:
         while self._number < number:
             try:
                 self._x_m, self._applied, self._live = self._stepped(tracked)
-            except Exception as error:  # whatever it is, try the next step
+            except Exception as error:  # after any error, the next step is tried
                 if self._failures.add(seconds(self._number * self.period_ns)):
                     self._failure = Refusal(f"{LAST_GOES_ON}: {sentence(error)}")
             self._number += 1
@@ -91,7 +91,7 @@ class Reference:
         return self._failures.count
 
     def pop_failure(self) -> Refusal | None:
-        """Return why steps have failed, or None if there is nothing new to report."""
+        """Return why steps have failed since the last report, or None if no step has failed."""
         failure, self._failure = self._failure, None
         return failure
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of recorded commands: CSV with the columns time, s, and value.
+"""Read files of recorded commands, which are CSV with the columns time, in s, and value.
 
 time,value
 0.00,0.0
@@ -19,7 +19,7 @@ EXPECTED = "a CSV file whose first line is time,value"
 
 
 def read_stick(file: str, key: str) -> dict[str, Any]:
-    """Read `time`, s, and `value` from a file.
+    """Read the columns `time`, in s, and `value` from a CSV file.
 
     `key` names the file in the message of an error. Raises ParameterError if the file cannot be
     read, has another header, or has a row that is not two numbers.
