@@ -25,8 +25,8 @@ from rise_di_controller.internals import Saturation
 Windows = Mapping[str, tuple[float, float]]
 
 SETTLING_DWELL = 1.0
-"""A transient counts for this time beyond its end, s. An error has settled when it has stayed in
-the band for this time."""
+"""Time beyond its end for which a transient still counts, s. An error has settled if it has stayed
+in the band for this time."""
 
 SETTLING_BAND = 0.01  # half-width of the settling band as a fraction of the largest abs(y_m)
 
@@ -39,8 +39,8 @@ a probability of 97 %, 500 samples of normal noise stay within 4 noise floors.""
 MAX_DEVIATION = 0.15
 
 LONGEST_INTERVAL = 1.0
-"""A sample stands for at most this time, s. A longer interval is a gap of the log, and the rest of
-it does not count."""
+"""Longest time for which a sample stands, s. A longer interval is a gap in the log, and the rest of
+the interval does not count."""
 
 # names that `best_error` returns
 TRUE_ERROR = "true error"
@@ -55,7 +55,7 @@ CALM = "calm"
 UNKNOWN_AIR = "other"
 AIRS = (CALM, "wind", "shear", "turbulence", "microburst", UNKNOWN_AIR)
 """The disturbances of the air except gusts. The part of a flight without gust, command and
-engagement has the name of its air. UNKNOWN_AIR means that no simulated aircraft flew."""
+engagement is named after this disturbance. UNKNOWN_AIR means that no simulated aircraft flew."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -514,8 +514,8 @@ def inputs_by_part(
 ) -> dict[str, dict[str, InputMetrics]]:
     """Return the control effort by input and part of the flight.
 
-    The metrics are rms and max abs(u) about trim, and mean abs(u_dot). If the `topic` is y, they
-    are those of y. mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1)) over the steps
+    The metrics are rms and max abs(u) about trim, and mean abs(u_dot). If `topic` is "y", y takes
+    the place of u. mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1)) over the steps
     that end in the part. It is NaN if there is no such step.
     """
     if topic not in tape:

@@ -61,7 +61,7 @@ class ReplayDifference:
 class ReplayResult(NamedTuple):
     """The k channels of the N ticks of a log, as recorded and as computed.
 
-    The channels of `internals` come first, then those of u.
+    The channels of `internals` come first, followed by the channels of u.
     """
 
     names: tuple[str, ...]
@@ -436,6 +436,6 @@ def _bits(values: FloatArray) -> NDArray[np.int64]:
 
 
 def _ordinal(value: float) -> int:
-    """Return the index of a float64 among all float64 numbers in order; 0 has index 0."""
+    """Return the index of a float64 among all float64 numbers in order, where 0 has index 0."""
     bits = int(np.float64(value).view(np.int64))
     return bits if bits >= 0 else -(bits & 0x7FFF_FFFF_FFFF_FFFF)

@@ -32,7 +32,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 STOP_TOLERANCE = 1e-3  # relative, because files give limits and end stops with few digits
 
 ParameterOverrides = dict[str, str | float | bool | list[str] | list[float]]
-"""Parameters of one node, by name, that replace those of its section in the scenario."""
+"""Parameters of one node by name, which replace values of its section in the scenario."""
 
 
 class FlightConfig(Config):
@@ -72,9 +72,9 @@ class Scenario:
     def from_parts(cls, name: str, **sections: Mapping[str, Any] | Config) -> "Scenario":
         """Create a scenario without a file.
 
-        The sections are flight, aircraft, reference_model and controller; recorder and guidance are
-        optional. A section is a mapping of parameters, or a parameter set. Lists may be arrays.
-        Without `recorder`, the recorder has its defaults.
+        The sections are flight, aircraft, reference_model and controller. The sections recorder and
+        guidance are optional. A section is a mapping of parameters, or a parameter set. Lists may
+        be arrays. Without `recorder`, the recorder has its defaults.
 
         Args:
             name: Name of the scenario.
@@ -225,7 +225,8 @@ SCHEMAS: dict[str, type[Config]] = {
 OPTIONAL = ("recorder", "guidance")
 """Sections that a file may leave out.
 
-If `recorder` is missing, the recorder has its defaults. If `guidance` is missing, nothing guides.
+If `recorder` is missing, the recorder has its defaults. If `guidance` is missing, the flight has no
+guidance.
 """
 
 
@@ -477,8 +478,8 @@ def require_guidable(scenario: Scenario) -> None:
     """Raise ParameterError if guidance cannot fly a scenario.
 
     Guidance cannot fly if a bank does not turn the simulated airframe, or if the flight begins
-    outside a fence. Do not call this for a flight behind a bridge, because another airframe than
-    that of the scenario flies there.
+    outside a fence. Do not call this for a flight behind a bridge, where an airframe flies that is
+    not in the scenario.
     """
     aircraft = scenario.aircraft
     guidance = scenario.guidance

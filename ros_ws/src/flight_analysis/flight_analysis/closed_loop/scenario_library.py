@@ -117,7 +117,7 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
 
 
 def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
-    """Return the scenario with the values that a parameter file gives the nodes in a namespace.
+    """Return the scenario with the values from a parameter file for the nodes in a namespace.
 
     The values replace those of the same names in the scenario. An error must be in the parameter
     file, because the scenario alone is valid. ParameterError therefore names the parameter file.

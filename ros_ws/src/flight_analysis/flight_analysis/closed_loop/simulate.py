@@ -33,7 +33,7 @@ from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 Record = Callable[[Mapping[str, Signal]], None]
-"""Takes the samples of a span of a flight, by topic."""
+"""A function that takes the samples of a span of a flight, by topic."""
 
 
 class _Recorder:

@@ -28,7 +28,7 @@ from reference_model.reference import Reference
 from rise_di_controller.controller import Controller, ControlOutput
 
 Take = Callable[[StampedVector, int], object]
-"""Takes a sample at an instant, ns."""
+"""A function that takes a sample and the instant at which it arrives, ns."""
 
 
 class Station(Protocol):

@@ -162,8 +162,8 @@ def zeros_alone(linear: LinearLoop, late: float = 0.0) -> Zeros | None:
     """Compute how far the entries that are 0 in the file may deviate, if the others are exact.
 
     The box of the loop has only these entries. Search and proof stop early, at a gap of GAPS[0],
-    because such a box has the most entries of all. Returns None if the box is empty, or if the loop
-    is unstable.
+    because such a box has very many entries. Returns None if the box is empty, or if the loop is
+    unstable.
     """
     box = linear.box
     still = np.zeros(len(linear.inputs))

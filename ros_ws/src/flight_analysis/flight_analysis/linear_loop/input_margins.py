@@ -9,7 +9,7 @@ P(z) is the sampled aircraft from u to y, with actuators and delay, and K(z) the
     S(z) = (I - K P)^-1,    L_i(z) = 1 / S_ii(z) - 1  loop transfer function, input i alone open
 
 on z = exp(j w T), 0 < w <= pi / T. Sources: K. J. Astrom, R. M. Murray, "Feedback Systems", chapter
-10, for phase, gain and sensitivity; P. Seiler, A. Packard, P. Gahinet, "An Introduction to Disk
+10, for phase, gain and sensitivity. P. Seiler, A. Packard, P. Gahinet, "An Introduction to Disk
 Margins", IEEE Control Systems 40(5), 2020.
 """
 
@@ -34,12 +34,13 @@ IntArray = NDArray[np.intp]
 
 DECADES = 5
 PER_DECADE = 40
-"""The grid of frequencies has this many points per decade, over DECADES below pi / T. The
-frequencies of the modes are added to it, and eight points around every peak."""
+"""Number of points per decade in the grid of frequencies, which covers DECADES below pi / T. The
+frequencies of the modes, and eight points around every peak, are added to the grid."""
 
 SLOW = np.pi / 2.0
 """A mode counts as slow if its natural frequency times T is below this, rad, so that a cycle has
-more than four ticks. A faster mode shows in gain margin and S."""
+more than four ticks. The gain margin and S show faster modes.
+"""
 
 # An eigenvalue belongs to an integral or a constant state if its frequency times T is less, rad.
 NO_MODE = 1e-6
@@ -384,8 +385,8 @@ def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:
 def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
     """Return four frequencies on either side of each peak, (N, G), rad/s.
 
-    The peaks are those of abs(S_ii), of abs(S_ii - 1/2) and of the norms of S and S - I/2, where S
-    is balanced.
+    A peak is a maximum of abs(S_ii), abs(S_ii - 1/2), or the norm of S or S - I/2, where S is
+    balanced.
     """
     diagonal = np.einsum("NFii->NFi", S)
     half = S - np.eye(S.shape[-1]) / 2.0

@@ -46,8 +46,8 @@ LAG_ENTRY = "1/lag"  # beginning of the name of an uncertain entry that is the l
 LEAST_LAG = 2.0  # least lag of an actuator that can be uncertain, periods
 MOST_OF_LAG = 0.8
 """The largest deviation d of 1 / lag for which a proof holds. With a lag of LEAST_LAG, the two
-Legendre coefficients of a period leave out less than a thousandth of the deviation, a fifth of
-what each region of a proof has in reserve. For a larger d they leave out more."""
+Legendre coefficients of a period leave out less than a thousandth of the deviation. This is a fifth
+of the reserve in each region of a proof. For a larger d they leave out more."""
 
 BARE = (
     "; each output integrates its inputs, without drag and phugoid: the margins cover Omega alone"

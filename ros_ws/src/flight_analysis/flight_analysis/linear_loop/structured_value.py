@@ -166,7 +166,7 @@ class Centre(NamedTuple):
         return np.asarray(level * np.diag(self.d) - right)
 
     def bound(self, N: ComplexArray) -> float:
-        """Return the least level for this X and G."""
+        """Return the least level at which the inequality F > 0 can hold for this X and G."""
         root = np.sqrt(self.d)
         return -float(np.linalg.eigvalsh(self.inequality(N, 0.0) / root[:, None] / root)[0])
 

@@ -113,7 +113,7 @@ class FlightFacts(NamedTuple):
 
 
 PLANNED = FlightFacts()
-"""A flight of the scenario as it stands."""
+"""The facts of a flight that goes exactly as its scenario says."""
 
 
 class Comparison(NamedTuple):
@@ -184,8 +184,8 @@ def _compare_lags(
 ) -> tuple[FloatArray, list[Difference]]:
     """Compare the lags, and return the lags of the aircraft that flies and the differences.
 
-    A model of JSBSim has actuators of its own, whose lag is not among the keys of the aircraft. The
-    controller can therefore be told a longer lag than the keys have, but not a shorter one.
+    A model of JSBSim contains actuators, whose lag is not among the keys of the aircraft. The
+    controller can therefore be told a longer lag than the keys state, but not a shorter lag.
     """
     lag = np.array(controller.lag, dtype=np.float64)
     flown = flown_lag(scenario.aircraft, controller)
@@ -210,7 +210,7 @@ def _compare_delays(
 
     In simulation, y waits for the next tick and u for the next step of the aircraft, each up to a
     period of the aircraft. The controller can be told any delay in this range. If it is told
-    another one, the longest delay of the range is assumed. If you fly an aircraft of your own, its
+    another one, the longest delay of the range is assumed. For an aircraft of the user, the
     transport delay is unknown. The law steps with each y. If y comes less often than the ticks, the
     delay of one and a half ticks becomes one and a half periods of y.
     """
@@ -247,7 +247,7 @@ def _is_within(value: float, least: float, most: float) -> bool:
 
 
 def _of_log(controller: ControllerConfig, flight: FlightFacts) -> list[Difference]:
-    """Compare the period and the parameters of the controller with those of the log."""
+    """Compare the period and the parameters of the controller with what a log shows."""
     differences = []
     period = 1.0 / controller.rate
     if flight.tick is not None and abs(flight.tick - period) > SAME_PERIOD * period:
@@ -319,7 +319,7 @@ def _effect(aircraft: AircraftConfig, controller: ControllerConfig) -> FloatArra
 
 
 def _slew_beyond_rates(scenario: Scenario) -> list[str]:
-    """Return a sentence for each rate limit of the controller above that of the actuator."""
+    """Return a sentence for each rate limit of the controller that exceeds the actuator's."""
     controller = scenario.controller
     names = tuple(scenario.aircraft.channels().inputs)
     rates = dict(zip(names, scenario.aircraft.actuators.rate or (), strict=False))

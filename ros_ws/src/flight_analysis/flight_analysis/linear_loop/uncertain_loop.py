@@ -212,8 +212,8 @@ def uncertain_loop(
 def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
     """Return the rows of a matrix that give the Legendre coefficients of k channels.
 
-    They follow from the integrals of z, whose rows come after those of n states, and from the
-    integrals of these integrals.
+    The coefficients follow from the integrals of z and from the integrals of these integrals. The
+    rows of `matrix` are those of n states, then of the integrals.
     """
     once = matrix[n : n + k]
     twice = matrix[n + k : n + 2 * k]
@@ -286,8 +286,8 @@ def sensitivity_slopes(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Compute S and its slopes along d at the frequencies w, rad/s.
 
-    They are those of the aircraft with the deviations d, (k,). w has the shape (F,), S has (F, m,
-    m), and the slopes have (F, k, m, m). The loop must have disks in all inputs, and no late u.
+    Both belong to the aircraft with the deviations d, (k,). w has the shape (F,), S has (F, m, m),
+    and the slopes have (F, k, m, m). The loop must have disks in all inputs, and no late u.
     """
     around = loop.at(d)
     p, k = loop.uncertain, len(d)

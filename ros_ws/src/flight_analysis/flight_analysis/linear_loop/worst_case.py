@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Search of a box for the worst aircraft: the least unstable deviation, and the least margins.
+"""Search a box for the worst aircraft, with the least unstable deviation or the least margins.
 
 The search walks over the corners of the box. Each entry moves to the side at which a figure, such
-as a margin, is smaller. The gradient of the figure shows this side. It comes from the loop with the
-entries pulled out.
+as a margin, is smaller. The gradient of the figure shows this side. The gradient is computed from
+the loop with the entries pulled out.
 """
 
 from typing import Any, NamedTuple
@@ -271,8 +271,8 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box)
     """Search the corners of a box around a plant, A (n, n), for the least margins.
 
     The search follows each figure, such as the phase margin of an input, from the corners where it
-    is least to the corner to which its slope points, until no new corner is found. The values are
-    those of `input_margins`.
+    is least to the corner to which its slope points, until no new corner is found. The margins are
+    computed by `input_margins`.
     """
     rng = np.random.default_rng(SEED)
     k = len(box.names)

@@ -106,7 +106,7 @@ def _parameters(flight: RecordedFlight) -> dict[str, str]:
 
 
 def _shortened(texts: Sequence[str]) -> tuple[str, ...]:
-    """Shorten each long list of numbers to its count, and tell different lists apart."""
+    """Shorten each long list of numbers to its count, with a mark if the lists differ."""
     counts = [f"{text.count(',') + 1} values" if len(text) > LONG else text for text in texts]
     return tuple(
         f"{count}, others" if texts.index(text) and count in counts[: texts.index(text)] else count

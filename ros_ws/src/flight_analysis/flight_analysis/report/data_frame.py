@@ -18,7 +18,7 @@ def data_frame(tape: Tape) -> "pl.DataFrame":
 
     There is a row for each instant at which any topic has a sample. The first columns are
     "stamp_ns" (int64) and "t" = (stamp_ns - start) / 1e9. A topic that has no sample at an instant
-    has nulls there. If two samples have the same stamp, the table holds the later one.
+    has nulls there. If two samples have the same stamp, the table has the later sample.
 
     Args:
         tape: A flight.

@@ -32,7 +32,7 @@ QUANTITY_UNITS = {
     else DisplayUnit(unit=unit, factor=1.0)
     for name, unit in UNITS.items()
 }
-"""Units in which we show the quantities that guidance holds."""
+"""Display units of the quantities that guidance holds."""
 
 
 def channel_label(name: str, units: Mapping[str, DisplayUnit]) -> str:
@@ -42,7 +42,7 @@ def channel_label(name: str, units: Mapping[str, DisplayUnit]) -> str:
 
 
 DEGREES = {"rad": "deg", "rad/s": "deg/s"}
-"""Units in which angles and rates are shown, by the unit of the airframe file."""
+"""Display units of angles and rates, by the unit in the airframe file."""
 
 
 def display_unit(unit: str) -> DisplayUnit:
@@ -134,7 +134,7 @@ POSE_UNITS = {
     name: display_unit(unit)
     for name, unit in {**STATES, **dict.fromkeys(("v_north", "v_east", "climb"), "m/s")}.items()
 }
-"""Units in which we show the channels of a pose."""
+"""Display units of the channels of a pose."""
 
 
 def state_units(scenario: Scenario) -> dict[str, DisplayUnit]:

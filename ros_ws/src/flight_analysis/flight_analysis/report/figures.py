@@ -296,9 +296,9 @@ def input_figure(
 
 
 def input_limits(scenario: Scenario, tape: Tape) -> dict[str, Limits]:
-    """Return the limits of u by their kind, and each kind by input.
+    """Return the lower and upper limits of u in a mapping by kind and by input.
 
-    These are the limits of the controller and, if the actuators are simulated, their end stops.
+    The kinds are the limits of the controller and, if the actuators are simulated, their end stops.
     """
     actuators = scenario.aircraft.actuators
     controller = scenario.controller

@@ -79,14 +79,15 @@ def pace(flight: RecordedFlight) -> str:
 # ---- Verdict
 
 FLOWN = ("aircraft", "reference_model", "controller", "guidance")
-"""Sections of a scenario that decide a flight, apart from its length."""
+"""Sections of a scenario that determine a flight, apart from its length."""
 
 FILE_MODEL = "file"  # name of the model from the file, which a learner can fly as well
 NEXT = {
     Aim.ERROR: "Ask whether its loop is stable, and with what margins:",
     Aim.LOG: "Fly it in lockstep, where no message is late or lost:",
 }
-"""What to do about the gravest shortfall. For any other one, see the flight again."""
+"""The next step for the gravest shortfall. For other shortfalls, the next step is to look at the
+flight again."""
 
 
 def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
@@ -189,7 +190,7 @@ def _models_text(flight: RecordedFlight) -> str:
 
 
 def learned_spans(flight: RecordedFlight) -> list[Mapping[str, Any]]:
-    """Return the spans in which a learned model flew, not the first law or that of the file."""
+    """Return the spans in which a learned model flew, rather than the first law or the file's."""
     _, *later = flight.summary["models"]
     return [span for span in later if span["name"] != FILE_MODEL]
 
@@ -233,7 +234,7 @@ def run_argument(flight: RecordedFlight) -> str:
 # ---- Tiles
 
 NAMES = {"q": "pitch rate q", "p": "roll rate p", "r": "yaw rate r", "V": "airspeed V"}
-"""Outputs in words."""
+"""Names of outputs in words."""
 
 
 def tiles_of(flight: RecordedFlight) -> list[Tile]:

@@ -36,19 +36,20 @@ from reference_model.reference import Reference
 from rise_di_controller.learning.divergence import HARMLESS, LEAST, LEAST_RATE
 
 ROUNDING = 1e-9
-"""rad/s, m/s. Another build of NumPy may round the sine of a command differently; an error that
-means something is a million times larger."""
+"""Difference that counts as none, rad/s and m/s. Another build of NumPy can round the sine of a
+command differently. An error that matters is a million times larger."""
 
 AHEAD_NS = 5_000_000
-"""How far the clock of u_m may be ahead: if clocks differ by more, the nodes say so."""
+"""Time by which the clock of u_m may be ahead. If clocks differ by more, the nodes report it."""
 
 FITTING = 0.5
-"""Part of the samples that must be right for an instant to count as the t = 0 of a node that a user
+"""Share of the samples that must be right so that an instant counts as t = 0 of a node that a user
 started singly."""
 
 
 MOST_PATHS = 16
-"""Orders of the u_m that we follow at once: guidance sends ten within their age limit."""
+"""Largest number of hypotheses on the order of the u_m. Guidance sends ten u_m within their age
+limit."""
 
 
 class NotCompared(Enum):

@@ -54,11 +54,11 @@ BANDS: Mapping[str, float] = {
     "climb": 0.5,
     "V": 1.0,
 }
-"""Half-width of the settling band by quantity, rad, m, m/s."""
+"""Half-width of the settling band by quantity, in rad, m or m/s."""
 
 
 PATHS = (Lateral.ORBIT, Lateral.ROUTE, Lateral.PLACE)
-"""Modes whose error is in m: the distance beside a path, or from a place."""
+"""Modes whose error is a distance in m, beside a path or from a place."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,9 +183,10 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
 def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
     """Return the numbers of the legs that have not been flown when the flight ends.
 
-    The leg under way is one of them. The last leg of a route is not, because it is an orbit without
-    an end. The result is empty if a command replaced the route, or if the route is not in the log.
-    If the fence, a lost pose or a lost link ended the route, its remaining legs count as not flown.
+    The leg under way counts as not flown. The last leg of a route is left out, because it is an
+    orbit without an end. The result is empty if a command replaced the route, or if the route is
+    not in the log. If the fence, a lost pose or a lost link ended the route, its remaining legs
+    count as not flown.
     """
     log = tape["guidance"]
     on_route = np.flatnonzero(log["mode.lateral"] == Lateral.ROUTE)
@@ -233,7 +234,7 @@ def touched_beside(tape: Tape, section: GuidanceConfig) -> float:
 
 
 SCREEN = 15.24
-"""m, 50 ft: height over the threshold of a runway from which 14 CFR 23.2130 counts a landing."""
+"""Height over the threshold of a runway from which 14 CFR 23.2130 counts a landing, m (50 ft)."""
 
 
 class Touch(NamedTuple):

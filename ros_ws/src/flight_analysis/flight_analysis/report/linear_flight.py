@@ -55,15 +55,16 @@ AIRSPEED = "V"
 WIND = "gust.longitudinal"  # channel of `truth` with the wind along the axis of the aircraft, m/s
 
 NOISE_TIME = 1.0
-"""s. The mean error of a sensor over this time counts as bias or drift; without it, white noise at
-100 Hz loses a hundredth of its variance."""
+"""The mean error of a sensor over this time, s, counts as bias or drift. White noise at 100 Hz
+loses a hundredth of its variance if this mean is subtracted."""
 
 DECLARED = 4.0
-"""Standard deviations of a sensor's noise up to which it counts: one normal sample in 16,000 is
-beyond."""
+"""Number of standard deviations up to which a sensor's noise counts. One normal sample in 16,000
+lies beyond it."""
 
 NOISE_PEAK = 3.0
-"""Standard deviations of the inputs by noise that the actuators have to follow: 99.7 % of them."""
+"""Number of standard deviations of an input due to noise that the actuators must follow, which is
+99.7 % of the samples."""
 
 
 class Knowledge(NamedTuple):
@@ -88,7 +89,7 @@ class ErrorPair(NamedTuple):
 
 
 class LinearErrors(NamedTuple):
-    """Absolute errors of the linear loop, (N, m), SI; 0 if no linear loop is stable.
+    """Absolute errors of the linear loop, (N, m), SI, or 0 if no linear loop is stable.
 
     If the aircraft drifts, each error is the larger one of two, for the aircraft before and after
     the drift.
@@ -117,7 +118,7 @@ def error_pair(
     *,
     may_pause: bool = True,
 ) -> ErrorPair | None:
-    """Return the errors of a flight and those of the linear loop.
+    """Return the errors of a flight, and the errors that the linear loop would have had.
 
     Returns None if the log has no error, or if the law has no feedback. `aircraft` is the simulated
     aircraft, or None if the plant is unknown. If `may_pause` is True, ticks of an inactive
@@ -191,7 +192,7 @@ def _linear_errors(
     y_m: FloatArray,
     e_0: FloatArray,
 ) -> LinearErrors:
-    """Fly the linear loop around the aircraft, and around the drifted one if there is one."""
+    """Fly the linear loop around the aircraft, and around the drifted aircraft, if any."""
     config = controller
     if is_literal(controller):
         # The literal sign is the limit of the implicit sign, which has a linear law.

@@ -108,7 +108,7 @@ LEAST_MARGINS = {
     "damping of slow modes": ".2f",
     "delay margin, ms": ".0f",
 }
-"""The least margins of a loop, each with its format. They are those of the worst input, or of all
+"""The least margins of a loop, each with its format. They hold for the worst input, or for all
 inputs at once."""
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find the spans in which the controller flew each set of parameters, and the errors there."""
+"""Find when the controller flew which parameters, and the errors in each such span."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

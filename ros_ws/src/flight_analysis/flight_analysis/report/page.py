@@ -224,7 +224,7 @@ class Page(NamedTuple):
 
     @property
     def words(self) -> dict[str, str]:
-        """The words on the page that the glossary explains, with meanings, in its order."""
+        """The words on the page that the glossary explains, with their meanings."""
         used: set[str] = set()
         for block in self.shown:
             if isinstance(block, Cards):
@@ -307,7 +307,7 @@ def page_parts(page: Page) -> Iterator[str]:
 
 
 def script_json(value: Any) -> Markup:
-    """Write JSON for a script element, where "<" is escaped. It occurs only in strings."""
+    """Write JSON for a script element, with "<" as an escape, since it only occurs in strings."""
     content = finite_or_null(
         {"data": value.data, "layout": value.layout} if isinstance(value, Figure) else value
     )

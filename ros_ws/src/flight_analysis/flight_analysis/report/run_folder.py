@@ -149,7 +149,7 @@ def attachments_for(
 ) -> LogAttachments:
     """Return the attachments of the log of a flight.
 
-    They are the scenario, the airframe or the user's own model of JSBSim, every parameter after
+    They are the scenario, the airframe or the user's model of JSBSim, every parameter after
     validation, the `further` files, and the provenance. Attachments that are no files yet are
     written into the folder of the run. `overrides` are parameters of the scenario's nodes by the
     name of the node, or None for a flight without nodes. `replaced` names the nodes in place of
@@ -394,7 +394,7 @@ def _engagement(tape: Tape, engagement: Engagement) -> dict[str, Any]:
 
 
 def extract_scenario(run: Path, namespace: str | None = None) -> Scenario:
-    """Write the scenario in a log beside the log, and return it.
+    """Write the scenario that is stored in a log to a file beside the log, and return it.
 
     Raises ParameterError if the log holds none.
     """
@@ -405,7 +405,10 @@ def extract_scenario(run: Path, namespace: str | None = None) -> Scenario:
 
 
 def _scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
-    """Return the scenario in a log, with a path beside the log. Raises ParameterError."""
+    """Return the scenario that is stored in a log, with a path beside the log.
+
+    Raises ParameterError if the log has no valid scenario.
+    """
     stored = recorded.scenario_file()
     return parse_scenario(stored.content, _folder(run) / stored.name)
 
@@ -441,7 +444,7 @@ def write_report(
 
     runs/latest becomes a link to the run. The files are written beside the log, or into the new
     folder `output`. If no outcome is given, the report of an old run is written again, and
-    runs/latest stays. A `scenario` that replaces the one in the log is not written. Raises
+    runs/latest stays. If `scenario` replaces the scenario in the log, it is not written. Raises
     ParameterError as `read_flight` does, before any file is written, and UnwrittenReportError if a
     file cannot be written. If a run lacks y or y_m, summary.json gets only the outcome, and
     UnflownError is raised.

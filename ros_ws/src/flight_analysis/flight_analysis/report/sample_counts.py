@@ -168,7 +168,7 @@ def _expected(
 
 
 def is_real_time(tape: Tape) -> bool:
-    """Return whether the nodes flew by a clock, which is that of the host or /clock."""
+    """Return whether the nodes flew by a clock, either the host's clock or /clock."""
     return tape.is_by_clock or tape.start_ns > SINCE_EPOCH_NS
 
 
@@ -333,9 +333,9 @@ def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
 def _ticks(tape: Tape, scenario: Scenario, span: Span) -> tuple[int, float]:
     """Return the number of the controller's ticks up to the end, and the engaged time, s.
 
-    Each controller numbers its own ticks, so the ticks are counted for each publisher. If y and y_m
-    come from nodes of the user, the controller can fly before t = 0. Such ticks do not count in an
-    account from t = 0.
+    Each controller numbers its ticks from 1, so the ticks are counted for each publisher. If y and
+    y_m come from nodes of the user, the controller can fly before t = 0. Such ticks do not count in
+    an account from t = 0.
     """
     end_ns = span.end_ns
     step_ns = period_ns(scenario.controller.rate, "controller.rate")

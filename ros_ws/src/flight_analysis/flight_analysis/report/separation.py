@@ -16,8 +16,8 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 
 SEPARATION = 22.0
-"""Least distance of two aircraft by default, m: the sum of the spans of two Cessna 172 of 11.0 m
-(Cessna 172S specifications), the widest shipped aircraft."""
+"""Default of the least distance of two aircraft, m. It is the sum of the spans of two Cessna 172,
+11.0 m each (Cessna 172S specifications), which are the widest shipped aircraft."""
 
 PLACE = ("north", "east", "altitude")  # m
 

@@ -48,8 +48,8 @@ from rise_di_controller.params import ControllerConfig
 FED = Starvation()  # of a flight whose host was never too busy
 
 ENGAGED = 0.9
-"""Least share of the ticks with the law engaged. If u is held or at trim for longer, the figures
-say nothing about the law."""
+"""Least share of the ticks in which the law must be engaged. If u is held or at trim for longer,
+the metrics say nothing about the law."""
 
 
 def judge(

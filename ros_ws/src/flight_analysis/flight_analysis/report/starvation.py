@@ -29,8 +29,8 @@ BUSY = 0.05  # share of the ticks; a host that leaves out more is too busy
 WINDOW = 1.0  # s, window in which BUSY counts, so that one missing sample is harmless
 
 RECOVERY = 5.0
-"""s, after a starved part, until the errors that it caused have decayed: the airspeed of the osprey
-has settled by then."""
+"""Time after a starved span until the errors that it caused have decayed, s. The airspeed of the
+osprey has settled by then."""
 
 
 class Starvation(NamedTuple):

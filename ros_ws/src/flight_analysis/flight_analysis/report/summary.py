@@ -116,7 +116,7 @@ def transients(scenario: Scenario, tape: Tape, *, follows_scenario: bool = True)
 class RecordedFlight(NamedTuple):
     """A recorded flight, with its tape, its scenario and its summary.
 
-    Its name is that of the run. Figures, tables, exports and comparisons are made from it.
+    It has the name of the run. Figures, tables, exports and comparisons are made from it.
     """
 
     name: str
@@ -309,7 +309,7 @@ def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
 def summarise_own(tape: Tape, law: str, log: str, outcome: Outcome) -> dict[str, Any]:
     """Return the metrics of a flight of a user's aircraft, which its log does not describe.
 
-    The errors are those of the measured y. Nothing is judged, because there is no model of the
+    The errors are computed from the measured y. Nothing is judged, because there is no model of the
     aircraft.
     """
     source = {"log": log, "kind": f"an aircraft of its own under the law {law}"}
@@ -440,8 +440,8 @@ FIGURES = {
     "latency": ("y", "u"),
     "age_of_u": ("u",),
 }
-"""Topics that each table needs beside the error: those of its values, and those that tell the parts
-of the flight."""
+"""Topics that each table needs in addition to the error. Some have the values of the table, and the
+others show the parts of the flight."""
 
 
 def taken_over(summary: Mapping[str, Any], table: str) -> str:

@@ -77,7 +77,7 @@ ERROR_COLUMNS = (
     Column(group="max", head="gust", path=("gust", "max")),
     Column(group="ultimate", head="bound", path=("bound",)),
 )
-"""Columns that a table of errors may have; `columns_of` chooses those of a flight."""
+"""Columns that a table of errors can have. `columns_of` chooses the columns for a flight."""
 
 
 NOISE_FLOOR_COLUMN = Column(group="noise", head="floor", path=("floor",))
@@ -92,8 +92,8 @@ INPUT_COLUMNS = (
     Column(group="rate", head="whole", path=("whole", "rate")),
     *(Column(group="rate", head=air, path=(air, "rate")) for air in AIRS),
 )
-"""Columns that a table of inputs may have before SATURATION_COLUMN; `columns_of` chooses those of a
-flight."""
+"""Columns that a table of inputs can have before SATURATION_COLUMN. `columns_of` chooses the
+columns for a flight."""
 
 
 SATURATION_COLUMN = Column(group="saturated", head="%")
@@ -108,7 +108,7 @@ HELD_COLUMNS = (
     Column(group="", head="overshoot", path=("overshoot",)),
     Column(group="", head="settling (s)", path=("settling",), unit=NO_UNIT),
 )
-"""Errors of a quantity that guidance held over a segment."""
+"""Columns for the errors of a quantity that guidance held over a segment."""
 
 
 def _ms(group: str, topic: str, **heads: str) -> tuple[Column, ...]:
@@ -135,7 +135,7 @@ TIMING_COLUMNS = (
     *_ms("y sent to u sent", "latency", median="median", p99="p99", max="max"),
     *_ms("age of u at the aircraft", "age_of_u", mean="mean", max="max"),
 )
-"""The timing of the controller."""
+"""Metrics of the timing of the controller."""
 
 
 def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[Column, ...]:
@@ -178,7 +178,7 @@ def table_rows(
 
 
 def timing_rows(summary: Mapping[str, Any], *, is_timed: bool) -> list[tuple[str, str, str]]:
-    """Return the timing of the controller, with one row for all metrics of the same heading.
+    """Return the rows of the timing of the controller, one for all metrics with the same heading.
 
     A row has the topic of the summary, the heading with its unit, and the values. If `is_timed` is
     False, the host did not time the flight, and rows with times are left out.
@@ -202,7 +202,7 @@ def segment_table(
 ) -> tuple[list[Column], list[list[str]]]:
     """Return the columns and rows of a table on what guidance held in each segment.
 
-    Quantities without a unit in `units` have that of QUANTITY_UNITS.
+    A quantity without a unit in `units` has its unit from QUANTITY_UNITS.
     """
     units = {**QUANTITY_UNITS, **units}
     columns = [Column(group="", head=head) for head in ("from (s)", "to (s)")]
@@ -243,8 +243,8 @@ def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> 
 def slowest_settling(summary: Mapping[str, Any], channel: str, kind: str) -> str:
     """Return the longest settling time of a channel after transients of a kind, s.
 
-    If the error did not settle after one of them, the result is "> x". Here x is the longest time
-    of all, whether the error settled or not.
+    If the error did not settle after one of these transients, the result is "> x". Here x is the
+    longest time of all, whether the error settled or not.
     """
     times: list[float] = []
     unsettled: list[float] = []

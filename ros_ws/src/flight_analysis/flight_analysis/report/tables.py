@@ -232,7 +232,7 @@ def flight_tables(
     units: Mapping[str, DisplayUnit],
     event_list: Sequence[EventInterval],
 ) -> list[MetricTable]:
-    """Return the tables of a flight, which are those of metrics, events and processes."""
+    """Return the tables of a flight, with metrics, events and processes."""
     times = [Column(group="", head=head) for head in ("from (s)", "to (s)", "")]
     rows = [
         (event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent)

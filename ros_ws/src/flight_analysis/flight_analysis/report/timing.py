@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measure the timing of a flight, which is that of the ticks, and the latency and age of u."""
+"""Measure the timing of the ticks of a flight, and the latency and the age of u."""
 
 from typing import NamedTuple
 

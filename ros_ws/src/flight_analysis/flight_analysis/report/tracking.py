@@ -48,27 +48,29 @@ from rise_di_controller.learning.divergence import HARMLESS, LEAST, LEAST_RATE, 
 from rise_di_controller.params import ControllerConfig
 
 FACTOR = 2.0
-"""Of the error of the linear loop. An input with half of its effect doubles the error; healthy
-flights have at most 1.3 times the error."""
+"""Factor on the error of the linear loop. An input with half of its effect doubles the error, while
+healthy flights have at most 1.3 times the error."""
 
 COMMAND_PART = 0.5
-"""Of a command. A law so weak that even its linear loop does not follow is no success. An output
-has a command of its own unless another one of its kind has twice as much."""
+"""Fraction of a command. A law that is so weak that even its linear loop does not follow is no
+success. An output counts as commanded if no other output of its kind has more than twice as large a
+command."""
 
 END = 1.0
-"""s, length of the end of a flight. If an error grows, it is larger there than over WINDOW."""
+"""Length of the end of a flight, s. An error that grows is larger there than over WINDOW."""
 
 MOST = {"V": 6.0}
-"""m/s. Severe turbulence of MIL-F-8785C, sigma = 3.05 m/s at 4000 ft, leaves 3 m/s rms of V over a
-second to a Cessna, whose engine is too slow for gusts, and twice that is allowed."""
+"""Largest excuse for noise and wind, m/s. In severe turbulence of MIL-F-8785C, sigma = 3.05 m/s at
+4000 ft, V of a Cessna has an rms error of 3 m/s over a second, because its engine is too slow for
+gusts. Twice this is allowed."""
 
 MOST_RATE = 0.05
-"""rad/s, 3 deg/s. Severe turbulence, 45 kt at 20 ft by MIL-F-8785C, leaves 0.024 rad/s to the
-osprey, and twice that is allowed."""
+"""The same for a rate, rad/s (3 deg/s). In severe turbulence, 45 kt at 20 ft by MIL-F-8785C, the
+osprey has an error of 0.024 rad/s. Twice this is allowed."""
 
 SPEED_PART = 0.0075
-"""Of the trim speed: what the drag of an unknown polar leaves while V changes by a few m/s. While V
-is constant, a law with an integral of e leaves nothing of it."""
+"""Error due to the drag of an unknown polar, as a fraction of the trim speed, while V changes by a
+few m/s. While V is constant, a law with an integral of e removes this error."""
 
 SATURATED = 0.5  # share of the ticks; a stable osprey has at most 0.14 in moderate gusts
 SIDE = 0.1  # share of the ticks at either limit
