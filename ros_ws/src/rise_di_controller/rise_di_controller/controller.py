@@ -151,7 +151,7 @@ class Controller:
 
     @property
     def has_learned_model(self) -> bool:
-        """Whether feedforward or observer differ from those with which the flight started.
+        """Whether the feedforward or the observer has changed since the start of the flight.
 
         Only the proposals of a learner change them.
         """
@@ -175,8 +175,8 @@ class Controller:
                 is short.
 
         Raises:
-            ParameterError: The channels of the log would change, because the law changes or because
-                an observer is added or removed.
+            ParameterError: The channels of the log would change, because the law changes, or
+                because an observer is added or removed.
         """
         new = parameters if isinstance(parameters, Prepared) else prepared(parameters)
         if new.digest == self._digest:
@@ -334,7 +334,8 @@ class Controller:
     ) -> Refusal | None:
         """Return why a sample of m values is refused, if a value is beyond its bound, else None.
 
-        Raises ChannelError if its stamp is in the future or not newer than that of `last`.
+        Raises ChannelError if the stamp of the sample is in the future, or not newer than the stamp
+        of `last`.
         """
         require_not_future(sample.stamp_ns, now_ns, self._guard.max_age_ns)
         if last is not None:
@@ -465,7 +466,7 @@ class Controller:
         }
 
     def stale(self, now_ns: int) -> tuple[str, ...]:
-        """Return those of y and y_m that never came or are older than the age limit.
+        """Return which of y and y_m never came, or are older than the age limit.
 
         Args:
             now_ns: The clock, ns.

@@ -44,7 +44,7 @@ from rise_di_controller.law.control_law import ControlLaw, TunedLaw
 from rise_di_controller.law.saturation import Limits
 
 OF_NODE = frozenset({"lockstep", "y_rate", "autostart", "start_active"})
-"""Parameters that concern only the node: neither the law nor its guard depends on them."""
+"""Parameters that concern only the node, on which the law and its guard do not depend."""
 
 
 class ControllerSection(NodeConfig):

@@ -51,11 +51,11 @@ from rise_di_controller.law.linear_loop import (
 MARGIN_PARTS = (0.0, 0.5, 1.0)
 
 MAX_DELAY_PERIODS = 100
-"""The linear loop has m states for each period of the delay: with four channels, 100 periods take
-3 s of processor time and 1000 half a minute."""
+"""Largest delay in periods. The linear loop has m states for each period of the delay. With four
+channels, 100 periods take 3 s of processor time, and 1000 periods half a minute."""
 
 MAX_STABLE_STEP = 2.5
-"""Largest product of dt and the fastest zero. A Runge-Kutta step is stable up to 2.78; dt is the
+"""Largest product of dt and the fastest zero. A Runge-Kutta step is stable up to 2.78. dt is the
 longest step that the law takes."""
 
 
@@ -77,7 +77,7 @@ class ControllerConfig(ControllerSection):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Return the parameters that may change in flight: those of the law and the guard.
+        """Return the parameters of the law and of the guard, which may change in flight.
 
         The names of the channels and the signs D may not change.
         """
@@ -137,7 +137,7 @@ class ControllerConfig(ControllerSection):
             yield from self._check_observer(self.observer, nominal)
 
     def _check_names(self) -> None:
-        """Raise ParameterError if a name is used twice, which a log could not distinguish."""
+        """Raise ParameterError if two channels or states have the same name in the log."""
         require_distinct("outputs", self.outputs)
         require_distinct("inputs", self.inputs)
         for key, section in (("feedforward", self.feedforward), ("observer", self.observer)):
@@ -272,7 +272,7 @@ class ControllerConfig(ControllerSection):
                 yield
 
     def check_law(self) -> None:
-        """Check the law's own parameters against each other and the channels.
+        """Check the parameters of the law against each other and against the channels.
 
         Raises ParameterError.
         """

@@ -140,7 +140,7 @@ class LearnConfig(Config):
         return min(margin, LEAST_MARGIN) if self.margin is None else self.margin
 
     def spacing(self) -> float:
-        """Return the shortest time between two of `updates`, s; `window` if there is only one."""
+        """Return the shortest time between two of `updates`, s, or `window` for a single one."""
         return min(
             (after - before for before, after in pairwise(self.updates)), default=self.window
         )
@@ -411,7 +411,7 @@ class RiseDiConfig(ControllerConfig):
         return self._over_speed(matrices, partial(nominal_of, at_trim))
 
     def models(self) -> tuple[Any, ...]:
-        """Return the models as in the base class, and those at other speeds."""
+        """Return the models of the base class, and the models at other speeds."""
         return (*super().models(), () if self.schedule is None else self.schedule.models)
 
     def guard(self) -> GuardParams:

@@ -22,9 +22,9 @@ SWEEPS = 10
 """Largest number of sweeps over the effectors in an exchange."""
 
 RELAXATION = 1.9
-"""Factor on the excess over a stop that is exchanged; a factor of 1 is a projection on the stop. It
-was chosen with 500 random demands on 3 to 8 effectors that T v does not meet although some u inside
-the stops does. Ten sweeps meet 82 % of them with a factor of 1, and 99 % with 1.9."""
+"""Factor on the excess over a stop that is exchanged, where a factor of 1 is a projection on the
+stop. It was chosen with 500 random demands on 3 to 8 effectors that T v does not meet although some
+u inside the stops does. Ten sweeps meet 82 % of them with a factor of 1, and 99 % with 1.9."""
 
 HALVINGS = 5
 """Number of bisections that find which fraction of an input can be met. In 300 demands beyond the
@@ -79,7 +79,7 @@ def allocate(
     as well.
 
     Source: pseudo-inverse with redistribution and priority, T. A. Johansen, T. I. Fossen, "Control
-    allocation - a survey", Automatica 49(5), 2013, section 2; the exchange is the relaxation method
+    allocation - a survey", Automatica 49(5), 2013, section 2. The exchange is the relaxation method
     of T. S. Motzkin, I. J. Schoenberg, Canadian Journal of Mathematics 6, 1954.
     """
     low, high = bounds(u_before, dt, params.limits)

@@ -162,7 +162,7 @@ def step(
     second tick, so that u does not jump (bumpless transfer). dt > 0.
 
     y_m and u_ff have the shape (m,), and dt has (). The units are SI and radians, and u has the
-    units of B. Source: this project, after the feedforward of model inversion; see docs/theory.md.
+    units of B. Source: this project, after the feedforward of model inversion (see docs/theory.md).
     """
     xp = array_namespace(y_m)
     y_m_dot = (y_m - product(nominal.C, state.x)) / dt

@@ -145,8 +145,8 @@ def with_motion(
         square += part ((reading - mean)^2 - square)
         measures 1 where square > least, else 0
 
-    A frozen vane shows only electrical noise, with a mean square below `least`. A vane in calm air
-    does so as well, but there it has no wind to measure.
+    A frozen vane shows only electrical noise, with a mean square below `least`. The same holds for
+    a vane in calm air, but then there is no wind to measure.
     """
     xp = array_namespace(reading)
     part = xp.minimum(dt / params.time, 1.0 + 0.0 * dt)
@@ -162,7 +162,7 @@ def by_vanes(
     """Compute the correction of the estimates by the vanes in use, (s,).
 
     It is the sum over v of L_v [e - H z, deviation_v - H_v z]. `innovation` is e - H z, (m,).
-    `deviation` is the readings minus those of the reference motion, (k,).
+    `deviation` has the readings minus the readings in the reference motion, (k,).
     """
     xp = array_namespace(z)
     residual = deviation - product(params.H, z)

@@ -4,8 +4,8 @@
 
 The response to a control surface grows with the dynamic pressure. Omega therefore grows with V^2,
 and the delay margin of fixed gains falls accordingly. The schedule keeps Omega input_scale near its
-value at trim. It extends a law that has the parameter input_scale, without changing the law's own
-equations. If there is a feedforward and an observer, they use models for the present airspeed, too.
+value at trim. It extends a law that has the parameter input_scale, without changing the law's
+equations. A feedforward and an observer also use models for the present airspeed.
 """
 
 import math

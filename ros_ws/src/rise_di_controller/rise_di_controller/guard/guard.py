@@ -242,9 +242,9 @@ def tick(
     to u_trim + u_ff if there is a feedforward. Without a new y nothing changes.
 
     Stale inputs start the failsafe. Its modes are HOLD, in which nothing is integrated, then RAMP
-    to trim, then TRIM. The stamp of u is normally that of its y. In a failsafe it continues from
-    there with the clock, like the stamp of the y that is missing. A y that is older than the last u
-    does not engage the law, so the stamp of u never goes back.
+    to trim, then TRIM. The stamp of u is normally that of the y from which it is computed. In a
+    failsafe it continues from there with the clock, as the stamps of the missing y would. A y that
+    is older than the last u does not engage the law, so the stamp of u never goes back.
 
     If `active` is false, the mode is INACTIVE, and u is held or ramps to trim. With fresh inputs u
     is published even before the first engagement, and is then at trim. The returned inputs are None
@@ -494,10 +494,10 @@ def _vanes(
     guard: GuardParams,
     recorded: FloatArray | None,
 ) -> VaneReadings | None:
-    """Pair the readings of the vanes with those of the reference motion, or return None.
+    """Pair the readings of the vanes with their readings in the reference motion, or return None.
 
-    The reference motion is that of the nominal model along y_m, and the vanes would read its
-    states. Returns None without vanes.
+    The reference motion is the motion of the nominal model along y_m, in which the vanes would read
+    states of the model. Returns None without vanes.
     """
     if reading is None:
         return None
@@ -515,7 +515,7 @@ def law_within_limits(
     """Step the law inside the limits of the law and of the effectors.
 
     Returns the state, u before saturation, u, and the effectors. The argument `effectors`, (p,),
-    holds those of the last tick and is None without an allocation.
+    has the effectors of the last tick, or is None without an allocation.
     """
     after, u_free = law.control_law.step(state, measurements, dt, law.params)
     u, effector_values = _within_effectors(

@@ -25,7 +25,7 @@ from flight_core.rates import NANOSECONDS, seconds
 from flight_core.vectors import FloatArray, StampedVector
 
 TIMES = 5.0
-"""How much larger a change may be than the largest one of the last minute. Noise changes by up to
+"""Factor by which a change may exceed the largest change of the last minute. Noise changes by up to
 four standard deviations in a minute, so a factor of 5 allows 20 of them. In flights of seven of the
 scenarios no change exceeded a quarter of the limit."""
 
@@ -46,8 +46,8 @@ a gyro, 0.005 rad/s."""
 AGREEING = 3  # number of samples in a row that must agree after a jump
 
 STILL = 5
-"""Number of samples in a row that must equal the one before until y counts as frozen. They must
-also span this number of periods."""
+"""Number of samples in a row that must equal the sample before, so that y counts as frozen. They
+must also span this number of periods."""
 
 MOVING = 100
 """Number of changing samples in a row which show that this y never stands still by itself.
@@ -169,8 +169,9 @@ def step(
     locked out for ever. After lost samples, `largest` takes the whole change instead of the change
     per period, because y may be so noisy.
 
-    The samples of the first FIRST_NS are NEAR, too. A gyro may start with wrong values. During this
-    time `largest` therefore takes at most `reach` of a near change, and nothing of a larger change.
+    The samples within the first FIRST_NS are always NEAR. A gyro may start with wrong values.
+    During this time `largest` therefore takes at most `reach` of a near change, and nothing of a
+    larger change.
 
     A sample is FROZEN if every value has been the same for STILL samples and periods, after MOVING
     samples that changed.

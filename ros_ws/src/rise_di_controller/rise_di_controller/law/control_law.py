@@ -114,7 +114,7 @@ def without_limits(
 
 
 def fields(state: Any) -> dict[str, Array]:
-    """Return the arrays of a law's state by name, first those of a law that it extends."""
+    """Return the arrays of a law's state by name, beginning with a law that it extends."""
     values: dict[str, Array] = {}
     for name, value in state._asdict().items():
         values |= fields(value) if hasattr(value, "_asdict") else {name: value}

@@ -78,7 +78,7 @@ def decompose(Omega: ArrayLike) -> SDU:
         Omega = L diag(p) W,  p_k = Delta_k / Delta_(k-1),  Delta_k the leading minors, Delta_0 = 1
         S = L diag(abs(p)) L',  D = sign(p),  U = D L^-T D W
 
-    Source: equations (10)-(11) of Tanyer, Tatlicioglu, Zergeroglu; for their existence see A. S.
+    Source: equations (10)-(11) of Tanyer, Tatlicioglu, Zergeroglu. For the existence, see A. S.
     Morse, "A Gain Matrix Decomposition and Some of Its Applications", Systems & Control Letters 21,
     1993.
 

@@ -141,8 +141,8 @@ def step(
     dt^2 and without chatter. SOFT is for loops with lag. u is the deviation from the input at
     engagement, and sgn(0) = 0.
 
-    Source: (20)-(22) of Tanyer, Tatlicioglu, Zergeroglu; the sampling is this project's, see
-    docs/theory.md.
+    Source: (20)-(22) of Tanyer, Tatlicioglu, Zergeroglu. The sampling is of this project (see
+    docs/theory.md).
 
     Args:
         state: State after the previous tick, fields (m,).

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from flight_core.vectors import Array, array_namespace
 
 LEAST_DIVISOR = 2.0**-126
-"""The least normal float32: dividing by anything smaller could overflow."""
+"""The least normal float32. A division by a smaller number could overflow."""
 
 
 class Limits(NamedTuple):
@@ -73,7 +73,7 @@ def limited_integral(before: Array, after: Array, change: Array, beyond: Array) 
             if change beyond > 0, otherwise `after`, to the last bit
 
     u then ends at the limit, or moves at the rate if a rate limit acts.
-    Source: conditional integration, K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5; the
+    Source: conditional integration, K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5. The
     reduced increment is of this project.
 
     Args:

@@ -102,7 +102,8 @@ class Oscillations:
     def take(self, e: FloatArray, dt: float, is_learned: NDArray[np.bool_] | None) -> None:
         """Record a tick, and test once a second.
 
-        `is_learned` masks the outputs with a learned model, (m,); it is None under the first law.
+        `is_learned` is the mask of the outputs with a learned model, (m,), or None under the first
+        law.
         """
         if (is_learned is None) is not self._first_law:
             self._first_law = is_learned is None

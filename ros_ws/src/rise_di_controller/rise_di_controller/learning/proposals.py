@@ -42,8 +42,8 @@ DESIGNED = frozenset(
         "schedule",
     }
 )
-"""Parameters, or groups of them, that a proposal may change: what `rise-di gains select --observer`
-designs at every speed."""
+"""Parameters, or groups of parameters, that a proposal may change. `rise-di gains select
+--observer` designs them at every speed."""
 
 OPTIONAL = ("feedforward.inputs", "feedforward.gravity", "feedforward.deviation")
 """Parameters that a design may lack. A part that was not learned had no feedforward, and gets one
@@ -89,11 +89,11 @@ UNVERIFIED = "until a model is learned"
 """End of the sentence of a proposal that flies the rough model before there is any record."""
 
 FALLBACKS = 2
-"""After this number of fallbacks in an engagement a part gets no more models: the second model was
-certified, too, and still diverged."""
+"""Number of fallbacks in an engagement after which a part gets no further models, because the
+second model was certified as well and still diverged."""
 
 AUTHORITY_TICKS = 10
-"""Ticks of the controller between two samples of `authority`."""
+"""Number of ticks of the controller between two samples of `authority`."""
 
 
 class Fallback(NamedTuple):
