@@ -61,7 +61,7 @@ class Exported(NamedTuple):
 
     Attributes:
         files: The files that were written.
-        proof: The proof; None without a proof.
+        proof: The proof, or None without a proof.
         report: The text of the report.
     """
 
@@ -101,7 +101,7 @@ def export(
             most 20 s.
         drawn: Number of drawn steps in the proof.
         seed: Seed of the drawn inputs.
-        compiler: Commands of C compilers; if empty, gcc and clang.
+        compiler: Commands of C compilers. If empty, they are gcc and clang.
         runner: Command that starts a program of the compiler, such as qemu-aarch64 for a cross
             compiler.
         fmu: Whether to write a co-simulation unit of FMI 2.0, too.

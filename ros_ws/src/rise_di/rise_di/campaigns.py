@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     import polars as pl
 
 Progress = Callable[[int, int], None]
-"""Takes the number of flights so far, and that of all flights of a campaign."""
+"""A function that takes the number of flights so far, and the number of all flights of a
+campaign."""
 
 
 class CampaignResult(NamedTuple):

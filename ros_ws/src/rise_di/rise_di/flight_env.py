@@ -50,9 +50,9 @@ class _Channels:
 
 
 def _channels(scenario: Scenario) -> _Channels:
-    """Return the space of u within the controller's limits, and that of y followed by y_m.
+    """Return the spaces of actions u and of observations, which are y followed by y_m.
 
-    The bounds of y and y_m are those beyond which an aircraft counts as lost.
+    u has the controller's limits. Beyond the bounds of y and y_m, an aircraft counts as lost.
     """
     controller = scenario.controller
     limits = controller.effector_limits()
@@ -99,8 +99,8 @@ BY_TICK = frozenset(
         *("start_time", "lockstep", "control_rate", "duration", "recorded"),
     }
 )
-"""Keys of the aircraft with which its flight, and the sample at a tick, are the same whether or not
-the samples before that tick were measured."""
+"""Keys of the aircraft for which samples can be skipped. With only these keys, the flight and the
+sample at a tick do not depend on whether the samples before this tick were measured."""
 
 
 def _is_newest_last(scenario: Scenario) -> bool:

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     import control
 
 Plant = Callable[[float, FloatArray, float], ArrayLike]
-"""plant(t, u, dt) -> y: advances from t to t + dt with u (p,) held, and then measures y (m,); SI,
-deviations from trim."""
+"""A function plant(t, u, dt) -> y that advances from t to t + dt with u (p,) held, and then
+measures y (m,), as deviations from trim in SI."""
 
 
 class Loop:
