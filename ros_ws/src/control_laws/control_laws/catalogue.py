@@ -46,18 +46,19 @@ INITIAL_COMMON_GAINS = {
     "fade": 4.0,
     "loose": 0.01,
 }
-"""Initial gains common to all channels."""
+"""Initial gains of a search that all channels share."""
 
 INITIAL_WIND_GAINS = {"gust": 0.5, "wind_time": 2.0}
-"""Noise of the wind, m/s per root s, and its time constant, s, the same for every axis. Dryden's L
-/ V0 at 100 m and 25 m/s is 4 s vertically and 10 s along the flight; a design gust of 15 m peaks
-after 0.6 s."""
+"""Initial noise of the wind, m/s per root s, and its time constant, s, which are equal for every
+axis. Dryden's L / V0 at 100 m and 25 m/s is 4 s vertically and 10 s along the flight. A design gust
+of 15 m peaks after 0.6 s."""
 
 
 NONE = "none"
 AIRCRAFT = "aircraft"
 INTEGRATORS = "integrators"
-"""Models of a feedforward: none; A, B and f of the nominal aircraft; y_dot = Omega u."""
+"""Models of a feedforward, which are no model, A, B and f of the nominal aircraft, and y_dot =
+Omega u."""
 
 
 class Law(NamedTuple):

@@ -44,7 +44,7 @@ def control_law(model: NominalModel) -> ControlLaw:
 
     The measured y_dot already contains the model error. The two filters are equal, so y_dot_f and
     position_f belong to the same instant. The law has no integral, so it cannot wind up. Source: S.
-    Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6), 2010; E. J. J. Smeur, Q. P. Chu, G. C. H. E. de
+    Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6), 2010. E. J. J. Smeur, Q. P. Chu, G. C. H. E. de
     Croon, JGCD 39(3), 2016, for the filters.
     """
     inverse = model.inverse

@@ -107,7 +107,7 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
 
 
 CONTROL_LAWS = {feedforward: _control_law(feedforward=feedforward) for feedforward in (False, True)}
-"""L1 without and with a feedforward in u_trim."""
+"""The L1 law without and with a feedforward in u_trim."""
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> L1Params:

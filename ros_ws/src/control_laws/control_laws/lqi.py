@@ -129,7 +129,7 @@ def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:
 
     `integral` (m, N) and `fade` (1, N) are in 1/s, and `effort` (m, N) is in s. An input that moves
     y at the rate a costs as much as an error of `effort` a. Source: E. Kreindler, D. Rothschild,
-    AIAA J. 14(7), 1976, for model following; B. D. O. Anderson, J. B. Moore, "Optimal Control", ch.
+    AIAA J. 14(7), 1976, for model following. B. D. O. Anderson, J. B. Moore, "Optimal Control", ch.
     9.
     """
     size = (model.C @ model.size)[:, None]

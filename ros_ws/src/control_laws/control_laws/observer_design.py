@@ -23,7 +23,7 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import zero_order_hold
 
 Correction = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
-"""A function that computes the gain of `riccati.correction_of`, which is one of them."""
+"""A function that computes the gain as `riccati.correction_of` does."""
 
 # decay of the angles and the disturbances in the model, 1/s, so that every mode is observable or
 # stable
