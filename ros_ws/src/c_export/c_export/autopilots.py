@@ -18,7 +18,7 @@ from flight_core.files import write_file, writing
 from flight_core.parameters import require
 
 AXES: Mapping[str, int] = MappingProxyType({"p": 0, "q": 1, "r": 2})
-"""Channels of y, and the axes of autopilots that they are: roll, pitch, yaw."""
+"""Channels of y, with the number of the axis in autopilots: roll, pitch, yaw."""
 
 # Number of samples that are kept. y_m is stepped past each y, so a tick only needs the newest y and
 # two samples of y_m.
@@ -31,7 +31,7 @@ HOOKS = """ArduPlane/Plane.h, in class Plane, beside void stabilize();
 ArduPlane/Plane.cpp, in scheduler_tasks, behind FAST_TASK(stabilize),
     FAST_TASK(rise_di),
 """
-"""The two lines that ArduPlane needs in its own files."""
+"""The two lines that must be added to files of ArduPlane."""
 
 MESSAGE = """# Rate controller of RISE-DI: a cycle, in the order {channels}
 uint8 ORB_QUEUE_LENGTH = 16  # the logger misses no tick
@@ -113,8 +113,8 @@ vehicle_magnetometer 200
 vehicle_status
 wind 1000
 """
-"""Of the module and of `tune` at every sample, and those that PX4 1.16 logs by default
-(logged_topics.cpp): a file without them would leave them out of the log."""
+"""Topics of the module and of `tune`, logged at every sample, and the topics that PX4 1.16 logs by
+default (logged_topics.cpp). If the file lacked the latter, the log would lack them."""
 
 PX4 = {
     "logger_topics.txt": TOPICS,

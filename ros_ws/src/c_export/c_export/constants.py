@@ -64,8 +64,8 @@ TABLE: Mapping[str, tuple[str, float, float]] = MappingProxyType(
         "effect": ("v/effector", LEAST, LARGEST),
     }
 )
-"""Unit and bounds of the reals. A matrix of the model has no row here, since it has any finite
-values in SI."""
+"""Unit and bounds of the reals. A matrix of the model has no row here, because it can have any
+finite values in SI."""
 
 REALS: Mapping[str, float] = MappingProxyType(
     {

@@ -111,8 +111,8 @@ VALUE_REFERENCES = {
     "mode": 400,
     "parameter": 1000,
 }
-"""Value references of the first channel of each group, as in fmu.c. Those of the parameters follow
-their places."""
+"""Value references of the first channel of each group, as in fmu.c. The value references of the
+parameters follow from their order."""
 
 TUNABLE: Mapping[str, str] = MappingProxyType(
     {
@@ -126,7 +126,8 @@ TUNABLE: Mapping[str, str] = MappingProxyType(
         "limits.rate": "limit of the rate of u, per s",
     }
 )
-"""Parameters that may change between two steps, with a value for each channel, and what they are.
+"""Parameters that can change between two steps, with their meaning. Each has a value for each
+channel.
 """
 
 

@@ -104,7 +104,7 @@ def write_code(
 
 
 def compilers(names: Sequence[str] = ()) -> list[list[str]]:
-    """Return the commands of the C compilers: `names`, or those of COMPILERS on the PATH.
+    """Return the commands of the C compilers, which are `names`, or COMPILERS on the PATH.
 
     Raises ParameterError if there is no compiler.
     """
