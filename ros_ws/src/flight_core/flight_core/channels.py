@@ -11,11 +11,11 @@ RATES_AND_SPEED = ("q", "V", "p", "r")
 is the deviation of the airspeed from trim, m/s."""
 
 WITHOUT_RUDDER = RATES_AND_SPEED[:3]
-"""The same channels for an aircraft without rudder, such as a flying wing. Its r follows from the
+"""The channels of an aircraft without rudder, such as a flying wing, whose r follows from the
 bank."""
 
 VERTICAL = {"vertical_speed": 1.0, "w": -1.0}
-"""Channels of which a multicopter has one in place of V. The value is the rate of climb, m/s, if
+"""A multicopter has one of these channels in place of V. The value is the rate of climb, m/s, if
 the channel is 1 m/s."""
 
 

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Set a deadline for a process that holds even if a library call blocks the interpreter.
 
-During such a call neither a Python thread nor a signal handler of Python runs. The default action
-of a signal would end the process, but without the exit status. A timer of the kernel therefore
-starts a thread of the C library (POSIX timer_create, SIGEV_THREAD), which calls _exit(status).
+During such a call Python runs no other thread and no signal handler. The default action of a signal
+would end the process, but without the exit status. A timer of the kernel therefore starts a thread
+of the C library (POSIX timer_create, SIGEV_THREAD), which calls _exit(status).
 """
 
 import ctypes

@@ -24,7 +24,8 @@ LEAST_SHARED_MEMORY = 1 << 16  # bytes; rclpy and a flight use 12 kB
 LEAST_FILES = 128  # least number of files that a process must be able to hold open
 LAST_START = 2**31 - 86_400
 """Last time at which a node can start, s since the epoch. It is a day before the last stamp of ROS
-2, on 2038-01-19: a stamp counts seconds in 32 bits with a sign (builtin_interfaces/Time)."""
+2, on 2038-01-19, because a stamp counts seconds in 32 bits with a sign
+(builtin_interfaces/Time)."""
 MAX_DOMAIN = 232  # a higher domain has port numbers above 65535 (DDSI-RTPS 2.3, section 9.6.1.1)
 
 
@@ -164,7 +165,7 @@ def _require_log_folder() -> None:
 def _require_loopback() -> None:
     """Raise ParameterError if the host has no loopback.
 
-    Nodes talk over 127.0.0.1, unless the user has a profile of Fast DDS.
+    Nodes talk over 127.0.0.1 if the user has no profile of Fast DDS.
     """
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

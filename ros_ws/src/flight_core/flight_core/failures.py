@@ -5,14 +5,14 @@
 import math
 
 DWELL = 10.0
-"""Time without a failed step after which the next one is logged again, s."""
+"""Time without a failed step after which the next failed step is logged again, s."""
 
 
 class Failures:
     """A count of failed steps.
 
-    A sentence is due at the first failed step, and at the first one after a time DWELL without
-    failed steps.
+    A sentence is due at the first failed step. It is due again at a failed step if no step has
+    failed in the time DWELL before it.
     """
 
     def __init__(self) -> None:

@@ -47,7 +47,7 @@ class Problems:
         self.others: list[str] = []
 
     def sentences(self) -> list[str]:
-        """List the sentences, with those about unknown keys first.
+        """List the sentences, beginning with sentences about unknown keys.
 
         A mistyped key therefore comes before the key that is missing because of the mistake.
         """
@@ -65,7 +65,7 @@ class Problems:
         return sentences
 
     def summary(self) -> str:
-        """Return the first sentence and those about missing keys, and the number of other ones."""
+        """Return the first sentence, sentences about missing keys, and the number of the others."""
         sentences = self.sentences()
         told = list(dict.fromkeys([sentences[0], *self.missing_sentences()]))
         more = len(sentences) - len(told)

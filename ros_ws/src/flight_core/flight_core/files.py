@@ -52,9 +52,9 @@ INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)|0o[0-7]+|0x[0-9a-fA-F]+")
 FLOAT = re.compile(
     r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
 )
-"""Numbers of the core schema of YAML 1.2.2, section 10.3.2, except those with leading zeros: YAML
-1.1 reads 060 as 48, YAML 1.2 as 60. The core schema has neither 1:00, which YAML 1.1 reads as 60,
-nor 1_000. All of these are strings here, so that no number is guessed."""
+"""Numbers of the core schema of YAML 1.2.2, section 10.3.2, except numbers with leading zeros,
+because YAML 1.1 reads 060 as 48, and YAML 1.2 as 60. The core schema lacks 1_000, and 1:00, which
+YAML 1.1 reads as 60. All of these are strings here, so that no number is guessed."""
 
 
 LEADING_ZERO = re.compile(r"[-+]?0[0-9]+")
@@ -63,10 +63,10 @@ LEADING_ZERO = re.compile(r"[-+]?0[0-9]+")
 class _Loader(Composer, yaml.CSafeLoader):
     """Reads numbers as YAML 1.2 does, and rejects duplicate keys.
 
-    PyYAML would keep the last of several equal keys. Aliases that expand to more than
-    MAX_YAML_NODES values are rejected, too. libyaml parses the text, nine times as fast as Python.
-    The nodes of the text are composed in Python, because libyaml's binding exhausts the stack if
-    they are nested deeply.
+    PyYAML would keep the last of several equal keys. It also rejects aliases that expand to more
+    than MAX_YAML_NODES values. libyaml parses the text, nine times as fast as Python. The nodes of
+    the text are composed in Python, because libyaml's binding exhausts the stack if they are nested
+    deeply.
     """
 
     def __init__(self, stream: str) -> None:
@@ -157,13 +157,13 @@ def comment(lines: Iterable[str]) -> str:
 def is_file(path: Path) -> bool:
     """Return whether the path is a file.
 
-    Returns False for an invalid path, too, such as one that is too long.
+    Returns False for an invalid path, such as one that is too long.
     """
     return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises OSError and ValueError
 
 
 def is_folder(path: Path) -> bool:
-    """Return whether the path is a folder. Returns False for an invalid path, too."""
+    """Return whether the path is a folder. Returns False for an invalid path."""
     return os.path.isdir(path)  # noqa: PTH112 - as above
 
 

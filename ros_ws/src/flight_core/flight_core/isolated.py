@@ -36,7 +36,7 @@ FILE_LIMIT = 1 << 30  # largest size of a file that the subprocess writes, bytes
 
 NUMPY = frozenset({"_frombuffer", "_reconstruct", "dtype", "ndarray", "scalar"})
 """Names of functions and classes that a pickled array contains. Other names in a pickle could run
-code of the sender's choice, but these cannot."""
+any code that the sender chooses, but these names cannot."""
 
 
 class IsolatedCallError(RuntimeError):

@@ -30,7 +30,7 @@ class SetKey(NamedTuple):
 
 
 def keys_of(schema: type[Config]) -> frozenset[str]:
-    """Return every key of a parameter set, including those of its sections."""
+    """Return every key of a parameter set, including the keys of its sections."""
     return frozenset(_keys(schema, ""))
 
 

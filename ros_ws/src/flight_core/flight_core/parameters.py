@@ -46,7 +46,7 @@ class Config:
     """
 
     model_fields: ClassVar[dict[str, FieldInfo]] = {}
-    """Fields by name, those of base classes first."""
+    """Fields by name, beginning with the fields of base classes."""
 
     def __init_subclass__(cls) -> None:
         new_fields = {}

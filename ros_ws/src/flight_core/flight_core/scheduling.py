@@ -23,7 +23,7 @@ ATTRIBUTES = "=IIQiIQQQ"
 
 
 def compute_in_one_thread() -> None:
-    """Let the linear algebra of this process, and of those that it starts, use one thread.
+    """Let the linear algebra of this process, and of its child processes, use one thread.
 
     Call this before NumPy is imported, because OpenBLAS reads the number of threads only once. The
     matrices here have at most some hundred rows. For such matrices two threads take longer than
@@ -79,11 +79,10 @@ def disable_timer_slack() -> None:
 def request_short_slices() -> None:
     """Ask for time slices of SLICE_NS for every thread of this process.
 
-    When a thread with a shorter slice wakes, it runs before a running thread with a longer one. Its
-    share of a core stays the same. Linux before 6.12 ignores the request. If the user has chosen a
-    policy (chrt), the policy is kept.
-    Source: sched_setattr(2); the kernel's documentation, scheduler/sched-eevdf (latency-sensitive
-    tasks).
+    When a thread with a shorter slice wakes, it runs before a running thread with a longer one. The
+    share of a core that each thread gets stays the same. Linux before 6.12 ignores the request. If
+    the user has chosen a policy (chrt), the policy is kept. Sources: sched_setattr(2), and the
+    kernel's documentation, scheduler/sched-eevdf (latency-sensitive tasks).
     """
     number = SCHED_SETATTR.get(platform.machine())
     if number is None or not THREADS.is_dir():

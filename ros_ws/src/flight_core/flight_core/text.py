@@ -24,5 +24,5 @@ def bounded(text: str) -> str:
 
 
 def sentences(*parts: object) -> str:
-    """Join the texts and reasons that are neither None nor empty into one text."""
+    """Join texts and refusals into one text, leaving out None and empty ones."""
     return "; ".join(str(part) for part in parts if part)

@@ -78,10 +78,8 @@ BASE_UNITS: Mapping[str, Quantity] = MappingProxyType(
     }
 )
 """The units by name. Products, quotients and powers of these, such as ft/s^2, slug*ft^2 and deg/s,
-are units too.
-
-Source: B. N. Taylor, A. Thompson, Guide for the Use of the International System of Units, NIST SP
-811, 2008, appendix B.
+are also units. Source: B. N. Taylor, A. Thompson, Guide for the Use of the International System of
+Units, NIST SP 811, 2008, appendix B.
 """
 
 
