@@ -173,7 +173,7 @@ def _format_field(row: OutputRow | InputRow) -> str:
 def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: bool) -> None:
     """Compare the rows of a map with message definitions, and print which rows do not hold.
 
-    The definitions are those of releases of an autopilot.
+    The definitions come from releases of an autopilot.
     """
     kinds = list(dict.fromkeys(kind for _, _, kind, *_ in channel_map.used_fields()))
     installed = installed_definitions(kinds)

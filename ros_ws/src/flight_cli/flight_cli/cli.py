@@ -86,7 +86,8 @@ GROUPS = MappingProxyType(
 """What each command does, by group.
 
 The command `name` is the class `Name` of the module `flight_cli.name`. If the name is a keyword of
-Python, the module has an underscore behind it."""
+Python, the name of the module ends with an underscore.
+"""
 VERBS = MappingProxyType(
     {
         "gains": {
@@ -102,8 +103,8 @@ VERBS = MappingProxyType(
         },
     }
 )
-"""The commands that are groups, and what each of their verbs does: `rise-di gains check` is the
-class `Check` of the module `flight_cli.gains`."""
+"""The commands that are groups, and what each of their verbs does. For example, `rise-di gains
+check` is the class `Check` of the module `flight_cli.gains`."""
 COMMANDS = MappingProxyType(dict(ChainMap(*GROUPS.values())))
 
 

@@ -77,7 +77,7 @@ SELECTION = (
     "accept",
     "mixing",
 )
-"""Options of a study, and further ones of a selection."""
+"""Options of a study, and further options of a selection."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -186,7 +186,8 @@ NAME_COLUMN = TextColumn("{task.description}")
 COUNT_COLUMNS = (NAME_COLUMN, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
 SHOWN_COLUMN = TextColumn("{task.fields[shown]}")
 CLOCK_COLUMNS = (TextColumn("{task.fields[clock]}"), BarColumn(), SHOWN_COLUMN)
-"""Columns of progress bars: a count with the time that is left, a text, a clock with a text."""
+"""Columns of progress bars, with a count and the remaining time, with a text, or with a clock and a
+text."""
 
 
 def progress_bar(*columns: ProgressColumn, quiet: bool = False) -> Progress:

@@ -41,8 +41,8 @@ class RouteWords:
     ) -> tuple[Waypoint, ...]:
         """Read the waypoints of a route file, and print notes on the rest of it on standard error.
 
-        `fence` is the file of the fence, which may be the same file. Raises what `read_route_file`
-        raises.
+        `fence` is the file with the fence, which may be the route file itself. Raises what
+        `read_route_file` raises.
         """
         for key, value in (("altitude", self.altitude), ("simplify", self.simplify)):
             require(value is None or math.isfinite(value), f"--{key}", value, "a number")

@@ -371,8 +371,8 @@ def _uncertainty(identification: Identification) -> float:
     """Return twice the largest standard deviation of the best known effects, in LEAST to MOST.
 
     The deviation of an effect is a fraction of the identified value. An uncertain delay does not
-    count. If the delay is wrong, A and B are wrong as well, in such a way that the loop is still
-    that of the log.
+    count. If the delay is wrong, A and B are wrong as well, and compensate it, so that the loop is
+    still that of the log.
     """
     relative = [
         effect.deviation * abs(effect.nominal / effect.value)

@@ -28,9 +28,10 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 CALM, GUSTS = "calm", "gusts"
 TURBULENCE: Mapping[str, float] = MappingProxyType({"altitude": 5.0, "wind": 5.0})
-"""Near the ground the gusts of a wind of 5 m/s have 0.5 m/s rms along the vertical axis."""
+"""Turbulence of a wind of 5 m/s near the ground, which has 0.5 m/s rms along the vertical axis."""
 ROLLING = {"amplitude": 0.7, "frequency": 5.0}
-"""A gust that turns about the roll axis, rad/s and rad/s: 0.5 rad/s rms, with a time of 0.2 s."""
+"""A rotation of the air about the roll axis, rad/s and rad/s, with 0.5 rad/s rms and a time of 0.2
+s."""
 SAMPLES = 60  # number of uncertain aircraft
 DELAY_MARGIN = 0.01  # with the observer, s, as in examples/px4_airplane/rates_observer.yaml
 FORMER = "as in the scenario"

@@ -39,7 +39,7 @@ OTHER_NAMES: Mapping[str, Sequence[str]] = MappingProxyType(
         "--gui": ("--watch",),
     }
 )
-"""Names that options have in other tools, and the options of the same meaning here."""
+"""Names that options have in other tools, with the options of the same meaning here."""
 
 
 class Executable(Protocol):
