@@ -41,4 +41,4 @@ GROUPS = {
         "fence",
     ),
 }
-"""Channels and groups of channels that are kept. Other topics keep all of theirs."""
+"""Channels and groups of channels that are kept. Topics that are not listed keep all channels."""

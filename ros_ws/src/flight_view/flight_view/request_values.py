@@ -10,7 +10,7 @@ from typing import Any
 from flight_core.fields import short_repr
 
 RANGE = (0.5, 2.0)
-"""Factors on a gain of the scenario between which the page may set it."""
+"""Factors on a gain of the scenario, between which the page can set this gain."""
 
 
 class RefusedError(Exception):

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 from flight_core.vectors import FloatArray
 
 MAX_ROWS = 100_000
-"""Rows of a topic. 30 channels then need 12 MB. The samples become coarser after 17 min at 100 Hz,
-and after 33 min at 50 Hz."""
+"""Largest number of rows of a topic. With it, 30 channels need 12 MB. The samples become coarser
+after 17 min at 100 Hz, and after 33 min at 50 Hz."""
 
 DISORDER_NS = 1_000_000_000
-"""When a controller recovers from an overrun, a tick may be a few ms older than the one before."""
+"""Largest disorder of stamps, ns. When a controller recovers from an overrun, a tick can be a few
+ms older than the tick before."""
 
 FIRST_ROWS = 4096
 BLOCK = 4096  # number of rows that are thinned together, a multiple of four

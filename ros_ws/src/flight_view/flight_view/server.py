@@ -145,7 +145,7 @@ class Server:
         await self.http.close_all_connections()
 
     def knows(self, token: str | bytes) -> bool:
-        """Return whether a token is that of this server."""
+        """Return whether a token is the right one for this server."""
         return hmac.compare_digest(
             token.encode() if isinstance(token, str) else token, self.token.encode()
         )

@@ -80,7 +80,7 @@ def namespaces(run: Path) -> list[str | None]:
 def require_log(run: Path, namespace: str | None = None, remaps: Mapping[str, str] = {}) -> None:
     """Raise ParameterError if a run has no log of a flight and is not being recorded.
 
-    With a namespace, the flight must be that of the aircraft in it.
+    With a namespace, the aircraft in this namespace must have flown.
     """
     with suppress(OSError):
         if any(is_locked(file) for file in log_files(run)):
