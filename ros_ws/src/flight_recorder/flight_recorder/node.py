@@ -73,7 +73,7 @@ class _Subscribed(RecordedTopic):
 
 
 class _RecordedTopics:
-    """The recorded topics: those of a flight, and those in `names` once they have a publisher."""
+    """The recorded topics: the topics of a flight, and `names` once they have a publisher."""
 
     def __init__(self, node: Node, bag: FlightBag, names: Sequence[str]) -> None:
         self._node = node
