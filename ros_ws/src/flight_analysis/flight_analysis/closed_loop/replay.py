@@ -65,15 +65,15 @@ class ReplayResult(NamedTuple):
     """
 
     names: tuple[str, ...]
-    number: NDArray[np.int64]  # (N,), the channel "number"
-    t: FloatArray  # (N,), s
+    number: NDArray[np.int64]  # the channel "number", (N,)
+    t: FloatArray  # flight time, s, (N,)
     recorded: FloatArray  # (N, k)
-    computed: FloatArray  # (N, k), NaN where nothing was computed
-    checked: NDArray[np.bool_]  # (N,), whether the state before the tick is known
-    # (N,), whether the recorded controller had other parameters
+    computed: FloatArray  # (N, k), NaN if nothing was computed
+    checked: NDArray[np.bool_]  # whether the state before the tick is known, (N,)
+    # # whether the recorded controller had other parameters, (N,)
     other_parameters: NDArray[np.bool_]
     notes: tuple[str, ...]
-    # (N,), whether y and u of the tick are on their topics
+    # # whether y and u of the tick are on their topics, (N,)
     published: NDArray[np.bool_] | None = None
 
     @property

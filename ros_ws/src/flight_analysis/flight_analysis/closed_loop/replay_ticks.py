@@ -277,7 +277,7 @@ def _tick_order(
     """Order the ticks by their instants, and return the order and where each controller starts.
 
     The starts are indices into this order. The ticks of one controller are in the order of their
-    numbers, whichever of them was stored first.
+    numbers, even if they were stored in another order.
     """
     order = np.argsort(now_ns, kind="stable")
     starts = controller_starts(number[order])

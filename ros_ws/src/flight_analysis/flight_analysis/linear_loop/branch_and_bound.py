@@ -133,8 +133,8 @@ def frequency_in(region: Region, highest: float) -> float:
 def _levelled(part: Channels, scale: FloatArray) -> Channels:
     """Scale the channels of a late u so that one factor of X serves them at the worst frequency.
 
-    A delay can change from tick to tick. Its channels must therefore have the same X at all
-    frequencies, up to a common factor.
+    A delay can change from tick to tick. The channels of the delay must therefore have the same X
+    at all frequencies, up to a common factor.
     """
     if not part.late:
         return part

@@ -34,7 +34,7 @@ def delay_margin(
     begins at this margin and takes a third of the time.
     """
     delayed = np.broadcast_to(share, loop.lag.shape)
-    stride = 1  # in parts of 0.1 ms or less
+    stride = 1  # in multiples of the resolution, which is 0.1 ms or less
     while loop.period / 2.0 / stride > 1e-4:
         stride *= 2
     part = loop.period / 2.0 / stride

@@ -81,7 +81,7 @@ class Guarantee(NamedTuple):
     # part of its row up to which each entry that is 0 in the file may deviate, while the others are
     # within `stable`; 0 if such entries stay 0
     zeros: float = 0.0
-    zeros_alone: Zeros | None = None  # how far zeros go if the others are exact; None: not computed
+    zeros_alone: Zeros | None = None  # how far zeros go if the others are exact, if computed
     # "entries" and "steps" of each strongly connected part of the loop, as in `proof_of`
     proof: Sequence[dict[str, Any]] = ()
 

@@ -65,20 +65,20 @@ class Margins(NamedTuple):
     For an unstable loop the gain margins are 1, the other margins 0, and the sensitivity infinite.
     """
 
-    stable: NDArray[np.bool_]  # (...) whether no eigenvalue lies outside the unit circle
-    phase: FloatArray  # (..., m) rad, infinite where abs(L_i) is never 1
-    crossover: FloatArray  # (..., m) rad/s, frequency of the phase margin, 0 without a crossover
+    stable: NDArray[np.bool_]  # whether no eigenvalue lies outside the unit circle, (...)
+    phase: FloatArray  # phase margin, rad, (..., m), infinite if abs(L_i) is never 1
+    crossover: FloatArray  # frequency of the phase margin, rad/s, (..., m), 0 without one
     gain_decrease: (
-        FloatArray  # (..., m) factor below 1 at which the loop becomes unstable, 0 without a limit
+        FloatArray  # factor below 1 at which the loop becomes unstable, (..., m), 0 without a limit
     )
-    gain_increase: FloatArray  # (..., m) the same factor above 1, infinite without a limit
-    sensitivity: FloatArray  # (..., m) largest abs(S_ii)
-    disk: FloatArray  # (..., m) balanced disk margin of an input, 0 to 2
+    gain_increase: FloatArray  # the same factor above 1, (..., m), infinite without one
+    sensitivity: FloatArray  # largest abs(S_ii), (..., m)
+    disk: FloatArray  # balanced disk margin of an input, 0 to 2, (..., m)
     sensitivity_all: (
-        FloatArray  # (...) largest singular value of S, scaled diagonally: all inputs at once
+        FloatArray  # largest singular value of the diagonally scaled S for all inputs, (...)
     )
-    disk_all: FloatArray  # (...) balanced disk margin, with independent disks in all inputs at once
-    damping: FloatArray  # (...) least damping ratio of a slow mode, 1 without a slow mode
+    disk_all: FloatArray  # balanced disk margin for independent disks in all inputs, (...)
+    damping: FloatArray  # least damping ratio of a slow mode, 1 without one, (...)
 
     @property
     def gain(self) -> FloatArray:
@@ -123,8 +123,8 @@ def disk_phase(disk: FloatArray) -> FloatArray:
 class SlowModes(NamedTuple):
     """Oscillating modes of a closed loop that take at least four ticks a cycle, slowest first."""
 
-    frequency: FloatArray  # (k,) natural, rad/s
-    damping: FloatArray  # (k,) ratio
+    frequency: FloatArray  # natural frequency, rad/s, (k,)
+    damping: FloatArray  # damping ratio, (k,)
 
 
 def slow_modes(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> SlowModes:

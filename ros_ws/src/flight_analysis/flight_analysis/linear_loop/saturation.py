@@ -64,7 +64,7 @@ MARGIN = 0.02  # part of the bound 1 that is left for what a check between frequ
 MOST = 2000  # steps of a proof
 NARROWEST = 1e-3  # a half box below this part of the box is not halved again
 STRIDE = 0.1  # part of a frequency by which the next sample of an interval is farther, at most
-TURN = 0.2  # angle by which the farthest tap turns from one sample to the next, at most, rad
+TURN = 0.2  # largest angle by which the farthest tap turns between samples, rad
 BATCH = 200  # samples on each side of a frequency, at most
 
 

@@ -155,9 +155,9 @@ def tightened_at(
 class Centre(NamedTuple):
     """X and G of the linear matrix inequality, at a step of the search for its centre."""
 
-    d: FloatArray  # (p,) diagonal of X
-    g: FloatArray  # (real,) entries of G at the real channels
-    free: FloatArray  # (p, f) map from f free factors to d: channels with one factor share a column
+    d: FloatArray  # diagonal of X, (p,)
+    g: FloatArray  # entries of G at the real channels, (real,)
+    free: FloatArray  # map from f free factors to d, (p, f); equal factors share a column
 
     def inequality(self, N: ComplexArray, level: float) -> ComplexArray:
         """Compute the matrix F of the inequality, (p, p)."""

@@ -32,7 +32,8 @@ SMALLEST = 1e-6  # difference of two times that counts as none, s: it changes no
 # Relative difference of two periods that counts as none. The clocks of two hosts differ by only
 # 1e-4, and a missed tick changes a period by much more.
 SAME_PERIOD = 0.01
-# longest wait in periods of the aircraft: y waits up to one for a tick, and u up to one to act
+# longest wait in periods of the aircraft: y waits up to one period for a tick, and u up to one
+# period to act
 WAITS = 2.0
 
 IN_LOOP = frozenset(

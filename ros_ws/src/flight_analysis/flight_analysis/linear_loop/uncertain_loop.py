@@ -96,8 +96,8 @@ class Channels(NamedTuple):
     D: FloatArray
     entries: tuple[int, ...]  # indices of the entries in the box
     period: float  # s
-    # Number of the channels of a delay. Those of w_0 come first, then those of w_1. Both are
-    # ordered by j, with the m inputs for each j.
+    # Number of the channels of a delay. The channels of w_0 come first, then the channels of w_1.
+    # Both groups are ordered by j, with the m inputs for each j.
     late: int = 0
 
     @property

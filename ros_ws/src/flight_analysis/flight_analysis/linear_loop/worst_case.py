@@ -46,7 +46,7 @@ ROUNDS = 12  # largest number of moves to other corners
 POLISHED = 4  # number of corners from which each flip of an entry is tried
 CLIMBERS = 24  # number of further corners at which climbs start
 LONGEST_CLIMB = 40  # largest number of flips in a climb
-FALL = 0.005  # the next size to try is smaller than the least one found by this fraction
+FALL = 0.005  # fraction by which the next size to try is smaller than the least found
 RESOLUTION = 1e-4  # resolution of the size of an unstable deviation
 NEAR = 2.5  # a mode counts as near a frequency if the two differ by at most this factor
 SLOWEST = 0.05  # frequency, rad/s, below which a mode counts as one at 0 rad/s
@@ -262,9 +262,9 @@ class WorstCase(NamedTuple):
     """The least margins that were found in a box. Each margin can belong to another aircraft."""
 
     worst: Margins
-    corners: FloatArray  # (N, k) deviations of all aircraft that were tried
+    corners: FloatArray  # deviations of all aircraft that were tried, (N, k)
     margins: Margins  # margins of these N aircraft
-    least_phase: FloatArray  # (k,) deviations of the aircraft with the smallest phase margin
+    least_phase: FloatArray  # deviations with the smallest phase margin, (k,)
 
 
 def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box) -> WorstCase:

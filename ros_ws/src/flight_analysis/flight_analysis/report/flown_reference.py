@@ -66,7 +66,7 @@ class NotCompared(Enum):
 class ReferenceErrors(NamedTuple):
     """The difference between the y_m of a log and the y_m of the scenario."""
 
-    t: FloatArray  # (N,) flight time, s
+    t: FloatArray  # flight time, s, (N,)
     outputs: tuple[str, ...]
     error: FloatArray  # y_m of the log less y_m of the scenario, (N, m), SI
     allowed: FloatArray  # largest abs(error) that counts as none, (m,), SI

@@ -68,7 +68,7 @@ NOISE_PEAK = 3.0
 
 
 class Knowledge(NamedTuple):
-    """What is known of a simulated flight beyond y and u."""
+    """What is known about the aircraft and the wind of a flight."""
 
     has_model: bool  # whether A and B of the aircraft are known
     has_wind: bool  # whether the log has the wind that moved the aircraft
@@ -77,12 +77,12 @@ class Knowledge(NamedTuple):
 class ErrorPair(NamedTuple):
     """The errors of a flight and those of the linear loop, at the ticks of the controller."""
 
-    t: FloatArray  # (N,) flight time, s
+    t: FloatArray  # flight time, s, (N,)
     names: tuple[str, ...]
     e: FloatArray  # error of the flight, (N, m), SI
     y_m: FloatArray  # (N, m)
     linear: "LinearErrors"
-    is_flown: NDArray[np.bool_]  # (N,), whether the law should fly and the log has the error
+    is_flown: NDArray[np.bool_]  # whether the law should fly and the log has the error, (N,)
     not_numbers: int  # number of ticks with an error that is not finite
     noise: FloatArray  # rms of the noise in e, (m,), which is 0 for a true error
     knowledge: Knowledge
@@ -96,9 +96,9 @@ class LinearErrors(NamedTuple):
     """
 
     whole: FloatArray
-    command: FloatArray  # by the commands alone
-    noise: FloatArray  # by the noise alone
-    wind: FloatArray  # by the wind alone
+    command: FloatArray  # caused by the commands alone
+    noise: FloatArray  # caused by the noise alone
+    wind: FloatArray  # caused by the wind alone
 
 
 class Reach(NamedTuple):
