@@ -55,9 +55,9 @@ class DecompositionError(ParameterError):
 class SDU(NamedTuple):
     """Factors of Omega = S diag(D) U, equations (10)-(11)."""
 
-    S: FloatArray  # (m, m) symmetric positive definite, units of y_dot
-    D: FloatArray  # (m,) diagonal of D, +1 or -1
-    U: FloatArray  # (m, m) upper triangular with a diagonal of ones
+    S: FloatArray  # symmetric positive definite, units of y_dot, (m, m)
+    D: FloatArray  # diagonal of D, +1 or -1, (m,)
+    U: FloatArray  # upper triangular with a diagonal of ones, (m, m)
 
 
 class Pairing(NamedTuple):
@@ -159,11 +159,11 @@ def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
     Up to MANY channels, every order of the outputs is combined with every order of the inputs,
     which is (m!)^2 cases. With more channels only three orders are tried: the given one, the inputs
     by their largest responses, and the order of complete pivoting. A smaller change may then exist,
-    even if None is returned. For each combination the signs of the inputs follow, namely as D,
-    because the sign of input k changes only D_k. Pairings are preferred in this order: most outputs
-    keep their input, most outputs keep their place, most inputs keep their sign, and max abs(U - I)
-    in inputs of unit response is smallest. Orders with a zero on the diagonal, or with max abs(U -
-    I) above `largest_U`, are excluded.
+    even if None is returned. Each combination determines the signs of the inputs, which are those
+    in D, because the sign of input k changes only D_k. Pairings are preferred in this order: most
+    outputs keep their input, most outputs keep their place, most inputs keep their sign, and max
+    abs(U - I) in inputs of unit response is smallest. Orders with a zero on the diagonal, or with
+    max abs(U - I) above `largest_U`, are excluded.
 
     Raises DecompositionError if Omega is not square or not finite.
     """
