@@ -34,8 +34,8 @@ class LinearSystems(NamedTuple):
 def linear_systems(scenario: Scenario) -> LinearSystems:
     """Return plant, law and closed loop of a scenario as linear systems of python-control.
 
-    `margins` and `rise-di gains check` compute the margins of this loop. It holds at y_m = 0 and
-    inside all limits. With an allocation, `u_NAME` are the channels of the law.
+    `margins` and `rise-di gains check` compute the margins of this loop. The loop holds at y_m = 0
+    and inside all limits. With an allocation, `u_NAME` are the channels of the law.
 
     Args:
         scenario: The aircraft and the controller.
