@@ -228,10 +228,10 @@ class Fly(RouteWords):
         return scenario if files is None else self._with_files(scenario)
 
     def _may_choose(self, scenario: Scenario) -> bool:
-        """Return whether the load of the host decides between real time and lockstep.
+        """Return whether the capacity of the host decides between real time and lockstep.
 
-        It does not decide if an autopilot or a simulator has its own time, or if a user activates
-        the controller.
+        The capacity does not decide if an autopilot or a simulator has its own time, or if a user
+        activates the controller.
         """
         by_clock = self.use_sim_time or scenario.flight.use_sim_time
         has_own_time = by_clock or self.bridge is not None
