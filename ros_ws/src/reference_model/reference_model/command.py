@@ -16,7 +16,7 @@ from flight_core.vectors import Array, FloatArray
 class Line(NamedTuple):
     """A piecewise linear signal through points, held before the first and after the last point."""
 
-    time: FloatArray  # (N,) s, increasing
+    time: FloatArray  # increasing times, s, (N,)
     value: FloatArray  # (N,) in the channel's unit
 
 
@@ -35,7 +35,7 @@ class Edge(NamedTuple):
 class Polyline(NamedTuple):
     """The sum of the piecewise linear signals of m channels, with K common knots."""
 
-    time: FloatArray  # (K,) s, increasing
+    time: FloatArray  # increasing times of the knots, s, (K,)
     value: FloatArray  # values at the knots, (K, m)
     slope: FloatArray  # slope from each knot to the next, (K, m), per s; 0 after the last
     area: FloatArray  # integral from the first knot, (K, m)
