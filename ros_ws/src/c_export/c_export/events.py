@@ -317,8 +317,8 @@ def flight_recordings(
 ) -> Iterator[Recording]:
     """Yield recordings of flights in one process: undisturbed, with a tenth of y lost, and faulty.
 
-    The faults are new parameters, deactivation, engagement and tight limits, and losses of y or y_m
-    that end within the hold, within the ramp, and after the ramp.
+    The faults are new parameters, deactivation, engagement, tight limits, and losses of y or y_m.
+    A loss ends while the failsafe holds u, while it ramps u to trim, or after this ramp.
     """
     sensors = scenario.aircraft.sensors.model_dump() | {"dropout": 0.1}
     yield _flight("the flight", scenario, Recorder(sets, samples=samples))

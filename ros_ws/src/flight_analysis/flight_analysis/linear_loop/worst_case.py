@@ -201,7 +201,10 @@ def _climbed(
 
 
 def _radii(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
-    """Return the largest abs(z) of a mode near a frequency, shape (...), for d of (..., k)."""
+    """Return the largest abs(z) of a mode near a frequency for each d.
+
+    `d` has the shape (..., k), and the result has the shape (...).
+    """
     return np.asarray(_near(np.linalg.eigvals(part.at(d).A), frequency, part.period).max(axis=-1))
 
 

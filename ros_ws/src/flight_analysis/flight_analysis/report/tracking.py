@@ -12,8 +12,8 @@ output with its own command. The excuse is FACTOR times the error that noise and
 most MOST over a WINDOW. If an aircraft shakes more than this, the flight is no success, whatever
 the cause. The floor is
 
-- the fraction HARMLESS of the least errors of a divergence, which is 0.02 rad/s and 0.2 m/s, plus
-  the noise of a measured error, at most MOST;
+- the fraction HARMLESS of the least errors of a divergence, plus the noise of a measured error, at
+  most MOST. This fraction is 0.02 rad/s for a rate and 0.2 m/s for the airspeed;
 - the fraction SPEED_PART of the trim speed, while V changes by its command or by the wind, if the
   model of the aircraft and therefore its drag is unknown;
 - the least errors of a divergence, 0.1 rad/s and 1 m/s, if the wind is unknown.
