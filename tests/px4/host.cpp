@@ -16,6 +16,7 @@ orb_metadata orb_vehicle_angular_velocity, orb_airspeed_validated, orb_vehicle_l
 	     orb_vehicle_torque_setpoint_virtual_fw, orb_vehicle_thrust_setpoint_virtual_mc, orb_vehicle_torque_setpoint_virtual_mc,
 	     orb_manual_control_setpoint, orb_rise_di_status, orb_vehicle_thrust_setpoint, orb_vehicle_torque_setpoint;
 float parameter_values[8];
+unsigned places;
 
 // PX4 cuts a line of its log after 126 characters, of which 43 are level, name of the module and colours.
 static void print(const char *text, va_list values, size_t size)
@@ -91,6 +92,9 @@ int main(int argc, char **argv)
 		for (int i = 0; i < 3; i++) { not_numbers += !std::isfinite(torque.xyz[i]) || !std::isfinite(sent.xyz[i]); }
 
 		if (torque.timestamp_sample != now_us && !(past && is("rates"))) { printf("told %.2f late torque\n", t); }
+
+		// PX4's allocator runs on the torque, and takes the thrust that it finds then
+		if (orb_vehicle_thrust_setpoint.place > orb_vehicle_torque_setpoint.place) { printf("told %.2f late thrust\n", t); }
 
 		if (k == 1999) {
 			printf("published %u %u not_numbers %u thrust %.4f wanted %.4f torque %.4f\n", orb_vehicle_torque_setpoint.generation,

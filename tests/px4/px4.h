@@ -32,7 +32,9 @@ namespace time_literals { constexpr hrt_abstime operator""_ms(unsigned long long
 constexpr hrt_abstime operator""_s(unsigned long long t) { return t * 1000000; } }
 
 namespace px4 { struct ScheduledWorkItem; }
-struct orb_metadata { unsigned char data[256]; unsigned generation; px4::ScheduledWorkItem *callback; };
+// `place` is that of the last sample among the samples of all topics.
+struct orb_metadata { unsigned char data[256]; unsigned generation; px4::ScheduledWorkItem *callback; unsigned place; };
+extern unsigned places;
 extern orb_metadata orb_vehicle_angular_velocity, orb_airspeed_validated, orb_vehicle_land_detected, orb_vehicle_control_mode,
        orb_parameter_update, orb_vehicle_rates_setpoint, orb_vehicle_thrust_setpoint_virtual_fw,
        orb_vehicle_torque_setpoint_virtual_fw, orb_vehicle_thrust_setpoint_virtual_mc,
@@ -133,6 +135,7 @@ template <typename T> struct Publication {
 	{
 		memcpy(_topic->data, &value, sizeof value);
 		_topic->generation++;
+		_topic->place = ++places;
 		return true;
 	}
 private:

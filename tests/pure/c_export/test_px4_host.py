@@ -123,6 +123,7 @@ def test_takes_over_and_hands_on_the_thrust(program: Path) -> None:
     assert texts(flight, "RISE-DI flies")[0] == approx(2.0, abs=0.01)
     assert flight.published == CYCLES
     assert flight.thrust == flight.wanted
+    assert texts(flight, "late thrust") == []
     assert texts(flight, "refused while armed")
 
 

@@ -195,7 +195,6 @@ void RiseDiControl::publish(bool flies)
 	for (int k = 0; k < 3; k++) { torque.xyz[k] = _rates.torque[k]; }
 
 	torque.timestamp = hrt_absolute_time();
-	_torque_pub.publish(torque);
 
 	vehicle_thrust_setpoint_s thrust{};
 	thrust.timestamp = torque.timestamp;
@@ -203,7 +202,9 @@ void RiseDiControl::publish(bool flies)
 
 	for (int k = 0; k < 3; k++) { thrust.xyz[k] = _rates.thrust[k]; }
 
+	// The allocator runs on the torque, and takes the thrust that it finds then (PX4 1.17 publishes in this order, too).
 	_thrust_pub.publish(thrust);
+	_torque_pub.publish(torque);
 
 	status.timestamp = torque.timestamp;
 	status.timestamp_sample = flies ? _rates.y_us : _velocity.timestamp_sample;
