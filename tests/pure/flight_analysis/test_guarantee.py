@@ -97,6 +97,16 @@ def test_gain_of_integrator_may_rise_to_two_over_k_period(k: float) -> None:
     assert promise.unstable.frequency == approx(np.pi / PERIOD)
 
 
+def test_each_step_of_the_work_is_told() -> None:
+    """A size that is proved was tried, so it was told."""
+    told: list[str] = []
+    promise = guarantee(integrator(150.0, 0.3), report=told.append)
+    sizes = [float(text.split()[-2]) for text in told if text.startswith("proving every aircraft")]
+    assert any(abs(size - 100.0 * promise.stable) <= 0.051 for size in sizes)
+    assert told[0] == "searching for an unstable aircraft"
+    assert told[-1].startswith("proving the disk margin of ")
+
+
 def test_disk_margin_of_integrator_is_that_of_its_worst_gain() -> None:
     """S - 1/2 at pi / T is 1 / (1 - k T (1 + d) / 2) - 1/2, the largest for the largest gain."""
     promise = guarantee(integrator(120.0, 0.2))

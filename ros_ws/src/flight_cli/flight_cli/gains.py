@@ -318,7 +318,7 @@ class Guarantee(Check):
             if self.saturation is not None:
                 self._bound_limited(answer, loop)
                 return
-            promise = proved(answer, self.late)
+            promise = proved(answer, self.late, status.update)
             lines = write_certificate(self.certificate, loop, promise, self.airframe, self.scenario)
             lines += write_unstable(self.worst, promise, self.airframe, self.scenario)
         name = Path(self.scenario).stem

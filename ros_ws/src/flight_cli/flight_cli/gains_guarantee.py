@@ -4,6 +4,7 @@
 
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -72,17 +73,20 @@ def require_guarantee(
     require(fits, "certificate", certificate, "a file in a folder that can be written")
 
 
-def proved(answer: GainAssessment[ControllerConfig], late: float) -> Guarantee:
+def proved(
+    answer: GainAssessment[ControllerConfig], late: float, report: Callable[[str], None]
+) -> Guarantee:
     """Return the guarantee of a loop, and keep it for the pages of its flights.
 
     If the box leaves out the entries that are 0 in the file, the guarantee also says how far they
-    may deviate while the others are exact. Raises ParameterError before the proof if the aircraft
-    has no linear loop.
+    may deviate while the others are exact. `report` is told each step. Raises ParameterError before
+    the proof if the aircraft has no linear loop.
     """
     loop = answer.loop_with_box()
     require_linear(loop)
-    promise = guarantee(loop, late)
+    promise = guarantee(loop, late, report)
     if not answer.study.spread.zeros:
+        report("proving how far the entries that are 0 in the file may go")
         zeros = answer.study._replace(uncertainty=0.0, spread=Spread(zeros=1.0))
         alone = zeros_alone(loop_with_box(zeros, answer.controller), late)
         promise = promise._replace(zeros_alone=alone)

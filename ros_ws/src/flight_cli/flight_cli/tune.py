@@ -200,7 +200,8 @@ class Tune:
         found = candidates(selectors)
         best = best_of(found, accept=self.accept)
         say(console, f"best: {best.name}; bounding every aircraft within the errors")
-        promise = _promise(best.scenario, airframe, entries)
+        with console.status("checking the gains on uncertain airframes") as status:
+            promise = _promise(best.scenario, airframe, entries, status.update)
         own = own_loop(of_log.taken.parameters, best.scenario, autopilot)
         return Tuned(
             identification=identification,
@@ -268,12 +269,20 @@ def _with_lead(controller: RiseDiConfig) -> RiseDiConfig:
     return controller.model_copy(update={"feedforward": feedforward})
 
 
-def _promise(scenario: Scenario, airframe: Airframe, entries: Mapping[str, float]) -> Guarantee:
-    """Return the guarantee for A and B within their errors, or within LEAST without an error."""
+def _promise(
+    scenario: Scenario,
+    airframe: Airframe,
+    entries: Mapping[str, float],
+    report: Callable[[str], None],
+) -> Guarantee:
+    """Return the guarantee for A and B within their errors, and tell each step to `report`.
+
+    An entry without an error may be off by the fraction LEAST.
+    """
     answer = check_gains(
         airframe, scenario, uncertainty=LEAST, samples=SAMPLES, entries=entries, as_told=True
     )
-    return guarantee(answer.loop_with_box())
+    return guarantee(answer.loop_with_box(), report=report)
 
 
 def _identified(

@@ -7,7 +7,7 @@ It assumes that the deviations are constant in time, and that the loop is linear
 or rate limits.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,11 +108,14 @@ class Guarantee(NamedTuple):
         return content
 
 
-def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
+def guarantee(
+    linear: LinearLoop, late: float = 0.0, report: Callable[[str], None] = lambda _: None
+) -> Guarantee:
     """Compute the guarantee for the box of a loop.
 
     The guarantee holds although each input is late by an unknown time from 0 to `late`, s, which
-    changes from tick to tick. Raises ParameterError if the loop has no box.
+    changes from tick to tick. The work can take minutes, and `report` is told each of its steps.
+    Raises ParameterError if the loop has no box.
     """
     box = linear.box
     require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
@@ -133,6 +136,7 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     if not is_stable(linear.nominal, linear.law, linear.loop, np.zeros(len(linear.inputs))):
         return none
     uncertain = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
+    report("searching for an unstable aircraft")
     first = _first_unstable(linear, late)
     size = 1.0 / float(box.part.max()) if first is None else first.deviation / largest
     # beyond MOST_OF_LAG nothing can be proved for a lag
@@ -140,21 +144,19 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     exact = first is None or most < size
     reserve = LAG_SLACK if is_lag.any() else 0.0
     parts = parts_of(uncertain)
-    proved, proof = _proved(parts, min(size, most), disks=False, exact=exact, reserve=reserve)
+
+    def show(proved: float) -> None:
+        report(f"proving every aircraft within {100.0 * largest * proved:.1f} %")
+
+    proved, proof = _proved(
+        parts, min(size, most), disks=False, exact=exact, reserve=reserve, show=show
+    )
     promise = none._replace(
         stable=largest * proved, unstable=first, proof=proof, zeros=box.largest_zero * proved
     )
     if not promise.holds:
         return promise
-    loops = _loops(linear, late)
-    worst = [worst_in_box(linear.nominal, linear.law, loop, box).worst for loop in loops]
-    places = tuple(range(len(linear.inputs)))
-    disk_all = _disk(uncertain, places, min(float(least.disk_all) for least in worst))
-    disks = {}
-    for i, name in enumerate(linear.inputs):
-        least_found = min(float(least.disk[i]) for least in worst)
-        # disks in all inputs at once include a disk in one input
-        disks[name] = max(_disk(uncertain, (i,), least_found), disk_all)
+    disks, disk_all = _disks(linear, uncertain, late, report)
     return promise._replace(disk=disks, disk_all=disk_all)
 
 
@@ -208,6 +210,27 @@ def _first_unstable(linear: LinearLoop, late: float, *, quick: bool = False) -> 
     return min(filter(None, found), key=lambda unstable: unstable.deviation, default=None)
 
 
+def _disks(
+    linear: LinearLoop, uncertain: Channels, late: float, report: Callable[[str], None]
+) -> tuple[dict[str, float], float]:
+    """Return the disk margin proved in each input alone, by its name, and in all at once."""
+    box = linear.box
+    assert box is not None  # noqa: S101 - for mypy
+    report("searching for the aircraft with the least margins")
+    loops = _loops(linear, late)
+    worst = [worst_in_box(linear.nominal, linear.law, loop, box).worst for loop in loops]
+    report("proving the disk margin in all inputs at once")
+    places = tuple(range(len(linear.inputs)))
+    disk_all = _disk(uncertain, places, min(float(least.disk_all) for least in worst))
+    disks = {}
+    for i, name in enumerate(linear.inputs):
+        report(f"proving the disk margin of {name}")
+        least_found = min(float(least.disk[i]) for least in worst)
+        # disks in all inputs at once include a disk in one input
+        disks[name] = max(_disk(uncertain, (i,), least_found), disk_all)
+    return disks, disk_all
+
+
 def _disk(loop: Channels, inputs: tuple[int, ...], least: float) -> float:
     """Return the disk margin that is proved for every aircraft of the box.
 
@@ -224,15 +247,18 @@ def _proved(
     exact: bool = False,
     finer_gaps: Sequence[float] = FINER_GAPS,
     reserve: float = 0.0,
+    show: Callable[[float], None] = lambda _: None,
 ) -> tuple[float, list[dict[str, Any]]]:
     """Prove the largest size possible below `least`, and return this size and the proof.
 
     The size belongs to the deviations. If `disks` is True, it belongs to the disks, and the
     deviations cover the whole box. The size is 0 if none is proved. `least` is a size that a search
-    found too large. If `exact` is True, it may be provable, and is tried first.
+    found too large. If `exact` is True, it may be provable, and is tried first. `show` gets each
+    size before its proof is tried.
     """
     for proved in (*(0.0,) * exact, *GAPS):
         most = FEWER_BOXES if disks or proved > GAPS[0] else BOXES
+        show(least / (1.0 + proved))
         proof = _proof(parts, least / (1.0 + proved), most, disks=disks, reserve=reserve)
         if proof is not None:
             break
@@ -242,6 +268,7 @@ def _proved(
         if sum(len(part["steps"]) for part in proof) > FEWER_BOXES:
             break
         size = least / (1.0 + finer)
+        show(size)
         tighter = _proof(parts, size, FEWER_BOXES, disks=disks, reserve=reserve)
         if tighter is None:
             break
