@@ -26,7 +26,9 @@ from flight_analysis.linear_loop.input_margins import input_margins
 from flight_analysis.linear_loop.loop_margins import LinearLoop, box_of, margins, scenario_loop
 from flight_analysis.linear_loop.structured_value import (
     Centre,
+    Scaling,
     bound_at,
+    is_below_one,
     tightened,
 )
 from flight_analysis.linear_loop.uncertain_loop import (
@@ -156,6 +158,19 @@ def test_every_scaling_is_above_corners_of_small_matrices() -> None:
         real = np.abs(values[np.abs(values.imag) < 1e-12].real)
         value, _ = tightened(M.astype(complex), 3, 0.0)
         assert value >= real.max(initial=0.0) * (1.0 - 1e-9)
+
+
+def test_bound_below_one_is_that_of_the_eigenvalues() -> None:
+    """Matrices scaled around the bound 1, all below it, all above, and some of each."""
+    rng = np.random.default_rng(4)
+    M = rng.standard_normal((40, 5, 5)) + 1j * rng.standard_normal((40, 5, 5))
+    scaling = Scaling(0.3 * rng.standard_normal(5), np.r_[rng.standard_normal(3), 0.0, 0.0])
+    parts = np.asarray(np.linspace(0.0, 0.5, 40)[:, None, None] * M, dtype=np.complex128)
+    expected = bound_at(parts, scaling) < 1.0
+    assert 5 < expected.sum() < 35
+    assert is_below_one(parts, scaling).tolist() == expected.tolist()
+    for some in (expected, ~expected):
+        assert is_below_one(parts[some], scaling).tolist() == expected[some].tolist()
 
 
 def test_bound_is_that_of_slicot() -> None:
