@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gains for an aircraft, with margins, and observers."""
+"""Selection of the law's gains and observers for an aircraft, with the margins of the loop."""

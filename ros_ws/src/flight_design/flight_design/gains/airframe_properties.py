@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The theorem's assumptions on an airframe, checked on the matrices.
+"""Check the theorem's assumptions on an airframe, with the matrices of the airframe.
 
-The table has Remark 1 and Assumptions 1 and 3. Assumption 2 (f is C1, f and f_dot bounded) needs no
-check: the file's schema bounds gusts and sine terms, which are C1 and have bounded rates for
-bounded angular rates.
+The table of these facts covers Remark 1 and Assumptions 1 and 3. Assumption 2 (f is C1, and f and
+f_dot are bounded) needs no check. The schema of an airframe file bounds gusts and sine terms. They
+are C1, and their rates are bounded as long as the angular rates are.
 """
 
 from collections.abc import Sequence
@@ -47,14 +47,14 @@ class ZeroDynamics(StrEnum):
     """Location of the invariant zeros, which decides whether Assumption 3 holds."""
 
     STABLE = "stable"  # all in the open left half plane
-    # some on the imaginary axis: outside the theorem too, since an outer loop must control these
-    # angles
+    # some on the imaginary axis. This is outside the theorem too, because an outer loop must
+    # control the angles to which these zeros belong.
     MARGINAL = "marginal"
-    UNSTABLE = "unstable"  # one in the right half plane: outside the theorem
+    UNSTABLE = "unstable"  # some in the right half plane: outside the theorem
 
 
 class AirframeFacts(NamedTuple):
-    """The theorem's assumptions on an airframe, in SI: a row of the table."""
+    """The facts that decide whether the theorem applies to an airframe, in SI."""
 
     name: str
     n: int
@@ -65,22 +65,23 @@ class AirframeFacts(NamedTuple):
     Omega: FloatArray  # (m, m) C B
     minors: FloatArray  # (m,) leading minors of Omega
     D: FloatArray | None  # (m,) diagonal of D, None if a minor is (nearly) zero
-    coupling: float | None  # max abs(U - I) in inputs of unit response, None if D is None
+    coupling: float | None  # (m,) signs on the diagonal of D; None if a minor is (nearly) zero
     outputs: tuple[str, ...]
     inputs: tuple[str, ...]
-    # from `search`: the change that makes D = I; None if no order that was tried has such a change
+    # the change that makes D = I, as `search` finds it; None if none of the orders that were tried
+    # has such a change
     pairing: Pairing | None
     zero_dynamics: ZeroDynamics
     controllable: bool  # Assumption 1
-    # states that integrate nothing but outputs: each of them gives a zero at the origin
+    # states that are integrals of outputs alone. Each of them gives a zero at the origin.
     integrated: tuple[str, ...]
 
     @property
     def in_theorem(self) -> bool:
-        """Whether the checks hold.
+        """Whether the theorem applies to the airframe.
 
-        They are Assumption 1, that D exists (10)-(11), and that no zero lies in the right half
-        plane.
+        It does if Assumption 1 holds, if D of (10)-(11) exists, and if no zero lies in the right
+        half plane.
         """
         return (
             self.controllable
@@ -90,7 +91,7 @@ class AirframeFacts(NamedTuple):
 
     @property
     def remedy(self) -> str:
-        """Change that makes D = I, as text.
+        """Change of pairs and signs that makes D = I, as text.
 
         Examples are "none needed", "flip rudder", "pair p-rudder, r-aileron, flip rudder", "none".
         """
@@ -111,10 +112,10 @@ class AirframeFacts(NamedTuple):
 def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
     """Compute poles, zeros, Omega = C B with D, and Assumptions 1 and 3 of an airframe, in SI.
 
-    The airframe may be a name or a file. Source: Assumptions 1 and 3, equations (10)-(11) and
-    Remark 1 of Tanyer, Tatlicioglu, Zergeroglu. Zeros are those of the linear part (A, B, C),
-    without f, but a published A may contain gravity. If there are more inputs than outputs, the
-    pseudo-inverse of C B, in SI, makes them m inputs of the law.
+    Source: Assumptions 1 and 3, equations (10)-(11) and Remark 1 of Tanyer, Tatlicioglu,
+    Zergeroglu. The zeros are those of the linear part (A, B, C), so f has no effect on them. A
+    published A may still contain gravity. If there are more inputs than outputs, the pseudo-inverse
+    of C B, in SI, combines them to m inputs of the law.
 
     Args:
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
@@ -177,11 +178,12 @@ def library() -> list[AirframeFacts]:
 
 
 def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:
-    """Find the finite s, 1/s, at which Rosenbrock's pencil [[A - s I, B], [C, 0]] loses rank.
+    """Find the invariant zeros, the finite s at which a pencil loses rank, in 1/s, by real part.
 
-    They are sorted by real part. The shapes are A (n, n), B (n, m), C (m, n). There are n - m zeros
-    if C B is nonsingular. They are the poles of the zero dynamics, which is the motion of the
-    aircraft with y = 0. Source: H. H. Rosenbrock, "State-Space and Multivariable Theory", 1970.
+    The pencil is that of Rosenbrock, [[A - s I, B], [C, 0]]. The shapes are A (n, n), B (n, m), C
+    (m, n). There are n - m zeros if C B is nonsingular. The zeros are the poles of the zero
+    dynamics, which is the motion of the aircraft while y = 0. Source: H. H. Rosenbrock,
+    "State-Space and Multivariable Theory", 1970.
     """
     n, m = B.shape
     pencil = np.block([[A, B], [C, np.zeros((m, m))]])
@@ -200,11 +202,11 @@ def fastest_zero(A: FloatArray, B: FloatArray, C: FloatArray) -> float:
 
 
 def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return P (n, m), N (n, n - m) and H (n, n - m) with x = P y + N eta, eta = H' x.
+    """Return P (n, m), N (n, n - m) and H (n, n - m) with x = P y + N eta and eta = H' x.
 
-    y are the outputs. A QR decomposition of C with pivoting picks the m states on which y depends
-    most, and eta has the n - m others. Raises ParameterError unless C (m, n) has full rank. If C
-    selects states, P = C' and N = H.
+    They split the state x into the outputs y and the n - m other coordinates eta. A QR
+    decomposition of C with pivoting picks the m states on which y depends most. Raises
+    ParameterError unless C (m, n) has full rank. If C selects states, P = C' and N = H.
     """
     m, n = C.shape
     _, R, pivots = qr(C, pivoting=True)
@@ -237,9 +239,9 @@ def marginal_sentence(facts: Sequence[AirframeFacts]) -> str | None:
 
 
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
-    """Say in which half plane the zeros lie, 1/s, shape (n - m,), for (5)-(9).
+    """Say in which half plane the zeros lie, in 1/s, shape (n - m,), for (5)-(9).
 
-    Within ZERO_REAL_PART they count as on the imaginary axis.
+    A zero whose real part is at most ZERO_REAL_PART counts as on the imaginary axis.
     """
     rightmost = float(np.max(zeros.real, initial=-np.inf))
     if rightmost > ZERO_REAL_PART:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The signs D of a pairing of inputs and outputs, checked against Omega = C B."""
+"""Check the signs D of a pairing of inputs and outputs against Omega = C B."""
 
 from collections.abc import Sequence
 
@@ -23,17 +23,17 @@ def signs_of_pairing(
     D: Sequence[int] | None = None,
     input_signs: Sequence[int] | None = None,
 ) -> FloatArray:
-    """Return D of a pairing of channels, shape (m,).
+    """Return the signs D of a pairing of inputs with outputs, shape (m,).
 
-    Omega = C B is in the order of the channels, (m, m), with the airframe's signs of the inputs.
-    `input_signs` has -1 for an input whose sign is flipped between law and airframe. Such a flip
-    changes the sign of D_k and nothing else. The checks are made in this order:
+    Omega = C B, (m, m), is in the order of the channels, and its inputs have the signs of the
+    airframe. `input_signs` has -1 for an input whose sign is flipped between law and airframe. Such
+    a flip changes the sign of D_k and nothing else. The checks are made in this order:
 
     1. The pairing has a D, and max abs(U - I) is at most 10.
     2. The input signs fit the D that is given.
     3. D fits Omega.
 
-    Raises ParameterError, which names the contradiction to Omega and a choice that fits.
+    Raises ParameterError, which names what contradicts Omega and a choice that fits.
     """
     m = len(Omega)
     flips = np.ones(m) if input_signs is None else np.array(input_signs, dtype=np.float64)

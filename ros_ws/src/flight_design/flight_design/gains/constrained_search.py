@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A search for factors on gains, so that a loop meets a requirement at the least cost.
+"""Search for factors on gains, so that a loop meets a requirement at the least cost.
 
-A place is a tuple of k m exponents: k factors for each of m channels. Each factor is STEP to the
-power of its exponent, a whole number, so that the search is deterministic. Source of the pattern
-search: R. Hooke, T. A. Jeeves, Journal of the ACM 8(2), 1961.
+Each of the m channels has k factors. A place of the search is a tuple of the k m exponents of these
+factors: a factor is STEP to the power of its exponent. Exponents are whole numbers, so that the
+search is deterministic. Source of the pattern search: R. Hooke, T. A. Jeeves, Journal of the ACM
+8(2), 1961.
 """
 
 import math
@@ -19,25 +20,26 @@ Place = tuple[int, ...]
 IntArray = NDArray[np.int64]
 
 STEP = 1.05  # the factor that an exponent of 1 stands for
-GAIN = 0.01  # least fall of cost or shortage that counts as better: 1 % of the cost, or of a goal
+GAIN = 0.01  # least fall of cost or shortage that counts as better: 1 % of a cost or of a goal
 REACH = 16  # largest change of an exponent by one move while there is a shortage: a factor of 2.2
 
 
 class Moves(NamedTuple):
-    """The moves of a search. A move has the changes of the k exponents of a channel."""
+    """The moves that a search tries. A move changes the k exponents of a channel."""
 
     mending: Sequence[tuple[int, ...]]  # moves that may reduce a shortage
     cheaper: Sequence[tuple[int, ...]]  # moves that may lower the cost
-    begin: int = 1  # reach of the first moves: the factor by which a move is multiplied
+    begin: int = 1  # reach of the first moves, which is the factor by which a move is multiplied
     is_joint: bool = False  # whether all channels may move together while there is a shortage
 
 
 class Trial(NamedTuple, Generic[Content]):
-    """A place, with the shortage and the cost of its loop."""
+    """A place of the search, with the shortage and the cost of its loop."""
 
     place: Place
-    shortage: float  # sum over the goals of 1 - found / needed where this is above 0
-    # a logarithm, so that a difference of costs stands for a ratio; infinite if there is a shortage
+    shortage: float  # sum of 1 - found / needed over the goals that the loop misses
+    # cost of the loop as a logarithm, so that a difference of costs stands for a ratio; infinite if
+    # there is a shortage
     cost: float
     content: Content
 
@@ -68,10 +70,10 @@ def descend(
 ) -> Trial[Content]:
     """Move from a start until no move of a single channel helps, and return the last trial.
 
-    `lowest` and `highest`, (k, m), bound the exponents. While there is a shortage, the best move
-    among those of all channels is taken, and the reach doubles if none of them helps. If there is
-    no shortage, each channel moves in turn, beginning with the last reach. The reach is halved if
-    no move helps.
+    `lowest` and `highest`, (k, m), bound the exponents. As long as there is a shortage, the search
+    takes the best move of all channels, and doubles the reach if no move helps. Then each channel
+    moves in turn, beginning with the reach that the search has at that moment, and the reach is
+    halved whenever no move helps.
     """
     best = start
     reach = moves.begin

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Design of an allocation for the effectors of an airframe.
+"""Design the allocation for an airframe that has more effectors than outputs.
 
-It finds the matrix T of u = T v, and the inputs v with their limits and lags, which the law uses.
+The design gives the matrix T of u = T v. It also gives the inputs v, which the law uses, with their
+limits and lags.
 """
 
 from collections.abc import Sequence
@@ -18,33 +19,34 @@ from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from rise_di_controller.extensions.model_sections import AllocationConfig
 
-LAW_INPUT = "v_"  # beginning of the name of an input of the law: v_q belongs to the output q
-DIGITS = 10  # digits of T and effect in a file, so that their product is I to 1e-9
-# s, lag of a fast servo. The weights add it to each lag, or else an ideal servo would do all work.
+LAW_INPUT = "v_"  # prefix of the names of the law's inputs: v_q belongs to the output q
+DIGITS = 10  # digits of T and effect in a file, so that their product is I within 1e-9
+# lag of a fast servo, s. The weights add it to each lag. Without it an ideal servo, which has no
+# lag, would do all the work.
 SERVO = 0.01
-# An effector does not limit an input of the law if it gives less than this fraction of what the
-# effector with the largest share gives.
+# An effector limits an input of the law only if its share is at least this fraction of the largest
+# share of an effector.
 SMALL = 1e-9
 
 
 class Effectors(NamedTuple):
-    """The effectors of an airframe, in its order: deviations from trim in SI, shapes (p,)."""
+    """The effectors of an airframe in its order, as deviations from trim in SI, shape (p,) each."""
 
-    lower: FloatArray  # end stops
+    lower: FloatArray  # lower end stops
     upper: FloatArray
-    rate: FloatArray  # per s, infinite without a limit
-    lag: FloatArray  # s
+    rate: FloatArray  # largest rates, per s; infinite without a limit
+    lag: FloatArray  # lags, s
 
 
 class LawInputs(NamedTuple):
-    """The inputs v of the law, one per output, before an allocation; (m,), units of y / s."""
+    """The inputs v of the law before an allocation, one per output, shape (m,), units of y / s."""
 
     names: tuple[str, ...]
-    # limit at which the first effector reaches its stop, if all other inputs are 0
+    # limit of each input at which the first effector reaches its stop, if all other inputs are 0
     lower: FloatArray
     upper: FloatArray
     slew: FloatArray
-    lag: FloatArray  # s
+    lag: FloatArray  # lags, s
 
 
 def design_allocation(
@@ -57,11 +59,12 @@ def design_allocation(
         T = W^-1 Omega' (Omega W^-1 Omega')^-1,  W = diag(((lag_j + SERVO) / range_j)^2),
             effect = Omega
 
-    v is the part of y_dot that the inputs cause, so D = S = U = I on this airframe. T gives v with
-    the least sum of squares of (lag_j + SERVO) u_j / range_j, where range_j is half the distance
-    between the stops. So a slow effector helps a fast one only a little. lag_i = sum_j Omega_ij
-    T_ji lag_j is the lag of v_i, exact to first order. `priority` lists outputs; the first one
-    keeps its input the longest. All other outputs follow in their order.
+    The input v is the part of y_dot that the effectors cause, so D = S = U = I on this airframe.
+    For a given v, T finds the u with the least sum of squares of (lag_j + SERVO) u_j / range_j.
+    Here range_j is half the distance between the stops. So a slow effector helps a fast one only a
+    little. The lag of v_i is lag_i = sum_j Omega_ij T_ji lag_j, exact to first order. `priority`
+    lists outputs. If an effector saturates, the input of the first output in the list is kept the
+    longest. The outputs that are not listed follow in their order.
 
     Raises ParameterError for fewer effectors than outputs, for infinite stops, and for dependent
     rows of Omega. Source of the pseudo-inverse: M. W. Oppenheimer, D. B. Doman, M. A. Bolender,
@@ -100,7 +103,7 @@ def design_allocation(
 
 
 def _require_effectors(airframe: Airframe, effectors: Effectors) -> None:
-    """Refuse fewer effectors than outputs, and infinite stops."""
+    """Raise ParameterError for fewer effectors than outputs, and for infinite stops."""
     names = tuple(airframe.inputs)
     m = len(airframe.outputs)
     require(
@@ -140,9 +143,10 @@ def _pseudo_inverse(airframe: Airframe, Omega: FloatArray, effectors: Effectors)
 
 
 def _alone(T: FloatArray, sides: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """Return the largest v_i >= 0 that each input reaches by itself inside the stops.
+    """Return the largest v_i >= 0 of each input that keeps all effectors within their stops, (m,).
 
-    `sides` are the stops in the directions -T_ji and +T_ji, of either sign.
+    All other inputs are 0. `sides` are two arrays of stops: those that a movement along -T_ji
+    reaches, and those that a movement along +T_ji reaches. Only their magnitudes count.
     """
     against, along = (np.abs(side)[:, None] for side in sides)
     counts = np.abs(T) > SMALL * np.abs(T).max(axis=0)
@@ -159,7 +163,7 @@ def _rounded(matrix: FloatArray) -> list[float]:
 
 
 def lags_by_input(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:
-    """Return the lags by input, s. Raises ParameterError."""
+    """Return the lag of each input, s, by the input's name. Raises ParameterError."""
     names = list(airframe.inputs)
     values = as_numbers(lag, "lag", expected := "seconds, 0 or more")
     values = values * len(names) if len(values) == 1 else values

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gains beside an extended state observer.
+"""Select gains of the law for a loop with an extended-state observer.
 
-The observer takes the aircraft for one integrator per output, and knows only the sign and the size
-of its gain.
+This observer models each output of the aircraft as an integrator of its input. Of the aircraft it
+knows only the sign and the size of the integrator's gain.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ EXTENDED_STATE_PRODUCTS: Mapping[str, tuple[float, ...]] = {
 together; no other aircraft took part."""
 
 
-# for an output that is not in EXTENDED_STATE_PRODUCTS
+# product for an output that is not in EXTENDED_STATE_PRODUCTS
 DEFAULT_PRODUCTS = EXTENDED_STATE_PRODUCTS["p"]
 
 
@@ -42,7 +42,7 @@ def extended_state_weights(outputs: tuple[str, ...], T: FloatArray) -> ExtendedS
 def integrator_model(controller: ControllerConfig, Omega: FloatArray) -> FeedforwardConfig:
     """Build the model y_dot = Omega u of a feedforward, Omega (m, m) in the law's order.
 
-    The lead of the feedforward is lag + delay + half a period.
+    The feedforward leads by the lag, the delay and half a period.
     """
     return FeedforwardConfig(
         states=controller.outputs,

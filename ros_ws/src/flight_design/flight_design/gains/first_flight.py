@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A first scenario for an airframe.
+"""Write a first scenario for an airframe.
 
-It has the channels, assumed actuators, noise, and gusts in proportion to the aircraft.
+The scenario has the channels, assumed actuators, noise, and gusts in proportion to the trim speed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,7 +46,7 @@ RATE_NOISE = 0.001  # rad/s, also for any other output
 RATE = 200.0  # Hz, of y and y_m
 CONTROL_RATE = 100.0  # Hz, of the law
 DELAY = 0.003  # s, beyond sampling
-APART = 3.0  # s, time between two gusts
+APART = 3.0  # time between two gusts, s
 
 
 def first_flight(
@@ -58,10 +58,11 @@ def first_flight(
     part: float = 1.0,
     shortfall: Refusal | None = None,
 ) -> str:
-    """Write a scenario file for the airframe in `path`, with the text of the section controller.
+    """Write a scenario file for the airframe that is in the file `path`.
 
-    `part` multiplies the commands, and `shortfall` becomes the first line. The commands are those
-    of `first_commands`. The gusts blow across the flight path with 3 % of the trim speed.
+    `controller` is the text of the section controller. The commands are those of `first_commands`,
+    and their heights are multiplied by `part`. `shortfall` becomes the first line of the file. The
+    gusts blow across the flight path at 3 % of the trim speed.
     """
     V0 = airframe.speed
     stops = _stops(airframe)
@@ -110,7 +111,7 @@ def first_flight(
 
 
 def _channels(airframe: Airframe, lag: Sequence[float]) -> dict[str, Channel]:
-    """Return the channels by output."""
+    """Return the properties of each channel, by output."""
     outputs = list(airframe.outputs)
     if len(airframe.inputs) > len(outputs):
         _, law = _distributed(airframe, lag)
@@ -144,7 +145,8 @@ def _surfaces(airframe: Airframe) -> list[bool]:
 def _stops(airframe: Airframe) -> list[float]:
     """Choose the end stop of every input.
 
-    A surface has STOP; any other input has what gives AUTHORITY on the output that it drives.
+    A surface gets STOP. The stop of any other input is the deflection that gives AUTHORITY on the
+    output that the input drives.
     """
     Omega = np.abs(airframe.matrix_c() @ airframe.matrix_b())
     authorities = np.array(
@@ -179,12 +181,12 @@ def _distributed(airframe: Airframe, lag: Sequence[float]) -> tuple[AllocationCo
 
 
 def default_lags(airframe: Airframe) -> tuple[float, ...]:
-    """Return the lags of the inputs, s: a servo's lag for an angle, else the lag of an engine."""
+    """Return the lag of each input, s: a servo's lag for an angle, otherwise an engine's lag."""
     return tuple(SURFACE_LAG if surface else ENGINE_LAG for surface in _surfaces(airframe))
 
 
 def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
-    """Write a section controller with gains of 1, from which gains can be selected."""
+    """Write a section controller with all gains at 1, from which gains can be selected."""
     allocation = None
     m = len(airframe.outputs)
     if len(airframe.inputs) > m:
@@ -217,10 +219,10 @@ def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
 
 
 def pairing(airframe: Airframe) -> tuple[int, ...]:
-    """Return the index of every output's input, by the smallest change that makes D = I.
+    """Return the index of the input that is paired with each output.
 
-    The coupling must stay within MAX_COUPLING. If there is no such change, the inputs stay in their
-    order.
+    The pairs are those of the smallest change that makes D = I with a coupling of at most
+    MAX_COUPLING. If there is no such change, the inputs stay in their order.
     """
     best = search(airframe.matrix_c() @ airframe.matrix_b(), MAX_COUPLING)
     if best is None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A first scenario of an aircraft: commands by one rule for all, and the text of the file."""
+"""Choose the commands of an aircraft's first scenario by one rule, and write the scenario file."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,9 +30,10 @@ LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identi
 
 # rad/s, largest natural frequency of the reference model, as in osprey_gust
 FASTEST = {"q": 4.0, "p": 5.0, "r": 4.0}
-FASTEST_SPEED = 1.2  # rad/s, the same for an airspeed, a climb, and any other output
-# natural frequency of the reference model as a fraction of the loop's bandwidth: the loop follows
-# it without a feedforward
+# rad/s, largest natural frequency for an airspeed, a climb, and any other output
+FASTEST_SPEED = 1.2
+# natural frequency of the reference model as a fraction of the loop's bandwidth. With this fraction
+# the loop follows the reference without a feedforward.
 OF_BANDWIDTH = 0.5
 # fraction of the authority that a command may use; the rest is for climbs, turns and gusts
 OF_AUTHORITY = 1.0 / 3.0
@@ -42,29 +43,32 @@ HOVER = 0.15  # rad/s, size of a command of a rate if there is no airspeed
 # the gains allow.
 OF_SPEED = 0.03
 LARGEST_SPEED = 2.0  # m/s, largest change of an airspeed
-SEEN = 5.0  # least size of a command in units of the noise, so that its error shows
+SEEN = 5.0  # least size of a command, as a multiple of the noise, so that its error shows
 SPEEDS = {"V", "u", "climb"}  # motions that thrust moves: slow, without overshoot
 
-RISE = 0.2  # s, length of a pulse's edges, which bounds u_m_dot; short beside the filters
-REST = 2.0  # s, before the first command
+# s, length of a pulse's edges, which bounds u_m_dot; short compared with the filters' response
+RISE = 0.2
+REST = 2.0  # s, time before the first command
 TURNS = ((0.0, 1.0), (2.0, -1.0), (5.0, -1.0), (7.0, 1.0))
 """Starts, s, and directions of the pulses of a rate: the second pair restores the flight path."""
 PULSE = 1.0  # s, length of a pulse of a rate
 TURNS_TIME = 9.0  # s, length of the four pulses
 SPEED_PULSE = 20.0  # s, length of a pulse of airspeed or climb
-LAST = 20.0  # s, after the last command, for a gust and the return to trim
-COMMANDED = "osprey_servo"  # its commands and gusts are for gains that have no scenario
-GAINS = {"k_g", "k_d", "Lambda", "beta", "omega", "input_scale", "D"}  # that are selected
+LAST = 20.0  # s, time after the last command, for a gust and the return to trim
+# scenario whose commands and gusts serve for gains that have no scenario
+COMMANDED = "osprey_servo"
+# parameters that the selection of gains finds
+GAINS = {"k_g", "k_d", "Lambda", "beta", "omega", "input_scale", "D"}
 
 
 class Channel(NamedTuple):
     """The properties of an output from which its commands follow, in SI."""
 
     motion: str  # q, p, r, V or climb; any other output has no size of its own
-    authority: float  # y_dot that the input causes at its nearer end stop
+    authority: float  # largest y_dot that the input causes before it reaches its nearer end stop
     bandwidth: float  # rad/s, bandwidth of the loop, which follows from lags, delay and rate
     noise: float = 0.0  # rms per sample
-    damping: float = 0.0  # 1/s, rate at which y decays by itself
+    damping: float = 0.0  # 1/s, rate at which y decays without control
 
     @property
     def is_speed(self) -> bool:
@@ -73,11 +77,14 @@ class Channel(NamedTuple):
 
     @property
     def frequency(self) -> float:
-        """Natural frequency of the reference model, rad/s: half of the bandwidth, or FASTEST."""
+        """Natural frequency of the reference model, rad/s.
+
+        It is half of the bandwidth, but at most FASTEST.
+        """
         return min(FASTEST.get(self.motion, FASTEST_SPEED), OF_BANDWIDTH * self.bandwidth)
 
     def size(self, speed: float | None) -> float:
-        """Compute the height of a pulse; `speed` is V0 in m/s, None in hover.
+        """Return the height of a pulse of command; `speed` is V0 in m/s, None in hover.
 
             least(size of the motion, reach), at least SEEN noise
             reach (frequency / e + damping) = OF_AUTHORITY authority
@@ -91,7 +98,7 @@ class Channel(NamedTuple):
 
 
 def _largest(motion: str, speed: float | None) -> float:
-    """Return the size of a command from its motion alone."""
+    """Return the size of a command that suits the motion, before the authority limits it."""
     if motion in SIZE and (speed is None) and motion != "climb":
         return HOVER
     if motion == "q" and speed is not None:
@@ -102,7 +109,7 @@ def _largest(motion: str, speed: float | None) -> float:
 
 
 class FirstCommands(NamedTuple):
-    """The commands of a first flight."""
+    """The commands of an aircraft's first flight."""
 
     reference: dict[str, Any]  # the section reference_model
     duration: float  # s
@@ -124,13 +131,13 @@ def first_commands(
 ) -> FirstCommands:
     """Choose the commands of a first flight by output: rates one after another, then the speeds.
 
-    Frequency and height of each follow from its `Channel`; `part` multiplies the heights. If the
-    aircraft `banks` to turn, the yaw rate is that of a coordinated turn, g / V0 sin(bank). `speed`
-    is V0, m/s, or None in hover; `rate` is that of the reference model, Hz; `wait` is the time
-    before all commands, s.
+    The frequency and height of each command follow from its `Channel`, and `part` multiplies the
+    heights. If the aircraft `banks` to turn, the yaw rate is that of a coordinated turn, g / V0
+    sin(bank). `speed` is V0, m/s, or None in hover. `rate` is that of the reference model, Hz.
+    `wait` is the time before all commands, s.
 
-    The reference is slower than the loop, and stays within the authority of the input. Source:
-    K. J. Astrom, R. M. Murray, "Feedback Systems", 12.2 (two degrees of freedom).
+    The reference is slower than the loop, and stays within the authority of the input. Source: K.
+    J. Astrom, R. M. Murray, "Feedback Systems", 12.2 (two degrees of freedom).
     """
     names = {channel.motion: name for name, channel in channels.items()}
     turn = banks and speed is not None and {"p", "r"} <= set(names)
@@ -165,9 +172,9 @@ def first_commands(
 
 
 def unit_gains(lag: Sequence[float], delay: float) -> dict[str, Any]:
-    """Return the keys of a controller for channels with lags and a delay, s.
+    """Return the parameters of a controller for channels with given lags and a delay, s.
 
-    The gains are 1 here; they still have to be selected.
+    All gains are 1, because they still have to be selected.
     """
     ones = [1.0] * len(lag)
     return dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones) | {
@@ -201,11 +208,10 @@ def scenario_to_design(scenario: FilePath | Scenario) -> Scenario:
 
 
 def scenario_to_check(scenario: FilePath | Scenario) -> Scenario:
-    """Load a scenario, or COMMANDED if a file has only the section controller.
+    """Load a scenario, or the scenario COMMANDED if a file has only the section controller.
 
-    COMMANDED then gives the commands, gusts and rate limits. Its aircraft may differ from the one
-    that the controller is for.
-    Raises ParameterError.
+    In the second case COMMANDED gives the commands, gusts and rate limits. Its aircraft may differ
+    from the aircraft that the controller is for. Raises ParameterError.
     """
     controller = controller_alone(scenario)
     if controller is None:
@@ -214,9 +220,9 @@ def scenario_to_check(scenario: FilePath | Scenario) -> Scenario:
 
 
 def airframe_to_check(airframe: FilePath | Airframe, flight: Scenario) -> Airframe:
-    """Return an airframe, or the linear model of the aircraft of JSBSim that a scenario flies.
+    """Return an airframe, or the linear model of the JSBSim aircraft that a scenario flies.
 
-    Raises ParameterError for an airframe with other channels than the law of the scenario.
+    Raises ParameterError if the airframe has other channels than the law of the scenario.
     """
     flown = flight.aircraft
     law = flight.controller
@@ -233,9 +239,10 @@ def airframe_to_check(airframe: FilePath | Airframe, flight: Scenario) -> Airfra
 
 
 def controller_alone(scenario: FilePath | Scenario) -> ControllerConfig | None:
-    """Return the controller of a file with only this section, as `selection_yaml` writes it.
+    """Return the controller of a file that has only the section controller.
 
-    Returns None for a scenario and for any other file. Raises ParameterError.
+    `selection_yaml` writes such a file. Returns None for a scenario and for any other file. Raises
+    ParameterError.
     """
     if isinstance(scenario, Scenario):
         return None
@@ -302,10 +309,10 @@ Sections = Mapping[str, Mapping[str, Any] | str]
 
 
 def scenario_text(heading: Iterable[str], sections: Sections) -> str:
-    """Write the text of a scenario file: a heading, each line as a comment, then the sections.
+    """Write the text of a scenario file: a heading as comments, and then the sections.
 
-    `gain_yaml.selection_yaml` writes a whole section. Empty lines of the heading are left out, and
-    so are keys without a value, None or {}.
+    A section may be a text, such as `gain_yaml.selection_yaml` writes, or a mapping. Empty lines of
+    the heading are left out. Keys whose value is None or {} are left out too.
     """
     rows = {name: _with_values(section) for name, section in sections.items()}
     lines = LICENCE + "#\n" + comment(filter(None, heading))
@@ -313,7 +320,7 @@ def scenario_text(heading: Iterable[str], sections: Sections) -> str:
 
 
 def _with_values(section: Mapping[str, Any] | str) -> Mapping[str, Any] | str:
-    """Drop the keys of a section that have no value; return a text as it is."""
+    """Return a section without the keys that have no value; return a text as it is."""
     if isinstance(section, str):
         return section
     return {key: value for key, value in section.items() if value is not None and value != {}}

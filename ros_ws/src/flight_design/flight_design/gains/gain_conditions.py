@@ -7,17 +7,18 @@ The two procedures are Theorem 1 and the engineering procedure.
 
 The theorem's conditions are sufficient, not necessary, and they contain no actuator.
 `theorem_gains` meets them all, but behind servos its result is unstable. `engineering_gains` starts
-from the lag of the loop. `check_theorem` evaluates the theorem's conditions on a gain set,
-`check_rules` the rules of the engineering procedure, and `check_loop` what the linear margins of
-the loop leave out. `rise_di_controller.law.linear_loop` has the linear loop and its delay margin.
+from the lag of the loop. On a gain set, `check_theorem` evaluates the theorem's conditions, and
+`check_rules` the rules of the engineering procedure. `check_loop` evaluates what the linear margins
+of the loop do not cover. `rise_di_controller.law.linear_loop` has the linear loop and its delay
+margin.
 
-The crossover lag product of a channel is its bandwidth times the lag of its loop, in rad. It is the
-phase that the lag costs at the crossover: 57.3 degrees times the product. A loop that integrates
-then has a phase margin of 90 degrees minus this phase. If you take the lag as a pure delay, the
-gain margin of the loop is (pi / 2) / product: 2.5 at 0.63, 2.0 at 0.8.
+The crossover lag product of a channel is its bandwidth times the lag of its loop, in rad. This is
+the phase in rad that the lag costs at the crossover. A loop that integrates then has a phase margin
+of 90 degrees minus this phase. If you take the lag as a pure delay, the gain margin of the loop is
+(pi / 2) / product: 2.5 at 0.63, 2.0 at 0.8.
 
-All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), in which
-abs(Omega_ii) is about 1.
+All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), with
+which abs(Omega_ii) is about 1.
 """
 
 import math
@@ -37,10 +38,11 @@ MIN_K = 1.5
 """1/s, lower bound of K, since (22) requires K > 1. A slower channel gets this K and a smaller
 input scale, which is the same loop."""
 
-# factor of k_g above its bound rho^2 / (4 min(Lambda, 1)): after step 2 a third of the decay is
-# left for step 3
+# factor by which k_g exceeds its bound rho^2 / (4 min(Lambda, 1)). With it, step 2 leaves a third
+# of the decay to step 3.
 K_G_MARGIN = 1.5
-MAX_STEP_3_FRACTION = 0.3  # of the whole decay, which step 3 uses: less than that third
+# fraction of the whole decay that step 3 uses; less than the third that is left
+MAX_STEP_3_FRACTION = 0.3
 
 MAX_CROSSOVER_LAG_PRODUCT = 0.8
 """rad, bandwidth times the lag of the loop: 46 degrees of phase at the crossover. On the `osprey`
@@ -55,11 +57,11 @@ MAX_BETA_TO_RATE_LIMIT = 0.7
 """Upper bound of beta_i / rate limit of the actuator. At 1 the `osprey`'s yaw rate had a limit
 cycle, at 2/3 it had none."""
 
-BOUND_TOLERANCE = 1e-5  # relative tolerance of a bound, since files hold gains with six digits
+BOUND_TOLERANCE = 1e-5  # relative tolerance of a bound, because files hold gains with six digits
 
 
 class GainSet(NamedTuple):
-    """The gains of (20)-(22) over m channels."""
+    """The gains of (20)-(22) for m channels."""
 
     k_g: float  # 1/s
     k_d: FloatArray  # (m - 1,) 1/s
@@ -75,31 +77,32 @@ class GainSet(NamedTuple):
 class Bounds(NamedTuple):
     """Bounds on the aircraft that Theorem 1 requires."""
 
-    # (m, m) upper bounds of abs(U_ij) for j > i, zero elsewhere. They are zeta_U of (27), and
-    # zeta_Psi of (30) with two indices.
+    # (m, m) upper bounds of abs(U_ij) for j > i; the other entries are zero. In the paper they are
+    # zeta_U of (27), and zeta_Psi of (30) if it is given two indices.
     U: FloatArray
     N_d: FloatArray  # (m,) zeta_Nd,i of (19), units of y / s^2
     rho: float  # of (19), 1/s
-    gamma_2: FloatArray  # (m,) of Lemma 1, 1/s: we must assume it, since no bound of it is known
+    # (m,) of Lemma 1, 1/s, which must be assumed, because no bound of it is known
+    gamma_2: FloatArray
 
 
 class GainCondition(NamedTuple):
     """A condition on a gain set: value >= bound or value <= bound.
 
-    A strict bound means value > bound.
+    If the condition is strict, it is value > bound.
     """
 
     name: str
-    channel: int | None  # None for all of them together
+    channel: int | None  # index of the channel; None for a condition on all channels together
     value: float
     bound: float
     at_least: bool = True
     estimate: bool = False  # whether it depends on gamma_2, an assumption
-    strict: bool = False  # whether value = bound fails to meet it
+    strict: bool = False  # whether the condition fails if value = bound
 
     @property
     def side(self) -> str:
-        """Relation in words: the value is "at least", "at most" or "above" the bound."""
+        """The relation in words: the value must be "at least", "at most" or "above" the bound."""
         if self.strict:
             return "above"
         return "at least" if self.at_least else "at most"
@@ -116,9 +119,10 @@ class GainCondition(NamedTuple):
 
     @property
     def margin(self) -> float:
-        """Factor by which the condition is met: below 1 if it fails, 0 if no gain can meet it.
+        """Factor by which the gain set meets the condition.
 
-        It is NaN for a lower bound of 0.
+        The factor is below 1 if the condition fails, and 0 if no gain can meet it. It is NaN for a
+        lower bound of 0.
         """
         if self.at_least:
             return self.value / self.bound if self.bound > 0.0 else math.nan
@@ -127,9 +131,9 @@ class GainCondition(NamedTuple):
         return self.bound / self.value if self.value > 0.0 else math.inf
 
     def sentence(self, channels: Sequence[str]) -> str:
-        """Write the condition as errors do: "beta (30) of q: found 15, expected at least 29.1".
+        """Write the condition as in "beta (30) of q: found 15, expected at least 29.1".
 
-        `channels` are the names of y.
+        `channels` are the names of the outputs y.
         """
         where = self.name if self.channel is None else f"{self.name} of {channels[self.channel]}"
         return f"{where}: found {self.value:.4g}, expected {self.side} {self.bound:.4g}"
@@ -144,11 +148,11 @@ def failing(conditions: Sequence[GainCondition]) -> tuple[GainCondition, ...]:
 
 
 def bound_U(Omegas: FloatArray) -> FloatArray:
-    """Find the largest abs(U_ij), j > i, over samples of Omega; all other entries are zero.
+    """Return the largest abs(U_ij), j > i, over samples of Omega, shape (m, m), else zero.
 
-    Omegas has shape (N, m, m), the result (m, m). U comes from the decomposition Omega = S D U
-    (11). The result bounds the off-diagonal entries of D U D as well, because their magnitudes are
-    the same. Raises DecompositionError if a sample has no such decomposition.
+    `Omegas` has shape (N, m, m). U comes from the decomposition Omega = S D U (11). The result also
+    bounds the off-diagonal entries of D U D, because they have the same magnitudes. Raises
+    DecompositionError if a sample has no such decomposition.
     """
     return np.asarray(np.max([np.triu(np.abs(decompose(Omega).U), 1) for Omega in Omegas], axis=0))
 
@@ -156,10 +160,10 @@ def bound_U(Omegas: FloatArray) -> FloatArray:
 def rho(Omega: FloatArray, CAC: FloatArray, Lambda: FloatArray) -> float:
     """Bound norm(N~) / norm(z), (19), 1/s, by the largest singular value of [I - G Lambda, G].
 
-    G = M (C A C^+ + Lambda) with M = S^-1. N~ = G (r - Lambda e) + e, where the reference term of
-    (18) has moved to N_d. Omega and CAC = C A C^+ have shape (m, m), Lambda has (m,). Raises
-    DecompositionError if Omega has no S D U. Source: (16)-(19) of Tanyer, Tatlicioglu, Zergeroglu,
-    with the correction of docs/theory.md.
+    G = M (C A C^+ + Lambda) with M = S^-1. N~ = G (r - Lambda e) + e. The reference term of (18) is
+    not in this N~, because it counts as a part of N_d. Omega and CAC = C A C^+ have shape (m, m),
+    Lambda has (m,). Raises DecompositionError if Omega has no decomposition S D U. Source:
+    (16)-(19) of Tanyer, Tatlicioglu, Zergeroglu, with the correction of docs/theory.md.
     """
     G = np.linalg.solve(decompose(Omega).S, CAC + np.diag(Lambda))
     return float(np.linalg.norm(np.hstack([np.eye(len(G)) - G * Lambda, G]), 2))
@@ -168,8 +172,8 @@ def rho(Omega: FloatArray, CAC: FloatArray, Lambda: FloatArray) -> float:
 def least_beta(Lambda: FloatArray, bounds: Bounds) -> FloatArray:
     """Compute the smallest beta of step 1 of Theorem 1, shape (m,), from the last channel up.
 
-    beta_i = (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i), i = m .. 1
-    Source: (29), (30), with the two-index bound that Lemma 2 requires (docs/theory.md).
+    beta_i = (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i), i = m .. 1 Source:
+    (29), (30), with the bound zeta_U,ij of two indices that Lemma 2 requires (docs/theory.md).
     """
     beta = np.zeros(len(Lambda))
     for i in reversed(range(len(Lambda))):
@@ -188,8 +192,8 @@ def zeta_Phi(i: int, K: FloatArray, U: FloatArray) -> float:
 def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
     """Compute gains that meet (22), (29), (30) and steps 2 and 3 of Theorem 1 for given bounds.
 
-    The shapes are those in `Bounds` and `GainSet`. least is the decay of e and r, from which N~ and
-    Phi then take a part:
+    The shapes are those in `Bounds` and `GainSet`. `least` is the decay rate of e and r. N~ takes a
+    part of this decay in step 2, and Phi takes a part in step 3:
 
         least = min(Lambda, 1)
         k_g   = 1.5 rho^2 / (4 least)                                     step 2
@@ -197,8 +201,8 @@ def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
         beta  = `least_beta`                                              step 1
 
     so that rho^2 / (4 k_g) + sum zeta_Phi,i^2 / (4 k_d,i) <= (2/3 + 0.3) least. The factors 1.5 and
-    0.3 are this project's, because the paper only says "small". bounds.rho must belong to the same
-    Lambda.
+    0.3 are choices of this project, because the paper only says "small". bounds.rho must belong to
+    the same Lambda.
     """
     m = len(Lambda)
     least = min(float(Lambda.min()), 1.0)
@@ -216,15 +220,15 @@ def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
 def check_theorem(gains: GainSet, bounds: Bounds) -> tuple[GainCondition, ...]:
     """Evaluate the conditions of Theorem 1 on a gain set.
 
-    They are (29), (30) from the last channel up, then steps 2 and 3:
+    The conditions are (29), (30) from the last channel up, and then those of steps 2 and 3:
 
         beta_i >= (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i)
         k_g >= rho^2 / (4 min(Lambda, 1))
         sum_i zeta_Phi,i^2 / (4 k_d,i) <= min(Lambda, 1) - rho^2 / (4 k_g)
 
-    beta_j are those of the gain set. The last condition names the channel with the largest term.
-    (22) needs no condition, since the gain set holds k_g and k_d. Raises ParameterError if a gain
-    is not positive.
+    In the first condition, beta_j is that of the gain set. The last condition names the channel
+    with the largest term. Equation (22) needs no condition, because the gain set states k_g and
+    k_d. Raises ParameterError if a gain is not positive.
     """
     for key in GainSet._fields:
         require(
@@ -266,7 +270,7 @@ def bandwidths(loop: LoopTiming, crossover_lag_product: FloatArray) -> FloatArra
     """Compute the bandwidths of the channels, shape (m,), rad/s.
 
     Bandwidth i is crossover_lag_product_i / (lag_i + 1.5 period + delay). A product of 0.63 rad
-    costs 36 degrees of phase at the crossover, so that the phase margin is 90 - 36 = 54 degrees.
+    costs 36 degrees of phase at the crossover, which leaves a phase margin of 90 - 36 = 54 degrees.
     Source: this project.
     """
     return np.asarray(crossover_lag_product / loop.total)
@@ -276,7 +280,7 @@ def split_gain(K: FloatArray) -> tuple[float, FloatArray]:
     """Split K = 1 + k_g + (k_d, 0), shape (m,), 1/s, into k_g and k_d of (22).
 
     k_d is at least 0.01, because (22) requires it to be positive. Raises ParameterError if the last
-    K is not the smallest or not above 1: (22) has no such K.
+    K is not the smallest, or is not above 1, because (22) gives no such K.
     """
     require(
         float(K[-1]) <= float(K.min()),
@@ -295,7 +299,7 @@ def engineering_gains(
     rate_limit: FloatArray,
     slower: FloatArray | float = 1.0,
 ) -> tuple[GainSet, FloatArray]:
-    """Compute gains for a loop with lag from bandwidths (rad/s); all arguments have shape (m,).
+    """Compute gains from the bandwidths (rad/s) of a loop with lag; all arguments have shape (m,).
 
     The second result is response_i, which is abs(Omega_ii) in scaled inputs. It is less than 1 in a
     channel that is too slow for (22), and 1 in all others.
@@ -305,9 +309,10 @@ def engineering_gains(
         beta_i = min(factor slew_i, 0.7 rate_limit_i) / response_i
 
     The bandwidth of channel i is then K_i response_i. `slew` is the largest rate of the ideal
-    control and `rate_limit` that of the actuator (infinite without one), both in inputs of unit
-    response, units of y / s^2. Raises ParameterError for a factor below 1. Source: this project;
-    beta follows from N_d = -D U v*_dot at e = 0, see `N_d`.
+    control, and `rate_limit` is that of the actuator (infinite without a limit). Their inputs are
+    scaled to unit response, so their units are those of y / s^2. Raises ParameterError for a factor
+    below 1. Source: this project. The formula of beta follows from N_d = -D U v*_dot at e = 0, see
+    `N_d`.
     """
     require(factor >= 1.0, "factor", factor, "at least 1: beta above the slew of the ideal control")
     K = np.maximum(bandwidth, max(MIN_K, float(bandwidth[-1])))
@@ -322,9 +327,10 @@ def engineering_gains(
 def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:
     """Compute N_d of (17) along the ideal control v*, at e = 0: -D U v*_dot.
 
-    It has the shape of v_dot, (..., m), and units of y / s^2. It follows from Omega v*_dot =
-    y_m_ddot - C (A x_dot + f_dot) and N_d = M (C A x_dot + C f_dot - y_m_ddot) with M Omega = D U.
-    Omega (m, m) is in the inputs of v. Raises DecompositionError if it has no S D U.
+    The result has the shape of v_dot, (..., m), and units of y / s^2. The formula follows from
+    Omega v*_dot = y_m_ddot - C (A x_dot + f_dot) and N_d = M (C A x_dot + C f_dot - y_m_ddot) with
+    M Omega = D U. Omega, (m, m), is the response to the inputs v. Raises DecompositionError if
+    Omega has no decomposition S D U.
     """
     factors = decompose(Omega)
     return np.asarray(-v_dot @ (factors.D[:, None] * factors.U).T)
@@ -333,7 +339,7 @@ def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:
 def check_rules(
     params: LawParams, loop: LoopTiming, response: FloatArray, slew: FloatArray
 ) -> tuple[GainCondition, ...]:
-    """Return the rules of the engineering procedure on a gain set, channel by channel.
+    """Evaluate the rules of the engineering procedure on a gain set, channel by channel.
 
         lag product:      K_i response_i total_i <= 0.8
             rad: the lag costs at most 46 degrees of phase
@@ -341,11 +347,11 @@ def check_rules(
         beta above slew:  beta_i >= slew_i                   shown in inputs of unit response
         softening:        eps_i K_i / beta_i >= total_i      softened sign
 
-    The search for gains begins at these rules. They estimate what the margins of the loop measure,
-    so a loop may break them if its margins suffice.
+    The search for gains begins at gains that meet these rules. The rules only estimate the margins
+    of the loop, so a loop may break a rule if its margins suffice.
 
-    response_i = abs(Omega_ii) is nominal, in the inputs of the law; slew is in those same inputs,
-    units of y / s^2. All have shape (m,).
+    response_i is the nominal abs(Omega_ii) in the scaled inputs of the law. slew is the largest
+    rate of the ideal control in the same inputs, units of y / s^2. All have shape (m,).
     """
     bandwidth = params.K * response
     most = np.full(len(loop.total), MAX_CROSSOVER_LAG_PRODUCT)
@@ -370,17 +376,17 @@ def check_loop(
     largest: FloatArray,
     rate_limit: FloatArray,
 ) -> tuple[GainCondition, ...]:
-    """Return the conditions of the loop that its linear margins do not cover, channel by channel.
+    """Evaluate the conditions that the linear margins of a loop do not cover, channel by channel.
 
         beta below rate:  beta_i <= 0.7 rate_limit_i
         implicit: lag:    lag_i + delay <= period / 2
         implicit: omega:  omega_i >= largest_i
 
-    If the first condition fails, beta may cause a limit cycle. It holds in inputs of unit response,
-    to which the check converts. If one of the others fails, the implicit sign chatters. response_i
-    = abs(Omega_ii) is nominal, in the inputs of the law, and `largest` is its upper bound.
-    rate_limit is in those same inputs, in units of y / s^2, and infinite without a limit. All have
-    shape (m,).
+    If the first condition fails, beta may cause a limit cycle. This condition holds in inputs of
+    unit response, to which the check converts beta and the rate limit. If one of the other
+    conditions fails, the implicit sign chatters. response_i is the nominal abs(Omega_ii) in the
+    inputs of the law, and `largest` is an upper bound of abs(Omega_ii). rate_limit is in the same
+    inputs, in units of y / s^2, and infinite without a limit. All have shape (m,).
     """
     fastest = MAX_BETA_TO_RATE_LIMIT * rate_limit * response
     conditions = _by_channel("beta below rate", params.beta * response, fastest, at_least=False)

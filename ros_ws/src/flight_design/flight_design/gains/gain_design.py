@@ -116,13 +116,13 @@ def select_gains(
         scenario: Name, path of a file (.yaml) whose controller may lack the gains, or a Scenario.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
         rate: Rate of the law in Hz; None for that of the scenario.
-        y_rate: Rate of y in Hz. If its period is longer than that of the law, the difference
-            counts as delay, and y is stale after three periods.
+        y_rate: Rate of y in Hz. If its period is longer than the law's, the difference counts as
+            delay; y is stale after three of its periods.
         lag: Lags of the actuators in s, one for all or one per input in the airframe's order;
             None for those of the scenario.
         delay: Pure delay in s; None for that of the scenario.
-        inputs: Input of each output, in the airframe's order: a list, or a text with commas. If it
-            is empty, the pairing is that of the scenario or else of the airframe.
+        inputs: Input of each output, in the airframe's order: a list, or a text with commas. If
+            empty, the pairing is the scenario's, otherwise the airframe's.
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
@@ -135,7 +135,7 @@ def select_gains(
             observer holds only at the trim speed.
         weights: File of gains and weights from which the search for the margins begins
             (`observer_gains.read_gains`); with `accept` they are taken as they are. None for those
-            of a search for the scenario, or of a rule.
+            that a search for the scenario found, or that a rule gives.
         phase_margin: Least phase margin of the nominal loop behind servos, deg; with the observer
             it is 35 deg. The gain margin must be 6 dB, the sensitivity at most 2, the damping 0.4.
         accept: Whether a `phase_margin` below 40 deg is accepted.
@@ -201,7 +201,7 @@ def _beside_observer(required: Requirement, *, as_read: bool) -> Requirement:
 
 
 def _two_speeds(speeds: ArrayLike, *, observer: bool) -> tuple[float, float] | None:
-    """Return the two fractions of the trim speed; None if there are none. Raises ParameterError."""
+    """Return the two fractions of the trim speed, or None. Raises ParameterError."""
     ratios = as_numbers(
         speeds,
         "speeds",
@@ -233,8 +233,8 @@ def check_gains(
 ) -> GainAssessment[ControllerConfig]:
     """Evaluate all conditions on the gains of a scenario, and the margins of its loop.
 
-    Any law will do. Lags and delay are those of the aircraft in the scenario, even if the
-    controller was told others.
+    The law need not be RISE-DI. Lags and delay are those of the aircraft in the scenario, even if
+    the controller was told others.
 
     Args:
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe. If the
@@ -246,8 +246,8 @@ def check_gains(
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
-        entries: Deviations by entry, {"A[q,alpha]": 0.6}, and of lags, {"1/lag[elevator]": 0.3}.
-        zeros: Largest part of its row that an entry of A or B becomes that is 0 in the file.
+        entries: Deviations by entry, {"A[q,alpha]": 0.6}, and by lag, {"1/lag[elevator]": 0.3}.
+        zeros: Largest value that a zero entry of A or B may take, as a part of its row.
         as_told: Whether lags and delay are those of the controller. Set it for an aircraft of your
             own, for which the one in the scenario stands in.
 
@@ -285,7 +285,7 @@ def study(
     """Study the airframe as the law of a controller sees it, and uncertain airframes around it.
 
     The airframes fly the commands and gusts of a scenario. With `flown`, lags and delay are those
-    of an aircraft, otherwise those that the controller was told. Raises ParameterError.
+    of the aircraft that flies, otherwise those in the controller. Raises ParameterError.
     """
     timing = loop_of(controller) if flown is None else flown.comparison.timing
     matrices, _ = of_matrices_and_lags(spread, timing, controller.inputs)
@@ -314,8 +314,8 @@ def _loop(
 ) -> LoopSetting:
     """Return the loop of a scenario with another rate of the law or of y, Hz, lag or delay, s.
 
-    The law steps with each y, so sampling lags by 1.5 periods of y. The loop only counts 1.5
-    periods of the law, so the difference is added to the delay. Raises ParameterError.
+    The law runs once per sample of y, so sampling lags by 1.5 periods of y. The loop counts only
+    1.5 periods of the law, so the difference is added to the delay. Raises ParameterError.
     """
     loop = gain_selection.loop_setting(scenario)
     if rate is not None:
@@ -335,7 +335,7 @@ def _loop(
 
 
 def _mixed(loop: LoopSetting, scenario: Scenario, airframe: Airframe, mixing: str) -> LoopSetting:
-    """Add an allocation to the loop if the airframe or the mixing needs one.
+    """Add an allocation to the loop if the airframe or the mixing needs it.
 
     Otherwise the loop gets the limits of the actuators.
     """
@@ -347,7 +347,7 @@ def _mixed(loop: LoopSetting, scenario: Scenario, airframe: Airframe, mixing: st
 def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> LoopSetting:
     """Limit u within the end stops of the scenario's actuators.
 
-    The loop of a different aircraft has no limits.
+    If the scenario flies another aircraft than this airframe, the loop gets no limits.
     """
     aircraft = scenario.aircraft
     if aircraft.is_jsbsim or load_airframe(aircraft.airframe).name != airframe.name:
@@ -370,7 +370,7 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
 def _pairing(
     inputs: str | Sequence[str], controller: ControllerConfig, airframe: Airframe
 ) -> tuple[str, ...]:
-    """Return the input of each output: that of `inputs`, or else of the controller, or else ().
+    """Return the input of each output, in this order: from `inputs`, from the controller, or ().
 
     The pairs of the controller count only if it has the same inputs as the airframe.
     """
@@ -398,14 +398,14 @@ def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
 
 
 def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> LoopSetting:
-    """Add an allocation by the airframe's own C B to the loop.
+    """Add an allocation to the loop, from the airframe's C B.
 
-    Lags are those of the loop, or else of the actuators. Raises ParameterError if the airframe's
+    The lags are those of the loop, or of the actuators if it has none. Raises ParameterError if the
     actuators have no end stops.
     """
     actuators = scenario.aircraft.actuators
     names = list(airframe.inputs)
-    # The effectors: end stops, rates and lags of the scenario's actuators.
+    # The effectors have the end stops, rates and lags of the scenario's actuators.
     same_airframe = (
         not scenario.aircraft.is_jsbsim
         and load_airframe(scenario.aircraft.airframe).name == airframe.name
@@ -427,7 +427,7 @@ def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> Loo
     allocation, law = design_allocation(airframe, effectors, priority)
     m = len(law.names)
     slew = dict(zip(law.names, law.slew.tolist(), strict=True))
-    # The law has inputs of its own now, so models and gains still have to be selected.
+    # The law has other inputs now, so models and gains still have to be selected.
     base = {
         "outputs": airframe.outputs,
         "inputs": law.names,
@@ -523,9 +523,9 @@ def selected_observer(
 def _noise(
     controller: RiseDiConfig, scenario: Scenario, model: Airframe
 ) -> tuple[FloatArray, dict[str, float]]:
-    """Return the rms per sample of the outputs, (m,), and of the vanes in use, by channel.
+    """Return the noise of the outputs, (m,), and of the vanes in use, by channel, rms per sample.
 
-    A perfect sensor gets a small noise here.
+    A sensor without noise gets a small value.
     """
     channels = scenario.aircraft.channels().outputs
     measured = scenario.aircraft.sensors.noise or (0.0,) * len(channels)
@@ -579,9 +579,9 @@ def _shipped(name: str) -> Scenario:
 
 
 def _tuned_scenario(scenario: Scenario) -> Scenario:
-    """Return a scenario with tuned gains: this one, or a shipped one.
+    """Return a scenario that has tuned gains: the given scenario, or a shipped one.
 
-    The shipped scenario has the same airframe and actuators.
+    A shipped scenario must have the same airframe and actuators.
     """
     shipped = (_shipped(path.stem) for path in sorted(tuned_gains.TUNED.glob("*.yaml")))
     model = scenario.aircraft.airframe, scenario.aircraft.actuators.lag

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gain selection for an airframe: two gain sets, and their assessment.
+"""Select two gain sets for an airframe, and assess gain sets.
 
 The gain sets follow from the ideal control of the airframe along a manoeuvre.
 
-`study_airframe` finds the rates of the ideal control, on the airframe as published and on uncertain
-ones around it. `gain_sets` derives two gain sets, one by Theorem 1 and one by the engineering
-procedure. `assess_scenario` assesses the gain set of a scenario: conditions, stability and delay
-margin. `gain_yaml.selection_yaml` writes a gain set as the section of a scenario file.
+`study_airframe` computes the rates of the ideal control, for the airframe as published and for
+uncertain airframes around it. `gain_sets` derives one gain set by Theorem 1 and one by the
+engineering procedure. `assess_scenario` assesses the gains of a scenario: conditions, stability and
+delay margin. `gain_yaml.selection_yaml` writes a gain set as a section of a scenario file.
 """
 
 import math
@@ -69,7 +69,7 @@ not enough, until the margins meet the requirement."""
 
 DEFAULT_CROSSOVER_LAG_PRODUCT = 0.23  # rad, for an output that is not in CROSSOVER_LAG_PRODUCTS
 
-SOFTENING = 2.75  # 1, width of the softened sign at the start of the search, in total lags
+SOFTENING = 2.75  # width of the softened sign at the start of the search, in total lags
 
 BETA_TO_SLEW = 1.25
 """beta / largest slew of the ideal control. The law needs at least 1; more than 1.5 gained nothing
@@ -79,18 +79,18 @@ on the `osprey`."""
 INPUT_LIMITS = ("lower", "upper", "slew")
 
 
-# step of the search for the speed up to which the delay margin lasts
+# step of V / V0 in the search for the largest speed with a delay margin
 SPEED_STEP = 0.05
 MAX_SPEED_RATIO = 3.0
 
-# name of the condition on the fraction of aircraft whose loop is stable
+# name of the condition on the fraction of uncertain aircraft whose loop is stable
 STABILITY = "linear stability"
 
 Controller = TypeVar("Controller", bound=ControllerConfig)
 
 
 class LoopSetting(NamedTuple):
-    """The loop that the gains are selected for, and the settings of the selection."""
+    """The loop for which the gains are selected, and the settings of the selection."""
 
     base: ControllerConfig  # source of all parameters that are not selected: max_age, limits
     rate: float  # Hz
@@ -98,9 +98,9 @@ class LoopSetting(NamedTuple):
     delay: float  # s
     rate_limit: Mapping[str, float]  # SI, by input; an input without entry is not limited
     gamma_2: float = 0.0  # 1/s, an assumption: 0 gives the smallest bounds (29), (30)
-    factor: float = BETA_TO_SLEW  # beta / slew of the ideal control
+    factor: float = BETA_TO_SLEW  # beta divided by the slew of the ideal control
     crossover_lag_products: Mapping[str, float] = CROSSOVER_LAG_PRODUCTS
-    # input of each output, in the airframe's order; empty for the airframe's pairing
+    # input of each output, in the airframe's order; if empty, the airframe's pairing holds
     inputs: tuple[str, ...] = ()
     # whether the result uses the published airframe as model of a feedforward
     feedforward: bool = False
@@ -112,16 +112,16 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
     controller: Controller
     theorem: tuple[GainCondition, ...]  # empty for a law other than RISE-DI
-    # of the engineering procedure; empty with an observer, and for a law other than RISE-DI
+    # rules of the engineering procedure; empty with an observer, and for a law other than RISE-DI
     rules: tuple[GainCondition, ...]
     loop: tuple[GainCondition, ...]
     bounds: Bounds | None  # None for a law other than RISE-DI
-    margins: LoopMargins | None  # None for the literal sign
-    study: Study  # of the airframe
+    margins: LoopMargins | None  # None if the law has the literal sign
+    study: Study  # study of the airframe
 
     @property
     def delay_margin(self) -> float | None:
-        """Delay margin of the nominal aircraft with the delay in every channel, s.
+        """Largest delay in every channel that the nominal loop tolerates, s.
 
         It is None for the literal sign.
         """
@@ -129,21 +129,21 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
     @property
     def channel_margins(self) -> tuple[float, ...]:
-        """Delay margins of the nominal aircraft with the delay in a single channel, s.
+        """Largest delay in each single channel that the nominal loop tolerates, s.
 
-        They are empty for the literal sign.
+        The tuple is empty for the literal sign.
         """
         return () if self.margins is None else self.margins.channel_delay
 
     def loop_with_box(self) -> LinearLoop:
-        """Return the linear loop with the box of the study, or refuse the literal sign."""
+        """Return the linear loop with the study's box of A and B, or refuse the literal sign."""
         return loop_with_box(self.study, self.controller)
 
     @property
     def has_requirement(self) -> bool:
         """Whether the loop must have certain margins.
 
-        An ideal loop with the implicit or the literal sign has no such requirement.
+        A loop with the implicit or the literal sign has no required margins.
         """
         return any(condition.name in REQUIRED for condition in self.loop)
 
@@ -164,7 +164,7 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
 
 def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
-    """Return the linear loop of a controller around a study's aircraft, with the box of A and B."""
+    """Return the linear loop of a controller around a study's aircraft, with a box of A and B."""
     timing = study.timing_of(controller)
     loop = linear_loop(controller, study.airframe, study.A, study.B, timing)
     airframe = study.airframe if study.effected is None else study.effected.airframe
@@ -185,7 +185,7 @@ class Selection:
     setting: LoopSetting
     literal: RiseDiConfig  # the gain set of Theorem 1
     chosen: RiseDiConfig  # the engineering gains
-    origin: str = ""  # with an observer: a sentence on how the gains beside it were selected
+    origin: str = ""  # with an observer: a sentence on how the gains of the law were selected
 
     @cached_property
     def theorem(self) -> GainAssessment[RiseDiConfig]:
@@ -201,14 +201,14 @@ class Selection:
 def gain_sets(study: Study, setting: LoopSetting) -> Selection:
     """Derive two gain sets for an airframe: by Theorem 1 and by the engineering procedure.
 
-    The set by Theorem 1 has the literal sign. Both sets have the same channels (the fastest first,
-    so that the last has the smallest K), inputs scaled by 1 / abs(Omega_ii), and D from the minors.
+    The set by Theorem 1 has the literal sign. In both sets the fastest channel comes first, so the
+    last has the smallest K. Inputs are scaled by 1 / abs(Omega_ii), and D follows from the minors.
     The theorem's set is `theorem_gains` with Lambda = 1 / s, for which the smallest k_g suffices.
-    The other one is `engineering_gains` with the slew of the nominal airframe. Behind servos,
-    `within_requirement` searches for the integral gains and the bandwidths with the least error.
-    Their margins must meet the setting's requirement on the nominal airframe and on every sample.
-    `omega` is the largest abs(Omega_ii) of the samples. Raises ParameterError as `signs_of_pairing`
-    does, and for parameters that the controller does not accept.
+    The other set is `engineering_gains` with the nominal slew. Behind servos, `within_requirement`
+    searches for the integral gains and bandwidths with the least error. The margins must meet the
+    requirement on the nominal airframe and on every sample. `omega` is the largest abs(Omega_ii) of
+    the samples. Raises ParameterError as `signs_of_pairing` does, and for parameters that the
+    controller does not accept.
     """
     pairs = _paired(study, setting)
     engineering = gain_candidates(study, setting)
@@ -226,8 +226,8 @@ def gain_candidates(
 ) -> Callable[[FloatArray, FloatArray], Candidate[RiseDiConfig]]:
     """Return a function that builds the engineering gains and the loop for `slower` and `lower`.
 
-    Both have shape (m,). The bandwidth is divided by `lower`, and the integral gain by both. Raises
-    ParameterError as `gain_sets` does.
+    Both factors have shape (m,). `lower` divides the bandwidth, and both divide the integral gain.
+    Raises ParameterError as `gain_sets` does.
     """
     pairs = _paired(study, setting)
     limits = (
@@ -247,11 +247,11 @@ def gain_candidates(
 
 
 class _Paired(NamedTuple):
-    """The channels of a selection, the fastest first: (22) gives the last the smallest K."""
+    """The channels of a selection, the fastest first: (22) gives the last one the smallest K."""
 
     channels: ChannelPairing
-    rows: list[int]  # of the outputs, in the airframe's order
-    columns: list[int]  # of the inputs
+    rows: list[int]  # indices of the outputs, in the airframe's order
+    columns: list[int]  # indices of the inputs
     bandwidth: FloatArray  # (m,) rad/s, at the start of the search
     D: FloatArray  # (m,)
     unit: FloatArray  # (m,) 1 / abs(Omega_ii)
@@ -388,16 +388,16 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
 def assess_scenario(
     scenario: Scenario, study: Study, gamma_2: float = 0.0
 ) -> GainAssessment[ControllerConfig]:
-    """Evaluate every condition on the gain set of a scenario's controller.
+    """Evaluate every condition on the gains in a scenario's controller.
 
-    The airframe is studied along the scenario's manoeuvre and must have its outputs. Raises
+    The study flies the scenario's manoeuvre, so the airframe must have its outputs. Raises
     ParameterError if D or the pairing contradicts the airframe.
     """
     return assess_gains(study, scenario.controller, loop_setting(scenario, gamma_2))
 
 
 def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
-    """Return the loop of a scenario. The lower rate limit of controller and actuator counts."""
+    """Return the loop of a scenario, with the lower rate limit of controller and actuator."""
     controller = scenario.controller
     rates = scenario.aircraft.actuators.rate
     slew = dict(zip(controller.inputs, controller.slew or (), strict=bool(controller.slew)))
@@ -420,16 +420,16 @@ def assess_gains(
 ) -> GainAssessment[Controller]:
     """Evaluate every condition on a gain set.
 
-    Rate, lag and delay are the controller's; gamma_2 and rate limits are the setting's.
+    Rate, lag and delay come from the controller, gamma_2 and rate limits from the setting.
 
     The conditions of the theorem are those of `_rise_di_conditions`, and without an observer the
-    rules are those of `check_rules`. The loop has these conditions: those of `check_loop`, without
-    an observer; the fraction of the samples for which the linear loop is stable; its delay margin
-    on the nominal airframe, which must be a period, so that a tick may be missed, or with an
-    observer what this requires beyond the delay; and the margins of the setting's requirement,
-    which is 35 degrees of phase with an observer. With the implicit sign the linear loop is the one
-    inside the width of the sign, dt^2 omega beta; its margin is then the delay at which chatter
-    begins, at most half a period. A law other than RISE-DI has the conditions of the linear loop.
+    rules are those of `check_rules`. The loop must meet those of `check_loop` (without an
+    observer), be stable for every sample, and have the required margins, with an observer 35
+    degrees of phase. The delay margin of the nominal loop must be one period, so that a tick may be
+    missed. With an observer it must be the observer's margin minus the delay. With the implicit
+    sign, the loop is linear inside the sign's width, dt^2 omega beta. Its margin is then the delay
+    at which chatter begins, at most half a period. A law other than RISE-DI has the conditions of
+    the linear loop.
     """
     rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
@@ -481,8 +481,8 @@ def _rise_di_conditions(
 ) -> tuple[tuple[GainCondition, ...], tuple[GainCondition, ...], tuple[GainCondition, ...], Bounds]:
     """Evaluate the conditions of Theorem 1, `check_rules`, `check_loop`, and the theorem's bounds.
 
-    "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of
-    (29), (30), steps 2 and 3 are the largest over the samples for which both hold. "V2_dot" is the
+    "D" and "zero dynamics" are the fractions of the samples that meet each condition. The bounds of
+    (29), (30), steps 2 and 3 are the largest over the samples that meet both. "V2_dot" is the
     smallest eigenvalue of Q in V2_dot = -z'Qz over these samples; steps 2 and 3 are sufficient for
     Q > 0.
     """
@@ -522,9 +522,9 @@ def _rise_di_conditions(
 
 
 def response(study: Study, controller: ControllerConfig) -> FloatArray:
-    """Compute abs(Omega_ii) in the scaled inputs of a controller, law's order, (m,).
+    """Compute abs(Omega_ii) in a controller's scaled inputs, in the law's order, shape (m,).
 
-    It is less than 1 in a channel that is too slow for (22), and 1 in all others.
+    The value is less than 1 in a channel that is too slow for (22), and 1 in all others.
     """
     rows, columns = law_order(study.airframe, controller)
     scale = getattr(controller, "input_scale", 1.0)
@@ -532,10 +532,10 @@ def response(study: Study, controller: ControllerConfig) -> FloatArray:
 
 
 def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
-    """Return the largest V / V0 up to which the delay margin stays positive with the same gains.
+    """Return the largest V / V0 up to which the same gains have a positive delay margin.
 
-    The response to every input but the one of V grows with V^2. Everything else stays as in trim.
-    The result is rounded down to SPEED_STEP. It is 0 if there is no delay margin in trim, and
+    The response to every input grows with V^2, except that to the input of V. Everything else stays
+    as in trim. The result is a multiple of SPEED_STEP, 0 if there is no delay margin in trim,
     infinite if the linear loop is stable up to MAX_SPEED_RATIO. Raises ParameterError for the
     literal sign.
     """
@@ -564,8 +564,8 @@ def _bounds(
 ) -> tuple[Bounds, NDArray[np.bool_], NDArray[np.bool_]]:
     """Compute the bounds of Theorem 1 for inputs divided by `scale`, with two masks of samples.
 
-    `scale` is (m,). The first mask has the samples whose Omega has the signs D. The second mask has
-    those of these samples that have stable zeros as well.
+    `scale` is (m,). The first mask marks the samples whose Omega has the signs D. The second mask
+    marks those of them that have stable zeros as well.
     """
     C = study.C[rows]
     Omegas = C @ study.B[:, :, columns] * scale

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gains as the section of a controller in a scenario file."""
+"""Write gains as the section of a controller in a scenario file."""
 
 import json
 import re
@@ -28,14 +28,15 @@ from rise_di_controller.law.law import Sign
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# a string that needs no quotes, unless it is a word such as true
+# a string that YAML needs no quotes for, unless it is a word with a meaning such as true
 PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./:-]*")
 
 
 def yaml_flow(value: Any, precision: int = 6) -> str:
     """Write a value in YAML's flow style.
 
-    Floats have six digits and always a point, which YAML 1.1 requires of a float.
+    Floats have six significant digits and always a decimal point, which YAML 1.1 requires of a
+    float.
     """
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(yaml_flow(entry, precision) for entry in value)}]"
@@ -58,10 +59,10 @@ def yaml_flow(value: Any, precision: int = 6) -> str:
 
 
 def yaml_template(text: str) -> Template:
-    """Make a template of a YAML file.
+    """Return a Jinja template of a YAML file.
 
-    "{{ value | flow }}" writes a value by `yaml_flow`. "| digits(3)" writes a number with three
-    digits, and "| line" a text without a line end.
+    In the template, "{{ value | flow }}" writes a value by `yaml_flow`. "| digits(3)" writes a
+    number with three digits, and "| line" writes a text without a line end.
     """
     environment = Environment(
         trim_blocks=True,
@@ -135,7 +136,7 @@ def selection_yaml(selection: Selection, *, theorem: bool = False) -> str:
     as_instance(selection, Selection, "selection", "a Selection, as select_gains returns one")
     assessed = selection.theorem if theorem else selection.engineering
     controller = assessed.controller
-    # an observer with a part of 0 does not fly; a learner designs it later
+    # an observer with a `part` of 0 does not act yet; a learner designs it later
     has_observer = controller.observer is not None and controller.observer.part > 0.0
     engineering = "beside an observer" if has_observer else "by the engineering procedure"
     comments = _comments(selection, controller)
@@ -160,7 +161,7 @@ def selection_yaml(selection: Selection, *, theorem: bool = False) -> str:
 
 
 def _comments(selection: Selection, controller: RiseDiConfig) -> dict[str, str]:
-    """Write the unit and reason of each parameter of the engineering gains."""
+    """Return a comment with unit and reason for each parameter of the engineering gains."""
     study = selection.study
     params = controller.law_params()
     _, columns = law_order(study.airframe, controller)
@@ -203,7 +204,8 @@ def section_yaml(
 ) -> str:
     """Write a controller as the section `/**/controller` of a scenario file.
 
-    A parameter without a comment gets its description. Margins that are `unmet` are named first.
+    A parameter without an entry in `comments` gets its description as comment. The margins that are
+    `unmet` come first.
     """
     parameters = [
         (key, value, comments.get(key, type(controller).model_fields[key].description))
@@ -224,16 +226,16 @@ def section_yaml(
 
 
 def below_requirement(unmet: Sequence[GainCondition], outputs: Sequence[str]) -> str:
-    """Write the first line of a file whose margins fall short; "" if none does."""
+    """Write the first line of a file that says which margins are too small; "" if none is."""
     lacking = "; ".join(condition.sentence(outputs) for condition in unmet)
     return f"Margins below the requirement: {lacking}." if lacking else ""
 
 
 def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) -> str:
-    """Write the margins of a loop in a sentence: nominal and worst phase margins.
+    """Write the nominal and the worst phase margins of a loop in a sentence.
 
-    With the implicit sign it is the sentence of `chatter_sentence`. Returns "" if the loop has the
-    literal sign or is unstable.
+    With the implicit sign the sentence is that of `chatter_sentence`. Returns "" if the loop has
+    the literal sign or is unstable.
     """
     if margins is None or not margins.nominal.stable:
         return ""
@@ -268,7 +270,7 @@ def chatter_sentence(controller: ControllerConfig, margins: LoopMargins | None) 
 
 
 def _shown_response(responses: FloatArray) -> str:
-    """Write the factors of 1 / abs(Omega_ii).
+    """Write the factors on 1 / abs(Omega_ii) in the input scales.
 
     A factor is less than 1 in a channel that is too slow for a K of (22), and 1 in all others.
     """
@@ -326,7 +328,7 @@ def _sections(
 def _columns_of(
     section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int
 ) -> dict[str, int]:
-    """Return the number of columns of each matrix of a section."""
+    """Return the number of columns of each matrix in a section, by the matrix's name."""
     if isinstance(section, VanesConfig):
         return {"H": len(section.H) // len(section.channels), "L": m + 1}
     if isinstance(section, AllocationConfig):
@@ -340,9 +342,9 @@ def _columns_of(
 def _matrix_rows(
     section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int
 ) -> dict[str, Any]:
-    """Write the entries of each parameter in flow style, matrices in rows.
+    """Write each parameter of a section in flow style, a matrix row by row.
 
-    Numbers of an allocation and an observer have ten digits.
+    Numbers of an allocation and of an observer have ten digits.
     """
     rows: dict[str, Any] = {}
     columns_of = _columns_of(section, m)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The ideal control along a manoeuvre, of the published airframe and of uncertain airframes."""
+"""Compute the ideal control along a manoeuvre, for the published and for uncertain airframes."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -60,10 +60,10 @@ class ChannelPairing(NamedTuple):
 
 
 class Effected(NamedTuple):
-    """An airframe file with uncertain entries. An allocation u = T v moves its effectors."""
+    """An airframe with uncertain entries whose effectors an allocation u = T v moves."""
 
     airframe: Airframe
-    T: FloatArray  # (p, m)
+    T: FloatArray  # (p, m) matrix of the allocation
 
 
 class Flown(NamedTuple):
@@ -74,23 +74,23 @@ class Flown(NamedTuple):
 
 
 class Study(NamedTuple):
-    """The nominal airframe, then N - 1 uncertain airframes, along a manoeuvre.
+    """The nominal airframe and N - 1 uncertain airframes along a manoeuvre, with the ideal control.
 
-    The channels are in the airframe's order, SI.
+    The channels are in the airframe's order, in SI.
     """
 
     airframe: Airframe
     A: FloatArray  # (N, n, n)
     B: FloatArray  # (N, n, m)
     C: FloatArray  # (m, n)
-    gravity: FloatArray  # (n, n), the Jacobian of f at trim
+    gravity: FloatArray  # (n, n) Jacobian of f at trim
     u_dot: FloatArray  # (T, N, m) rate of the ideal control, units of u / s
     slew: FloatArray  # (m,) largest abs(u_dot) of the nominal airframe
-    slew_undisturbed: FloatArray  # (m,) the same without gusts
-    # (N,) whether no zero lies in the right half plane, and no state overflows
+    slew_undisturbed: FloatArray  # (m,) largest abs(u_dot) of the nominal airframe without gusts
+    # (N,) whether no zero lies in the right half plane and no state overflows
     stable: NDArray[np.bool_]
     uncertainty: float
-    effected: Effected | None = None  # None: the entries of `airframe` are uncertain
+    effected: Effected | None = None  # if it is None, the entries of `airframe` are uncertain
     seed: int = 1
     spread: Spread = UNIFORM  # deviations of the entries, and of the lags
     flown: Flown | None = None  # None if the loop does not fly an aircraft yet
@@ -98,7 +98,7 @@ class Study(NamedTuple):
     def timing_of(self, controller: ControllerConfig) -> LoopTiming:
         """Return lags, delay and period of the aircraft that flies.
 
-        If none flies, they are those that the controller was told.
+        If no aircraft flies yet, they are those in the controller.
         """
         return loop_of(controller) if self.flown is None else self.flown.comparison.timing
 
@@ -115,10 +115,10 @@ class Study(NamedTuple):
 
 
 def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
-    """Extract the commands and gusts of a scenario for the channels and gust axes of an airframe.
+    """Return the commands and gusts of a scenario for the channels and gust axes of an airframe.
 
-    A coordinated turn stays if the airframe has both of its channels, at the airframe's own speed.
-    Raises ParameterError if the scenario has no command for an output.
+    A coordinated turn is kept if the airframe has both of its channels. The turn is then flown at
+    the airframe's speed. Raises ParameterError if the scenario has no command for an output.
     """
     commands = scenario.reference_model
     for name in airframe.outputs:
@@ -164,24 +164,24 @@ def study_airframe(
     effected: Effected | None = None,
     spread: Spread = UNIFORM,
 ) -> Study:
-    """Compute the rates of the ideal control along a manoeuvre.
+    """Compute the rates of the ideal control along a manoeuvre, for N airframes.
 
-    The first rates belong to the airframe as published, the others to uncertain airframes.
+    The first airframe is the published one, the others are uncertain airframes.
 
-    The ideal control keeps y on y_m. x = P y_m + N eta, where eta are the states beside the outputs
-    (`output_coordinates`). Then
+    The ideal control keeps y on y_m. The state is x = P y_m + N eta, where eta are the coordinates
+    beside the outputs (`output_coordinates`). Then
 
         eta_dot = H' (I - B Omega^-1 C) (A x + f(x, t)) + H' B Omega^-1 y_m_dot
             the zero dynamics, eta(0) = 0
         u* = Omega^-1 (y_m_dot - C (A x + f)),  x_dot = A x + f + B u*
         u*_dot = Omega^-1 (y_m_ddot - C (A x_dot + f_dot)),  f_dot along (1, x_dot)
 
-    It is integrated by Runge-Kutta in steps of 0.01 s, and u*_dot is evaluated at the steps. Only
-    f_dot and u_m_dot are differences, central and over 1e-5 s. f is that of the nominal airframe.
-    If there is an `effected` airframe, its entries are drawn. Raises ParameterError if Omega is
-    singular or if the nominal airframe has a zero in the right half plane, because Assumption 3
-    does not hold then, and FlightEnded if the ideal flight of the nominal airframe diverges. An
-    uncertain one that diverges counts as unstable.
+    eta is integrated by Runge-Kutta in steps of 0.01 s, and u*_dot is evaluated at the steps. Only
+    f_dot and u_m_dot are central differences, over 1e-5 s. f is that of the nominal airframe. If
+    there is an `effected` airframe, the uncertain entries are those of this airframe. Raises
+    ParameterError if Omega is singular, or if the nominal airframe has a zero in the right half
+    plane, because Assumption 3 fails then. Raises FlightEnded if the ideal flight of the nominal
+    airframe diverges. An uncertain airframe that diverges counts as unstable.
     """
     drawn_airframe = airframe if effected is None else effected.airframe
     A, B = nominal_and_sampled(drawn_airframe, uncertainty, samples, seed, spread)
@@ -195,10 +195,10 @@ def study_airframe(
         f"a zero at {zeros[0]:.3g} 1/s",
         "none in the right half plane",
     )
-    # The last column is the nominal airframe without gusts: their speed is 0 there.
+    # The last column is the nominal airframe in still air: the speed of its gusts is 0.
     A = np.concatenate([A, A[:1]])
     B = np.concatenate([B, B[:1]])
-    # An aircraft that overflows is refused or counted below, so NumPy must not warn of it.
+    # An aircraft that overflows is refused or counted as unstable below, so NumPy must not warn.
     with np.errstate(over="ignore", invalid="ignore"):
         u_dot = _ideal_rates(
             _ideal_plant(airframe, manoeuvre, A, B), _references(manoeuvre, airframe)
@@ -243,13 +243,13 @@ class _IdealPlant(NamedTuple):
     inverse: FloatArray  # (N, m, m) Omega^-1
     project: FloatArray  # (N, n - m, n)
     follow: FloatArray  # (N, n - m, m)
-    aircraft: Aircraft  # with f
+    aircraft: Aircraft  # nonlinear part f of the aircraft
     P: FloatArray  # (n, m)
     N: FloatArray  # (n, n - m)
 
 
 def _times(matrices: FloatArray, columns: FloatArray) -> FloatArray:
-    """Multiply N matrices with N columns each, (n, ..., N)."""
+    """Multiply each of N matrices with its own columns, which have shape (n, ..., N)."""
     return np.asarray(np.einsum("Nij,j...N->i...N", matrices, columns))
 
 
@@ -278,7 +278,7 @@ def _ideal_plant(
 def _ideal_rates(
     plant: _IdealPlant, references: tuple[FloatArray, FloatArray, FloatArray]
 ) -> FloatArray:
-    """Compute u*_dot at the steps, (T, N, m)."""
+    """Compute u*_dot at the steps of the integration, shape (T, N, m)."""
     y_m, y_m_dot, y_m_ddot = references
     steps = (len(y_m) + 1) // 2
     count = max(COLUMNS // len(plant.A), 1)
@@ -289,7 +289,7 @@ def _ideal_rates(
         halves = np.arange(2 * first, 2 * last + 1)
         path = _zero_dynamics(plant, eta, halves, y_m[halves], y_m_dot[halves])
         eta = path[:, -1]
-        # each part begins where the one before it ends
+        # each stretch begins at the instant at which the previous stretch ends
         places = halves[::2][: min(count, steps - first)]
         wanted = (y_m[places].T, y_m_dot[places].T, y_m_ddot[places].T)
         u_dot.append(_rates(plant, places, wanted, path[:, : len(places)]))
@@ -303,9 +303,9 @@ def _zero_dynamics(
     y_m: FloatArray,
     y_m_dot: FloatArray,
 ) -> FloatArray:
-    """Integrate eta over the steps that begin and end at every other place, (n - m, steps, N).
+    """Integrate eta by Runge-Kutta and return it at every step, shape (n - m, steps, N).
 
-    The places count half steps.
+    `halves` counts instants in half steps. A step begins and ends at every second instant.
     """
     t = (STEP / 2.0 * halves)[:, None, None]
     held = y_m @ plant.P.T
@@ -333,9 +333,10 @@ def _rates(
     references: tuple[FloatArray, FloatArray, FloatArray],
     eta: FloatArray,
 ) -> FloatArray:
-    """Compute u*_dot at T instants, (T, N, m), that count half steps.
+    """Compute u*_dot at T instants, shape (T, N, m).
 
-    The references have the shape (m, T), and eta has the shape (n - m, T, N).
+    `halves` counts the instants in half steps. Each of the references has shape (m, T), and eta has
+    shape (n - m, T, N).
     """
     y_m, y_m_dot, y_m_ddot = references
     instants = np.repeat(STEP / 2.0 * halves, eta.shape[-1])
@@ -363,7 +364,7 @@ def _references(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Compute y_m and its two derivatives every STEP / 2, for the stages of Runge-Kutta.
 
-    The order is the airframe's, the shape (2 T - 1, m).
+    The channels are in the airframe's order, and each result has shape (2 T - 1, m).
     """
     matrices = manoeuvre.reference.model()
     profile = manoeuvre.reference.profile()
@@ -377,14 +378,14 @@ def _references(
     for k, stages in enumerate(np.concatenate([u_m[:-1], half_later[:-1], u_m[1:]], axis=1)):
         x[k + 1] = model.step(x[k], stages, step)
     x_dot = model.x_m_dot(t, x.T, u_m.T, matrices)
-    x_ddot = model.x_m_dot(t, x_dot, u_m_dot.T, matrices)  # (2) differentiated
+    x_ddot = model.x_m_dot(t, x_dot, u_m_dot.T, matrices)  # the derivative of (2)
     places = [manoeuvre.reference.outputs.index(name) for name in airframe.outputs]
     y_m, y_m_dot, y_m_ddot = (model.output(z, matrices)[places].T for z in (x.T, x_dot, x_ddot))
     return y_m, y_m_dot, y_m_ddot
 
 
 def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Aircraft:
-    """Return the aircraft with f for states in columns, shape (n, columns).
+    """Return the aircraft whose f takes states as columns, shape (n, columns).
 
     The last column has no gusts.
     """

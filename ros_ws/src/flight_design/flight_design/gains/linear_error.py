@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The error of a linear loop: along a manoeuvre, and in wind with noise."""
+"""Predict the tracking error of a linear loop: along a manoeuvre, and in wind with noise."""
 
 import math
 from typing import NamedTuple
@@ -19,29 +19,30 @@ from rise_di_controller.law.linear_loop import (
     zero_order_hold,
 )
 
-HORIZON = 20.0  # s, of turbulence and noise: longer than the slowest mode that counts
-GUST_HORIZON = 8.0  # s, over which the response to a gust counts
-FLIGHT = 60.0  # s, over which the errors of the gusts, one for each axis, are averaged
-TURBULENT = 0.5  # weight of errors in turbulence, which are about twice those in the gusts
+HORIZON = 20.0  # s, duration of turbulence and noise: longer than the slowest mode that counts
+GUST_HORIZON = 8.0  # s, time for which the response to a gust counts
+FLIGHT = 60.0  # s, length of a flight with a gust on each axis, over which the errors are averaged
+TURBULENT = 0.5  # weight of errors in turbulence, which are about twice those in gusts
 MEAN = math.sqrt(2.0 / math.pi)  # mean magnitude of a normal value, in standard deviations
 
-GUST_TIME = 0.6  # s, from the entry of a gust to its peak
+GUST_TIME = 0.6  # s, time from the entry of a gust to its peak
 GUST_LENGTHS = (9.1, 106.7)  # m, from the entry to the peak, CS 25.341 (a)(3): 30 to 350 ft
 GUST_SPEED = 17.07  # m/s, at 106.7 m and sea level, CS 25.341 (a)(5): 56 ft/s
 
 
 class Air(NamedTuple):
-    """The wind that a loop must withstand, and the noise that it measures.
+    """The wind that acts on a loop, and the noise of its measurements.
 
     The turbulence on each of G axes is a first-order process with a time constant and a standard
-    deviation. On each axis there is also a 1-cosine gust with a duration and a peak, which is 0 for
-    no gust.
+    deviation. Each axis also has a 1-cosine gust with a duration and a peak. A peak of 0 means no
+    gust.
     """
 
     wind: FloatArray  # (n, G) effect of 1 m/s on x_dot
-    reading: FloatArray  # (m + k, G) effect of 1 m/s on a measurement, namely on a vane
-    time: FloatArray  # (G,) s
-    sigma: FloatArray  # (G,) m/s
+    # (m + k, G) effect of 1 m/s on the m outputs and k vanes, of which only vanes feel the wind
+    reading: FloatArray
+    time: FloatArray  # (G,) time constant of the turbulence, s
+    sigma: FloatArray  # (G,) standard deviation of the turbulence, m/s
     noise: FloatArray  # (m + k,) rms per sample of the measurements, SI
     gust: FloatArray  # (G,) peaks, m/s
     gust_duration: float  # s
@@ -52,7 +53,8 @@ def discrete_gust(speed: float) -> tuple[float, float]:
 
         U = GUST_SPEED (H / 106.7 m)^(1/6),  H = GUST_TIME speed within GUST_LENGTHS
 
-    Source: CS 25.341 (a), without the alleviation factor.
+    H is the distance from the entry to the peak. Source: CS 25.341 (a), without the alleviation
+    factor.
     """
     length = min(max(GUST_TIME * speed, GUST_LENGTHS[0]), GUST_LENGTHS[1])
     peak = GUST_SPEED * (length / GUST_LENGTHS[1]) ** (1.0 / 6.0)
@@ -60,15 +62,17 @@ def discrete_gust(speed: float) -> tuple[float, float]:
 
 
 class AirResponse(NamedTuple):
-    """What a loop does in wind and noise."""
+    """The error and the activity of a loop in wind and noise."""
 
-    # (m,) SI: rms of the outputs in gusts, together with TURBULENT times their rms in turbulence
+    # (m,) rms of the outputs in gusts plus TURBULENT times their rms in turbulence, SI
     error: FloatArray
     activity: FloatArray  # (m,) mean abs(u_dot) in turbulence, SI
 
 
 def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air) -> AirResponse:
-    """Compute what a stable loop does in gusts, and in turbulence with noise for HORIZON from rest.
+    """Compute the response of a stable loop to gusts, and to turbulence with noise.
+
+    The response to turbulence begins at rest and lasts HORIZON.
 
         z+ = A z + N n,  P+ = A P A' + N N',  n white with unit variance
 
@@ -88,7 +92,7 @@ def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air)
     noise = noise_input * air.noise
     covariance, transition = _turbulent(matrix, blown, noise, loop.period, air)
     variance = np.einsum("ij,jk,ik->i", C, covariance[:n, :n], C)
-    # rows of u = K z + D v, and of its value a tick later
+    # rows of u = K z + D v, and of u one tick later
     K = np.hstack([law.D @ C_sampled, law.C, law.D @ air.reading])
     direct = law.D * air.noise
     after = transition @ covariance @ K.T
@@ -102,7 +106,7 @@ def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air)
 def _gust_energy(
     matrix: FloatArray, response: FloatArray, C: FloatArray, period: float, air: Air
 ) -> FloatArray:
-    """Integrate the squares of the outputs in a gust on each axis, (m,)."""
+    """Return the integral of the squared outputs over a gust on each axis, summed, shape (m,)."""
     state = np.zeros(response.shape)
     energy = np.zeros(len(C))
     for k in range(round(GUST_HORIZON / period)):
@@ -117,9 +121,9 @@ def _gust_energy(
 def _turbulent(
     matrix: FloatArray, blown: FloatArray, noise: FloatArray, period: float, air: Air
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance of the state of a loop in turbulence and noise, and the transition.
+    """Return the covariance of a loop's state in turbulence and noise, and the transition matrix.
 
-    The state of the wind comes below that of the loop.
+    The rows of the wind come below those of the loop.
     """
     size, G = blown.shape
     decay = np.exp(-period / air.time)
@@ -141,9 +145,10 @@ def _turbulent(
 def linear_error(loop: LinearLoop, u_dot: FloatArray) -> FloatArray:
     """Compute the rms of e of the nominal linear loop under the ideal control u*, (..., m), SI.
 
-    The loop must produce u* itself. u* keeps y on y_m, so e is the response of the loop to the
-    disturbance -u* at the input of the aircraft, starting from trim. Leading axes are those of the
-    laws of the loop. `u_dot` (T, m) is the rate of u* every STEP, inputs in the law's order.
+    The ideal control u* keeps y on y_m, but the loop must produce u* by feedback. So e is the
+    response of the loop to the disturbance -u* at the input of the aircraft, starting from trim.
+    The leading axes of the result are those of the laws of the loop. `u_dot`, (T, m), is the rate
+    of u* every STEP, with the inputs in the law's order.
     """
     period = loop.loop.period
     u = np.concatenate(

@@ -6,8 +6,8 @@ They are evidence for the theorem, not part of the law.
 
 All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), with
 Omega = C B in these inputs. Time derivatives are central differences over the samples of a flight.
-At a sample y_dot jumps with u, and the difference gives the mean of both sides. The differences are
-exact up to terms that vanish with the sampling period.
+y_dot jumps with u at a sample, and the difference then gives the mean of its values before and
+after the jump. The differences are exact up to terms that vanish with the sampling period.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ from rise_di_controller.law.law import LawParams, Sign, engage, step
 
 
 class KnownPlant(NamedTuple):
-    """Equation (1), x_dot = A x + f(t, x) + B v, y = C x.
+    """A plant as in equation (1), x_dot = A x + f(t, x) + B v, y = C x.
 
     Outputs and scaled inputs v are in the law's order.
     """
@@ -37,9 +37,9 @@ class KnownPlant(NamedTuple):
 
 
 class FlightSamples(NamedTuple):
-    """Signals of a flight at N >= 3 ticks of the law, input of `evidence`.
+    """Signals of a flight at N >= 3 ticks of the law, from which `evidence` computes the proof.
 
-    The first tick is the engagement.
+    The law engages at the first tick.
     """
 
     t: FloatArray  # (N,) s
@@ -99,11 +99,11 @@ def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples
 def fly_known_plant(
     plant: KnownPlant, y_m: FloatArray, dt: float, params: LawParams, x_0: FloatArray
 ) -> FlightSamples:
-    """Fly the plant under the law from x_0, engaged at t = 0.
+    """Fly the plant under the law from the state x_0, engaged at t = 0.
 
-    Each dt has a tick and a Runge-Kutta step, with v held between ticks. `y_m` is the reference at
-    the ticks, shape (N, m); `dt` is in s; `params` must have input_scale 1, since B acts on v;
-    `x_0` has shape (n,).
+    In each period dt, the law computes v at the tick, and a Runge-Kutta step integrates the plant
+    while v is held. `y_m` is the reference at the ticks, shape (N, m), and `dt` is in s. `params`
+    must have input_scale 1, because B acts on v. `x_0` has shape (n,).
     """
 
     def x_dot(t: float, x: FloatArray, v: FloatArray, _: None) -> FloatArray:
@@ -136,9 +136,10 @@ def evidence(
         L = r' (N_d - D U D Pi_dot)  (46), beta Sgn(e) being Pi_dot by (21)
         P = zeta_b - integral_0^t L  (trapezoid),  V2 = V1 + P            (47), (48)
 
-    C^+ is the pseudo-inverse: C^+ e_dot is the part of x_dot that appears in e_dot. Lemma 2 claims
-    P >= 0 for the zeta_b of `lemma_2`; with the default 0, P and V2 are known up to a constant.
-    The shapes are those of the fields. Raises DecompositionError if Omega has no S D U.
+    C^+ is the pseudo-inverse, and C^+ e_dot is the part of x_dot that appears in e_dot. Lemma 2
+    claims that P >= 0 if zeta_b is the constant of `lemma_2`. With the default 0, P and V2 are
+    known up to a constant. The shapes are those of the fields of `Evidence`. Raises
+    DecompositionError if Omega has no decomposition S D U.
     """
     S, D, U = decompose(plant.C @ plant.B)
     M = np.linalg.inv(S)
@@ -166,8 +167,8 @@ def decay_matrix(plant: KnownPlant, params: LawParams) -> FloatArray:
 
     z' Q z = e' Lambda e - r' N~ + r' D U D K r with N~ = G (r - Lambda e) + e, G = M (C A C^+ +
     Lambda). Q contains neither beta nor N_d. Steps 2 and 3 of Theorem 1 are sufficient for Q > 0:
-    k_g is large against N~, and k_d against the off-diagonal entries of U. Source: (24), (31),
-    (32), (46)-(48).
+    step 2 makes k_g large compared with N~, and step 3 makes k_d large compared with the
+    off-diagonal entries of U. Source: (24), (31), (32), (46)-(48).
     """
     S, D, U = decompose(plant.C @ plant.B)
     m = len(D)
@@ -191,7 +192,8 @@ def lemma_2(plant: KnownPlant, signals: Evidence, params: LawParams) -> float:
             the smallest for (40)
         zeta_b = sum_i beta_i abs(e_i(0)) + gamma_1,i zeta_i
 
-    Raises ValueError with the channel if beta_i < zeta_i: then no gamma_2 >= 0 meets (29), (30).
+    Raises ValueError, which names the channel, if beta_i < zeta_i, because no gamma_2 >= 0 meets
+    (29), (30) then.
     """
     U = decompose(plant.C @ plant.B).U
     zeta = np.max(np.abs(signals.N_d), axis=0) + np.triu(np.abs(U), 1) @ params.beta
@@ -207,9 +209,9 @@ def lemma_2(plant: KnownPlant, signals: Evidence, params: LawParams) -> float:
 
 
 def integral(signal: FloatArray, t: FloatArray) -> FloatArray:
-    """Integrate a sampled signal from 0 to t by the trapezoid rule; 0 at the first sample.
+    """Integrate a sampled signal from the first sample to each t by the trapezoid rule.
 
-    The result has the shape of the signal: (N,) or (N, m).
+    The result is 0 at the first sample, and has the shape of the signal: (N,) or (N, m).
     """
     means = (signal[1:] + signal[:-1]) / 2.0
     result = np.zeros_like(signal)
@@ -227,10 +229,10 @@ class Example(NamedTuple):
 
 
 def example(dt: float, duration: float) -> Example:
-    """Build an example of four states and two inputs with D = diag(1, -1) and a full U.
+    """Build an example plant with four states and two inputs, D = diag(1, -1), and a full U.
 
-    The disturbance and the reference are persistent. It is well conditioned (M between 0.8 and 1.3,
-    zeros -1.48 and -1.02). Its gains meet the conditions of Theorem 1 on this flight:
+    The disturbance and the reference are persistent. The plant is well conditioned (M between 0.8
+    and 1.3, zeros -1.48 and -1.02). The gains meet the conditions of Theorem 1 on this flight:
     `decay_matrix` is positive definite and `lemma_2` finds a constant. Times are in s.
     """
     D = np.array([1.0, -1.0])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The nominal model of an airframe, for observers, filters and model-based laws."""
+"""Build the nominal model of an airframe for observers, filters and model-based laws."""
 
 import math
 from collections.abc import Sequence
@@ -14,20 +14,22 @@ from flight_core.units import ANGLE, DIMENSIONLESS, quantity, unit_sizes
 from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import LoopTiming
 
-ERROR_SHARE = 0.1  # unit of an error in a score as a share of a size: 0.1 m/s or 0.01 rad/s
+# share of an output's size that is one unit of error in a score: 0.1 m/s or 0.01 rad/s
+ERROR_SHARE = 0.1
 
-# mean abs(u_dot) that costs as much as one unit of error
+# mean abs(u_dot) that costs as much as one unit of error, by the kind of input
 SURFACE_ACTIVITY = np.deg2rad(60.0)  # rad/s
 THROTTLE_ACTIVITY = 6.0  # 1/s: 600 %/s
-# 1/s, relative to the thrust in trim: 600 %/s of the throttle if trim needs half of it
+# 1/s, relative to the thrust in trim. It equals 600 %/s of the throttle if trim needs half of the
+# thrust.
 THRUST_ACTIVITY = 12.0
 
 
 def activity_units(airframe: Airframe) -> FloatArray:
     """Return the mean abs(u_dot) of each input that costs as much as a unit of error, (p,).
 
-    It is in SI per s. If the file has no `no_thrust`, a thrust in newtons has an infinite unit, so
-    that its activity costs nothing.
+    The unit of each value is that of the input, in SI, per s. If the file has no `no_thrust`, a
+    thrust in newtons has an infinite unit, so that its activity costs nothing.
     """
     units = []
     channels = zip(airframe.inputs.values(), airframe.no_thrust(), strict=True)
@@ -49,10 +51,10 @@ def airframe_model(
     noise: FloatArray,
     loop: LoopTiming,
 ) -> NominalModel:
-    """Build the model of an airframe with channels in this order, without limits.
+    """Build the model of an airframe without limits, with the channels in the given order.
 
-    D is I until the caller sets it. `noise` is the noise of the outputs, (m,), rms per sample.
-    `loop` is in this order too.
+    D is I until the caller sets it. `noise`, (m,), is the noise of the outputs, rms per sample.
+    `loop` has its channels in the given order too.
     """
     rows = [airframe.outputs.index(name) for name in outputs]
     columns = [list(airframe.inputs).index(name) for name in inputs]

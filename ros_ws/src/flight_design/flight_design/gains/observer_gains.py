@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gains of the law beside an observer, with the weights of the observer.
+"""Find the gains of a law beside an observer, with the weights of the observer.
 
-They follow from a rule, from a sketch, or from a search.
+The gains and weights follow from a rule, from a sketch of the aircraft, or from a search.
 """
 
 from collections.abc import Mapping
@@ -19,33 +19,33 @@ from flight_core.files import read_yaml
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
-# share of the integral gain of PI that becomes Lambda; the rest is the slope of the softened sign
+# share of a PI law's integral gain that becomes Lambda; the slope of the softened sign is the rest
 SHARE = 0.9
 
 
 class ObserverGains(NamedTuple):
-    """Gains of the law in scaled inputs with abs(Omega_ii) of 1, and weights of the observer.
+    """Gains of the law, and weights of the observer, in the law's order.
 
-    They are in the law's order.
+    The gains are for scaled inputs with abs(Omega_ii) of 1.
     """
 
     K: FloatArray  # (m,) 1/s
     Lambda: FloatArray  # (m,) 1/s
     beta: FloatArray  # (m,) units of y / s^2
-    softening: FloatArray  # (m,) total lags
+    softening: FloatArray  # (m,) width of the softened sign, as a multiple of the total lag
     weights: Weights
 
 
 def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> ObserverGains:
-    """Derive gains from the lags of the loop, as a start.
+    """Derive gains from the lags of the loop, at which a search can start.
 
-    They were found on the `osprey` and scale with the total lag T:
+    The numbers were found on the `osprey`. The gains and weights scale with the total lag T:
 
         effort = 0.38 T,  drift = 0.4 0.035 s / T,  loose = 0.0036,  K = 0.026 / T,  Lambda = K / 4
         wind: 0.12 of Dryden's noise sqrt(2 V0 / L) sigma, with 17 times its time L / V0
         beta = K / T, and a softened sign of 3 T: eps is 3 units of y / s times T
 
-    `axes` are those of the wind in the order of the model's columns; `speed` is V0, m/s.
+    `axes` are the axes of the wind in the order of the model's columns, and `speed` is V0, m/s.
     """
     T = model.total_lag
     spectrum = dryden(**MODERATE, sigma=0.0)
@@ -76,7 +76,7 @@ more than a model does."""
 def gains_beside_sketch(
     model: NominalModel, outputs: tuple[str, ...], axes: tuple[str, ...], speed: float
 ) -> ObserverGains:
-    """Derive gains for a model from a sketch: `gains_by_rule` times BESIDE_SKETCH."""
+    """Derive gains for a model from a sketch: those of `gains_by_rule` times BESIDE_SKETCH."""
     by_rule = gains_by_rule(model, axes, speed)
     airspeed = [name == "V" for name in outputs]
     effort, K = (np.where(airspeed, *reversed(BESIDE_SKETCH[key])) for key in ("effort", "K"))
@@ -87,10 +87,10 @@ def gains_beside_sketch(
 
 
 def read_gains(path: Path, T: FloatArray, axes: int, states: int) -> ObserverGains:
-    """Read gains from a file with the fields of ObserverGains and of Weights by name, each a list.
+    """Read gains from a file that has the fields of ObserverGains and Weights by name, each a list.
 
-    T is the total lag, (m,), s. `axes` is the number of axes of the wind, and `states` the number
-    of states of the model. Raises ParameterError.
+    T is the total lag, (m,), s. `axes` is the number of axes of the wind, and `states` is the
+    number of states of the model. Raises ParameterError.
     """
     m = len(T)
     lengths: dict[str, tuple[int, ...]]
@@ -112,8 +112,9 @@ def read_gains(path: Path, T: FloatArray, axes: int, states: int) -> ObserverGai
 def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> ObserverGains:
     """Convert gains that `rise-di compare --tune` finds for rise_observer or pi_observer, by name.
 
-    T is the total lag, (m,), s. Inside its softened sign, RISE-DI equals a PI with K and Lambda if
-    it has the same K, and SHARE times this Lambda, and if 1 / (softening T) is the rest.
+    T is the total lag, (m,), s. Inside the width of its softened sign, RISE-DI acts as a PI law
+    with gains K and Lambda. It does so if it has the same K and SHARE times this Lambda, and if 1 /
+    (softening T) is the rest of this Lambda.
     """
     values = {name: np.array(row, dtype=np.float64) for name, row in gains.items()}
     weights = Weights(**{name: values[name] for name in Weights._fields})

@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The search for the relaxation of an observer's gains with the least error within the margins.
+"""Search for the relaxation of a law's gains beside an observer, with the least error.
 
-The relaxation of a channel divides K and the integral, and multiplies `effort`. Above 1 the loop is
-slower than the gains say, below 1 faster, because the inputs of an aircraft may act less or more
-than those for which the gains were found.
+The loop must have the required margins. The relaxation of a channel divides K and the integral
+gain, and multiplies `effort`. A relaxation above 1 makes the loop slower, and one below 1 makes it
+faster. Both may be needed, because the inputs of an aircraft may act less or more than those for
+which the gains were found.
 """
 
 import math
@@ -63,10 +64,12 @@ MOVES = Moves(mending=((1,),), cheaper=((-1,), (1,)), begin=4, is_joint=True)
 SLOWER = Moves(mending=((1,),), cheaper=((-1,),), is_joint=True)
 """Moves of the relaxation of a channel: both ways, or only where the margins need it."""
 
-RESOLUTION = 3e-4  # s, of the delay margin; the digits of gains in a file change it by less
+# s, resolution of the delay margin; the rounding of gains in a file changes the margin by less
+RESOLUTION = 3e-4
 
 MAX_RELAXATION = 18.0  # largest relaxation of a channel
-MAX_QUICKENING = 4.0  # 1 / least relaxation of a channel, for inputs with a fourth of the effect
+# 1 / least relaxation of a channel, for inputs that have a fourth of the effect
+MAX_QUICKENING = 4.0
 MEND = (
     "give the loop less delay or lag, ask for a smaller delay margin, or fly the law without "
     "an observer"
@@ -75,16 +78,17 @@ WORST_OF = 50  # number of uncertain aircraft whose least phase margin counts
 
 
 class SelectedObserver(NamedTuple):
-    """A controller with an observer, and what it tolerates."""
+    """A controller with an observer, and the delay and phase margins of its loop."""
 
     controller: RiseDiConfig
-    delay_margin: float  # s, of the nominal linear loop, including the declared delay
-    phase_margin: float  # rad, the least of the nominal linear loop
+    # s, delay margin of the nominal linear loop; it includes the declared delay
+    delay_margin: float
+    phase_margin: float  # rad, least phase margin of the nominal linear loop
     # (m,) factors by which `effort` is multiplied, and by which K and the integral are divided
     relaxation: FloatArray
-    cost: float  # in wind and noise, a logarithm
-    place: int = 0  # number of its gain set
-    origin: str = ""  # a sentence on where its gains come from
+    cost: float  # logarithm of error and activity in wind and noise
+    place: int = 0  # index of the gain set from which the search began
+    origin: str = ""  # a sentence on where the gains come from
     left_out: int = 0  # number of uncertain aircraft that no gains can hold
 
     def not_counted(self) -> str:
@@ -98,21 +102,21 @@ class SelectedObserver(NamedTuple):
 
 
 class AtSpeed(NamedTuple):
-    """The design at a ratio to the trim speed."""
+    """The design of an observer at a ratio to the trim speed."""
 
     ratio: float
     plant: LinearPlant
     feedforward: FeedforwardConfig
-    scale: FloatArray  # (m,) factors of input_scale
+    scale: FloatArray  # (m,) factors on input_scale
     design: Callable[[FloatArray], ObserverDesign]
 
     def model(self, slower: FloatArray) -> SpeedConfig:
-        """Return the models of feedforward and observer."""
+        """Return the models of feedforward and observer at this speed."""
         nominal = {key: getattr(self.feedforward, key) for key in ("A", "B", "gravity")}
         return SpeedConfig(ratio=self.ratio, **nominal, **_matrices(self.design(slower)))
 
     def flown(self, controller: RiseDiConfig, slower: FloatArray) -> RiseDiConfig:
-        """Return the controller that flies at this speed, without checking its parameters."""
+        """Return the controller for this speed, without checking its parameters."""
         assert controller.observer is not None  # noqa: S101 - it was designed
         values = {
             "observer": controller.observer.model_copy(update=_matrices(self.design(slower))),
@@ -123,11 +127,12 @@ class AtSpeed(NamedTuple):
 
 
 class _Loops(NamedTuple):
-    """A controller of the search, and its loops around the nominal aircraft at each speed."""
+    """A controller in the search, and its loops around the nominal aircraft at each speed."""
 
     controller: RiseDiConfig
     relaxation: FloatArray
-    # in order of speed, the trim speed first, and at each speed with all vanes in use first
+    # in order of speed, the trim speed first. At each speed, the loop with all vanes in use comes
+    # first.
     around: list[tuple[LinearPlant, LinearLaw]]
 
 
@@ -136,19 +141,21 @@ class ObserverSearch(NamedTuple):
 
     base: RiseDiConfig  # the controller without an observer
     model: NominalModel
-    plant: LinearPlant  # the nominal aircraft, then uncertain aircraft, if any
+    plant: LinearPlant  # the nominal aircraft, then the uncertain aircraft if there are any
     gains: ObserverGains
-    design: Callable[[FloatArray], ObserverDesign]  # the observer of a relaxation, (m,)
+    design: Callable[[FloatArray], ObserverDesign]  # designs the observer for a relaxation, (m,)
     margin: FloatArray  # (m,) s, least delay margin of each input
     needed: Requirement
     vanes: VanesConfig | None = None
-    others: Sequence[AtSpeed] = ()  # speeds whose margins count too
-    # None: the gains stay, unless the margins need slower ones
+    others: Sequence[AtSpeed] = ()  # designs at other speeds, whose margins count too
+    # wind and noise; if it is None, gains stay as they are, and only get slower if the margins need
+    # it
     air: Air | None = None
-    activity_unit: FloatArray | float = math.inf  # (m,) of mean abs(u_dot) in the cost, SI
+    # (m,) mean abs(u_dot) that costs as much as a unit of error, SI
+    activity_unit: FloatArray | float = math.inf
     # the search begins at the loop of this design; if it is None, it begins at a relaxation of 1
     earlier_design: SelectedObserver | None = None
-    # (m,) whether the relaxation may change; None: in every channel
+    # (m,) whether the relaxation of a channel may change; None if it may change in every channel
     is_free: Sequence[bool] | None = None
 
     @property
@@ -158,15 +165,16 @@ class ObserverSearch(NamedTuple):
 
     @property
     def loop(self) -> LoopTiming:
-        """Loop without its delay, because the delay margin counts the declared delay too."""
+        """Loop with zero delay, because the delay margin counts the declared delay too."""
         return LoopTiming(self.model.lag, 0.0, self.model.period)
 
     def best(self, progress: Callable[[str], None] = lambda _: None) -> Trial[_Loops]:
-        """Find the trial that meets the margins with the least error, or lacks least of them.
+        """Find the trial that meets the margins with the least error.
 
-        The damping that is required is at most that of the zeros of the aircraft, because no
-        feedback moves a zero. Without `air`, the least relaxed trial is best. `progress` gets a
-        sentence for each loop.
+        If no trial meets them, the result is the trial that lacks the least. The required damping
+        is lowered to that of the zeros of the aircraft if necessary, because no feedback moves a
+        zero. Without `air`, the least relaxed trial is best. `progress` gets a sentence for each
+        loop.
         """
         m = len(self.model.lag)
         free = np.ones((1, m)) if self.is_free is None else np.array([self.is_free])
@@ -193,8 +201,9 @@ class ObserverSearch(NamedTuple):
     def _trial(self, place: Place, requirement: Requirement, least: float) -> Trial[_Loops]:
         """Evaluate the trial at a place.
 
-        If another trial has the margins at the cost `least`, the margins of this one are computed
-        only if it tolerates its delay and costs less.
+        `least` is the least cost so far of a trial that meets the margins, infinite if there is
+        none. If it is finite, the margins are computed only if this trial tolerates its delay and
+        costs less.
         """
         loops = self._loops(place)
         if least < math.inf:
@@ -210,7 +219,7 @@ class ObserverSearch(NamedTuple):
         return Trial(place, shortage, cost, loops)
 
     def selected(self, best: Trial[_Loops]) -> SelectedObserver:
-        """Return the controller of a trial, with the delay margin that it states.
+        """Return the controller of a trial, with the delay margin of its loop.
 
         Raises ParameterError if the trial lacks the margins.
         """
@@ -253,9 +262,9 @@ class ObserverSearch(NamedTuple):
         return all(is_stable(plant, law, self.loop, late) for plant, law in loops.around)
 
     def _delay_fraction(self, plant: LinearPlant, law: LinearLaw) -> float:
-        """Return the delay margin divided by the needed one, at most 1.
+        """Return the ratio of the delay margin to the needed delay margin, at most 1.
 
-        Each input is late in proportion to the delay margin that it needs.
+        The delays of the inputs are in proportion to the delay margins that they need.
         """
         longest = float(self.margin.max())
         if longest == 0.0 or is_stable(plant, law, self.loop, self.margin + RESOLUTION):
@@ -264,7 +273,7 @@ class ObserverSearch(NamedTuple):
         return min(margin / (longest + RESOLUTION), 1.0)
 
     def _shortage(self, loops: _Loops, requirement: Requirement) -> float:
-        """Sum 1 - found / needed over the goals, where it is above 0."""
+        """Sum 1 - found / needed over the goals that the loops miss."""
         loop = loop_of(loops.controller)
         goals = [np.array([self._delay_fraction(plant, law) for plant, law in loops.around])]
         for plant, law in loops.around:
@@ -277,7 +286,7 @@ class ObserverSearch(NamedTuple):
     def _cost(self, loops: _Loops) -> float:
         """Sum the logarithms of error and activity in wind and noise over the channels.
 
-        Both are in the units of a score. Without `air`, only the relaxation counts.
+        Error and activity are in the units of a score. Without `air`, only the relaxation counts.
         """
         if self.air is None:
             return float(np.log(loops.relaxation).sum())
@@ -295,7 +304,7 @@ class ObserverSearch(NamedTuple):
         return min(float(phase_margins(uncertain, law, loop).min()) for law in laws)
 
     def _refusal(self, loops: _Loops) -> ParameterError:
-        """Say what is missing at the end of the search."""
+        """Return an error that says which margins are missing at the end of the search."""
         lack = self._lack(loops)
         if self.others and lack is None:
             return ParameterError(
@@ -309,7 +318,7 @@ class ObserverSearch(NamedTuple):
         return ParameterError(f"--margin: {lack or uncertain}; {MEND}")
 
     def _lack(self, loops: _Loops) -> Refusal | None:
-        """List the margins missing around the nominal aircraft."""
+        """List the margins that are missing around the nominal aircraft; None if none is."""
         requirement = above_zeros(self.needed, self.nominal)
         longest = float(self.margin.max())
         lacking = list[Refusal]()
@@ -363,9 +372,9 @@ def _parameters(
     relaxation: FloatArray,
     vanes: VanesConfig | None,
 ) -> RiseDiConfig:
-    """Return the parameters with gains and matrices.
+    """Return the parameters of a controller with the gains and matrices of a design.
 
-    A K below MIN_K becomes MIN_K with a smaller input scale, which is the same loop.
+    A K below MIN_K becomes MIN_K with a smaller input scale, which gives the same loop.
     """
     K = gains.K / relaxation
     permitted = np.maximum(K, MIN_K + MIN_GAIN)

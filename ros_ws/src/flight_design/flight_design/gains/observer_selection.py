@@ -1,12 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Observer selection: the sections feedforward and observer of a controller.
+"""Select the feedforward and the observer of a controller, together with the gains of the law.
 
-The gains of the law are selected together with them.
-
-`with_aircraft_observer` takes the model of an airframe, `with_extended_state_observer` only Omega
-and the lags. Both give a controller whose nominal linear loop has a delay margin and meets a
-requirement on phase, gain, sensitivity and damping.
+`with_aircraft_observer` uses the model of an airframe, and `with_extended_state_observer` only
+Omega and the lags. Both return a controller whose nominal linear loop has a delay margin and meets
+a requirement on phase, gain, sensitivity and damping.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -59,27 +57,28 @@ from rise_di_controller.law.linear_loop import LinearPlant
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# relative deviation of the uncertain aircraft, the least of whose phase margins counts
+# relative deviation of the uncertain aircraft, whose least phase margin counts
 WORST_UNCERTAINTY = 0.3
-# Part of its row that each entry of these aircraft may be that is 0 in the file. With 0.05, K of q
-# would be a tenth smaller, and the gains with vanes would change as well.
+# Entries of A and B that are 0 in the file may become this part of their row in the uncertain
+# aircraft. With 0.05, K of q would be a tenth smaller, and the gains with vanes would change as
+# well.
 WORST_ZEROS = 0.02
-# 1/s. An aircraft with a zero to the right of this diverges while its outputs are held.
+# 1/s. An aircraft with a zero to the right of this value diverges while its outputs are held.
 FASTEST = 1e-3
 WORST_SEED = 1
 
-# factor on the noise of the wind in a filter that has a vane; with a factor of 10, u moves three
-# times as much
+# factor on the noise of the wind in the filter of an observer with a vane. With a factor of 10, u
+# moves three times as much.
 GUST_WITH_VANE = 2.0
-# s, wing span over trim speed, if the airframe has no span: that of the osprey
+# s, wing span divided by trim speed for an airframe without a span: the value of the osprey
 SPAN_TIME = 0.12
-STILL = 1.4  # motion of a vane that counts as none, in units of its noise
+STILL = 1.4  # motion of a vane that counts as rest, as a multiple of its noise
 
 
 def model_for(airframe: Airframe, controller: ControllerConfig, noise: FloatArray) -> NominalModel:
     """Build the model of an airframe for a controller, in the law's order.
 
-    `noise` is that of the measured outputs, (m,), rms per sample.
+    `noise`, (m,), is that of the measured outputs, rms per sample.
     """
     model = airframe_model(
         airframe, controller.outputs, controller.inputs, noise, loop_of(controller)
@@ -88,7 +87,7 @@ def model_for(airframe: Airframe, controller: ControllerConfig, noise: FloatArra
 
 
 def _limited(model: NominalModel, controller: ControllerConfig) -> NominalModel:
-    """Give a model the limits and D of a controller."""
+    """Return a model with the limits and the D of a controller."""
     limits = controller.guard().limits
     return model._replace(
         D=np.array(controller.D, dtype=np.float64), lower=limits.lower, upper=limits.upper
@@ -112,24 +111,23 @@ def with_aircraft_observer(
     activity: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
-    """Give a controller the feedforward and the observer of an airframe.
+    """Add the feedforward and the observer of an airframe to a controller, and select its gains.
 
-    The gains of the law are selected beside the observer.
-
-    The gains are relaxed, or made faster, channel by channel. The search minimises the error of the
-    linear loop in moderate turbulence with the noise of the sensors. The loop must have its
-    margins. If there are several gain sets, the one with the least error is taken. `margin` is the
-    least delay margin, s, of all inputs or of each, (m,). `vanes` has the noise of each vane, rms
-    per sample in rad, by its channel, alpha or beta. If the airframe is `uncertain`, WORST_OF
+    The gains of each channel are relaxed or made faster. The search minimises the error of the
+    linear loop in moderate turbulence with the noise of the sensors, and the loop must have its
+    margins. If there are several gain sets, the result with the least error is taken. `margin` is
+    the least delay margin, s, for all inputs or for each, (m,). `vanes` has the noise of each vane,
+    rms per sample in rad, by its channel, alpha or beta. If the airframe is `uncertain`, WORST_OF
     uncertain aircraft must have the phase margin too. Aircraft with a zero on the right do not
     count, because no gains can hold all of their outputs. If `speeds` has two ratios to the trim
-    speed, the controller has a schedule, and must have the margins at these speeds too. With
-    `keeps_gains` the gains are only relaxed, if the margins need it. The search begins at the loop
-    of the `earlier_design` with the new feedforward. It changes the relaxation of free channels
-    only, so this loop stays if no change lowers the error. `activity` is the weight of the activity
-    of u against the error. `progress` gets a sentence for each loop. Raises ParameterError for
-    margins that no relaxation reaches, and for an airframe that has another D, has no wind, or
-    cannot be the model of a feedforward.
+    speed, the controller gets a schedule, and must have the margins at these speeds too. With
+    `keeps_gains` the gains stay as they are, and are only relaxed if the margins need it.
+
+    The search begins at the loop of the `earlier_design` with the new feedforward. It changes the
+    relaxation of free channels only, so this loop stays if no change lowers the error. `activity`
+    is the weight of the activity of u against the error. `progress` gets a sentence for each loop.
+    Raises ParameterError for margins that no relaxation reaches. It is also raised for an airframe
+    that has another D, has no wind, or cannot be the model of a feedforward.
     """
     activity_unit = law_activity_unit(airframe, controller) / activity
     airframe = through_allocation(airframe, controller)
@@ -201,9 +199,9 @@ def _with_schedule(
 
 
 def _air(airframe: Airframe, model: NominalModel, vanes: Mapping[str, float]) -> Air:
-    """Return moderate turbulence, gusts from below and the side, and noise of all sensors.
+    """Return moderate turbulence, gusts from below and from the side, and the noise of all sensors.
 
-    The air rolls too; otherwise nothing but noise would move a symmetrical aircraft in roll.
+    The air rolls too. Otherwise only noise would move a symmetrical aircraft in roll.
     """
     speed = airframe.speed
     spectrum = dryden(**MODERATE, sigma=0.0)
@@ -239,11 +237,11 @@ def _air(airframe: Airframe, model: NominalModel, vanes: Mapping[str, float]) ->
 
 
 class _AircraftDesigns(NamedTuple):
-    """The designs of observers of an airframe."""
+    """The observer designs of an airframe for a controller."""
 
     base: RiseDiConfig  # with the feedforward, without an observer
     airframe: Airframe
-    noise: FloatArray  # (m,) of the outputs
+    noise: FloatArray  # (m,) noise of the outputs
     model: NominalModel
     names: Names
 
@@ -251,7 +249,7 @@ class _AircraftDesigns(NamedTuple):
     def around(
         cls, controller: RiseDiConfig, airframe: Airframe, noise: FloatArray
     ) -> "_AircraftDesigns":
-        """Prepare the designs, or refuse an airframe that no observer of the controller fits."""
+        """Prepare the designs, or refuse an airframe that fits no observer of the controller."""
         require(
             bool(airframe.gusts),
             f"airframe {airframe.name}",
@@ -289,7 +287,7 @@ class _AircraftDesigns(NamedTuple):
     ) -> Callable[[FloatArray], ObserverDesign]:
         """Return a function that designs the observer of a model for a relaxation, (m,).
 
-        The relaxation only changes u_o.
+        The relaxation changes only the part u_o of the observer.
         """
         observer = aircraft_observer(model, self.names, gains.weights)
         model_by_tick = ObserverModel(observer.states, observer.Phi, observer.Gamma, observer.H)
@@ -316,7 +314,7 @@ class _AircraftDesigns(NamedTuple):
 
 
 def _require_no_vanes(vanes: Mapping[str, float], outputs: Sequence[str]) -> None:
-    """Refuse what a design at several speeds does not cover."""
+    """Refuse vanes and outputs that a design at several speeds does not cover."""
     require(
         not vanes,
         "speeds",
@@ -333,7 +331,10 @@ def _vanes(
     weights: Weights,
     vanes: Mapping[str, float],
 ) -> VanesConfig:
-    """Build the section of the vanes, which read alpha and beta minus (wind on their axes / V0)."""
+    """Build the section of the vanes.
+
+    They measure alpha and beta minus (wind on their axes / V0).
+    """
     model_by_tick = aircraft_model(model, names, weights.wind_time)
     H = []
     L = []
@@ -358,14 +359,14 @@ def with_extended_state_observer(
     margin: float,
     requirement: Requirement = OBSERVER_REQUIREMENT,
 ) -> SelectedObserver:
-    """Give a controller an observer that knows only Omega and the lags, and no A, f or wind.
+    """Add an observer that knows only Omega and the lags, and no A, f or wind, to a controller.
 
-    Its gains stay, unless the margin needs slower ones.
-
-    The model of its feedforward is y_dot = Omega u, and the model of its observer is y_dot =
-    diag(Omega) u. With all of Omega the elevator would correct V, and turn the aircraft. Omega (m,
-    m) is in the law's order. `noise` (m,) is that of the outputs, rms per sample. `size` (m,) holds
-    their units, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer` does.
+    The gains of the law stay, unless the margin needs slower gains. The model of the feedforward is
+    y_dot = Omega u, and the model of the observer is y_dot = diag(Omega) u. With all of Omega in
+    its observer, the elevator would correct V, and turn the aircraft. Omega, (m, m), is in the
+    law's order. `noise`, (m,), is the noise of the outputs, rms per sample. `size`, (m,), holds the
+    units of the outputs, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer`
+    does.
     """
     m = len(controller.outputs)
     require_same_signs(Omega, controller.D, "Omega")
@@ -378,7 +379,7 @@ def with_extended_state_observer(
     names = Names(controller.outputs, controller.inputs, controller.outputs, ())
     law = controller.law_params()
     weights = extended_state_weights(controller.outputs, model.total_lag)
-    # y_dot for a unit of scaled input, because the gains are for a unit response
+    # y_dot for a unit of scaled input: the gains are for a unit response
     response = np.abs(np.diag(Omega)) * law.input_scale
     unused = Weights(
         effort=weights.effort,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Say which margins of its requirement a loop lacks, and which change would give it the margins."""
+"""Say which required margins a loop lacks, and which change of the loop would give them."""
 
 import math
 from collections.abc import Sequence
@@ -14,19 +14,19 @@ from flight_design.gains.requirement import ACCEPTED_PHASE_MARGIN, PHASE_MARGINS
 
 
 def binding(selection: Selection) -> GainCondition:
-    """Return the unmet condition that the engineering gains miss by the most."""
+    """Return the unmet condition that the engineering gains miss by the largest factor."""
     return min(selection.engineering.unmet, key=lambda condition: condition.margin)
 
 
 def reason_against_gains(selection: Selection, *, options: Sequence[str] = ()) -> Refusal | None:
-    """Say which bound limits the best gains of the search, unless every condition is met.
+    """Say which bound limits the best gains of the search; None if every condition is met.
 
     The sentences name the binding bound, every unmet condition, and every change of the loop that
     reaches the margins.
 
-    A change is a smaller goal, half of the lags, no delay or twice the rate. The gains are searched
-    for each change. `options` are those of phase_margin, lag, delay and rate that the calling
-    command has. A sentence names a change by its option if the command has this option.
+    A change is a smaller goal, half of the lags, no delay, or twice the rate. For each change,
+    gains are searched again. `options` are those of phase_margin, lag, delay and rate that the
+    calling command has. A sentence names a change by its option if the command has this option.
     """
     assessed = selection.engineering
     if not assessed.unmet:
@@ -45,7 +45,7 @@ def reason_against_gains(selection: Selection, *, options: Sequence[str] = ()) -
 
 
 def _relaxed(selection: Selection, options: Sequence[str]) -> dict[str, LoopSetting]:
-    """Return the relaxed settings of a loop, by the words that describe the change."""
+    """Return the relaxed settings of a loop, by a text that describes the change."""
     setting = selection.setting
     changes: dict[str, LoopSetting] = {}
     margins = selection.engineering.margins

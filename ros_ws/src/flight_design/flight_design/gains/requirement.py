@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The required margins of a loop, and the search for gains with these margins.
+"""Define the required margins of a loop, and search for gains with these margins.
 
-Every margin is a condition, and the search measures the margins themselves.
+Every margin is a condition, and the search evaluates the margins themselves.
 
 The margins are those of the sampled loop with actuators, delay and hold
-(`flight_analysis.linear_loop.input_margins`). 45 degrees and 6 dB come from MIL-F-9490D, 3.1.3.6.1,
-for an aerodynamic surface. A sensitivity of at most 2 comes from K. J. Astrom, R. M. Murray,
-"Feedback Systems", 12.3.
+(`flight_analysis.linear_loop.input_margins`). The values of 45 degrees and 6 dB come from
+MIL-F-9490D, 3.1.3.6.1, for an aerodynamic surface. A sensitivity of at most 2 comes from K. J.
+Astrom, R. M. Murray, "Feedback Systems", 12.3.
 """
 
 import math
@@ -45,12 +45,12 @@ ACCEPTED_PHASE_MARGIN = 40.0  # deg: a requirement below this must be accepted e
 # deg, range of a required phase margin: a loop that integrates behind a lag has less than 90
 PHASE_MARGINS = (5.0, 80.0)
 
-# largest factors by which the search divides the integral and the bandwidth. A throttle that is
-# weak near its stop has a bandwidth 200 times below the integral of the rule. With a factor of
-# 1000, V still has a phase margin of 85 deg.
+# Largest factors by which the search divides the integral gain and the bandwidth. A throttle that
+# has little effect near its stop has a bandwidth 200 times below the integral gain of the rule.
+# With a factor of 1000, V still has a phase margin of 85 deg.
 MAX_SLOWER = 1000.0
 MAX_LOWER = 18.0
-# Exponents of `slower` and `lower` of all channels.
+# Pairs of exponents of `slower` and `lower`, for all channels, at which further searches start.
 FURTHER_STARTS = (
     (exponent(8.0), 0),
     (exponent(2.0), exponent(2.0)),
@@ -63,31 +63,32 @@ after a slow disturbance grows with slower lower^2, so only moves with a + 2 b <
 cost."""
 
 NO_ERROR = 1e-12  # SI: an error below it costs nothing
-# step by which the nominal phase margin rises while the worst aircraft has too little
+# step by which the nominal phase margin is raised while the worst aircraft has too little
 WORST_STEP = math.radians(2.5)
 MAX_WORST_STEPS = 8
 
 OF_ZERO = 0.98  # required damping as a fraction of the damping of the zeros
-NO_MOTION = 1e-3  # 1/s: a zero this close to the origin, or to the real axis, has no motion
+NO_MOTION = 1e-3  # 1/s. A zero with a real or imaginary part below this belongs to no oscillation.
 
 
 class Requirement(NamedTuple):
-    """The least margins of a loop, each with one input open, where the worst input counts."""
+    """The margins that a loop must have, each with one input open; the worst input counts."""
 
     phase: float = math.radians(PHASE_MARGIN)  # rad, nominal aircraft
     gain: float = 10.0 ** (6.0 / 20.0)  # factor, up or down: 6 dB
     sensitivity: float = 2.0  # the largest abs(S_ii)
     damping: float = 0.4  # damping ratio of the slow modes
-    worst_phase: float = math.radians(30.0)  # rad, of the uncertain aircraft, by samples
-    # rad, of the worst aircraft that a search over the corners of the uncertainty finds: shipped
-    # loops that have 30 deg by samples have at least this much there
+    # rad, least phase margin over the samples of uncertain aircraft
+    worst_phase: float = math.radians(30.0)
+    # rad, least phase margin that a search over the corners of the uncertainty finds. Shipped loops
+    # that have 30 deg by samples have at least this much there.
     searched_phase: float = math.radians(28.0)
 
     @property
     def uncertain_phase(self) -> float:
-        """Phase margin of the worst uncertain aircraft, rad.
+        """Phase margin that the worst uncertain aircraft must have, rad.
 
-        It is at most what the nominal aircraft must have.
+        It is at most the phase margin that the nominal aircraft must have.
         """
         return min(self.worst_phase, self.phase)
 
@@ -111,7 +112,7 @@ loop, and costs phase."""
 def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
     """Return the requirement with a phase margin in deg.
 
-    Raises ParameterError if it is below 40 deg, unless you `accept` it.
+    Raises ParameterError if the phase margin is below 40 deg, unless `accept` is set.
     """
     phase_margin = as_number(phase_margin, "phase_margin", *PHASE_MARGINS, "deg")
     expected = f"at least {ACCEPTED_PHASE_MARGIN:g} deg, or accept beside it"
