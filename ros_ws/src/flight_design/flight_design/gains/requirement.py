@@ -68,7 +68,8 @@ WORST_STEP = math.radians(2.5)
 MAX_WORST_STEPS = 8
 
 OF_ZERO = 0.98  # required damping as a fraction of the damping of the zeros
-NO_MOTION = 1e-3  # 1/s. A zero with a real or imaginary part below this belongs to no oscillation.
+# 1/s. A zero closer than this to the origin or to the real axis is no oscillation.
+NO_MOTION = 1e-3
 
 
 class Requirement(NamedTuple):
@@ -123,8 +124,8 @@ def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
 def above_zeros(requirement: Requirement, plant: LinearPlant) -> Requirement:
     """Lower the damping of a requirement to what a loop around an aircraft can reach.
 
-    It becomes at most about that of the zeros. No feedback moves a zero, and a loop with small
-    errors has modes near the zeros.
+    The damping becomes at most about that of the zeros of the aircraft. No feedback moves a zero,
+    and a loop with small errors has modes near the zeros.
     """
     zeros = invariant_zeros(plant.A, plant.B, plant.C[: plant.B.shape[-1]])  # without vanes
     modes = zeros[(np.abs(zeros.imag) > NO_MOTION) & (np.abs(zeros) > NO_MOTION)]
@@ -135,11 +136,11 @@ def above_zeros(requirement: Requirement, plant: LinearPlant) -> Requirement:
 def fractions(
     margins: Margins, requirement: Requirement
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compute found / needed of the margins of m inputs, with shapes (..., m), (..., m), (...).
+    """Compute found / needed for the margins of m inputs, with shapes (..., m), (..., m), (...).
 
-    A fraction is at least 1 if the requirement holds. The first result is the smaller fraction of
-    phase and sensitivity, the second the fraction of the gain, in dB, and the third the fraction of
-    the damping.
+    A fraction is at least 1 if the margin meets the requirement. The first result is the smaller
+    fraction of phase and sensitivity, the second is the fraction of the gain, in dB, and the third
+    is the fraction of the damping.
     """
     with np.errstate(divide="ignore"):
         phase = np.minimum(
@@ -153,9 +154,9 @@ def fractions(
 
 
 def least_fractions(margins: Margins, requirement: Requirement) -> FloatArray:
-    """Return the least of the `fractions` of a loop, (...).
+    """Return the least of the `fractions` of each loop, (...).
 
-    It is at least 1 if the requirement holds, and 0 for an unstable loop.
+    It is at least 1 if the loop meets the requirement, and 0 for an unstable loop.
     """
     phase, gain, damping = fractions(margins, requirement)
     least = np.minimum(np.minimum(phase.min(axis=-1), gain.min(axis=-1)), damping)
@@ -163,12 +164,12 @@ def least_fractions(margins: Margins, requirement: Requirement) -> FloatArray:
 
 
 def least_fraction(margins: Margins, requirement: Requirement) -> float:
-    """Return the `least_fractions` of a single loop."""
+    """Return the least of the `fractions` of a single loop."""
     return float(least_fractions(margins, requirement))
 
 
 def margin_conditions(margins: LoopMargins, requirement: Requirement) -> tuple[GainCondition, ...]:
-    """Write the requirement as conditions, input by input, with the nominal aircraft first."""
+    """Return the requirement as conditions, input by input, those on the nominal aircraft first."""
     nominal = nominal_conditions(margins.nominal, requirement)
     if margins.worst is None:
         return nominal
@@ -180,7 +181,7 @@ def margin_conditions(margins: LoopMargins, requirement: Requirement) -> tuple[G
 
 
 def nominal_conditions(nominal: Margins, requirement: Requirement) -> tuple[GainCondition, ...]:
-    """Write the requirement on the nominal aircraft as conditions, input by input."""
+    """Return the requirement on the nominal aircraft as conditions, input by input."""
     with np.errstate(divide="ignore"):
         decibels = 20.0 * np.log10(nominal.gain)
     rows: list[tuple[str, FloatArray, float, bool]] = [
@@ -200,7 +201,7 @@ def nominal_conditions(nominal: Margins, requirement: Requirement) -> tuple[Gain
 def reason_against_margins(
     margins: LoopMargins, requirement: Requirement, outputs: Sequence[str]
 ) -> Refusal | None:
-    """Say what a loop lacks. `outputs` are those of the law."""
+    """Say which required margins a loop lacks. `outputs` are those of the law."""
     return joined(
         Refusal(condition.sentence(outputs))
         for condition in failing(margin_conditions(margins, requirement))
@@ -208,7 +209,7 @@ def reason_against_margins(
 
 
 class Candidate(NamedTuple, Generic[Controller]):
-    """A controller of the search and the loop of the nominal and uncertain aircraft."""
+    """A controller of the search, and its loop around the nominal and the uncertain aircraft."""
 
     controller: Controller
     loop: LinearLoop
@@ -219,18 +220,18 @@ def within_requirement(
     requirement: Requirement,
     u_dot: FloatArray,
 ) -> Candidate[Controller]:
-    """Search for the candidate with the least error whose measured margins meet a requirement.
+    """Search for the candidate with the least error whose margins meet a requirement.
 
-    If there is none, the candidate with the least shortage is returned.
+    If no candidate meets it, the candidate with the least shortage is returned.
 
-    `build(slower, lower)` makes a controller whose integral is divided by both factors and whose
-    bandwidth is divided by `lower`. There is one factor per channel, (m,). It is at least 1, and 1
-    gives the gains of the rule. The error is the product over the outputs of `linear_error` along
-    `u_dot` (T, m), inputs in the law's order. The required damping is that of `above_zeros`. The
-    search begins with the bandwidths of the rule, and with the fastest integrals that have the
-    margins of their own channel. If it ends with a margin missing, it tries other starts. While the
-    worst uncertain aircraft has less than `worst_phase`, the required phase margin of the nominal
-    loop is raised in steps of 2.5 degrees.
+    `build(slower, lower)` makes a controller. It divides the integral gain by both factors, and the
+    bandwidth by `lower`. Each factor has a value of 1 or more for each channel, (m,), and 1 gives
+    the gains of the rule. The error is the product of the `linear_error` of all outputs along
+    `u_dot`, (T, m), with inputs in the law's order. The required damping is that of `above_zeros`.
+    The search begins with the bandwidths of the rule, and with the largest integral gains with
+    which each channel has its margins. If a margin is missing at the end, the search tries other
+    starts. While the worst uncertain aircraft has less than `worst_phase`, the required phase
+    margin of the nominal loop is raised in steps of 2.5 degrees.
     """
     loops = _Loops(build, u_dot)
     target = above_zeros(requirement, loops.start.loop.nominal)
@@ -251,11 +252,11 @@ def within_requirement(
 
 class _Measured(NamedTuple, Generic[Controller]):
     candidate: Candidate[Controller]
-    reached: FloatArray  # (m,) found / needed, for each channel by itself
+    reached: FloatArray  # (m,) least found / needed, for each channel alone
 
 
 class _Loops(Generic[Controller]):
-    """The loops of a search, each built and measured once.
+    """The loops of a search, each built and assessed once.
 
     A place is a point of the search: the exponents of `slower`, followed by those of `lower`.
     """
@@ -272,7 +273,7 @@ class _Loops(Generic[Controller]):
         self.highest = np.repeat([[exponent(MAX_SLOWER)], [exponent(MAX_LOWER)]], self.m, axis=1)
 
     def search(self, requirement: Requirement) -> Trial[_Measured[Controller]]:
-        """Find the trial with the least cost that meets a requirement, or the least shortage."""
+        """Find the trial of least cost that meets a requirement, or the trial of least shortage."""
         assess = partial(self.assess, requirement)
         lowest = np.zeros_like(self.highest)
         best = descend(assess, self._fastest_integrals(assess), MOVES, lowest, self.highest)
@@ -295,8 +296,8 @@ class _Loops(Generic[Controller]):
         for place in places:
             candidate, margins = self._measured[place]
             phase, gain, damping = fractions(margins, requirement)
-            # Each channel integrates, so a channel without a crossover has it below the frequencies
-            # that were evaluated.
+            # Each channel integrates, so it has a crossover. A channel without one has it below the
+            # frequencies that were evaluated.
             is_certain = margins.stable & np.isfinite(margins.phase)
             fraction = np.where(is_certain, np.minimum(phase, gain), 0.0)
             goals = np.append(fraction, damping if margins.stable else 0.0)
@@ -331,18 +332,19 @@ class _Loops(Generic[Controller]):
     def _fastest_integrals(
         self, assess: Assess[_Measured[Controller]]
     ) -> Trial[_Measured[Controller]]:
-        """Find the trial with the rule's bandwidths and the fastest integrals within the margins.
+        """Find the trial with the rule's bandwidths and the largest possible integral gains.
 
-        Here every channel has its margins by itself. If a channel has no such integral, it gets the
-        integral of the rule.
+        Here every channel alone must have its margins. A channel for which no integral gain
+        suffices gets that of the rule.
 
-        All channels double and bisect their exponents at once, since channels couple little. If the
-        result then lacks a margin, its channel gets a slower integral, step by step.
+        The exponents of all channels are doubled and bisected at once, because channels couple
+        little. If the result lacks a margin, its channel gets a smaller integral gain, step by
+        step.
         """
         highest = self.highest[0]
         rule = np.zeros(self.m, dtype=np.int64)
-        short = rule - 1  # the largest exponents so far at which a margin is missing
-        enough = highest + 1  # the least exponents so far at which no margin is missing
+        short = rule - 1  # the largest exponents so far with which a margin is missing
+        enough = highest + 1  # the least exponents so far with which no margin is missing
         tried = rule
         while True:
             (trial,) = assess([(*tried.tolist(), *rule.tolist())])
@@ -367,7 +369,7 @@ class _Loops(Generic[Controller]):
 
 
 def _stacked(candidates: Sequence[Candidate[Controller]]) -> LinearLoop:
-    """Stack the loops of candidates around one aircraft into one, with a law each."""
+    """Join the loops of candidates around the same aircraft to one loop with several laws."""
     laws = zip(*(candidate.loop.law for candidate in candidates), strict=True)
     return candidates[0].loop._replace(law=LinearLaw(*(np.stack(matrices) for matrices in laws)))
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a phase margin costs: the error of the linear loop along a manoeuvre.
+"""Show what a phase margin costs in tracking error of the linear loop along a manoeuvre.
 
-Gains are selected for several requirements, and their errors compared.
+Gains are selected for several requirements, and the errors of their loops are compared.
 """
 
 import math
@@ -19,10 +19,10 @@ TRADED_PHASE_MARGINS = (30.0, 40.0, 45.0, 60.0)  # deg
 
 
 class TradeRow(NamedTuple):
-    """The engineering gains for a phase margin."""
+    """The margins and errors of the loop with the engineering gains for a phase margin."""
 
     phase_margin: float  # deg, the requirement
-    reached: float  # deg, the least phase margin of the loop
+    reached: float  # deg, least phase margin that the loop has
     delay_margin: float  # s
     # (m,) rms error of the linear loop along the manoeuvre, SI, by output of the law
     rms: FloatArray
@@ -31,9 +31,9 @@ class TradeRow(NamedTuple):
 def trade(
     selection: Selection, phase_margins: Sequence[float] = TRADED_PHASE_MARGINS
 ) -> tuple[TradeRow, ...]:
-    """Select the engineering gains for other phase margins, deg.
+    """Select the engineering gains for several required phase margins, deg.
 
-    The errors are those of the nominal aircraft.
+    The errors in the rows are those of the nominal aircraft.
     """
     nominal = _nominal(selection.study)
     rows = []
@@ -53,7 +53,7 @@ def trade(
 
 
 def _nominal(study: Study) -> Study:
-    """Reduce a study to the nominal airframe."""
+    """Return a study of the nominal airframe alone."""
     return study._replace(
         A=study.A[:1], B=study.B[:1], u_dot=study.u_dot[:, :1], stable=study.stable[:1]
     )

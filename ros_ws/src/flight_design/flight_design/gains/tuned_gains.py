@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of tuned gains: a file per scenario, with gains by law and objective."""
+"""Read and write files of tuned gains: one per scenario, with gains by law and objective."""
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -18,7 +18,7 @@ TUNED = Path(__file__).parent / "tuned"  # folder of the tuned gains, one file a
 
 
 class TuningResult(NamedTuple):
-    """Result of a search."""
+    """Result of a search for tuned gains."""
 
     gains: dict[str, list[float]]
     cost: float
@@ -28,7 +28,7 @@ class TuningResult(NamedTuple):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes a tuning result in flow style: a line or two per gain set."""
+    """A YAML dumper that writes a tuning result in flow style, with a line or two per gain set."""
 
 
 _Dumper.add_representer(
@@ -45,7 +45,7 @@ def tuned_file(scenario: Scenario) -> Path:
 
 
 def load(path: Path) -> dict[str, dict[str, TuningResult]]:
-    """Load tuned gains by law and objective. Returns {} if there is no file.
+    """Load tuned gains by law and objective, or return {} if the file does not exist.
 
     Raises ParameterError if the file cannot be read.
     """
@@ -56,7 +56,10 @@ def load(path: Path) -> dict[str, dict[str, TuningResult]]:
 
 @lru_cache(maxsize=16)
 def _load(path: Path, _changed_ns: int) -> dict[str, dict[str, TuningResult]]:
-    """Do the work of `load` once per state of a file: a learner designs every few seconds."""
+    """Load tuned gains, with a cache that holds as long as the file does not change.
+
+    The cache matters because a learner designs every few seconds.
+    """
     content = read_yaml(path, path.name, "a file of tuned gains")
     try:
         laws = content["laws"].items()

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The steps from a channel map to gains, without a model of the aircraft.
+"""Find gains for an aircraft behind a bridge, from a channel map and an experiment in flight.
 
-The first result is the scenario of an experiment, and the second a scenario that flies the
-aircraft.
+There is no model of the aircraft. The first result is the scenario of the experiment. The second
+result is a scenario that flies the aircraft.
 
 The experiment excites the inputs in turn, open loop. `identify_response` estimates Omega, lags and
-delays from its log. The airframe of the scenarios is y_dot = Omega u, because nothing else is known
-about the aircraft.
+delays from its log. The airframe in both scenarios is y_dot = Omega u, because nothing else is
+known about the aircraft.
 """
 
 import math
@@ -39,11 +39,11 @@ from rise_di_controller.params import ControllerConfig
 
 RATE = 100.0  # Hz, default rate of the law and the reference model
 
-AMPLITUDE = 0.2  # default amplitude as a share of the smaller limit of an input
+AMPLITUDE = 0.2  # default amplitude, as a share of the smaller limit of an input
 
 
 class Excitation(NamedTuple):
-    """The excitation of an input."""
+    """The excitation of an input by doublets and a frequency sweep."""
 
     width: float = 0.25  # s
     period: float = 6.0  # s
@@ -58,21 +58,22 @@ EXCITATIONS: Mapping[str, Excitation] = {
     "climb": Excitation(width=0.8, period=10.0, lowest=0.1, highest=1.5),
 }
 """Excitations by the motion that the input causes. Any other input turns the aircraft."""
-PAUSE = 1.5  # s, between the inputs
+PAUSE = 1.5  # s, pause between the excitations of two inputs
 
-# Ratio of the controller's age limit to the largest age limit of the bridge. The failsafe of the
-# bridge must act first.
+# Ratio of the controller's age limit to the largest age limit of the bridge. It is above 1, so that
+# the failsafe of the bridge acts first.
 AGE = 1.5
 HOLD = 0.5  # s
 RAMP = 2.0  # s
-WAIT = 30.0  # s before the first command of the flight, in which the user engages
+WAIT = 30.0  # s before the first command of the flight; in this time the user engages
 
 
 def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
     """Pair each output with the input that drives it, and return the signs of the effects, (m,).
 
-    The motions of the map decide. Raises ParameterError if an output has no input, or if the sign
-    of an output is opposite to that of the stack.
+    An output and an input belong together if the map gives them the same motion. Raises
+    ParameterError if an output has no input, or if the sign of an output is opposite to that of the
+    stack.
     """
     drivers: dict[str, tuple[str, int]] = {}
     for name, row in channel_map.inputs.items():
@@ -129,9 +130,9 @@ def require_envelope(channel_map: ChannelMap) -> None:
 
 
 class Experiment(NamedTuple):
-    """The files of an experiment."""
+    """The files of an experiment that excites the inputs of an aircraft."""
 
-    airframe: str  # text of the airframe file, which has nothing but signs
+    airframe: str  # text of the airframe file, in which only the signs of the effects are known
     scenario: str  # text of the scenario file
     controller: ExcitationConfig
 
@@ -188,7 +189,7 @@ def experiment(
     )
 
 
-WHOLE = 0.95  # share of the planned duration; reports of the engagement are late by less than 5 %
+WHOLE = 0.95  # share of the planned duration; reports of engagement are less than 5 % late
 
 
 def reason_against_experiment(engagements: Sequence[Engagement], duration: float) -> Refusal | None:
@@ -212,12 +213,12 @@ def reason_against_experiment(engagements: Sequence[Engagement], duration: float
 def channel_models(
     channel_map: ChannelMap, tape: Tape, spans: Spans, speed: float | None
 ) -> list[ChannelModel | None]:
-    """Identify the channels of a map from the log of an experiment, in `spans` of engagement.
+    """Identify the channels of a map from an experiment's log, within the `spans` of engagement.
 
     A channel without a model is None. `speed` is the airspeed in trim, m/s, or None in hover. V
-    only gets a model if a climb is measured, because thrust also excites the phugoid, which would
-    be taken for a response to thrust. A climb in hover is of first order. Source: G. D. Padfield,
-    "Helicopter Flight Dynamics", 2007, 4.3 (heave).
+    gets a model only if a climb is measured. Thrust also excites the phugoid, and without the climb
+    the phugoid would be taken for the response to thrust. The model of a climb in hover is of first
+    order. Source: G. D. Padfield, "Helicopter Flight Dynamics", 2007, 4.3 (heave).
     """
     pairing, sign = channel_pairs(channel_map)
     y = tape["y"].within(spans)
@@ -242,7 +243,7 @@ def channel_models(
 
 
 def gravity_along_path(pose: Signal, speed: float) -> Signal | None:
-    """Return the part of V_dot that gravity causes, -g climb / speed, m/s^2, at a pose's stamps.
+    """Return the part of V_dot that gravity causes, -g climb / speed, m/s^2, at the pose's stamps.
 
     Returns None if the pose has no climb.
     """
@@ -256,26 +257,26 @@ def gravity_along_path(pose: Signal, speed: float) -> Signal | None:
 
 
 class IdentifiedChannels(NamedTuple):
-    """What is known about m channels, where input i drives output i; SI."""
+    """What is known about m channels in which input i drives output i, in SI."""
 
     Omega: FloatArray  # (m, m)
-    Omega_deviation: FloatArray  # (m,) standard deviations of its diagonal
+    Omega_deviation: FloatArray  # (m,) standard deviations of the diagonal of Omega
     lag: FloatArray  # (m,) s
     delay: FloatArray  # (m,) s
     damping: FloatArray  # (m,) 1/s; 0 if none is known
     stiffness: FloatArray  # (m,) 1/s^2
-    zero: FloatArray  # (m,) 1/s, slow / Omega
-    # (m,) rms of the output error / rms of y; NaN if only the step response is known
+    zero: FloatArray  # (m,) zero of the response from u to y, 1/s
+    # (m,) rms of the output error divided by the rms of y; NaN if only the step response is known
     misfit: FloatArray
 
 
 def join(
     channel_map: ChannelMap, response: Response, models: Sequence[ChannelModel | None]
 ) -> IdentifiedChannels:
-    """Join the models of the channels with the step responses of those that have no model.
+    """Join the models of the channels; a channel without a model gets its step response.
 
-    Raises ParameterError if a channel has no certain result, or if signs contradict the map or each
-    other.
+    Raises ParameterError if a channel has no certain result. It is also raised if the signs of the
+    effects contradict the map or each other.
     """
     pairing, sign = channel_pairs(channel_map)
     Omega = np.where(np.isfinite(response.Omega), response.Omega, 0.0)
@@ -330,9 +331,10 @@ def join(
 
 
 def over_link(channels: IdentifiedChannels, link_delay: float) -> IdentifiedChannels:
-    """Add the delay of the link, s, to channels from a log that the autopilot wrote on board.
+    """Add the delay of the link, s, to channels that were identified from a log of the autopilot.
 
-    The law flies over the link, so it meets this longer delay.
+    The autopilot wrote the log on board, but the law flies over the link and meets the longer
+    delay.
     """
     return channels._replace(delay=channels.delay + link_delay)
 
@@ -340,9 +342,9 @@ def over_link(channels: IdentifiedChannels, link_delay: float) -> IdentifiedChan
 def measured_trims(
     channel_map: ChannelMap, would_send: Signal, engaged_ns: int
 ) -> dict[str, float]:
-    """Return the commands in trim by input, SI.
+    """Return the command of each input in trim, SI, by the input's name.
 
-    The bridge sent them in the pause after an engagement, while u was 0.
+    These are the commands that the bridge sent in the pause after an engagement, while u was 0.
     """
     stamps = (would_send.stamp_ns - engaged_ns) / NANOSECONDS
     still = (stamps > 0.2 * PAUSE) & (stamps < 0.8 * PAUSE)
@@ -364,9 +366,10 @@ def measured_trims(
 def within_range(
     channel_map: ChannelMap, trims: Mapping[str, float]
 ) -> tuple[ChannelMap, list[str]]:
-    """Return a map whose limits about the trims stay within the ranges of the fields.
+    """Narrow the limits of a map, so that trim plus u stays within the range of each field.
 
-    A sentence reports each limit that it narrows. Raises ParameterError if a trim is at a stop.
+    Returns the map, and a sentence for each limit that was narrowed. Raises ParameterError if a
+    trim is at a stop.
     """
     values = channel_map.model_dump(exclude_unset=True)
     sentences = []
@@ -386,7 +389,7 @@ def within_range(
             ("upper", row.upper, high - trim),
         ):
             if abs(limit) > abs(room):
-                # the trim is rounded, too
+                # stay within the range although the trim is rounded
                 values["inputs"][name][side] = float(f"{room * (1.0 - 1e-4):.5g}")
                 narrower = (
                     f"{name}: its trim is {trim:.3g}, so that the {side} limit is "
@@ -399,7 +402,7 @@ def within_range(
 def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -> str:
     """Write a channel map with the measured trims as text.
 
-    A captured trim is measured again at every engagement.
+    A trim that the map captures at the engagement will be measured again at every engagement.
     """
     values = channel_map.model_dump(exclude_unset=True)
     values["source"] = f"{values['source']}; trims measured in {source}"
@@ -410,7 +413,7 @@ def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -
 
 
 class _WholeRows(yaml.SafeDumper):
-    """A dumper that writes rows in full, without shared references."""
+    """A YAML dumper that writes rows in full, without anchors and aliases."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -443,7 +446,8 @@ def airframe_yaml(
                   + sum_j Omega_ij u_j
         z_i_dot = y_i - zero_i z_i
 
-    z_i has the dimension of y_i dt, and only exists if stiffness_i or zero_i is not 0.
+    The hidden state z_i has the dimension of y_i dt. It exists only if stiffness_i or zero_i is not
+    0.
     """
     m = len(pairing.outputs)
     second = [i for i in range(m) if channels.stiffness[i] or channels.zero[i]]
@@ -477,7 +481,7 @@ def airframe_yaml(
 
 
 def signs_alone(sign: FloatArray) -> IdentifiedChannels:
-    """Return channels of which nothing but the signs is known."""
+    """Return channels of which only the signs of the effects are known."""
     none = 0.0 * sign
     return IdentifiedChannels(
         Omega=np.diag(sign),

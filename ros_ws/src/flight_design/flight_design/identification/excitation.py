@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a log shows an aircraft, and which doublets would show what it lacks."""
+"""Check whether a log shows the effects of the inputs, and say which doublets would show them."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -22,21 +22,22 @@ from flight_design.identification.model_refusals import (
     in_time,
 )
 
-# Least share of an output's variance that its own input must explain. In doublets of yaw the share
-# is 0.2, and without them 0.01 or less.
+# Least share of an output's variance that its paired input must explain. With doublets of yaw the
+# share is 0.2, and without them it is 0.01 or less.
 LEAST_SHARE = 0.05
-CLEAR_SHARE = 0.2  # an output with less is flown again if another output has to be flown again
-WINDY = 1.0  # gusts above this hide the effects of the inputs, in units of moderate turbulence
-FORGETTING = 0.5  # 1/s, taken from the poles, so that what a neutral aircraft integrates fades
+CLEAR_SHARE = 0.2  # an output with a smaller share is flown again if another output has to be
+WINDY = 1.0  # gusts above this, in units of moderate turbulence, hide the effects of the inputs
+# 1/s, shift of the poles to the left, so that the integrals of a neutral aircraft fade
+FORGETTING = 0.5
 FEWEST = 3  # least number of doublets on an axis
 LENGTH = 0.5  # s, length of half a doublet, if the scenario has no pulses
 SIZE = 0.3  # rad/s, size of a doublet, if the scenario has no pulses
-APART = 2.0  # s between doublets
+APART = 2.0  # s, time between doublets
 YAW_RATES = "FW_ACRO_YAW_EN"
 
 
 class OwnShare(NamedTuple):
-    """The share of an output's variance that its own input explains."""
+    """The share of an output's variance that its paired input explains."""
 
     output: str
     input: str
@@ -44,7 +45,7 @@ class OwnShare(NamedTuple):
 
     @property
     def is_still(self) -> bool:
-        """Whether the log does not show the effect of the input."""
+        """Whether the log fails to show the effect of the input on the output."""
         return self.share < LEAST_SHARE
 
     @property
@@ -57,11 +58,11 @@ class OwnShare(NamedTuple):
 
 
 def shares(recorded: FlightData, airframe: Airframe) -> FloatArray:
-    """Return the share of each output's variance that each input explains, (m outputs, m inputs).
+    """Return the share of each output's variance that each input explains, (outputs, inputs).
 
         share_ij = var (C_i x_j) / var y_i,  x_j_dot = (A - FORGETTING) x_j + B_j u_j
 
-    The rough airframe suffices for this. A share is more than 1 if inputs work against each other.
+    A rough airframe suffices. A share exceeds 1 if two inputs work against each other.
     """
     A = airframe.matrix_a() - FORGETTING * np.eye(len(airframe.states))
     B = airframe.matrix_b()
@@ -80,7 +81,7 @@ def shares(recorded: FlightData, airframe: Airframe) -> FloatArray:
 def own_shares(
     recorded: FlightData, airframe: Airframe, channels: ChannelPairing
 ) -> list[OwnShare]:
-    """Return the share of each output, in the law's order, that its own input explains."""
+    """Return the share of each output that its paired input explains, in the law's order."""
     share = shares(recorded, airframe)
     inputs = list(airframe.inputs)
     return [
@@ -92,8 +93,8 @@ def own_shares(
 def to_set(outputs: Iterable[str], parameters: Mapping[str, float]) -> str:
     """Say which parameter of PX4 to set so that its controller flies the doublets, or return "".
 
-    Source: PX4 1.16, fw_rate_control, which without this parameter does not control the yaw rate of
-    a setpoint.
+    Source: PX4 1.16, fw_rate_control. Without this parameter it does not control the yaw rate to
+    its setpoint.
     """
     if "r" not in outputs or parameters.get(YAW_RATES) != 0.0:
         return ""
@@ -103,10 +104,11 @@ def to_set(outputs: Iterable[str], parameters: Mapping[str, float]) -> str:
 def to_fly(
     outputs: Mapping[str, float], scenario: Scenario, airframe: Airframe, y: FloatArray
 ) -> str:
-    """Say which doublets would show some outputs, given the factor on the amplitude of each.
+    """Say which doublets would show the effects on some `outputs`.
 
-    The doublets have the size and length of the scenario's pulses. Their size is at least that of
-    the motion in the log, y (T, m). Returns "" if there are no outputs.
+    `outputs` has the factor on the amplitude of each of them. The doublets have the size and length
+    of the scenario's pulses. Their size is at least that of the motion in the log, y, (T, m).
+    Returns "" if there are no outputs.
     """
     pulses = scenario.reference_model.pulses
     texts = []
@@ -122,10 +124,10 @@ def to_fly(
 
 
 def gust_warning(part: Part) -> str:
-    """Warn of a part that flew in gusts, or return "" if the air was calmer.
+    """Warn that a part of the aircraft was flown in gusts; return "" if the air was calm enough.
 
-    The deviations do not count the error that gusts cause. In gusts of 0.5 m/s the effects of a
-    light airplane came out a fifth too weak.
+    The standard deviations do not include the error that gusts cause. In gusts of 0.5 m/s, the
+    effects on a light airplane came out a fifth too weak.
     """
     if part.wind < WINDY:
         return ""
@@ -137,10 +139,10 @@ def gust_warning(part: Part) -> str:
 
 
 def factors_of(parts: Iterable[Part]) -> dict[str, float]:
-    """Return the outputs that need more motion, each with the factor on its amplitude.
+    """Return the factor on the amplitude of each output that needs more motion, by output.
 
-    No effect on such an output is known to MAX_DEVIATION. An output is left out if a delay makes
-    its effects uncertain, because more motion would not help.
+    For such an output no effect is known to MAX_DEVIATION. An output is left out if its effects are
+    uncertain because of a delay, since more motion would not help.
     """
     return {
         effect.row: excitation_factor(effect)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A scenario for an aircraft with identified channels: its gains, commands and margins."""
+"""Write a scenario for an aircraft with identified channels: gains, commands and margins."""
 
 from typing import Any, NamedTuple
 
@@ -51,15 +51,15 @@ from rise_di_controller.law.law import Sign
 from rise_di_controller.law.linear_loop import LoopTiming
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# s, least time in which u can move from trim to its limit; it bounds beta from below
+# s, least time that u takes from trim to its limit; it bounds beta from below
 FULL_RANGE_TIME = 1.0
 # relative deviation of the uncertain aircraft whose phase margin counts
 UNCERTAINTY = 0.3
 SAMPLES = 20
-# largest sensitivity of the loop of a channel with its integral: it leaves a gain margin of 2 and a
-# phase margin of 29 deg
+# largest sensitivity of a channel's loop with its integral gain. It leaves a gain margin of 2 and a
+# phase margin of 29 deg.
 MAX_SENSITIVITY = 2.0
-# Shares of the wanted integral that are tried.
+# Shares of the wanted integral gain that are tried.
 INTEGRALS = np.append(np.geomspace(1.0, 0.01, 40), 0.0)
 
 
@@ -67,10 +67,10 @@ class Flyable(NamedTuple):
     """A controller for an identified aircraft, and the files for its flight."""
 
     controller: RiseDiConfig
-    # s, of the loop around the identified channels with lags and delay; None without a softened
-    # sign
+    # s, delay margin of the loop around the identified channels with lags and delay; None if the
+    # sign is not softened
     delay_margin: float | None
-    lack: Refusal | None  # the required margins that the loop does not reach
+    lack: Refusal | None  # the required margins that the loop lacks
     airframe: str  # text of the airframe file
     scenario: str  # text of the scenario file
 
@@ -85,9 +85,9 @@ def flying_scenario(
     """Select gains for identified channels, and write the texts of the airframe and the scenario.
 
     The bandwidths follow from lag, delay and rate by the engineering procedure, for y_dot = Omega
-    u. The integrals follow from damping and stiffness. Both are lowered until the loop around the
-    identified channels meets `requirement`. The model of the feedforward is the airframe in
-    coordinated turns without sideslip.
+    u. The integral gains follow from damping and stiffness. Bandwidths and integral gains are
+    lowered until the loop around the identified channels meets `requirement`. The model of the
+    feedforward is the airframe in coordinated turns without sideslip.
     """
     identified = _Identified(channel_map, channels, speed)
     commands = identified.commands()
@@ -135,19 +135,19 @@ class _Identified(NamedTuple):
 
     @property
     def pairing(self) -> ChannelPairing:
-        """Outputs and the inputs that drive them."""
+        """Outputs, each with the input that drives it."""
         return channel_pairs(self.channel_map)[0]
 
     @property
     def loop(self) -> LoopTiming:
-        """The loop with one delay for all channels. Further delay of a channel counts as lag."""
+        """The loop with the least delay of all channels. Further delay counts as lag."""
         channels = self.channels
         delay = float(np.min(channels.delay))
         return LoopTiming(channels.lag + channels.delay - delay, delay, 1.0 / RATE)
 
     @property
     def products(self) -> dict[str, float]:
-        """Crossover times lag, by output."""
+        """Crossover frequency times lag of each channel's loop, rad, by output."""
         motion_by_output = motions(self.channel_map).items()
         return {
             name: gain_selection.CROSSOVER_LAG_PRODUCTS[motion] for name, motion in motion_by_output
@@ -155,12 +155,12 @@ class _Identified(NamedTuple):
 
     @property
     def reach(self) -> FloatArray:
-        """The smaller limit of each input, (m,)."""
+        """The smaller of the two limits of each input, (m,)."""
         rows = [self.channel_map.inputs[name] for name in self.pairing.inputs]
         return np.array([min(-row.lower, row.upper) for row in rows])
 
     def commands(self) -> FirstCommands:
-        """Return the `first_commands`, which the loop can follow, and which begin after WAIT."""
+        """Return the `first_commands`, which the loop can follow; they begin after WAIT."""
         crossover = bandwidths(self.loop, np.array(list(self.products.values())))
         authority = np.abs(np.diag(self.channels.Omega)) * self.reach
         channels = {
@@ -183,10 +183,10 @@ class _Identified(NamedTuple):
         return Airframe.validate_mapping(yaml.safe_load(self.airframe_text(source)), "airframe")
 
     def of_integrators(self, manoeuvre: Manoeuvre) -> Study:
-        """Study y_dot = Omega u.
+        """Study the ideal control of y_dot = Omega u, for its slew.
 
-        The study lasts only 1 s. It would have to be longer for the literal gain set, which needs
-        more of the manoeuvre than its slew but is not used.
+        A manoeuvre of 1 s suffices for the slew. Only the gain set of Theorem 1 would need more of
+        the manoeuvre, but it is not used.
         """
         none = np.zeros_like(self.channels.damping)
         channels = self.channels._replace(damping=none, stiffness=none, zero=none)
@@ -195,7 +195,7 @@ class _Identified(NamedTuple):
         return ideal_control.study_airframe(integrators, short, samples=1)
 
     def setting(self, requirement: Requirement) -> LoopSetting:
-        """Return the loop that gains are selected for. Before the selection every gain is 1."""
+        """Return the loop for which gains are selected; they are 1 before the selection."""
         loop = self.loop
         lag = loop.lag.tolist()
         channels = controller_values(self.channel_map, self.pairing)
@@ -215,7 +215,7 @@ class _Identified(NamedTuple):
 def _within_margins(
     controller: RiseDiConfig, study: Study, requirement: Requirement
 ) -> tuple[RiseDiConfig, LoopMargins | None]:
-    """Lower the integrals and bandwidths of a controller until its loop has the margins.
+    """Lower the integral gains and bandwidths of a controller until its loop has the margins.
 
     The loop is around the airframe of a study. Returns the controller and the margins. The input
     scale is divided by the same factor as the bandwidth, so that the K of (22) stays.
@@ -233,7 +233,7 @@ def _within_margins(
             "softening": np.array(controller.softening) * (slower * lower) * ones,
             "input_scale": np.array(controller.input_scale) / lower * ones,
             "omega": np.array(controller.omega) / lower * ones,
-            "beta": np.array(controller.beta) * lower * ones,  # the same rate of u
+            "beta": np.array(controller.beta) * lower * ones,  # keep the rate of u
         }
         values = controller.model_dump() | {key: value.tolist() for key, value in changes.items()}
         config = RiseDiConfig.validate_mapping(values, "controller")
@@ -244,10 +244,11 @@ def _within_margins(
 
 
 def _without_sideslip(channels: IdentifiedChannels, pairing: ChannelPairing) -> IdentifiedChannels:
-    """Return the channels, with the channel r reduced to its damping.
+    """Return the channels with the channel r reduced to its damping.
 
-    The stiffness of r is N_beta, which acts in straight flight. In a coordinated turn beta_dot = -r
-    + g / V phi is 0, and a rudder that worked against the stiffness would make the aircraft skid.
+    The stiffness of r is N_beta, which acts in straight flight. In a coordinated turn, beta_dot =
+    -r + g / V phi is 0, so the stiffness does not act. A rudder that worked against it would make
+    the aircraft skid.
     """
     turns = np.array([name == "r" for name in pairing.outputs])
     damping = np.where(turns, channels.damping - channels.zero, channels.damping)
@@ -264,12 +265,13 @@ def _with_integrals(
     channels: IdentifiedChannels,
     loop: LoopTiming,
 ) -> RiseDiConfig:
-    """Give the controller integrals for the models, at the crossover of y_dot = Omega u.
+    """Choose the integral gains of a controller from the models of the channels.
 
-    The slope of the softened sign is 1 / (softening total lag). Lambda and this slope are the
-    integrals of K (s + integral) / s. In a first-order channel, the integral is the damping, and
-    the loop becomes K / s. A stiff channel answers u with a rate and needs a larger integral,
-    unless the sensitivity would then exceed MAX_SENSITIVITY. Source: K. J. Astrom, T. Hagglund,
+    The slope of the softened sign is 1 / (softening total lag). Lambda plus this slope is the
+    integral of the PI law K (s + integral) / s. For a first-order channel the integral is the
+    damping, so that the loop becomes K / s. In a channel with stiffness, y returns to trim under a
+    constant u, so the channel needs a larger integral. The sensitivity must stay below
+    MAX_SENSITIVITY. The crossover is that of y_dot = Omega u. Source: K. J. Astrom, T. Hagglund,
     "Advanced PID Control", 2006, 6.5 (lambda tuning), 4.6 (largest sensitivity).
     """
     places = [pairing.outputs.index(name) for name in controller.outputs]
@@ -284,14 +286,14 @@ def _with_integrals(
 
 
 def _integral(channels: IdentifiedChannels, i: int, crossover: float, total_lag: float) -> float:
-    """Return the integral of a channel, 1/s, for a loop that crosses over at `crossover`, rad/s.
+    """Return the integral gain of a channel, 1/s, for a loop with the crossover `crossover`, rad/s.
 
-    It is at most the largest safe integral.
+    It is at most the largest integral gain whose sensitivity is below MAX_SENSITIVITY.
     """
     omega = np.geomspace(0.1, 1e3, 400) * crossover
 
     def response(omega: Any) -> Any:
-        """Return the response of the model times K, without the delay."""
+        """Return the frequency response of the model times K, without the delay."""
         s = 1j * omega
         return (
             crossover

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The Kalman filter of the observer over a recorded flight.
+"""Run the observer's Kalman filter over a recorded flight, for many models side by side.
 
-y and u come in equal periods. The innovations of many models are computed side by side.
+y and u have equal periods. The filters give the innovations of the models.
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,22 +28,23 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.nominal import airframe_model
 from rise_di_controller.law.linear_loop import LoopTiming
 
-# s at the start of a recording. Innovations in this time do not count, because the filter starts
-# from y alone.
+# s at the start of a recording whose innovations do not count, because the filter starts from y
+# alone.
 TRANSIENT = 0.5
-MOST_GAPS = 10.0  # largest ratio of the length of a log, gaps included, to the time with a u
-# Small noises of the filter apart from the wind, as in `observer_design.Weights`.
+MOST_GAPS = 10.0  # largest ratio of the length of a log, with its gaps, to the time that has a u
+# Noises of the filter other than the wind, as in `observer_design.Weights`. They are small.
 DRIFT = 0.003
 LOOSE = 1.5e-4
-# Least noise of y in the filter, in units of 1 m/s or 0.1 rad/s. Even with a perfect sensor the
+# Least noise of y in the filter, as a share of 1 m/s or 0.1 rad/s. Even with a perfect sensor the
 # model leaves something out.
 MIN_NOISE = 1e-2
-LEAK = 1e-3  # factor on observer_design.LEAK: the filter must not forget its angles in a minute
-HOLD = 5  # periods of a block; sin(x) - x is held over a block, because it changes slowly
-# s, decay of the rate of a gust, and of the change of that rate
+LEAK = 1e-3  # factor on observer_design.LEAK, because the filter must keep its angles for minutes
+HOLD = 5  # periods of a block, over which sin(x) - x is held, because it changes slowly
+# s, time constants with which the rate of a gust decays, and the change of this rate
 GUST_TIME = 0.5
 RATE_TIME = 0.2
-LEAST_RATE = 1e-4  # m/s^3 per root s, negligible noise of that change if there is no gust
+# m/s^3 per root s, negligible noise of the change of the rate, for a level without gusts
+LEAST_RATE = 1e-4
 LEVELS = np.array(
     [(strength, 0.0, 0.0) for strength in (0.002, 0.03, 0.1, 0.3, 1.0, 3.0)]
     + [(strength, 0.0, strength) for strength in (0.1, 0.3, 1.0, 3.0)]
@@ -63,7 +64,7 @@ SHEARED = ("alpha", "q")
 
 
 class FlightData(NamedTuple):
-    """A flight in T equal periods, channels in the airframe's order, deviations from trim."""
+    """A flight of T equal periods as deviations from trim, channels in the airframe's order."""
 
     period: float  # s
     t: FloatArray  # (T,) flight time, s
@@ -74,7 +75,8 @@ class FlightData(NamedTuple):
 def coarser(recorded: FlightData, factor: int) -> FlightData:
     """Average a flight over `factor` periods.
 
-    A mean of u is over the time between the middles of two means of y.
+    The time of each mean of u lies between the middles of two means of y, as u is held over a
+    period.
     """
     count = len(recorded.t) // factor
     leads = [
@@ -96,7 +98,7 @@ class Actuation(NamedTuple):
 
 
 def recording(tape: Tape, airframe: Airframe) -> FlightData:
-    """Return y and u of a tape at the rate of u, from the first u on.
+    """Return y and u of a tape at the rate of u, beginning with the first u.
 
     At each instant y is the nearest sample, within half a period, and u is the last sample. Raises
     ParameterError if the log lacks a channel of the airframe, is shorter than ten times TRANSIENT,
@@ -149,17 +151,16 @@ def recording(tape: Tape, airframe: Airframe) -> FlightData:
 
 
 def filter_model(airframe: Airframe, actuation: Actuation, recorded: FlightData) -> NominalModel:
-    """Return the model that the filter of an airframe uses, channels in the airframe's order."""
+    """Return the model for the filter of an airframe, with channels in the airframe's order."""
     noise = measured_noise(recorded.y, airframe.matrix_c() @ unit_sizes(airframe.states.values()))
     loop = LoopTiming(actuation.lag, actuation.delay, recorded.period)
     return airframe_model(airframe, airframe.outputs, tuple(airframe.inputs), noise, loop)
 
 
 def delayed(u: FloatArray, periods: float) -> FloatArray:
-    """Return u, (T, m), some periods later.
+    """Return u, (T, m), delayed by a number of periods.
 
-    If the delay is not a whole number of periods, the result is the mean of the u that acts within
-    a period.
+    If the number is not whole, the result is the mean of u over each period.
     """
     full_periods = int(periods)
     part = periods % 1.0
@@ -168,27 +169,28 @@ def delayed(u: FloatArray, periods: float) -> FloatArray:
 
 
 def measured_noise(y: FloatArray, size: FloatArray) -> FloatArray:
-    """Estimate the noise of each channel, rms of a sample, from the third differences of y, (T, m).
+    """Estimate the noise of each channel from the third differences of y, (T, m), rms per sample.
 
     The variance of these differences is 20 times that of the noise. The result is at least
     MIN_NOISE times `size`, the unit of the channel.
     """
     third = np.diff(y, n=3, axis=0)
-    spread = np.nanmedian(np.abs(third), axis=0) / 0.6745  # for a normal distribution
+    # 0.6745 sigma is the median magnitude of a normal value
+    spread = np.nanmedian(np.abs(third), axis=0) / 0.6745
     return np.asarray(np.maximum(spread / np.sqrt(20.0), MIN_NOISE * size))
 
 
 class FilterBank(NamedTuple):
     """Stationary Kalman filters of N models at each level of the wind."""
 
-    sampled: ObserverModel  # Phi (N, 1, s, s), Gamma (N, 1, s, m)
+    sampled: ObserverModel  # Phi (N, 1, s, s) and Gamma (N, 1, s, m) of s states
     L: FloatArray  # (N, levels, s, m)
-    covariance: FloatArray  # (N, levels, m, m) of the innovations
+    covariance: FloatArray  # (N, levels, m, m) covariance of the innovations
     gravity: FloatArray  # (n, n)
     period: float  # s
 
     def by_level(self) -> "FilterBank":
-        """Return the first model at every level of the wind, as one model for each level."""
+        """Return a bank with the first model of this bank once for each level of the wind."""
         levels = self.L.shape[1]
         Phi, Gamma = (
             np.repeat(matrix[:1], levels, axis=0)
@@ -202,9 +204,11 @@ class FilterBank(NamedTuple):
         )
 
     def lifted(self, level: int, seen: Sequence[bool]) -> FloatArray:
-        """Return HOLD periods as one step, (N, HOLD m + s, ..).
+        """Return HOLD periods of the filters as one linear map, (N, HOLD m + s, ..).
 
-        The map takes z, the y and u of the periods, and sin(x) - x, in this order, to r and z.
+        The map takes z, the y and u of the periods, and sin(x) - x, stacked in this order. It gives
+        the innovations r of the periods and then the z after them. `seen` says in which periods y
+        was received.
         """
         H = self.sampled.H
         Phi = self.sampled.Phi[:, 0]
@@ -225,13 +229,13 @@ class FilterBank(NamedTuple):
 
 
 class Passage:
-    """The filters of a bank over y, (T, m), and u, (T, m), or (N, T, m) if each model has its own.
+    """The filters of a bank over a flight, with y, (T, m), and u, (T, m) or (N, T, m) by model.
 
         r = y - H z,  z+ = Phi (z + L r) + Gamma u + period gravity (sin(x) - x)
 
-    There is no update if y is lost. A block of HOLD periods has one `level`, (T / HOLD,). sin(x) -
-    x is held over a block, so that a block is linear. Blocks with the same level and the same lost
-    samples have the same matrix.
+    If y is lost, there is no update by r. A block of HOLD periods has one `level`, (T / HOLD,).
+    sin(x) - x is held over a block, so that a block is linear. Blocks with the same level and the
+    same lost samples share a matrix.
     """
 
     def __init__(
@@ -260,7 +264,7 @@ class Passage:
         )
         state_columns = np.r_[:s, s + 2 * HOLD * m : lifted[0].shape[-1]]
         driven = slice(s, s + 2 * HOLD * m)
-        # z, and its angles once more in place of sin(x) - x
+        # z, followed by its angles a second time, which become sin(x) - x
         following = HOLD * m + np.append(np.arange(s), self._angles)
         for k, matrix in enumerate(lifted):
             columns = np.flatnonzero(self._kind == k)
@@ -275,7 +279,7 @@ class Passage:
     def run(
         self, z: FloatArray, first: int = 0, last: int | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the innovations in some blocks, (N, periods, m), and the z after them.
+        """Return the innovations in blocks `first` to `last`, (N, periods, m), and z after them.
 
         The filters start from z, (N, s). The innovations are NaN where y is lost.
         """
@@ -285,7 +289,7 @@ class Passage:
         states[0, ..., 0] = np.concatenate([z, z[:, self._angles]], axis=1)
         sine = np.empty(states[0, :, s:].shape)
         next_state = np.empty(states[0].shape)
-        # This loop takes half of a search, so that it makes no arrays.
+        # This loop takes half the time of a search, so it allocates no arrays.
         for k, now, turned, following in zip(
             kind.tolist(), states[:-1], states[:-1, :, s:], states[1:], strict=True
         ):
@@ -302,7 +306,7 @@ class Passage:
 
 
 def in_rolling_air(airframe: Airframe) -> Airframe:
-    """Add the rotary gust in roll to an airframe whose span is known.
+    """Add the rotary gust in roll to an airframe, if its span is known.
 
     The rotary gust in pitch follows from the vertical wind, see `filter_bank`. The rotary gust in
     yaw is small compared with the lateral wind.
@@ -313,12 +317,12 @@ def in_rolling_air(airframe: Airframe) -> Airframe:
 def wind_model(
     axes: Sequence[str], speed: float, span: float | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return time constants, s, and noises, m/s per root s, of winds of first order, (G,) each.
+    """Return the time constants, s, and noises, m/s per root s, of first-order winds, (G,) each.
 
-    The winds resemble Dryden's moderate turbulence, whose spectrum they have at low and at high
-    frequencies. With T = L / V0 this spectrum is 2 sigma^2 T / (1 + (T omega)^2) along the flight
-    path, and sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across it. The rotary gust in
-    roll, rad/s, is that of `roll_gust`. `speed` is V0 and `span` the wing span, both in SI.
+    The winds approximate Dryden's moderate turbulence: they have its spectrum at low and at high
+    frequencies. With T = L / V0, Dryden's spectrum is 2 sigma^2 T / (1 + (T omega)^2) along the
+    flight path, and sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across it. The rotary gust
+    in roll, rad/s, is that of `roll_gust`. `speed` is V0 and `span` the wing span, both in SI.
     """
     if not axes:
         # A multicopter hovers at a speed of 0.
@@ -337,7 +341,7 @@ def wind_model(
 
 
 class FilterAir:
-    """The winds of a filter and how they move the aircraft, see `filter_bank`."""
+    """The states of the wind in a filter, and how they move the aircraft, see `filter_bank`."""
 
     def __init__(
         self, names: Names, speed: float, span: float | None, shear: FloatArray | None
@@ -357,7 +361,7 @@ class FilterAir:
         )
 
     def around(self, model: NominalModel) -> NominalModel:
-        """Extend the models by the states of the winds: A (N, 1, s, s) and B (N, 1, s, m)."""
+        """Add the states of the winds to the models: A becomes (N, 1, s, s), and B (N, 1, s, m)."""
         (N, n, m), G = model.B.shape, model.wind.shape[-1]
         s = n + len(self.states)
         x, w, v, a, slow = np.split(np.arange(s), np.cumsum([n, G, *2 * [len(self._smooth)]]))
@@ -393,7 +397,10 @@ class FilterAir:
         )
 
     def noises(self, strength: FloatArray, levels: NDArray[np.int64] | slice) -> FloatArray:
-        """Return the noises of all states, (N, levels, s), for winds of some strength, (N, G)."""
+        """Return the noises of all s states at each level, (N, levels, s).
+
+        `strength`, (N, G), multiplies the noise of each wind.
+        """
         winds, changes, rolls = (LEVELS[levels, None, k] for k in range(3))
         noise = self._noise
         smooth = self._smooth
@@ -420,20 +427,21 @@ def filter_bank(
 ) -> FilterBank:
     """Design the filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G).
 
-    The models are at the trim speed V0, m/s, and z = [x, w, v, a, ..].
+    The models hold at the trim speed V0, m/s. The state z = [x, w, v, a, ..] has the aircraft's
+    state x, the wind w, the rate v of the wind in a gust, and the change a of this rate.
 
         w_dot = v - w / wind_time + noise,  v_dot = a - v / GUST_TIME,
             a_dot = -a / RATE_TIME + noise
 
-    A rotary gust has neither v nor a. With a `shear` (N, 2), the vertical wind w also turns the
-    air: its slope acts behind the lag T = 4b / (pi V0) of the span b.
+    A rotary gust has neither v nor a. With a `shear`, (N, 2), the vertical wind w also turns the
+    air. The slope of w along the path acts behind the lag T = 4b / (pi V0) of the span b.
 
         q_g = (w - l) / (V0 T),  l_dot = (w - l) / T
         alpha_dot -= shear_1 q_g,  q_dot -= shear_2 A[q, q] q_g
 
-    A frozen field of wind has the shear (0, -1). The specification has the opposite sign, and in
-    other models of the air the slope also moves alpha. The noises are those of `levels` of LEVELS
-    times `strength` (N, G). `drift` is as in `observer_design.Weights`. If the models are `near`
+    A frozen field of wind has the shear (0, -1). The specification gives q_g the opposite sign, and
+    in other models of the air the slope also moves alpha. The noises are the `levels` of LEVELS
+    times `strength`, (N, G). `drift` is as in `observer_design.Weights`. If the models are `near`
     the first one, their gains are computed from its gains, exact to first order.
     """
     air = FilterAir(names, speed, span, shear)
@@ -453,7 +461,7 @@ def filter_bank(
     L = observer_design.aircraft_correction(
         sampled, each, weights, corrections_near if near else correction_of
     )
-    # Since L = S H'(H S H' + R)^-1, I - H L = R (H S H' + R)^-1.
+    # S is the covariance. L = S H'(H S H' + R)^-1, so I - H L = R (H S H' + R)^-1.
     covariance = np.linalg.solve(
         np.eye(m) - sampled.H @ L, np.broadcast_to(np.diag(model.noise**2), (*L.shape[:2], m, m))
     )
@@ -473,11 +481,14 @@ OF_INPUTS = (
     "total_lag",
     "lower",
     "upper",
-)  # vectors of a model, by input
+)  # parameters of a model that are vectors over its inputs
 
 
 class Block(NamedTuple):
-    """Indices of a part of the aircraft that does not couple with the rest."""
+    """Indices of the states, channels and winds of a block.
+
+    A block is a part of the aircraft that does not couple with the rest.
+    """
 
     states: NDArray[np.int64]
     inputs: NDArray[np.int64]
@@ -499,7 +510,7 @@ class Block(NamedTuple):
         return Names(*parts)
 
     def restricted(self, model: NominalModel) -> NominalModel:
-        """Restrict a model to this part."""
+        """Return the part of a model that belongs to this block."""
         x = self.states
         u = self.inputs
         y = self.outputs
@@ -525,7 +536,7 @@ def _block(parts: Sequence[NDArray[np.int32]], label: np.int32) -> Block:
 def blocks(model: NominalModel) -> list[Block]:
     """Split an aircraft into the parts that A, gravity, B, C and the wind do not couple.
 
-    If a part has not as many inputs as outputs, the whole aircraft is one part.
+    If the numbers of inputs and outputs differ in a part, the whole aircraft is one part.
     """
     (n, m), G = model.B.shape, model.wind.shape[1]
     coupled = np.zeros((n + 2 * m + G, n + 2 * m + G))

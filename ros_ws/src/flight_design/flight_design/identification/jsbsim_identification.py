@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification of an aircraft of JSBSim: its linear airframe, its gains and a scenario.
+"""Identify an aircraft of JSBSim: its linear airframe, its gains and a scenario.
 
-The airframe is the linearisation of JSBSim about the trim. Its gains are those that `rise-di gains`
-would select for it. No number in this module is specific to an aircraft.
+The airframe is the linearisation of JSBSim about the trim. The gains are those that `rise-di gains`
+would select for this airframe. No number in this module is specific to an aircraft.
 """
 
 from collections.abc import Callable
@@ -67,21 +67,22 @@ from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiCo
 
 CONTROL_RATE = 100.0
 STEP = 0.005
-# s, delay over topics. At a tick y is up to 5 ms old, and u waits up to 5 ms. The delay is half of
-# both together, and 1 ms for transport.
+# s, delay over topics. At a tick y is up to 5 ms old, and u waits up to 5 ms. Half of these 10 ms
+# counts, and 1 ms for transport.
 DELAY = 0.006
 
 THROTTLE = list(INPUTS).index("throttle")
 
-# ratio of an output's unit to the noise that an observer expects: 1 mrad/s, 0.01 m/s
+# unit of an output divided by the noise that an observer expects, 1 mrad/s or 0.01 m/s
 NOISE_SHARE = 100.0
 
-# s, least delay margin. The model of an observer without A has no damping, so its loop has less
-# margin than the loop around the aircraft.
+# s, least delay margin of the observer's design loop. The observer's model without A has no
+# damping, so this loop has a smaller margin than the loop around the aircraft.
 STEP_MARGIN = 0.015
 LATERAL = ("beta", "p", "r")
-HELD_FACTOR = 2.0  # damping that is added, in units of the unstable zero: its sign is reversed
-APART = 5.0  # s, from one gust to the next
+# damping that is added, as a multiple of the unstable zero: it reverses the zero's sign
+HELD_FACTOR = 2.0
+APART = 5.0  # s, time from one gust to the next
 
 NOISE = {"q": 0.001, "V": 0.05, "p": 0.001, "r": 0.001}
 """Assumed noise of the sensors of an aircraft that learns, rms of a sample, rad/s and m/s.
@@ -90,33 +91,34 @@ A first flight has the same.
 """
 
 
-# The manoeuvre: one rule for all aircraft
+# The manoeuvre, by one rule for all aircraft
 
-# rad, bandwidth of V times the lag of its loop. It costs 26 degrees of phase, because an engine is
-# more than a lag.
+# rad, bandwidth of V times the lag of its loop. It costs 26 degrees of phase: an engine is more
+# than a lag.
 FASTEST_V = 0.46
-LIGHT_SIGMA = 1.52  # m/s, of light turbulence at high altitude: 5 ft/s, MIL-F-8785C 3.7.2
+LIGHT_SIGMA = 1.52  # m/s, light turbulence at high altitude, 5 ft/s, MIL-F-8785C 3.7.2
 
 
 # Identification
 
 
 class IdentifiedAircraft(NamedTuple):
-    """An identified aircraft and its scenario."""
+    """An aircraft of JSBSim that was identified, with its scenario and flights."""
 
     linear: Linearization
-    # max abs(U - I), for inputs of unit response and outputs in units of the manoeuvre
+    # max abs(U - I), with inputs scaled to unit response and outputs in units of the manoeuvre
     coupling: float
     selection: Selection
-    text: str  # of the scenario file
+    text: str  # text of the scenario file
     sideslip_zero: (
-        float  # 1/s, of sideslip while p and r are held; Assumption 3 fails if it is positive
+        # 1/s, growth rate of sideslip while p and r are held; if positive, Assumption 3 fails
+        float
     )
-    flights: dict[str, ManoeuvreResult]  # "calm", "gust", "turbulence"
+    flights: dict[str, ManoeuvreResult]  # results by air: "calm", "gust", "turbulence"
 
     @property
     def condition(self) -> FlightCondition:
-        """The flight condition, without the rudder if that moves nothing."""
+        """The flight condition, without the rudder if the rudder moves nothing."""
         return self.linear.condition
 
     @property
@@ -133,9 +135,9 @@ class IdentifiedAircraft(NamedTuple):
 
     @property
     def failure(self) -> Refusal | None:
-        """Why the aircraft does not fly.
+        """Why the aircraft does not fly, or None if it flies.
 
-        It flies if every flight completes, and if in calm air the errors are below the commands.
+        It flies if every flight completes, and if the errors in calm air are below the commands.
         """
         for title, flight in self.flights.items():
             if flight.outcome != str(COMPLETED):
@@ -164,25 +166,25 @@ def identify_jsbsim(
 ) -> IdentifiedAircraft:
     """Identify an aircraft of JSBSim in a flight condition, select gains, and fly it.
 
-    The speed is in m/s, the altitude in m. There are four steps.
+    The speed is in m/s, the altitude in m. The identification has four steps.
 
-    1. Trim, first in another process, and linearise: `linearize` gives the airframe.
+    1. Trim, first in a separate process, and linearise: `linearize` gives the airframe.
 
     2. Pair the channels, with outputs in units of the manoeuvre, and take D from the minors.
 
     3. Select gains by the engineering procedure for the airframe behind the lags, along the
-    commands and gusts: `gain_selection.gain_sets`. The sign of V is that of `airspeed_slew`. With
-    `observer_margin`, the delay margin in s of the loop on y_dot = Omega u, the gains are those
-    that go with an extended-state observer for y_dot = Omega u. The margins of that loop meet
+    commands and gusts: `gain_selection.gain_sets`. The beta of V follows from `airspeed_slew`. With
+    `observer_margin`, the gains are those beside an extended-state observer for y_dot = Omega u,
+    and it is the delay margin, in s, of the loop around this model. The margins of that loop meet
     `requirement`, with 35 degrees of phase.
 
     4. Simulate the result in calm air, with a gust, and in turbulence.
 
-    If `guided`, the scenario has guidance by rule in place of the pulses: a turn by 90 degrees and
-    a climb by 100 m. Its stall speed is that of `slowest_trim`. Its sideslip feedback can also fly
-    an aircraft whose `sideslip_zero` is positive. If the scenario `learns`, it does so in moderate
-    turbulence: it begins with the gains alone, `observer_margin` is the margin of the designs, and
-    the rough model is the `sketch` of Omega and speed.
+    If `guided`, guidance flies a turn by 90 degrees and a climb by 100 m in place of the pulses.
+    Its stall speed is that of `slowest_trim`. Its sideslip feedback can also fly an aircraft whose
+    `sideslip_zero` is positive. With `learns`, the flight learns in moderate turbulence. It begins
+    with the gains alone, its designs have the `observer_margin`, and the rough model is the
+    `sketch` of Omega and speed.
 
     Raises FlightEnded if the aircraft does not trim or does not respond, and ParameterError if its
     outputs and inputs cannot be paired, or if the speed is below guidance's speed floor.
@@ -237,9 +239,10 @@ def identify_jsbsim(
 
 
 def _linear(condition: FlightCondition, progress: Callable[[str], None]) -> Linearization:
-    """Linearise the aircraft.
+    """Linearise the aircraft of a flight condition.
 
-    Raises FlightEnded, which names the nearest condition that has a trim.
+    If the condition has no trim, raises FlightEnded, which names the nearest condition that has
+    one.
     """
     progress("trim and linearisation")
     try:
@@ -251,10 +254,10 @@ def _linear(condition: FlightCondition, progress: Callable[[str], None]) -> Line
 
 
 def sideslip_zero(airframe: Airframe) -> float:
-    """Return the rate at which sideslip decays (negative) or grows while p and r are held, 1/s.
+    """Return the growth rate of sideslip while p and r are held, 1/s; negative if sideslip decays.
 
-    It is a zero of the aircraft. Gravity is left out, because the coupling of bank to sideslip is
-    much slower. If the rate is positive, Assumption 3 does not hold. Without a rudder, the aileron
+    The rate is a zero of the aircraft. Gravity is left out, because bank moves sideslip much more
+    slowly. If the rate is positive, Assumption 3 does not hold. Without a rudder, only the aileron
     holds p, and r follows.
     """
     states = [airframe.index(name) for name in LATERAL]
@@ -269,10 +272,10 @@ def sideslip_zero(airframe: Airframe) -> float:
 
 
 def with_sideslip_held(airframe: Airframe, zero: float) -> Airframe:
-    """Return the airframe with more damping of sideslip if its zero of sideslip is unstable.
+    """Return the airframe, with more damping of sideslip if its zero of sideslip is unstable.
 
-    The law holds p and r. Without the feedback of sideslip that guidance gives, sideslip would then
-    diverge.
+    With such a zero, sideslip would diverge while the law holds p and r. The added damping stands
+    for the sideslip feedback of guidance.
     """
     if zero <= 0.0:
         return airframe
@@ -283,19 +286,20 @@ def with_sideslip_held(airframe: Airframe, zero: float) -> Airframe:
 
 
 def airspeed_slew(bandwidth: float, effect: float) -> float:
-    """Return the throttle slew behind beta, 1/s, for a bandwidth of V, rad/s, and an effect, m/s^2.
+    """Return the throttle slew from which beta of V follows, 1/s.
 
-    The airspeed V contains the wind itself. With beta = K bandwidth / 4 sigma, where sigma is
-    LIGHT_SIGMA, the sign moves the throttle in light turbulence no faster than the Lambda of the
-    rule, bandwidth / 4, would.
+    `bandwidth` is that of V, rad/s, and `effect` is that of the throttle, m/s^2. The airspeed V
+    contains the wind itself. With beta = K bandwidth / 4 sigma, where sigma is LIGHT_SIGMA, the
+    sign moves the throttle in light turbulence no faster than the Lambda of the rule, bandwidth /
+    4, would.
     """
     return bandwidth**2 / 4.0 * LIGHT_SIGMA / (gain_selection.BETA_TO_SLEW * effect)
 
 
 def _too_weak(linear: Linearization) -> str:
-    """Say which outputs are moved too weakly by their own input, in sentences after a "; ".
+    """Say in sentences after a "; " which outputs their paired input moves too weakly.
 
-    At full travel, the own input of such an output moves it less than a tenth as much as another
+    At full travel, the paired input of such an output moves it less than a tenth as much as another
     input does.
     """
     inputs = linear.condition.inputs()
@@ -317,9 +321,9 @@ def _too_weak(linear: Linearization) -> str:
 def slowest_trim(condition: FlightCondition) -> float:
     """Find the slowest airspeed at which an aircraft trims in level flight at an altitude, m/s.
 
-    Below this speed, lift or thrust is not enough, so that guidance takes it as the stall speed.
-    The search is a bisection from 0.2 of the condition's speed, and errs by at most 1 % of that
-    speed.
+    Below this speed lift or thrust is not enough, so guidance takes it as the stall speed. The
+    search is a bisection that begins at 0.2 of the condition's speed. Its error is at most 1 % of
+    the condition's speed.
     """
     slow = 0.2 * condition.speed
     fast = condition.speed
@@ -336,7 +340,7 @@ def slowest_trim(condition: FlightCondition) -> float:
 def with_extended_state(selection: Selection, Omega: FloatArray, margin: float) -> Selection:
     """Add an extended-state observer to the engineering gains of a selection.
 
-    Omega is in the aircraft's order.
+    Omega has its channels in the aircraft's order.
     """
     controller = selection.chosen
     size = unit_sizes(OUTPUTS[name] for name in controller.outputs)
@@ -357,9 +361,9 @@ def _in_law_order(Omega: FloatArray, controller: RiseDiConfig) -> FloatArray:
 def learning_selection(
     selection: Selection, condition: FlightCondition, Omega: FloatArray, margin: float
 ) -> Selection:
-    """Add `learn` to a selection, with the feedforward and observer of a sketch.
+    """Add the section `learn`, and the feedforward and observer of a sketch, to a selection.
 
-    They do not fly yet. Omega is in the aircraft's order.
+    Feedforward and observer do not act yet. Omega has its channels in the aircraft's order.
     """
     start = selection.chosen
     name = Path(condition.name).stem
@@ -373,8 +377,8 @@ def learning_selection(
 def _study(airframe: Airframe, commands: FirstCommands) -> Study:
     """Study an airframe along the commands and gusts, without any uncertain aircraft.
 
-    The study uses the equations of the aircraft that flies. An aircraft whose entries are 30 % off
-    can have an unstable zero of sideslip, and then no gains could hold its outputs.
+    The study uses the equations of the aircraft that flies. An uncertain aircraft whose entries are
+    30 % off can have an unstable zero of sideslip, and then no gains could hold its outputs.
     """
     reference = ReferenceModelConfig.validate_mapping(commands.reference, "reference_model")
     gusts = {
@@ -387,7 +391,7 @@ def _study(airframe: Airframe, commands: FirstCommands) -> Study:
 
 
 def _integrators(linear: Linearization) -> Airframe:
-    """Return y_dot = Omega u as an airframe, which is the model of an extended-state observer."""
+    """Return the airframe y_dot = Omega u, which is the model of an extended-state observer."""
     airframe = linear.airframe
     units = airframe.units_of_outputs()
     m = len(units)
@@ -402,10 +406,10 @@ def _integrators(linear: Linearization) -> Airframe:
 def airspeed_bandwidth(authority: float, lag: float) -> float:
     """Return the bandwidth of V, rad/s, for a throttle with an authority, m/s^2, and a lag, s.
 
-    It is min(0.46 / total, authority / sigma). V contains the wind along the path itself. In
-    moderate turbulence, sigma = 3.05 m/s rms, the throttle then moves by its authority rms. With
-    more bandwidth it would go from stop to stop, and the error of V would be twice the wind. This
-    happened on the 737.
+    It is min(0.46 / total, authority / sigma), where total is the total lag. V contains the wind
+    along the path itself. So in moderate turbulence, sigma = 3.05 m/s rms, the throttle moves with
+    an rms of up to its authority. With more bandwidth it would go from stop to stop, and the error
+    of V would be twice the wind. This happened on the 737.
     """
     return min(
         FASTEST_V / float(total_lag(np.array(lag), DELAY, 1.0 / CONTROL_RATE)),
@@ -414,7 +418,7 @@ def airspeed_bandwidth(authority: float, lag: float) -> float:
 
 
 def _setting(linear: Linearization, V_bandwidth: float) -> LoopSetting:
-    """Return the loop for which the gains are selected. The parameters to select are 1."""
+    """Return the loop for which the gains are selected, with gains of 1 before the selection."""
     inputs = list(linear.condition.inputs())
     trim = linear.trim
     base = RiseDiConfig.validate_mapping(
@@ -451,7 +455,7 @@ def _load(text: str) -> Scenario:
 
 
 def _commands(linear: Linearization, setting: LoopSetting) -> FirstCommands:
-    """Return the commands of a linear aircraft in the loop of its gains."""
+    """Return the commands for the linear aircraft in its loop."""
     condition = linear.condition
     products = setting.crossover_lag_products
     total = total_lag(linear.lag, setting.delay, 1.0 / setting.rate)

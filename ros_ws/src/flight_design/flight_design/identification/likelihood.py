@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The likelihood of A and B over one block of a flight.
+"""Compute the likelihood of A and B for one block, from a recorded flight.
 
-The filter of the observer gives the innovations at each level of the wind.
+A block is a part of the aircraft that does not couple with the rest. The Kalman filter of the
+observer gives the innovations at each level of the wind.
 """
 
 from collections.abc import Iterable, Sequence
@@ -34,62 +35,63 @@ from flight_design.identification.innovation_filters import (
 )
 
 PRIOR = 0.29  # standard deviation of a relative error before the flight: uniform within +-50 %
-SHEAR_PRIOR = 1.0  # the same for the effects of the slope of the vertical wind
-WIND_PRIOR = 1.0  # the same for the logarithm of the strength of the wind along an axis
-MAX_ERROR = 0.6  # two standard deviations; minus this is the lower bound of a relative error
-# bound of the error of the delay, in standard deviations: 60 ms for a deviation of 15 ms
+SHEAR_PRIOR = 1.0  # prior standard deviation of the effect of the vertical wind's slope on a state
+WIND_PRIOR = 1.0  # prior standard deviation of the logarithm of the wind's strength along an axis
+# two prior standard deviations; its negative is the lower bound of a relative error
+MAX_ERROR = 0.6
+# largest error of the delay in standard deviations: 60 ms for a deviation of 15 ms
 MAX_DELAY_ERROR = 4.0
-# Largest ratio of a value to the nominal one, 1 / (1 - MAX_ERROR): a rough model errs by a factor
-# either way.
+# Largest ratio of an entry to its nominal value, 1 / (1 - MAX_ERROR): a rough model errs by a
+# factor, up or down.
 MAX_FACTOR = 2.5
-# Unit of an entry that is 0, relative to the largest effect on its row. It gives a deviation of
-# 10 % before the flight.
+# Unit of an entry that is 0, relative to the largest effect on its row. With it, the prior
+# deviation is 10 % of this effect.
 COUPLING = 0.34
-CHANGE = 3.0  # gain of log-likelihood that a stronger wind must bring in a span: odds of 20 to 1
-# Mean square of the innovations of a span relative to the median one, above which no level of the
-# wind explains the span.
+# least gain of log-likelihood in a span for which a stronger wind is taken: odds of 20 to 1
+CHANGE = 3.0
+# A span whose innovations have a mean square above this multiple of the median is explained by no
+# level of the wind.
 UNEXPLAINED = 5.0
-FEW = 0.25  # if less than this share of the spans has gusts, they do not count: no gust is noise
-RECOVERY = 2  # spans after one that does not count; these do not count while estimates recover
+FEW = 0.25  # gusts in a smaller share of the spans do not count, because gusts are no white noise
+# number of spans that do not count after a span that does not, while the estimates recover
+RECOVERY = 2
 SPAN = 1.0  # s, length of a span, within which the level of the wind is constant
-# Every third span is held out, so that each command and gust is in both parts. The last third of a
-# flight may have no command.
+# Every third span is held out, so that each command and gust is in both sets of samples. Commands
+# may be missing in the last third of a flight.
 HELD_OUT = 3
 
 
 def span_length(recorded: FlightData) -> int:
-    """Return how many periods a span has: whole blocks of the filters, about SPAN s."""
+    """Return the number of periods in a span: whole blocks of the filters, about SPAN s."""
     return HOLD * max(round(SPAN / recorded.period / HOLD), 1)
 
 
 def held_out(periods: int, span: int) -> NDArray[np.bool_]:
-    """Return the mask of the periods that validate, every HELD_OUT-th span."""
+    """Return the mask of the periods that validate the model: every HELD_OUT-th span."""
     return np.asarray(np.arange(periods) // span % HELD_OUT == HELD_OUT - 1)
 
 
 class Innovations(NamedTuple):
-    """Innovations of a model over a recording.
-
-    Each span has the level of the wind that predicts it best.
-    """
+    """Innovations of a model over a recording, with the best level of the wind in each span."""
 
     r: FloatArray  # (T, m) in units of y, NaN where y is lost
-    normalised: FloatArray  # (T, m) of covariance I if the model is right
-    log_likelihood: FloatArray  # (T,) of each sample, up to a constant, see `predicted`
+    normalised: FloatArray  # (T, m) innovations whose covariance is I if the model is right
+    # (T,) log-likelihood of each sample up to a constant, see `predicted`
+    log_likelihood: FloatArray
 
 
 class Normalised(NamedTuple):
-    """Innovations of N models."""
+    """Innovations of N models over a recording, with their normalised values."""
 
     r: FloatArray  # (N, T, m) in units of y, NaN where y is lost
-    e: FloatArray  # (N, T, m) of covariance I if a model is right
-    half_log_det: FloatArray  # (N, T) of the covariance of r
+    e: FloatArray  # (N, T, m) innovations whose covariance is I if the model is right
+    half_log_det: FloatArray  # (N, T) half the logarithm of the determinant of the covariance of r
 
 
 def normalised(r: FloatArray, covariance: FloatArray, place: NDArray[np.int64]) -> Normalised:
     """Normalise innovations r, (N, T, m), by covariances (N, levels, m, m).
 
-    `place` is the level of each sample among these, (T,).
+    `place`, (T,), is the index of each sample's level in the covariances.
     """
     root = np.linalg.cholesky(covariance)
     inverse = np.linalg.inv(root)
@@ -104,17 +106,17 @@ class Models(NamedTuple):
     """The filters of N models, and their inputs."""
 
     bank: FilterBank
-    levels: NDArray[np.int64]  # (levels of the bank,) their places in LEVELS
+    levels: NDArray[np.int64]  # indices in LEVELS of the levels that the bank has
     begin: FloatArray  # (N, s) estimates at the beginning of the flight
     u: FloatArray  # (T, m), or (N, T, m) if the delay is identified
 
 
 class Unknown(NamedTuple):
-    """Standard deviations of what is identified beside A and B, or 0 for what is known.
+    """Standard deviations of what is identified, each 0 for a value that is known.
 
-    The class also has the deviations of the entries of A and B, and the noise of the disturbances.
-    The rows of hidden states, such as alpha, count as known if they follow from mass and lift while
-    y has nothing but the rates.
+    They are those of delay and angles, of the entries of A and B, and of the noise of the
+    disturbances. Hidden states, such as alpha, are states that y does not contain. If y has only
+    the rates, mass and lift give the rows of the hidden states, which count as known then.
     """
 
     delay: float = 0.0  # s, deviation of the delay of u
@@ -126,7 +128,7 @@ class Unknown(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """Largest factor between an entry and the nominal one, up or down: MAX_FACTOR at PRIOR."""
+        """Largest factor of an entry on its nominal value, up or down: MAX_FACTOR at PRIOR."""
         roughness = max(self.error, self.effect, PRIOR) / PRIOR
         return float(MAX_FACTOR**roughness)
 
@@ -135,25 +137,26 @@ KNOWN = Unknown()
 
 
 class Fit(NamedTuple):
-    """The most probable theta of a block."""
+    """The most probable parameters theta of a block, and the innovations of the models."""
 
     theta: FloatArray
     """(p,) relative errors of the uncertain entries of A, then of B; logarithms of the strengths of
     the winds; then, if they are identified, the shear, the angles at the beginning and the errors
     of the delays, in units of their deviations."""
-    deviation: FloatArray  # (p,) standard deviations after the flight
-    before: Innovations  # those of the nominal model in these winds
-    after: Innovations  # those of the identified model
-    levels: NDArray[np.int64]  # (spans,) levels of the wind, with the identified model
-    flown: Innovations | None = None  # those of the model that flies, in its best winds
+    deviation: FloatArray  # (p,) standard deviations of theta after the flight
+    before: Innovations  # innovations of the nominal model in the winds of this fit
+    after: Innovations  # innovations of the identified model
+    levels: NDArray[np.int64]  # (spans,) levels of the wind with the identified model
+    # innovations of the model in flight, in the winds that fit it best
+    flown: Innovations | None = None
 
 
 def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:
-    """Return the units of the errors of A and B, SI; 0 for a known entry.
+    """Return the units of the errors of A and B, SI; an entry with the unit 0 is known.
 
-    The units are the nominal values, and 0 in the rows of angles. If `coupled`, an entry that is 0
-    gets the unit COUPLING times the largest effect on its row, in units of motion. The columns of
-    angles stay 0.
+    The units are the nominal values, except in the rows of angles, where they are 0. If `coupled`,
+    an entry that is 0 gets the unit COUPLING times the largest effect on its row, in units of
+    motion. The columns of angles stay 0.
     """
     free = model.kinematic[:, None] == 0.0
     is_dynamic = model.kinematic == 0.0
@@ -177,9 +180,9 @@ def largest_error(entry: Entry) -> float:
 
 
 class Likelihood:
-    """The data of one block, and the functions of theta over them."""
+    """The data of one block, and functions of the parameters theta, such as their likelihood."""
 
-    coarse: "Likelihood"  # the same for means over the shortest lag
+    coarse: "Likelihood"  # likelihood of the same flight, averaged over the shortest lag
 
     def __init__(
         self,
@@ -193,11 +196,11 @@ class Likelihood:
         *,
         coupled: bool = False,
     ) -> None:
-        """Set up the likelihood; each error of A has the prior PRIOR until `believe` replaces it.
+        """Set up the likelihood; the relative errors have the priors in `unknown`.
 
-        `delay` is the delay of u, s, if it is known. The search starts on means over `factor`
-        periods, by default over the shortest lag. If `coupled`, the entries that are 0 are
-        identified, too.
+        `believe` may replace the priors later. `delay` is the delay of u, s. The search starts with
+        means over `factor` periods, by default over the shortest lag. If `coupled`, the entries
+        that are 0 are identified, too.
         """
         if factor is None:
             factor = max(int(float(np.min(model.lag)) / recorded.period + 1e-9), 1)
@@ -234,17 +237,17 @@ class Likelihood:
             units_A, units_B = self._units
             self._units = units_A * is_output, units_B * is_output
         count_A, count_B = map(np.count_nonzero, self._units)
-        # theta, levels and innovations from the last call of `levels`
+        # theta, levels and innovations of the last call of `levels`
         self._passed: tuple[bytes, NDArray[np.int64], Normalised] | None = None
-        self.count = int(count_A + count_B)  # number of the entries that are identified
+        self.count = int(count_A + count_B)  # number of entries of A and B that are identified
         self._factor = unknown.factor
         self.believe(np.repeat([unknown.error, unknown.effect], [count_A, count_B]))
 
     def believe(self, deviation: FloatArray, centre: FloatArray | None = None) -> None:
-        """Take these standard deviations of the relative errors before the flight, (p - G,).
+        """Set the prior deviations and the prior mean of the relative errors, (p - G,) each.
 
-        The errors lie about a `centre`, (p - G,), by default 0. Deviations and bounds are relative
-        to the values there.
+        The mean is `centre`, by default 0. The deviations and the bounds of the search are relative
+        to the values of the entries at the centre.
         """
         delay_prior = np.ones(len(self._block.inputs) if self._delay_deviation else 0)
         wind_prior = np.full(len(self._block.winds), WIND_PRIOR)
@@ -273,7 +276,7 @@ class Likelihood:
             for bounds in (self._lower, self._upper):
                 bounds[self._errors] = centre + scale * bounds[self._errors]
             self.prior[self._errors] *= scale
-        if len(delay_prior):  # no u can act before it is sent
+        if len(delay_prior):  # u cannot act before it is sent
             earliest = -self._delay / self._delay_deviation
             self._lower[self._late] = np.maximum(-MAX_DELAY_ERROR, earliest)
             self._upper[self._late] = MAX_DELAY_ERROR
@@ -282,9 +285,9 @@ class Likelihood:
         self._begin = slice(self._shear.stop, self._shear.stop + len(self._angles))
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
-        """Return the models with relative errors (N, p): A (N, n, n), B (N, n, m), wind (N, n, G).
+        """Return the models for N thetas, (N, p): A (N, n, n), B (N, n, m), wind (N, n, G).
 
-        The wind acts through each model's own A.
+        The wind acts on each model through the A of this model.
         """
         matrices = []
         parts = np.split(thetas, [np.count_nonzero(self._units[0]), self.count], axis=1)[:2]
@@ -303,9 +306,10 @@ class Likelihood:
     def models(
         self, thetas: FloatArray, levels: NDArray[np.int64], *, near: bool = False
     ) -> Models:
-        """Design the filters for theta, (N, p), at some levels of the wind.
+        """Design the filters of N models, with parameters theta (N, p), at some levels of the wind.
 
-        All of them may be `near` the first theta.
+        With `near`, the gains of all models are computed from those of the first model, to first
+        order.
         """
         levels = np.unique(levels)
         strength = np.exp(thetas[:, self._winds])
@@ -332,7 +336,7 @@ class Likelihood:
         return Models(bank, levels, begin, np.array([late[tuple(row)] for row in periods.tolist()]))
 
     def _delayed(self, periods: FloatArray) -> FloatArray:
-        """Return u, (T, m), with each input some periods later, (m,)."""
+        """Return u, (T, m), with each input delayed by its number of periods, (m,)."""
         columns = zip(self._u.T, np.maximum(periods, 0.0).tolist(), strict=True)
         return np.hstack([delayed(u[:, None], late) for u, late in columns])
 
@@ -345,10 +349,10 @@ class Likelihood:
         return self._period * late, self._period * deviation
 
     def levels(self, theta: FloatArray) -> NDArray[np.int64]:
-        """Return the level of the wind in each span, (spans,), for theta, (p,).
+        """Return the best level of the wind in each span, (spans,), for the parameters theta, (p,).
 
-        Each level predicts a span from the estimates at the begin of this span. Of the levels whose
-        log-likelihood is within CHANGE of the best, the calmest is taken.
+        Each level predicts a span from the estimates at the beginning of this span. Of the levels
+        whose log-likelihood is within CHANGE of the best, the calmest is taken.
         """
         models = self.models(theta[None], self._usable)
         bank = models.bank.by_level()
@@ -379,11 +383,11 @@ class Likelihood:
         return levels
 
     def _of_span(self, values: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Spread values of the spans over their samples, (T,)."""
+        """Repeat the value of each span for all samples of the span, (T,)."""
         return np.repeat(np.asarray(values), self._spans[0].stop)[: len(self._y)]
 
     def innovations(self, models: Models, levels: NDArray[np.int64]) -> Normalised:
-        """Return the innovations of N models at given levels."""
+        """Return the innovations of N models, with the level of the wind in each span given."""
         place = self._of_span(np.searchsorted(models.levels, levels))
         r = Passage(models.bank, self._y, models.u, place[::HOLD]).run(models.begin)[0][
             :, : len(self._y)
@@ -391,9 +395,9 @@ class Likelihood:
         return normalised(r, models.bank.covariance, place)
 
     def passed(self, theta: FloatArray, levels: NDArray[np.int64]) -> Normalised:
-        """Return the innovations of a theta, (p,), at some levels.
+        """Return the innovations for theta, (p,), with the level of the wind in each span given.
 
-        If `levels` was just called with this theta, they are not computed again.
+        If the last call of `levels` had this theta, its innovations are returned.
         """
         if (
             self._passed is not None
@@ -404,12 +408,13 @@ class Likelihood:
         return self.innovations(self.models(theta[None], levels), levels)
 
     def predicted(self, theta: FloatArray, levels: NDArray[np.int64]) -> Innovations:
-        """Return the innovations of a theta, (p,), with their log-likelihood.
+        """Return the innovations for theta, (p,), with their log-likelihood.
 
             log p = -1/2 sum_i (e_i^2 / s_i + log s_i) - 1/2 log det S,   s_i = mean e_i^2
 
-        The means s_i are over the samples that fit the model, as in the cost. The noise of the
-        filter is a guess, and a model must not gain by a better guess.
+        As in the cost, the means s_i are over the samples that fit the model. They take out the
+        scale of e, because the noise of the filter is a guess, and a model must not gain by a
+        better guess.
         """
         (r,), (e,), (half_log_det,) = self.passed(theta, levels)
         scale = np.mean(e[self.fitted()] ** 2, axis=0)
@@ -422,7 +427,7 @@ class Likelihood:
         used: NDArray[np.bool_],
         levels: NDArray[np.int64] | None = None,
     ) -> float:
-        """Return the cost of `fit` for theta, (p,), at some levels of the wind or the best."""
+        """Return the cost of `Search.fit` for theta, (p,), at given or at the best levels."""
         levels = self.levels(theta) if levels is None else levels
         (cost,), _, _ = self._costs(self.passed(theta, levels), used, theta[None])
         return float(cost)
@@ -464,7 +469,7 @@ class Likelihood:
         return names + others[: len(self.prior) - len(names)]
 
     def model_errors(self, airframe: Airframe) -> FloatArray:
-        """Return the theta, (p,), of a model, with the winds and the delay that theta = 0 has."""
+        """Return the theta, (p,), of a model, with winds, angles and delays as at theta = 0."""
         A = airframe.matrix_a()
         B = airframe.matrix_b()
         inputs = list(airframe.inputs)
@@ -479,8 +484,8 @@ class Likelihood:
         return theta
 
     def entries(self, fit: Fit) -> list[Entry]:
-        """Return the identified entries of A and B."""
-        # In theta, the winds follow the entries.
+        """Return the entries of A and B with their identified errors."""
+        # The entries are the first parameters in theta; winds and others follow.
         errors = zip(
             self.nominal_entries(), fit.theta.tolist(), fit.deviation.tolist(), strict=False
         )
@@ -498,9 +503,9 @@ class Likelihood:
         return centred
 
     def reason_against_air(self, fit: Fit) -> Refusal | None:
-        """Refuse a fit in which the effect of the slope of the wind on a state is at its bound.
+        """Refuse a fit if the effect of the vertical wind's slope on a state is at a bound.
 
-        The wind then stands for a different aircraft.
+        Such a wind explains errors of the aircraft's model.
         """
         effects = np.abs(fit.theta[self._shear])
         bounds = self._upper[self._shear]
@@ -516,7 +521,7 @@ class Likelihood:
     def known(self) -> NDArray[np.bool_]:
         """Return the mask of the samples that count, (T,).
 
-        They have a y, and come after the transient of the filter.
+        They have a y, and lie after the transient of the filter.
         """
         return np.isfinite(self._y).all(axis=1) & (
             np.arange(len(self._y)) >= TRANSIENT / self._period - 0.5
@@ -529,14 +534,14 @@ class Likelihood:
     def _counted(self, theta: FloatArray, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return the mask of the samples that count in the fit, (T,).
 
-        Spans that no level explains do not count, nor do gusts if they are FEW, nor do the RECOVERY
-        spans after either.
+        A span does not count if no level of the wind explains it. Gusts do not count if their share
+        of the spans is below FEW. The RECOVERY spans after such a span do not count either.
         """
         _, (e,), _ = self.passed(theta, levels)
         square = np.array(
             [np.nansum(e[span] ** 2) / max(np.isfinite(e[span]).sum(), 1) for span in self._spans]
         )
-        # The mean square is 0 at rest without noise.
+        # At rest without noise, the mean square is 0.
         largest = UNEXPLAINED * np.median(square[square > 0.0]) if square.any() else np.inf
         unexplained, gusts = (
             np.convolve(spans, np.ones(RECOVERY + 1))[: len(levels)] > 0.0
@@ -548,9 +553,9 @@ class Likelihood:
     def _costs(
         self, innovations: Normalised, used: NDArray[np.bool_], thetas: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the costs of some models, the normalised innovations used, and sum log det S / 2.
+        """Return the costs of N models, the normalised innovations in use, and sum log det S / 2.
 
-        The innovations are (N, samples, m).
+        `used` masks the samples. The innovations have shape (N, samples, m).
         """
         e = innovations.e[:, used]
         total = np.sum(innovations.half_log_det[:, used], axis=1)

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The search for the most probable A and B of one block.
+"""Search for the most probable A and B of one block.
 
-The method is Gauss-Newton with damping, from several starts.
+A block is a part of the aircraft that does not couple with the rest. The method is Gauss-Newton
+with damping, from several starts.
 """
 
 from collections.abc import Callable, Iterable
@@ -15,31 +16,34 @@ from flight_core.vectors import FloatArray
 from flight_design.identification.likelihood import Fit, Innovations, Likelihood
 
 DIFFERENCE = 1e-4  # step of a parameter in the finite differences of the derivatives
-LATER = 1e-3  # s, step of the delay in these finite differences
-BLOCK = 4.0  # s, longer than a doublet: length of the blocks of a log over which scores are summed
-# Share of the decrease that the quadratic model predicts. From this on, the undamped step is taken
-# and no damped one is tried.
+LATER = 1e-3  # s, step of the delay in the finite differences of the derivatives
+BLOCK = 4.0  # s, length of the blocks of a log over which scores are summed; longer than a doublet
+# If the undamped step lowers the cost by at least this share of the decrease that the quadratic
+# model predicts, no damped step is tried.
 GOOD = 0.7
-# dampings of the steps that are tried side by side, and fractions of the undamped step
+# dampings of the steps that are tried side by side, and fractions of the undamped step that are
+# tried
 DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0)
 FRACTIONS = (0.5, 0.25)
 # levels with which the search begins: calm air, light and moderate turbulence, gusts
 STARTS = (0, 3, 4, 13)
 TURBULENT = STARTS[2]
-ALIKE = 0.8  # share of the spans that must have the same level for `fit_alike` to take it for all
-SIGNS = (-1.0, 1.0)  # of the effect of the vertical wind's slope on q, in two more starts
-# largest number of steps of a start, and of the search from one of the best starts
+# least share of the spans with the same level for which `fit_alike` takes this level for all
+ALIKE = 0.8
+# signs of the effect of the vertical wind's slope on q, each for one more start
+SIGNS = (-1.0, 1.0)
+# largest number of steps at a start, and in the search that goes on from one of the best starts
 START_STEPS = 8
 STEPS = 12
 REFINED = 2  # largest number of starts from which the search goes on
-CLOSE = 100.0  # largest excess of the cost of such a start over that of the best start
-# A start, or the search, ends when a step lowers the cost, a log-likelihood, by less than this.
+CLOSE = 100.0  # largest excess of the cost of such a start over the cost of the best start
+# A start, or a search, ends when a step lowers the cost, a log-likelihood, by less than this.
 START_PROGRESS = 5.0
 PROGRESS = 0.3
 
 
 class SearchEnd(NamedTuple):
-    """Where a search ends."""
+    """The parameters at which a search ends, with their cost."""
 
     cost: float
     theta: FloatArray  # (p,)
@@ -48,16 +52,16 @@ class SearchEnd(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """The innovations of a theta divided by their rms, with their derivatives."""
+    """The innovations for a theta, divided by their rms, and their derivatives by theta."""
 
     cost: float
-    e: FloatArray  # (samples, m)
+    e: FloatArray  # (samples, m) innovations divided by their rms
     J: FloatArray  # (p, samples m), derivatives of e
     half_log_det: FloatArray  # (p,) derivatives of the sum of log det S / 2
 
 
 class Doubt(NamedTuple):
-    """Two sources of error that the deviations of a fit count beside the innovations' noise."""
+    """Two sources of error beside the innovations' noise that the deviations of a fit include."""
 
     timing: float  # s, standard deviation of the delay of u, which is not identified
     whiteness: FloatArray  # (m,) `whiteness` of the innovations of the held-out samples
@@ -75,22 +79,23 @@ class Search(Likelihood):
         begin: FloatArray | None = None,
         flown: FloatArray | None = None,
     ) -> Fit:
-        """Find the theta of the least cost over the samples that are `used`, (T,).
+        """Find the parameters theta of the least cost over the samples in the mask `used`, (T,).
 
-        The cost is N/2 sum_i log mean r_i^2 + sum log det S / 2 + |theta / prior|^2 / 2. r are the
-        normalised innovations, S their covariance, N the number of samples. It has several minima,
-        because a wrong wind can explain a wrong model.
+        The cost is N/2 sum_i log mean r_i^2 + sum log det S / 2 + |theta / prior|^2 / 2. Here r are
+        the normalised innovations, S is the covariance of the innovations, and N is the number of
+        samples. The cost has several minima, because a wrong wind can explain a wrong model.
 
-        So the search begins several times on means over the shortest lag: with each level of STARTS
-        in all spans, and with either sign of the effect that the slope of the wind has on q. It
-        goes on from the REFINED best starts, or from 0. Then theta decides the level of each span,
-        and the strengths of the winds are free. At last, the level that most spans have stands for
-        all of them, and the search goes on from the best end. Turbulence is the same in every span,
-        and levels that change with theta would leave the search at a worse minimum. In this stage,
-        spans that no level explains do not count, nor do a few gusts.
+        So the search begins several times, with means over the shortest lag. One start has each
+        level of STARTS in all spans, and two more have either sign of the effect of the wind's
+        slope on q. The search goes on from the REFINED best of these starts and theta = 0. Now
+        theta decides the level of each span, and the strengths of the winds are free. At last, the
+        search goes on from the best end with the most frequent level in every span. Turbulence is
+        the same in every span, and levels that change with theta could hold the search at a worse
+        minimum. After the starts, spans that no level explains do not count, and a few gusts do not
+        count either.
 
-        If there is a theta to `begin` at, (p,), it is the only start. The theta of the model that
-        has `flown` is one more start.
+        If `begin`, (p,), is given, it is the only start. Otherwise `flown`, the theta of the model
+        in flight, is one more start.
         """
         if begin is None:
             ends = self._ends(flown, used)
@@ -103,16 +108,19 @@ class Search(Likelihood):
         return self._fit_at(min(best, steady, key=lambda end: end.cost), same, used, flown)
 
     def fit_about(self, fit: Fit, used: NDArray[np.bool_], flown: FloatArray | None = None) -> Fit:
-        """Find the minimum of `fit` from an earlier fit on, with its errors as the prior mean."""
+        """Find the minimum of `fit` again, starting at an earlier fit.
+
+        The errors of the earlier fit become the prior mean.
+        """
         deviation = self.prior[self._errors]
         self.believe(deviation, fit.theta[self._errors])
         return self.fit(used, fit.theta, flown)
 
     def fit_alike(self, used: NDArray[np.bool_], flown: FloatArray | None = None) -> Fit | None:
-        """Find the minimum of `fit` from a single start, in air that is the same in every span.
+        """Find the minimum of `fit` from one start, with the same level of the wind in every span.
 
-        The start is the model that has `flown`, or else the nominal one, in moderate turbulence.
-        Returns None if fewer than ALIKE of the spans have the same level.
+        The start is in moderate turbulence, at the model that has `flown`, or at the nominal model
+        if there is none. Returns None if fewer than ALIKE of the spans have the same level.
         """
         coarse = self.coarse
         begin = self._within(np.zeros(len(self.prior)) if flown is None else flown)
@@ -132,9 +140,10 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         flown: FloatArray | None,
     ) -> Fit:
-        """Return the fit at the end of a search; other models get their best levels.
+        """Return the fit at the end of a search, with the innovations of the other models.
 
-        Theta decides these levels, unless it costs less to have the `same` level in every span.
+        Each of the other models gets the levels of the wind that fit it best, or the `same` level
+        in every span if this costs less.
         """
         theta = best.theta
         deviation = np.sqrt(np.diag(np.linalg.inv(best.hessian)))
@@ -158,14 +167,14 @@ class Search(Likelihood):
         )
 
     def _ends(self, flown: FloatArray | None, used: NDArray[np.bool_]) -> list[SearchEnd]:
-        """Search from the best starts, and return where the searches end."""
+        """Search from the best starts, and return the ends of these searches."""
         coarse = self.coarse
         fitted = coarse.fitted()
         zero = np.zeros(len(self.prior))
         candidates = [(coarse.cost(zero, fitted), zero)]
         begins = [(zero, level) for level in STARTS]
         if self._is_sheared:
-            # With the wrong sign of the slope's effect, the search ends at another model.
+            # With the wrong sign of this effect, the search would end at another model.
             for sign in SIGNS:
                 begin = zero.copy()
                 begin[self._shear.stop - 1] = sign
@@ -182,16 +191,16 @@ class Search(Likelihood):
         ]
 
     def _within(self, theta: FloatArray) -> FloatArray:
-        """Return theta, (p,), within the bounds of the search."""
+        """Return theta, (p,), clipped to the bounds of the search."""
         return np.clip(theta, self._lower, self._upper)
 
     def _started(
         self, theta: FloatArray, levels: NDArray[np.int64] | None, *, winds: bool
     ) -> FloatArray:
-        """Return theta, (p,), after some steps on means over the shortest lag.
+        """Return theta, (p,), after some steps with means over the shortest lag.
 
-        `levels` gives the level of each span; without it, theta decides. `winds` says whether the
-        strengths of the winds are free.
+        `levels` gives the level of each span. If it is None, theta decides the levels. `winds` says
+        whether the strengths of the winds are free.
         """
         free = np.ones(len(theta), dtype=bool)
         free[self._winds] = winds
@@ -213,10 +222,10 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         unsettled: int = 1,
     ) -> SearchEnd:
-        """Search from one start, and return where it ends.
+        """Search from one start, and return the end of the search.
 
-        `levels` gives the level of each span; without it, theta decides. In the first step and in
-        the next `unsettled` steps every span counts, and the search cannot end in any of them.
+        `levels` gives the level of each span. If it is None, theta decides the levels. In the first
+        step and in the next `unsettled` steps every span counts, and the search goes on.
         """
         for iteration in range(STEPS):
             self.progress()
@@ -237,11 +246,12 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         free: NDArray[np.bool_],
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Return theta after a step of Gauss-Newton with damping, and the Hessian before it.
+        """Return theta after a damped step of Gauss-Newton, and the Hessian before the step.
 
         The third result is the decrease of the cost. The derivatives are finite differences, from
-        filters that run side by side. The Hessian is J'J + prior^-2, where J has the derivatives of
-        the innovations over their rms. Source: L. Ljung, "System Identification", 7.4 and 10.2.
+        filters that run side by side. The Hessian is J'J + prior^-2, where J has the derivatives by
+        theta of the innovations divided by their rms. Source: L. Ljung, "System Identification",
+        7.4 and 10.2.
         """
         slopes = self._slopes(theta, levels, used, free)
         hessian = slopes.J @ slopes.J.T + np.diag(self.prior**-2)
@@ -273,7 +283,7 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         free: NDArray[np.bool_],
     ) -> Slopes:
-        """Return the derivatives at theta by finite differences.
+        """Return the derivatives of the innovations and costs at theta by finite differences.
 
         The filters of all differences run side by side, as one batch.
         """
@@ -293,17 +303,17 @@ class Search(Likelihood):
         return Slopes(cost=float(costs[0]), e=e[0] / rms, J=J, half_log_det=log_det)
 
     def with_doubt(self, fit: Fit, doubt: Doubt) -> tuple[Fit, FloatArray]:
-        """Replace the deviations of a fit by those that also hold for a model that is not right.
+        """Replace the deviations of a fit by deviations that also hold for a wrong model.
 
             covariance = H^-1 (M + prior^-2) H^-1 + s s' timing^2,  s = -H^-1 J j
 
-        H is the Hessian, and J has the derivatives by theta of the innovations e over their rms. If
-        the model were right, M would be J J'. Here M is the larger one of two matrices. One is the
-        sum of the outer products of J e over blocks of the log. The other is J J' times the
+        H is the Hessian. J has the derivatives by theta of the innovations e, divided by their rms.
+        If the model were right, M would be J J'. Here M is the larger of two matrices. The first
+        sums the outer products of J e over blocks of the log. The second is J J' times the
         whiteness of each output, as in Birge's ratio. s is the change of theta with the delay of u,
-        and j is the derivative of e by this delay.
-        Sources: H. White, Econometrica 50(1), 1982; R. T. Birge, Phys. Rev. 40(2), 1932; S. F.
-        Schmidt, Advances in Control Systems 3, 1966, for a delay that is not estimated.
+        and j is the derivative of e by this delay. Sources: H. White, Econometrica 50(1), 1982; R.
+        T. Birge, Phys. Rev. 40(2), 1932; S. F. Schmidt, Advances in Control Systems 3, 1966, for a
+        delay that is not estimated.
 
         Returns the fit, and the part of the entries' deviations that the delay causes, (p - G,).
         """
@@ -330,9 +340,9 @@ class Search(Likelihood):
         return fit._replace(deviation=np.sqrt(np.maximum(*spread) + late**2)), late[: self.count]
 
     def flying(self, flown: FloatArray, parts: Iterable[tuple[Likelihood, Fit]]) -> Innovations:
-        """Return the innovations of the model that flies, theta (p,).
+        """Return the innovations of the model that flies, whose theta is `flown`, (p,).
 
-        Winds, angles and delays come from the parts.
+        The winds, angles and delays are those of the `parts`, the blocks that were fitted.
         """
         theta = np.where(self._errors, flown, self.joined(parts))
         return self.predicted(theta, self.levels(theta))
@@ -340,7 +350,7 @@ class Search(Likelihood):
     def joined(self, parts: Iterable[tuple[Likelihood, Fit]]) -> FloatArray:
         """Return a theta, (p,), with the parts' mean winds, angles and delays, and errors of 0.
 
-        If a part was searched apart from the parts with which it couples, its errors are wrong.
+        The errors stay 0, because those of a part are wrong if it couples with another part.
         """
         values: dict[str, list[float]] = {}
         for part, fit in parts:
@@ -359,11 +369,11 @@ def damped_steps(
     upper: FloatArray,
     free: NDArray[np.bool_],
 ) -> FloatArray:
-    """Return damped steps -(hessian + d diag hessian)^-1 slope, and parts of the first one, (k, p).
+    """Return steps of theta: -(hessian + d diag hessian)^-1 slope for each damping d, (k, p).
 
-    Each damping d gives one step. The first step follows again, times each of FRACTIONS. Only the
-    parameters in the mask `free`, (p,), move, and none of them moves outwards at its bound. Source:
-    D. W. Marquardt, J. SIAM 11(2), 1963.
+    After them come the first step times each of FRACTIONS. Only the parameters in the mask `free`,
+    (p,), move. A parameter at its bound does not move outwards. Source: D. W. Marquardt, J. SIAM
+    11(2), 1963.
     """
     steps = np.zeros((len(DAMPINGS), len(theta)))
     while True:

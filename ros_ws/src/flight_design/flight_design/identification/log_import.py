@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Import y, u and pose by a channel map, from the log of a flight that the stack did not fly."""
+"""Import y, u and pose by a channel map from the log of a flight that the stack did not fly."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,23 +33,23 @@ from flight_log.bag import IMPORTED
 from flight_log.tape_reader import RecordedRun
 from flight_log.vehicle_tables import COPTER, PLANE, ULOG_TORQUES, LogField, VehicleLog
 
-COMMANDS = "commands"  # the topic with trim + u, by input
-# Share of the typical airspeed, or for a multicopter of the typical thrust, below which the
-# aircraft is on the ground.
+COMMANDS = "commands"  # topic with the commands trim + u, by input
+# An aircraft counts as on the ground below this share of its typical airspeed, or, for a
+# multicopter, of its typical thrust.
 AIRBORNE = 0.5
-# We take this percentile as the typical value: a log may have more time on the ground than in the
-# air.
+# percentile of the samples that counts as the typical value. It is high, because a log may contain
+# more time on the ground than in the air.
 TYPICAL = 90.0
 LEAST = 2.0  # s, length of the shortest stretch that is imported
-# s. If the speed is too low for at most this long, the aircraft still counts as in the air, because
-# no landing is as short.
+# s. If the speed is too low for at most this time, the aircraft still counts as in the air, because
+# no landing is that short.
 BRIDGED = 1.0
-AROUND = 5  # number of samples whose median is taken: it is never a damaged value
+AROUND = 5  # number of samples in a running median, which is never a damaged value
 
 FLOWN_AS = LogField("vehicle_status", "vehicle_type")
 VEHICLE_TYPES = {COPTER: 1.0, PLANE: 2.0}  # PX4, VehicleStatus.msg
 
-PARAMETERS = "vehicle_parameters.yaml"  # in the folder and in the log
+PARAMETERS = "vehicle_parameters.yaml"  # file of the parameters in the folder, and name in the log
 
 Stamps = NDArray[np.int64]
 
@@ -79,7 +79,7 @@ class Imported:
 
 
 def kind_of_map(channel_map: ChannelMap) -> str:
-    """Tell a plane, whose map has an airspeed, from a multicopter, whose map has a climb."""
+    """Return the kind of vehicle: plane for a map with airspeed, multicopter for one with climb."""
     return PLANE if any(row.motion[0] == "V" for row in channel_map.outputs.values()) else COPTER
 
 
@@ -94,15 +94,16 @@ def imported(
     """Return y, u, `commands` and the pose of a log, as the bridge would have published them.
 
     y and the pose hold the newest values, at the stamps of the map's `instant` and of the first
-    channel of the pose. u is the command minus its median. The command is the setpoint of the map
-    (PX4) or of the rate controllers (ArduCopter), or else the stick in MANUAL. With `servos` it is
-    the position of the servo, scaled like the stick. Without a window the longest stretch in the
-    air is taken. If the command is the stick, the stretch must be in MANUAL. `show` gets the
-    comparison of the log with the map before a mismatch is refused.
+    channel of the pose. u is the command minus its median. With PX4, the command is the setpoint
+    that the map names. With ArduCopter, it is the output of the rate controllers, and with
+    ArduPlane it is the stick in MANUAL. With `servos` it is the position of the servo, scaled like
+    the stick. Without a window the longest stretch in the air is taken. If the command is the
+    stick, this stretch must be in MANUAL. `show` gets the comparison of the log with the map before
+    a mismatch is refused.
 
-    Raises ParameterError if the log lacks a channel, is of another vehicle or has no such stretch,
-    or if its parameters differ from the map or change between the samples. If the log has lost
-    data, the message of the error says so at its end.
+    Raises ParameterError if the log lacks a channel, is of another vehicle, or has no such stretch.
+    It is also raised if the parameters differ from the map or change between the samples. If the
+    log has lost data, the message of the error says so at its end.
     """
     start_ns = log.start_ns(channel_map.outputs[channel_map.instant].motion[0])
     losses = [] if log.loss is None else [log.loss.sentence(start_ns)]
@@ -178,9 +179,9 @@ def _speed(
     stamps: Stamps,
     servos: bool,
 ) -> FloatArray | None:
-    """Return the airspeed, or a multicopter's thrust, which shows when the aircraft flies.
+    """Return a signal that shows when the aircraft flies: the airspeed, or a multicopter's thrust.
 
-    Returns None if the map has neither.
+    Returns None if the map has neither of them.
     """
     for name, row in channel_map.outputs.items():
         if row.motion[0] == "V":
@@ -200,7 +201,7 @@ def _tape(
     readers: Mapping[str, "_Reader"],
     ends: tuple[int, int],
 ) -> Tape:
-    """Return the signals between two instants."""
+    """Return the signals of a log between two instants."""
     first, last = ends
     rows = channel_map.outputs
     stamps = log.tables[sources[channel_map.instant].message].stamp_ns
@@ -232,7 +233,7 @@ def _tape(
 
 
 def median_trims(commands: Signal) -> dict[str, float]:
-    """Return the commands in trim by input: the medians over an imported flight, SI."""
+    """Return the command of each input in trim, SI: its median over an imported flight."""
     return {name: float(np.median(commands[name])) for name in commands.names}
 
 
@@ -248,7 +249,7 @@ def _measured(log: VehicleLog, quantity: str, key: str) -> LogField:
 
 
 def _messages(log: VehicleLog, quantity: str) -> str:
-    """Name the messages of a log's format that have a quantity."""
+    """Name the messages that hold a quantity, for the format of a log."""
     from flight_log.vehicle_tables import ULOG_SOURCES  # noqa: PLC0415 - only this sentence needs it
 
     sources = ULOG_SOURCES if log.format is None else log.format.sources
@@ -259,9 +260,9 @@ def _messages(log: VehicleLog, quantity: str) -> str:
 
 
 class _Reader(NamedTuple):
-    """The command of an input: SI = line(raw).
+    """Reads the command of an input from a log: in SI it is line(raw).
 
-    In the log of a plane by ArduPilot, raw is computed from the pulse of the stick or of the servo.
+    For a plane of ArduPilot, raw is computed from the pulse of the stick or of the servo.
     """
 
     log: VehicleLog
@@ -336,7 +337,7 @@ def _commands(
 
 
 def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
-    """Read the output of a multicopter's rate controller, normalised in the same way as PX4's.
+    """Return the reader of a multicopter's rate controller output, normalised as PX4's is.
 
     The sticks of a multicopter do not command its inputs in any mode.
     """
@@ -361,9 +362,10 @@ def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
 def _flight(
     log: VehicleLog, stamps: Stamps, speed: FloatArray | None, window: Window, *, needs_manual: bool
 ) -> tuple[tuple[int, int], str | None]:
-    """Return the first and the last instant that are taken, and a sentence on other flights.
+    """Return the first and the last instant to import, and a sentence on other flights.
 
-    The window is taken, or else the longest stretch in the air. With sticks it must be in MANUAL.
+    They are those of the window or, without a window, of the longest stretch in the air. If the
+    command is the stick, this stretch must be in MANUAL.
     """
     start_ns = int(stamps[0])
     keep = np.ones(len(stamps), dtype=bool)
@@ -388,7 +390,7 @@ def _flight(
         )
         in_air = speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
         keep &= _bridged(stamps, in_air)
-    if log.has(FLOWN_AS):  # A VTOL flies as both.
+    if log.has(FLOWN_AS):  # A VTOL flies as a plane and as a multicopter.
         keep &= log.at(FLOWN_AS, stamps) == VEHICLE_TYPES[log.vehicle]
     require(
         bool(keep.any()),
@@ -444,7 +446,7 @@ def _length(run: tuple[int, int]) -> float:
 def _other_flights(
     runs: Sequence[tuple[int, int]], taken: tuple[int, int], start_ns: int
 ) -> str | None:
-    """Return a sentence on the flights of a log that are not taken; None if there is one flight."""
+    """Return a sentence on the flights of a log that are not imported; None if there are none."""
     others = [
         f"{seconds(first - start_ns):.1f} to {seconds(last - start_ns):.1f} s"
         for first, last in runs
@@ -457,11 +459,11 @@ def _other_flights(
 
 
 def _complete(stamp_ns: Stamps, values: FloatArray, is_damaged: bool) -> tuple[Stamps, FloatArray]:
-    """Return the samples in which every channel is known.
+    """Return the samples in which every channel has a value.
 
-    Bytes that are lost within a message leave wrong values. In a damaged log, take the
-    running medians over AROUND samples, from the lowest to the highest. A value counts as wrong if
-    it is farther outside of this range than the range is wide.
+    Bytes that are lost within a message leave wrong values. In a damaged log, the running medians
+    over AROUND samples span a range, from the lowest to the highest median. A value counts as wrong
+    if it lies farther outside this range than the range is wide.
     """
     is_known = np.isfinite(values).all(axis=1)
     stamp_ns, values = stamp_ns[is_known], values[is_known]
@@ -475,7 +477,7 @@ def _complete(stamp_ns: Stamps, values: FloatArray, is_damaged: bool) -> tuple[S
 
 
 def gap_sentence(name: str, stamp_ns: Stamps, start_ns: int) -> str | None:
-    """Say how many samples a topic lacks, judged by its usual period; None if it has all."""
+    """Say how many samples a topic lacks, judged by its usual period; None if it lacks none."""
     gaps = np.diff(stamp_ns)
     period = float(np.median(gaps))
     expected = _expected(stamp_ns)
@@ -499,7 +501,7 @@ def _expected(stamp_ns: Stamps) -> int:
 
 
 def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Signal | None:
-    """Return the channels of the map's pose that the log has; NaN until a value is known."""
+    """Return the channels of the map's pose that the log has, NaN until the first value of each."""
     sources = {
         name: source for name in channel_map.pose if (source := log.source(name)) is not None
     }
@@ -512,7 +514,7 @@ def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Si
 
 
 def require_map_of_import(channel_map: ChannelMap, recorded: RecordedRun) -> None:
-    """Raise ParameterError if u of an imported log comes from rows of another map."""
+    """Raise ParameterError if u of an imported log was read by rows of another map."""
     source = recorded.metadata.get(IMPORTED)
     if source is None:
         return
@@ -532,7 +534,7 @@ def require_map_of_import(channel_map: ChannelMap, recorded: RecordedRun) -> Non
 
 
 def _rows_of_import(channel_map: ChannelMap) -> dict[str, object]:
-    """Return what an import uses of a map, by key."""
+    """Return the rows of a map that an import uses, by key."""
     keys = {
         "outputs": {"positive", "sign"},
         "inputs": {"field", "positive", "sign", "scale", "offset", "range"},

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The flights of an identified aircraft: in calm air, with a gust and in turbulence."""
+"""Fly an identified aircraft in calm air, with a gust and in turbulence."""
 
 import math
 from collections.abc import Callable
@@ -17,11 +17,12 @@ from flight_core.tape import Tape
 RATE = 200.0  # Hz, of y and y_m
 HEIGHTS = {"q": 0.05, "V": 2.0, "p": 0.15, "r": 0.05}
 """Units of the outputs in the coupling; also the largest errors of a flight in calm air, SI."""
-# m/s, downwards, and length in m to the peak: 100 ft, within the 30 to 350 ft of FAR/CS 25.341
+# speed of the gust, m/s, downwards, and its length in m to the peak, 100 ft; FAR/CS 25.341 has 30
+# to 350 ft
 GUST_SPEED = 5.0
 GUST_LENGTH = 30.48
 TURN = math.pi / 2.0  # rad
-CLIMB = 100.0  # m; with guidance, a turn and a climb are commanded in place of the pulses
+CLIMB = 100.0  # m. With guidance, a turn and a climb are commanded in place of the pulses.
 # s, instants at which the turn and the climb begin
 TURN_START = 2.0
 CLIMB_START = 30.0
@@ -30,7 +31,7 @@ CLIMB_START = 30.0
 def moderate_turbulence(altitude: float) -> dict[str, Any]:
     """Return the parameters of moderate turbulence at an altitude, m.
 
-    At high altitude its intensity is 10 ft/s.
+    At high altitude the rms of this turbulence is 10 ft/s.
     """
     values: dict[str, Any] = {"altitude": max(altitude, LOWEST), "seed": 1}
     if altitude < HIGH:
@@ -50,7 +51,7 @@ class ManoeuvreResult(NamedTuple):
     outcome: str
     rms: dict[str, float]  # rms of the error by output, SI
     largest: dict[str, float]  # largest abs(u) by input
-    # by input, the share of the ticks with the input at its limit, if it is LEAST_SHARE or more
+    # share of the ticks in which an input was at its limit, by input, if it is LEAST_SHARE or more
     at_stop: dict[str, float]
 
     @property
@@ -69,7 +70,8 @@ def fly_all(
 ) -> dict[str, ManoeuvreResult]:
     """Fly a scenario of `identify` three times.
 
-    The flights are in "calm" air, with its "gust", and in moderate "turbulence" without the gust.
+    The flights are in "calm" air, with the "gust" of the scenario, and in moderate "turbulence"
+    without the gust.
     """
     turbulence = moderate_turbulence(scenario.aircraft.flight_condition().altitude)
     flights = {}

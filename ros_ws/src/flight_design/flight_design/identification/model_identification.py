@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification of A and B from the log of one flight.
+"""Identify A and B of an aircraft from the log of one flight.
 
-The estimate is the maximum a posteriori over the innovations of the observer's filter.
+The estimate maximises the posterior probability, given the innovations of the observer's filter.
 
-It uses nothing but y, and u after its limits. Two of three seconds fit the model, and every third
-one is held out to validate it. y does not show the scale of alpha or beta, so that entries which
-depend on it stay near their nominal values. No number in this module is specific to an aircraft.
+It uses only y, and u after its limits. Two of three seconds fit the model, and every third second
+is held out to validate it. y does not show the scale of alpha or beta, so entries that depend on
+this scale stay near their nominal values. No number in this module is specific to an aircraft.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -72,13 +72,14 @@ from flight_design.identification.model_refusals import (
     reason_against_timing,
 )
 
-# Innovations follow the u of another part if their `correlation` is at least this. Aircraft without
-# coupling have up to 3.
+# The innovations of a part follow the u of another part if their `correlation` is at least this. It
+# is up to 3 for aircraft without coupling.
 FOLLOWS = 10.0
-# Least gain in the log-likelihood of held-out samples for a model with coupling. Aircraft without
-# coupling have -20.
+# Least gain in the log-likelihood of held-out samples for which a model with coupling is taken. The
+# gain is -20 for aircraft without coupling.
 COUPLED_GAIN = 20.0
-# largest number of further searches about the last result; each allows another factor of 2.5
+# largest number of further searches about the last result; each of them allows another factor of
+# 2.5
 AGAIN = 2
 
 
@@ -88,26 +89,26 @@ class Part(NamedTuple):
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     entries: tuple[Entry, ...]
-    before: Prediction  # by the nominal model
-    after: Prediction  # by the identified model
+    before: Prediction  # prediction by the nominal model
+    after: Prediction  # prediction by the identified model
     refusal: Refusal | None  # why this part must not be used
     latest: tuple[float, ...]  # s, the delay of each input plus two standard deviations
-    gusts: bool  # whether its seconds with gusts are a share of FEW or more
+    gusts: bool  # whether the share of its spans with gusts is FEW or more
     delays: tuple[float, ...] = ()  # s, the delay of each input
-    # advantage of the model `flown` over the nominal one, see `identify_model`
+    # advantage of the model in flight over the nominal one, see `identify_model`
     advantage: float = 0.0
-    wind: float = 0.0  # wind in most of its seconds, relative to moderate turbulence
-    # the part of the deviation of each entry that an uncertain delay causes
+    wind: float = 0.0  # level of the wind in most of its spans, relative to moderate turbulence
+    # part of each entry's deviation that comes from an uncertain delay
     by_timing: tuple[float, ...] = ()
 
 
 class Identification(NamedTuple):
-    """The identified model of one flight."""
+    """The model of an aircraft that was identified from one flight."""
 
     airframe: Airframe
     recorded: FlightData
-    held_out: NDArray[np.bool_]  # (T,)
-    # (T, m) each, units of y: innovations of the nominal model, then of the identified one
+    held_out: NDArray[np.bool_]  # (T,) mask of the samples that validate the model
+    # (T, m) each, units of y: innovations of the nominal model, and of the identified model
     innovations: tuple[FloatArray, FloatArray]
     before: Prediction
     after: Prediction
@@ -115,7 +116,7 @@ class Identification(NamedTuple):
 
     @property
     def entries(self) -> tuple[Entry, ...]:
-        """The identified entries of all parts."""
+        """The identified entries of A and B in all parts."""
         return tuple(chain.from_iterable(part.entries for part in self.parts))
 
     @property
@@ -132,15 +133,16 @@ class _Study(NamedTuple):
     delay: float  # s, delay of u
     unknown: Unknown
     validating: NDArray[np.bool_]  # (T,)
-    later: NDArray[np.bool_]  # (T,) samples on which the model `flown` is tested
+    # (T,) samples on which the model in flight is compared with the nominal model
+    later: NDArray[np.bool_]
     channels: ChannelPairing
-    bound_count: int  # how many entries may lie at their bound
+    bound_count: int  # number of entries that may lie at a bound
     searches_again: bool
-    timing: float | None  # s, deviation of the delay; None if the model counts as right
+    timing: float | None  # s, deviation of the delay; if None, the model counts as right
     step: Callable[[], None]
 
     def search(self, model: NominalModel, block: Block, *, coupled: bool = False) -> Search:
-        """Set up the search of a block."""
+        """Set up the search for the model of a block."""
         search = Search(
             recorded=self.recorded,
             model=model,
@@ -154,7 +156,7 @@ class _Study(NamedTuple):
         return search
 
     def part(self, search: Search, fit: Fit) -> Part:
-        """Return the model of a block, with the reason if it must not be used."""
+        """Return the model of a block, with the reason why it must not be used, if there is one."""
         outputs = search.names.outputs
         before = prediction(fit.before, self.validating)
         after = prediction(fit.after, self.validating)
@@ -191,7 +193,7 @@ class _Study(NamedTuple):
     def identification(
         self, airframe: Airframe, parts: Sequence[Part], first: Innovations, last: Innovations
     ) -> Identification:
-        """Join the parts to one model, with the innovations of the nominal and the new model."""
+        """Join the parts to one model, with innovations of the nominal and the identified model."""
         return Identification(
             airframe=with_entries(airframe, chain.from_iterable(part.entries for part in parts)),
             recorded=self.recorded,
@@ -205,10 +207,11 @@ class _Study(NamedTuple):
     def again(
         self, search: Search, fit: Fit, used: NDArray[np.bool_], flown: Airframe | None
     ) -> Fit:
-        """Search again about a fit with too many entries at a bound, because the file was rough.
+        """Search again about a fit that has too many entries at a bound, because the file is rough.
 
-        Effects of inputs must stay within the bounds about the file. Beyond these bounds no law of
-        the file flies, and a part that couples with another part seems to have such effects.
+        There is no further search if the effect of an input is at a bound. No law designed from the
+        file can fly an aircraft beyond these bounds. A part that couples with another part also
+        seems to have such effects.
         """
         for _ in range(AGAIN * self.searches_again):
             entries = search.about_centre(search.entries(fit))
@@ -234,7 +237,7 @@ class _Study(NamedTuple):
         *,
         quick: bool,
     ) -> tuple[Fit, Part]:
-        """Find the most probable theta of a block, and its model."""
+        """Find the most probable theta of a block, and return the fit with the model."""
         also = None if flown is None else search.model_errors(flown)
         quick_fit = search.fit_alike(used, also) if quick else None
         if quick_fit is not None:
@@ -251,9 +254,9 @@ class _Study(NamedTuple):
         used: NDArray[np.bool_],
         apart: Innovations,
     ) -> tuple[Fit, Part] | None:
-        """Fit the aircraft as one part.
+        """Fit the aircraft as one part, with coupling.
 
-        Returns None unless this fit predicts better than the parts `apart`.
+        Returns None unless this fit predicts better than the parts that were fitted `apart`.
         """
         search = self.search(model, whole_aircraft(model), coupled=True)
         fit = self.again(search, search.fit(used, begin=search.joined(fits)), used, None)
@@ -264,7 +267,7 @@ class _Study(NamedTuple):
         return (fit, part) if is_white and is_better and not part.refusal else None
 
     def advantage(self, flown: Innovations, nominal: Innovations) -> float:
-        """Return the advantage of the model `flown` over the nominal one in later samples."""
+        """Return the advantage of the model in flight over the nominal one in `later` samples."""
         return advantage(flown, nominal, span_length(self.recorded), self.later)
 
 
@@ -295,14 +298,14 @@ def identify_model(
         progress: Takes the steps `completed` and their largest number `total`.
         bound_count: How many entries of a part may lie at their bound.
         unknown: Deviations of all that is identified, such as delays.
-        flown: The model in flight, which is one more start. Its advantage over the nominal model is
-            computed.
+        flown: The model in flight. It is one more start of the search, and its advantage over the
+            nominal model is computed.
         after: The advantage counts only samples after this flight time, s.
         may_couple: Whether the parts may be joined to one if they couple.
-        quick: Whether the search of a part begins only once, provided that the air is the same in
-            every span and the model may be used.
+        quick: Whether a single start of the search suffices if the air is the same in every span
+            and the model may be used.
         searches_again: Whether a part with too many entries of A at their bounds is searched again,
-            about what was found.
+            about the result of the first search.
         timing: Standard deviation of the delay in `actuation`, s. If it is given, even as 0, the
             deviations also hold for a model that is not right (`Search.with_doubt`).
 
@@ -355,7 +358,7 @@ def identify_model(
 def _counter(
     progress: Callable[..., None], parts: int, *, starts_at_flown: bool
 ) -> Callable[[], None]:
-    """Return a function to call at each search step of some parts, which tells `progress`."""
+    """Return a function that counts the search steps of the parts and tells `progress`."""
     starts = len(STARTS) + len(SIGNS) + starts_at_flown
     total = parts * (starts * START_STEPS + REFINED * STEPS)
     total += (parts > 1) * (START_STEPS + STEPS)
@@ -373,7 +376,7 @@ def _follows(
     u: FloatArray,
     known: NDArray[np.bool_],
 ) -> float:
-    """Return the largest `correlation` of a part's innovations with another's u, (T, m)."""
+    """Return the largest `correlation` of a part's innovations with another part's u, (T, m)."""
     largest = 0.0
     for (_, fit), block in zip(fits, every, strict=True):
         of_others = np.delete(u, block.inputs, axis=1)
@@ -382,13 +385,13 @@ def _follows(
 
 
 def _couples(flown: Airframe, nominal: Airframe) -> bool:
-    """Return whether a model has entries that are 0 in the nominal one."""
+    """Return whether a model has nonzero entries where the nominal model has zeros."""
     new, old = (np.hstack([model.matrix_a(), model.matrix_b()]) for model in (flown, nominal))
     return bool(np.any((new != 0.0) & (old == 0.0)))
 
 
 def _require_motion(outputs: Sequence[str], y: FloatArray) -> None:
-    """Raise ParameterError for an output that never changes; y (T, m)."""
+    """Raise ParameterError for an output that never changes in y, (T, m)."""
     still = [name for name, values in zip(outputs, y.T, strict=True) if not np.diff(values).any()]
     expected = "outputs that move, or the noise of their sensors"
     require(not still, "record", f"a constant {', '.join(still)}", expected)

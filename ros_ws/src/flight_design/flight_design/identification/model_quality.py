@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Assess how well a model predicts held-out samples."""
+"""Assess how well a model predicts the samples that were held out of its fit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ from flight_core.outcome import Refusal
 from flight_core.vectors import FloatArray
 from flight_design.identification.likelihood import Innovations
 
-# largest `whiteness`. White innovations have 1, with a deviation of 0.3. A model with more than
-# MAX_WHITENESS leaves out something that the aircraft does.
+# largest `whiteness` of a model's innovations. White innovations have 1, with a deviation of 0.3. A
+# model with more leaves out something that the aircraft does.
 MAX_WHITENESS = 3.0
-LAGS = 20  # lags of the autocorrelation in the figure of whiteness: 0.2 s at 100 Hz
+LAGS = 20  # largest lag in `whiteness`, in samples: 0.2 s at 100 Hz
 
 
 class Prediction(NamedTuple):
@@ -29,27 +29,29 @@ class Prediction(NamedTuple):
 
 
 def prediction(innovations: Innovations, held_out: NDArray[np.bool_]) -> Prediction:
-    """Assess how innovations predict the held-out samples, (T,)."""
+    """Assess how well innovations predict the held-out samples, whose mask has shape (T,)."""
     rms = np.sqrt(np.mean(innovations.r[held_out] ** 2, axis=0))
     likelihood = float(np.mean(innovations.log_likelihood[held_out]))
     return Prediction(rms, whiteness(innovations.normalised, held_out), likelihood)
 
 
 def whiteness(e: FloatArray, held_out: NDArray[np.bool_]) -> FloatArray:
-    """Return the mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m,).
+    """Return how far innovations are from white noise, for each output, (m,); 1 for white noise.
 
-    rho_k is the autocorrelation of n_k pairs of held-out samples. For white noise the mean is 1,
-    with a standard deviation of sqrt(2 / LAGS). e is (T, m), held_out (T,). Source: G. M. Ljung, G.
-    E. P. Box, Biometrika 65(2), 1978, here for the pairs within the held-out spans.
+    The value is the mean of n_k rho_k^2 over the lags k = 1 .. LAGS. rho_k is the autocorrelation
+    of n_k pairs of held-out samples. For white noise the mean is 1, with a standard deviation of
+    sqrt(2 / LAGS). e has shape (T, m), held_out (T,). Source: G. M. Ljung, G. E. P. Box, Biometrika
+    65(2), 1978, here for the pairs within the held-out spans.
     """
     return np.diag(correlation(e, e, held_out))
 
 
 def correlation(e: FloatArray, lagged: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
-    """Return the mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m, k).
+    """Return how strongly e follows each column of `lagged`, (m, k); 1 for independent noises.
 
-    rho_k is the correlation of e with `lagged` k samples earlier. For independent white noises the
-    mean is 1. e is (T, m), lagged (T, k), and `used` (T,) is the mask of n samples.
+    The value is the mean of n_k rho_k^2 over the lags k = 1 .. LAGS. rho_k is the correlation of e
+    with `lagged` k samples earlier. e has shape (T, m), lagged (T, k). `used`, (T,), is the mask of
+    n samples.
     """
     now, then = (np.where(used[:, None], values, 0.0) for values in (e, lagged))
     power = np.outer(*(np.sum(values**2, axis=0) / used.sum() for values in (now, then)))
@@ -63,16 +65,16 @@ def correlation(e: FloatArray, lagged: FloatArray, used: NDArray[np.bool_]) -> F
 def advantage(
     first: Innovations, second: Innovations, span: int, counts: NDArray[np.bool_]
 ) -> float:
-    """Return by how many standard deviations one model predicts a record better than another.
+    """Return by how many standard deviations the first model predicts a record better.
 
         t = sum d_k / sqrt(K var d),  d_k the difference of log-likelihood of span k of K
         z = Phi^-1(F_(K-1)(t)),  F of Student's distribution, Phi of the normal one
 
     If both models are equally far from the aircraft, z has a standard normal distribution. This
-    holds whichever model is simpler, and even if both are wrong. Source: Q. H. Vuong, Econometrica
-    57(2), 1989, here with spans of `span` samples, whose d_k are nearly independent. K is small,
-    hence Student's t. Only samples of the mask `counts`, (T,), count. With fewer than two spans z
-    is 0.
+    holds whichever model is simpler, and even if both models are wrong. Source: Q. H. Vuong,
+    Econometrica 57(2), 1989, here with spans of `span` samples, whose d_k are nearly independent.
+    Student's t is used because K is small. Only the samples in the mask `counts`, (T,), count. With
+    fewer than two spans z is 0.
     """
     end = len(counts) // span * span
     d = np.where(counts, first.log_likelihood - second.log_likelihood, 0.0)[:end]
@@ -86,16 +88,16 @@ def advantage(
 
 @dataclass(frozen=True)
 class NoBetter(Refusal):
-    """The only reason against a model is that it predicts no better than the nominal one."""
+    """Refusal of a model only because it predicts no better than the nominal model."""
 
 
 def reason_against_prediction(
     before: Prediction, after: Prediction, outputs: Sequence[str]
 ) -> NoBetter | None:
-    """Refuse a model that predicts the held-out samples no better than the nominal one.
+    """Refuse a model that predicts the held-out samples no better than the nominal model.
 
-    A model is also refused if the innovations of one of its outputs are neither white nor whiter
-    than those of the nominal model.
+    A model is also refused if the innovations of an output are not white, and no whiter than those
+    of the nominal model.
     """
     if after.log_likelihood <= before.log_likelihood:
         return NoBetter(

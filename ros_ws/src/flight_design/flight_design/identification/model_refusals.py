@@ -13,16 +13,16 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.likelihood import MAX_ERROR, MAX_FACTOR, PRIOR, largest_error
 
-# Largest relative deviation of the best known effect of an input on each output. Two such
-# deviations are a fifth of the loop gain.
+# Largest relative standard deviation of the best known effect on each output. Two such deviations
+# are a fifth of the loop gain.
 MAX_DEVIATION = 0.1
-# Largest part of this deviation that an uncertain delay of u may cause. The guarantee then has to
-# cover 30 % of the loop gain.
+# Largest part of this deviation that an uncertain delay of u may cause. With it the guarantee has
+# to cover 30 % of the loop gain.
 MAX_BY_TIMING = 0.15
 
 
 def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
-    """Return the best known effect of an input on each output."""
+    """Return, for each output, the effect of an input on it that is known best."""
     effects = [entry for entry in entries if entry.matrix == "B" and entry.nominal]
     best = []
     for output in outputs:
@@ -32,9 +32,10 @@ def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
 
 
 def reason_against_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> Refusal | None:
-    """Refuse the output whose inputs are known worst, if even its best known effect is uncertain.
+    """Refuse a model if even the best known effect on some output is uncertain.
 
-    An effect is uncertain if its deviation is above MAX_DEVIATION.
+    An effect is uncertain if its deviation is above MAX_DEVIATION. The refusal names the output
+    whose effects are known worst.
     """
     worst = max(best_known(entries, outputs), key=lambda effect: effect.deviation)
     if worst.deviation <= MAX_DEVIATION:
@@ -49,7 +50,7 @@ def reason_against_excitation(entries: Iterable[Entry], outputs: Iterable[str]) 
 
 
 def excitation_factor(effect: Entry) -> float:
-    """Return the factor on the amplitude with which an effect becomes known to MAX_DEVIATION.
+    """Return the factor on the amplitude at which an effect would be known to MAX_DEVIATION.
 
     Information grows with the square of the amplitude. If the factor is 1 or less, the effect is
     already known that well.
@@ -59,7 +60,7 @@ def excitation_factor(effect: Entry) -> float:
 
 
 def at_bound(entries: Iterable[Entry], factor: float = MAX_FACTOR) -> list[Entry]:
-    """Return the entries at a bound of a search whose largest factor is `factor`."""
+    """Return the entries at a bound of a search that allows factors up to `factor`."""
     found = []
     for entry in entries:
         lower, upper = -MAX_ERROR, largest_error(entry)
@@ -75,8 +76,8 @@ def reason_against_airframe(
 ) -> Refusal | None:
     """Refuse the airframe `name` if more than `allowed` entries are at a bound of the search.
 
-    A single entry is too many if the record shows it clearly, with at most half of the deviation
-    that it had before. Then the aircraft lies beyond the bound.
+    A single entry is too many if the record shows it clearly, so that its deviation is at most half
+    of the prior one. The aircraft then lies beyond the bound.
     """
     found = at_bound(entries, factor)
     is_shown = any(entry.deviation < PRIOR / 2.0 for entry in found)
@@ -90,7 +91,7 @@ def reason_against_airframe(
 
 
 def _minor_signs(Omega: FloatArray) -> list[float]:
-    """Return the signs of the leading minors."""
+    """Return the signs of the leading minors of Omega."""
     return [np.sign(np.linalg.det(Omega[:k, :k])) for k in range(1, len(Omega) + 1)]
 
 
@@ -123,9 +124,9 @@ def in_time(entries: Iterable[Entry], by_timing: Iterable[float]) -> list[Entry]
 def reason_against_timing(
     entries: Sequence[Entry], by_timing: Sequence[float], outputs: Iterable[str]
 ) -> Refusal | None:
-    """Refuse a part if its best known effects depend too much on the delay of u.
+    """Refuse a part of the aircraft if its best known effects depend too much on the delay of u.
 
-    `by_timing` is the part of the deviation of each entry that an uncertain delay of u causes.
+    `by_timing` is the part of each entry's deviation that an uncertain delay of u causes.
     """
     late = dict(zip((entry.name for entry in entries), by_timing, strict=False))
     worst = max(best_known(entries, outputs), key=lambda effect: late.get(effect.name, 0.0))

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight of the exported controller inside PX4, from the topic rise_di_status of a ULog.
+"""Read a flight of the exported controller inside PX4, from the topic rise_di_status of a ULog.
 
-The ticks become `internals`, and replay computes them again.
+The ticks become the signal `internals`, and a replay computes them again.
 """
 
 from collections.abc import Mapping
@@ -34,10 +34,10 @@ class ModuleChange(NamedTuple):
 
 
 class ModuleFlight(NamedTuple):
-    """y, y_m, u and `internals` of the ticks of a module.
+    """y, y_m, u and `internals` at the ticks of a module.
 
-    In `equal` ticks, u has the same bits in Python. `lost` ticks follow a gap of the log, so that
-    Python cannot compute them.
+    `equal` is the number of ticks whose u has the same bits in Python. `lost` is the number of
+    ticks after a gap of the log, which Python cannot compute.
     """
 
     tape: Tape
@@ -47,12 +47,13 @@ class ModuleFlight(NamedTuple):
 
 
 def module_flight(log: VehicleLog, controller: ControllerConfig) -> ModuleFlight:
-    """Compute the ticks of a module again, each stretch from its engagement on.
+    """Compute the ticks of a module again, beginning at each engagement.
 
-    Python steps the law from the u of the first tick of a stretch. In `internals`, e and u come
-    from the log, and the states of the law come from Python. At low airspeed a torque of 1 limits
-    u, which counts as a change of the parameters. Raises ParameterError if the log has no ticks or
-    other parameters, or if the module computes in single precision.
+    A stretch is a series of ticks without a gap after an engagement. Python starts a stretch with
+    the u of its first tick. In `internals`, e and u come from the log, and the states of the law
+    come from Python. At low airspeed a torque of 1 limits u, which counts as a change of the
+    parameters. Raises ParameterError if the log has no ticks or other parameters, or if the module
+    computes in single precision.
     """
     require(STATUS in log.tables, "the log", f"no {STATUS}", EXPECTED)
     table = log.tables[STATUS]
@@ -103,12 +104,12 @@ class _Ticks:
         )
 
     def flown(self) -> list[list[int]]:
-        """Return the rows of the ticks by stretch.
+        """Return the rows of the ticks, one list for each stretch.
 
         A stretch begins at an engagement, and ends at a gap or at the next engagement.
         """
         stretches: list[list[int]] = []
-        last: int | None = None  # number of the tick before; None if the stretch has ended
+        last: int | None = None  # number of the previous tick; None if the stretch has ended
         for k in np.flatnonzero(self._ticked).tolist():
             number = int(self._number[k])
             if number == 1:
@@ -130,13 +131,14 @@ class _Ticks:
         changes: list[ModuleChange] = []
         rows: list[FloatArray] = []
         equal = 0
-        number = 1  # the first tick of a stretch cannot be checked, so that its number leaves a gap
+        number = 1  # the first tick of a stretch cannot be checked, and leaves a gap in the numbers
         for stretch in stretches:
             state = guard.initial_state(len(controller.inputs), None)
             state = state._replace(u=self._values["u"][stretch[0]].copy())
             number += 1
             for k in stretch:
-                # If the limits of a row differ from those before, the parameters changed.
+                # If the limits of a row differ from those of the previous row, the parameters
+                # changed.
                 change = self._limits(k)
                 if any(getattr(controller, key) != value for key, value in change.items()):
                     controller = vary(controller, change)

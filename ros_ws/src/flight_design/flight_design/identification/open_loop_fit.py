@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A low-order model for each channel, from a log in which each input was excited by itself.
+"""Fit a low-order model to each channel of a log in which the inputs were excited one by one.
 
     lag v_dot = u(t - delay) - v,    z'' + damping z' + stiffness z = v,    y = Omega z' + slow z
 
-The excitation is open loop. The output error is fitted: the model is simulated from u alone, and
-the squares of y minus its output are minimised. Without stiffness the response does not tell the
-lag from 1 / damping. The lag is then the smaller of the two, which belongs to the faster pole.
+The excitation is open loop. The output error is minimised: the model is simulated from u alone, and
+the squares of y minus its output are summed. Without stiffness, lag and 1 / damping can change
+places in the response. The lag is then the smaller of the two, which belongs to the faster pole.
 Source: L. Ljung, "System Identification", 1999, 4.2 and 10.2.
 
-Thrust also moves the airspeed through the climb that follows, the phugoid. If the climb is
-measured, the model of V excludes the phugoid:
+Thrust also moves the airspeed through the climb that it causes, which is the phugoid. If the climb
+is measured, the model of V excludes the phugoid:
 
     V_dot = -damping V + Omega v - g climb / speed
 
@@ -32,24 +32,26 @@ from flight_core.vectors import FloatArray
 from flight_design.identification.response_identification import BRIDGED
 
 STEP = 0.004  # s, step of the simulation
-# s before and after the excitation of an input that count too
+# s, time before and after the excitation of an input that counts too
 BEFORE = 0.3
 AFTER = 0.5
-MIN_CERTAINTY = 5.0  # the sign of Omega is certain if Omega is this many standard errors
-LOOP_FREQUENCY = 0.5  # in 1 / (delay + lag): about the crossover of the loops of `rise-di gains`
-MAX_ZERO_LAG = 0.5  # largest product of zero and lag; at 1 they cancel
+MIN_CERTAINTY = 5.0  # an estimate is certain if it is at least this many standard errors
+# times 1 / (delay + lag), about the crossover frequency of the loops of `rise-di gains`
+LOOP_FREQUENCY = 0.5
+MAX_ZERO_LAG = 0.5  # largest product of zero and lag; at 1 zero and lag would cancel
 # 1/s, fastest zero that a feedforward of 100 Hz follows (rise_di_controller.params, _check_nominal)
 FASTEST_ZERO = 25.0
-# A model of second order must lower the misfit to this share. In 10 s noise alone does not do so.
+# A model of second order must lower the misfit to this share. Noise alone does not do so in 10 s.
 MIN_GAIN = 0.85
-# Starts of delay s, lag s, damping 1/s, stiffness 1/s^2 and zero 1/s: a short-period or Dutch roll
-# mode of a transport, the same behind slow servos, and such a mode of a model aircraft
+# Starts of the search: delay s, lag s, damping 1/s, stiffness 1/s^2 and zero 1/s. They are a
+# short-period or Dutch roll mode of a transport, the same mode behind slow servos, and such a mode
+# of a model aircraft.
 STARTS = ((0.03, 0.03, 5.0, 30.0, 6.0), (0.1, 0.1, 5.0, 30.0, 6.0), (0.03, 0.01, 30.0, 400.0, 1.0))
 # Bounds of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow.
 LOWER = np.array([0.0, 0.003, -np.inf, 0.0, 0.0, -np.inf])
 UPPER = np.array([0.4, 1.0, np.inf, 120.0, 3000.0, np.inf])
-ORDERS = (4, 6)  # numbers of parameters of the first and of the second order
-SETTLED = 2.0  # s after a gap, while the response to the unknown u in the gap decays
+ORDERS = (4, 6)  # numbers of parameters of the models of first and of second order
+SETTLED = 2.0  # s after a gap, until the response to the unknown u in it has decayed
 CORRELATION = 0.5  # s over which errors of neighbouring samples count as correlated
 
 
@@ -66,7 +68,7 @@ class Estimate(NamedTuple):
 
 
 class ChannelModel(NamedTuple):
-    """The model of a channel, SI, and the covariance of its parameters in their order."""
+    """The model of a channel, SI, and the covariance of its parameters in the fields' order."""
 
     delay: float  # s
     lag: float  # s
@@ -75,7 +77,7 @@ class ChannelModel(NamedTuple):
     stiffness: float  # 1/s^2; 0 if the first order is enough
     slow: float
     covariance: FloatArray  # (6, 6)
-    misfit: float  # rms of the output error / rms of y
+    misfit: float  # rms of the output error divided by the rms of y
 
     @property
     def usable(self) -> bool:
@@ -90,8 +92,8 @@ class ChannelModel(NamedTuple):
     def at_loop_frequency(self) -> tuple[Estimate, Estimate]:
         """Return abs(y / u) and the phase lag of y behind u, rad, at LOOP_FREQUENCY.
 
-        In a fit, Omega, damping, lag and delay can stand in for each other. The loop only needs the
-        gain and the phase.
+        Omega, damping, lag and delay can compensate each other in a fit. So each of them may be
+        uncertain while gain and phase, which the loop needs, are certain.
         """
         theta = np.array(self[:6])
         s = 1j * LOOP_FREQUENCY / (self.delay + self.lag)
@@ -128,11 +130,12 @@ def fit_channel(
     *,
     first_order: bool = False,
 ) -> ChannelModel | None:
-    """Fit a channel over the time of its excitation, with the lowest order that suffices.
+    """Fit a channel's model to the time of its excitation, with the lowest order that suffices.
 
     Returns None if there is no excitation, or if the output is constant. The search begins with an
-    Omega of this sign, and may end with the opposite one. `gravity` is a channel that measures the
-    part of y_dot that gravity causes. With `gravity` or `first_order`, the model is of first order.
+    Omega of the sign `sign`, and may end with the opposite sign. `gravity` is a channel that
+    measures the part of y_dot that gravity causes. With `gravity` or `first_order`, the model is of
+    first order.
     """
     # Take the time of the excitation, and a little before and after it.
     excited = np.flatnonzero(u[name] != 0.0)
@@ -167,7 +170,7 @@ def fit_channel(
         e = measured - response(theta)
         return np.asarray(e - q @ (q.T @ e))
 
-    # A second order must lower the misfit.
+    # A model of second order must lower the misfit.
     orders = ORDERS[:1] if first_order or gravity is not None else ORDERS
     values = residuals(np.array([0.0, 1.0, 0.0, 0.0]))
     fits = [
@@ -188,16 +191,16 @@ def _settled(t: FloatArray) -> NDArray[np.bool_]:
 
 
 def _decay(t: FloatArray, damping: float) -> FloatArray:
-    """Return the third function of time that is fitted beside a constant and t.
+    """Return the third function of time that is fitted, beside a constant and t.
 
-    It is the decay of an initial value, exp(-damping t), or t^2 if the damping is 0.
+    It shows the decay of an initial value, exp(-damping t). If the damping is 0, it is t^2 / 2.
     """
     x = damping * t
     return np.where(x > 1e-4, (np.expm1(-x) + x) / max(damping, 1e-9) ** 2, 0.5 * t**2)
 
 
 def _has_zero_of_its_own(theta: FloatArray) -> bool:
-    """Return whether a second order's zero is stable, and too slow to cancel the lag."""
+    """Return whether the zero of a second-order model is stable, and too slow to cancel the lag."""
     _, lag, Omega, _, _, slow = theta
     return bool(0.0 <= slow * Omega * lag <= MAX_ZERO_LAG * Omega**2)
 
@@ -205,9 +208,9 @@ def _has_zero_of_its_own(theta: FloatArray) -> bool:
 def _simulated(
     t: FloatArray, t_u: FloatArray, impulse: FloatArray, theta: FloatArray
 ) -> FloatArray:
-    """Return the output of the model from rest at the instants t, (N,).
+    """Return the output of the model at the instants t, (N,), starting at rest.
 
-    `impulse` is the integral of u, which is held between the instants t_u.
+    `impulse` is the integral of u at the instants t_u.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     grid = np.arange(0.0, t[-1] + 2.0 * STEP, STEP)
@@ -236,13 +239,13 @@ def _search(residuals: Any, values: FloatArray, order: int, amplitude: float) ->
     best = min(fits, key=lambda fit: float(fit.cost))
     if order == ORDERS[0] and best.x[1] * best.x[3] > 1.0:
         delay, lag, Omega, damping = best.x
-        # the same response
+        # This model has the same response.
         best = search(np.array([delay, 1.0 / damping, Omega / (lag * damping), 1.0 / lag]))
     return best
 
 
 def _model(fit: Any, misfit: float, period: float) -> ChannelModel:
-    """Return the model of a fit, with standard errors that allow for correlated output errors.
+    """Return the model of a fit; its standard errors allow for correlated output errors.
 
     Source: L. Ljung, 9.4 (coloured errors).
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rate loop of an autopilot, from its parameters: its margins, and its errors in simulation.
+"""Compute margins and simulated errors of an autopilot's rate loop from its parameters.
 
     torque = FF r + P (r - y) + I integral of (r - y),  abs(I integral) <= IMAX
 
@@ -39,17 +39,20 @@ ARDUPLANE = {
 class OwnLoop(NamedTuple):
     """Gains of an autopilot's rate loop in the order of a law.
 
-    The gains turn rad/s and rad into a torque.
+    The gains multiply errors in rad/s and their integrals in rad, and give a torque.
     """
 
     FF: FloatArray
     P: FloatArray
     I: FloatArray  # noqa: E741 - as the parameters are named
     imax: FloatArray
-    source: str  # the parameters from which they come
+    source: str  # the parameters from which the gains come
 
     def in_place(self, scenario: Scenario) -> Scenario:
-        """Return the scenario with this loop's feedback as the law `pi`, where u = end * torque."""
+        """Return the scenario with the feedback of this loop as the law `pi`.
+
+        An input u is its value at a torque of 1, times the torque.
+        """
         controller = scenario.rise_di()
         end = _ends(scenario)
         gain = end * self.P / np.array(controller.input_scale)
@@ -70,11 +73,11 @@ class OwnLoop(NamedTuple):
         noise: FloatArray,
         f: FloatArray,
     ) -> FloatArray:
-        """Return y - y_m, (N, m), of the aircraft under this loop, with y_m (N, m) as the setpoint.
+        """Return y - y_m, (N, m), of the aircraft in this loop, with y_m (N, m) as the setpoint.
 
-        A row is a period of the controller. y has the noise, (m,) rms. It is late by the delay of
-        the scenario minus a period, and u acts from the next period on. f, (N, n), is
-        the disturbance of x_dot, SI.
+        Each row is a period of the controller. y has the noise, (m,) rms. y is late by the delay of
+        the scenario minus a period, and u acts from the next period on. f, (N, n), is the
+        disturbance of x_dot, SI.
         """
         controller = scenario.rise_di()
         period = 1.0 / controller.rate
@@ -107,7 +110,7 @@ class OwnLoop(NamedTuple):
 
 
 def _ends(scenario: Scenario) -> FloatArray:
-    """Return u at a torque of 1, by input of the law, with the sign of D."""
+    """Return u at a torque of 1, for each input of the law, with the sign of D."""
     controller = scenario.rise_di()
     inputs = scenario.aircraft.channels().inputs
     upper = dict(zip(inputs, scenario.aircraft.actuators.upper or (), strict=False))
@@ -118,8 +121,8 @@ def _ends(scenario: Scenario) -> FloatArray:
 def own_loop(parameters: Mapping[str, float], scenario: Scenario, autopilot: str) -> OwnLoop | None:
     """Read the rate loop of an autopilot from its log, or return None if a parameter is missing.
 
-    PX4 and ArduPlane scale P and I by the square of a speed over the airspeed, and FF by this
-    ratio. Here the gains are those at the trim speed.
+    PX4 and ArduPlane multiply FF by a reference speed over the airspeed, and P and I by the square
+    of this ratio. Here the gains are those at the trim speed.
     """
     speed = scenario.aircraft.channels().speed
     names = ARDUPLANE if autopilot == "ardupilot" else FIXED_WING if speed > 0.0 else MULTICOPTER

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compare the parameters of ArduPilot in a log with what a channel map says of the transmitter.
+"""Compare the parameters of ArduPilot in a log with a channel map's rows of the transmitter.
 
 Sources: ArduPilot, RC_Channel.cpp and SRV_Channel.cpp (ends, trim, reversal), RCMapper.cpp,
 SRV_Channel.h (functions of servos); ArduPlane, mode_fbwa.cpp (if RCn_REVERSED is 0, high is roll
@@ -22,7 +22,7 @@ from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
 from flight_log.vehicle_tables import SERVOS, Parameters
 
-# Channel of a transmitter. Rc.msg counts from 0, MAVLink from 1.
+# Channel of a transmitter in a message. Rc.msg counts from 0, MAVLink from 1.
 CHANNEL = re.compile(r"channels\[(\d+)\]|chan(\d+)_raw")
 # axis of RCMAP, by the output that responds
 AXES: Mapping[str, str] = {"p": "ROLL", "q": "PITCH", "V": "THROTTLE", "r": "YAW"}
@@ -30,8 +30,8 @@ AXES: Mapping[str, str] = {"p": "ROLL", "q": "PITCH", "V": "THROTTLE", "r": "YAW
 FUNCTIONS = {"ROLL": 4, "PITCH": 19, "THROTTLE": 70, "YAW": 21}
 SAME_LINE = LinearConversion(1, 1.0, 0.0)
 
-# Largest difference of an end, as a share of half the range. The effect of the input differs by the
-# same share, which is less than the standard errors of `identify`.
+# Largest difference of an end of the range, as a share of half the range. The effect of the input
+# differs by the same share, which is less than the standard errors of `identify`.
 END_TOLERANCE = 0.01
 # Largest difference of the trim, as a share of half the range. The effects on either side of the
 # trim differ from their mean by the same share.
@@ -47,7 +47,7 @@ CALIBRATE = (
     "change `range`, `scale` and `offset` of the rows of `inputs` and `trims`, or "
     "calibrate the transmitter and fly again"
 )
-MENDS = {  # by part of the parameter's name; no remedy reverses what the pilot's stick does
+MENDS = {  # remedies by a part of the parameter's name; none reverses what the pilot's stick does
     "REVERSED": "change `positive` of the row of `inputs`, and not the parameter",
     "TRIM": "calibrate the transmitter with its trims in the middle and fly again",
     "MIN": CALIBRATE,
@@ -57,24 +57,24 @@ MENDS = {  # by part of the parameter's name; no remedy reverses what the pilot'
 
 
 class Stick(NamedTuple):
-    """The statements of a map about an input and its channel of the transmitter.
+    """What a map says about an input and its channel of the transmitter.
 
     `trim_line` turns the pulse, us, into the raw value.
     """
 
     axis: str  # ROLL, PITCH, THROTTLE or YAW
-    channel: int  # from 1
+    channel: int  # channel of the transmitter, from 1
     trim_line: LinearConversion
     raw_range: tuple[float, float]
-    raw_sign: int  # +1 if an increasing raw value is roll right, nose up, more thrust, nose right
+    raw_sign: int  # +1 if a higher raw value is roll right, nose up, more thrust, nose right
 
     @property
     def is_centred(self) -> bool:
-        """Whether ArduPilot measures the channel from its trim, and not from the lower end."""
+        """Whether ArduPilot measures the channel from its trim instead of the lower end."""
         return self.axis != "THROTTLE"
 
     def parameters(self) -> dict[str, tuple[float, float]]:
-        """Return the parameters by which ArduPilot agrees with the map: (value, tolerance)."""
+        """Return the parameters of ArduPilot that fit the map: (value, tolerance) by name."""
         low, high = sorted(to_raw(raw, self.trim_line) for raw in self.raw_range)
         half = (high - low) / 2.0
         name = f"RC{self.channel}"
@@ -89,9 +89,9 @@ class Stick(NamedTuple):
         }
 
     def raw(self, deflection: FloatArray) -> FloatArray:
-        """Return the raw value of a fraction of full deflection.
+        """Return the raw value at a fraction of full deflection.
 
-        The fraction is -1 to 1 about the middle; for a throttle it is 0 to 1 from the lower end.
+        The fraction is -1 to 1 about the middle. For a throttle it is 0 to 1 from the lower end.
         """
         low, high = self.raw_range
         part = (1.0 + self.raw_sign * deflection) / 2.0 if self.is_centred else deflection
@@ -99,7 +99,7 @@ class Stick(NamedTuple):
 
 
 def stick_of(channel_map: ChannelMap, name: str) -> Stick:
-    """Return what a map says of the channel of an input.
+    """Return what a map says about the channel of an input.
 
     Raises ParameterError if the input has no channel.
     """
@@ -125,7 +125,7 @@ def stick_of(channel_map: ChannelMap, name: str) -> Stick:
 
 
 class Servo(NamedTuple):
-    """A servo of ArduPilot: its output, which counts from 1, and its ends and trim, us."""
+    """A servo of ArduPilot: the number of its output, from 1, and its ends and trim, us."""
 
     output: int
     low: float
@@ -136,7 +136,7 @@ class Servo(NamedTuple):
     def deflection(self, pulse: FloatArray, stick: Stick) -> FloatArray:
         """Return the fraction of full deflection at a pulse, us.
 
-        It is -1 to 1, and for a throttle 0 to 1.
+        The fraction is -1 to 1, and for a throttle 0 to 1.
         """
         if not stick.is_centred:
             part = (pulse - self.low) / (self.high - self.low)
@@ -146,10 +146,10 @@ class Servo(NamedTuple):
 
 
 def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
-    """Return the first servo that has the function of an input.
+    """Return the first servo whose function is that of an input's stick.
 
-    `values` are the parameters at the samples. Raises ParameterError if there is no such servo, or
-    if one of its parameters is missing.
+    `values` has the parameters at the time of the samples. Raises ParameterError if there is no
+    such servo, or if one of its parameters is missing.
     """
     function = FUNCTIONS[stick.axis]
     outputs = [
@@ -187,13 +187,13 @@ def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
 
 
 class Agreement(NamedTuple):
-    """A line of the comparison of a log with a map."""
+    """A row of the comparison of a log with a map."""
 
-    what: str  # the parameter, or what is taken from the log
-    logged: str  # "" if the log has no record
-    mapped: str  # "" if the map has none
+    what: str  # the parameter, or the quantity that is taken from the log
+    logged: str  # the value in the log; "" if the log has no record
+    mapped: str  # the value in the map; "" if the map has none
     differs: bool = False
-    is_known: bool = True  # whether an earlier record gives its value at the samples
+    is_known: bool = True  # whether a record before the samples gives the value
 
 
 def compared(
@@ -201,8 +201,8 @@ def compared(
 ) -> list[Agreement]:
     """Compare the transmitter's parameters in a log with a map.
 
-    `values` are the parameters at the samples. If a parameter has no value there, its first record
-    after the samples is compared. No default value replaces it.
+    `values` has the parameters at the time of the samples. If a parameter has no value then, its
+    first record after the samples is compared. No default value replaces a missing record.
     """
     parameters = {name: records[0].value for name, records in recorded.items()} | dict(values)
     rows = []
@@ -223,9 +223,9 @@ def compared(
 
 
 def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str | None:
-    """Return a sentence on the parameters without a value at the samples, if there are any.
+    """Return a sentence on the parameters that have no value at the samples, or None.
 
-    Raises ParameterError if a parameter differs from the map's.
+    Raises ParameterError if a parameter differs from that of the map.
     """
     differing = [row for row in rows if row.differs]
     if differing:
@@ -247,7 +247,7 @@ def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str | None
 
 
 def change_sentences(recorded: Parameters, start_ns: int, first_ns: int, last_ns: int) -> list[str]:
-    """Say which decisive parameters change before or after the samples.
+    """Say which of the parameters that matter change before or after the samples.
 
     `first_ns` and `last_ns` are the first and the last sample, and `start_ns` is the beginning of
     the log. Raises ParameterError if a parameter changes between the samples.
