@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `learner`."""
+"""The entry point of the executable `learner`."""
 
 from flight_core.scheduling import leave_real_time_priority
 from flight_ros.startup import start_nodes

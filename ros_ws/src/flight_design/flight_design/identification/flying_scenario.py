@@ -140,7 +140,7 @@ class _Identified(NamedTuple):
 
     @property
     def loop(self) -> LoopTiming:
-        """The loop with the least delay of all channels. Further delay counts as lag."""
+        """The loop with the least delay of all channels; further delay counts as lag."""
         channels = self.channels
         delay = float(np.min(channels.delay))
         return LoopTiming(channels.lag + channels.delay - delay, delay, 1.0 / RATE)

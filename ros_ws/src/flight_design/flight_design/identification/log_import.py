@@ -364,8 +364,7 @@ def _flight(
 ) -> tuple[tuple[int, int], str | None]:
     """Return the first and the last instant to import, and a sentence on other flights.
 
-    They are those of the window or, without a window, of the longest stretch in the air. If the
-    command is the stick, this stretch must be in MANUAL.
+    They are those of the window or of the longest stretch in the air, with sticks in MANUAL.
     """
     start_ns = int(stamps[0])
     keep = np.ones(len(stamps), dtype=bool)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Take the rates and the torque of an autopilot's log as y and u of a scenario of body rates.
+"""Read y and u of a scenario of body rates from the rates and torques in an autopilot's log.
 
-A torque of 1 is u at the upper end stop, as in the module of `rise-di export`.
+A torque of 1 means u at the upper end stop, as in the module of `rise-di export`.
 """
 
 import math
@@ -34,29 +34,30 @@ CUTOFFS: Mapping[str, str] = MappingProxyType(
 SLOWEST, FASTEST = (
     0.6,
     1.6,
-)  # times the trim speed: c_export.autopilots clips the dynamic pressure there
+)  # times the trim speed: c_export.autopilots clips the dynamic pressure at these speeds
 PERIOD = 0.008  # s, least period of the identification: more samples make the search longer
-SPARSE = 1.5  # a log with a longer period, in periods of the law, does not have every u
-# Hz. Behind a filter with this cut-off, the noise of samples a PERIOD apart is white.
+SPARSE = 1.5  # largest period of a log that has every u, in periods of the law
+# cut-off in Hz of a filter behind which the noise of samples a PERIOD apart is white
 BROAD = 90.0
-OVER = 2.2  # least rate of a log from which the filter can be removed, in units of the cut-off
+# least rate of a log, as a multiple of the cut-off, from which the filter can be removed
+OVER = 2.2
 PERIODS = 6.0  # after so many periods of the cut-off, the filter's impulse response is below 1e-5
 
-MOST_SURFACES = 8  # most surfaces of PX4; their number if the log lacks CA_SV_CS_COUNT
-SAME_END = 1e-3  # largest rounding error of a servo at the torque 1, where it must be 1
+MOST_SURFACES = 8  # largest number of surfaces of PX4, taken if the log lacks CA_SV_CS_COUNT
+SAME_END = 1e-3  # largest rounding error of a servo's position of 1 at a torque of 1
 AXES: Mapping[str, str] = MappingProxyType({"R": "roll", "P": "pitch", "Y": "yaw"})
 """The axis that a letter of PX4's parameters stands for."""
 
 
 class RatesLog(NamedTuple):
-    """The rates and the torque of a log."""
+    """y and u from the rates and torques of a log, with what is known about them."""
 
     recorded: FlightData
     taken: Imported
     rate: float  # rate of the samples of y, Hz
-    cutoff: float  # of the gyro's second-order low-pass, Hz; 0 if the log names none
-    advance: float  # s, time by which y is earlier than the y behind this filter
-    # s, standard deviation of the instant at which u acts: it is anywhere in a period of the log
+    cutoff: float  # cut-off of the gyro's second-order low-pass, Hz; 0 if the log names none
+    advance: float  # s, time by which y is earlier than it was behind this filter
+    # s, standard deviation of the instant at which u acts, which is anywhere in a period of the log
     timing: float
     every: float  # s, time between two samples of u
 
@@ -64,8 +65,8 @@ class RatesLog(NamedTuple):
 def rates_map(scenario: Scenario, autopilot: str) -> ChannelMap:
     """Return the channel map of an autopilot with the channels and end stops of a scenario.
 
-    A fixed wing keeps V, which shows when it flies. Raises ParameterError if an input has no end
-    stop, or no row that moves its output.
+    The map of a fixed wing keeps V, which shows when it flies. Raises ParameterError if an input
+    has no end stop, or if no row of the autopilot's map moves its output.
     """
     base = load_map(MAPS[autopilot])
     controller = scenario.controller
@@ -99,11 +100,12 @@ def rates_of_log(
     window: Window,
     show: Callable[[list[Agreement]], None] = lambda _: None,
 ) -> RatesLog:
-    """Return y and u of a log for the identification of an airframe, and what was imported.
+    """Return y and u of a log for the identification of an airframe, with the imported log.
 
         u = sign(D) end torque (V / V0)^2
 
-    V is clipped as in the module. For ArduPlane, u is that of the servos. Raises ParameterError.
+    V / V0 is clipped as in the exported module. For ArduPlane, u is the position of the servos.
+    Raises ParameterError.
     """
     channel_map = rates_map(scenario, autopilot)
     taken = imported(channel_map, log, window, show, servos=autopilot == "ardupilot")
@@ -122,11 +124,10 @@ def rates_of_log(
     every = recorded.period
     timing = every / math.sqrt(12.0)
     if recorded.period > SPARSE / scenario.controller.rate:
-        # The loop changes u between two samples. The mean of both is exact if u is linear between
-        # them.
+        # The loop changes u between two samples. Their mean is exact if u is linear between them.
         following = np.vstack([recorded.u[1:], recorded.u[-1:]])
         recorded = recorded._replace(u=(recorded.u + following) / 2.0)
-        timing /= 2.0  # u is known at both ends
+        timing /= 2.0  # u is known at both ends of the period
     cutoff = taken.parameters.get(CUTOFFS[autopilot], 0.0)
     advance = 0.0
     if 0.0 < cutoff < BROAD < 1.0 / (OVER * recorded.period):
@@ -144,13 +145,13 @@ def rates_of_log(
 
 
 def scaled_torques(parameters: Mapping[str, float]) -> list[str]:
-    """Name the axes on which PX4 drives a surface to its end stop at another torque than 1.
+    """Name the axes on which PX4 moves a surface to its stop at another torque than 1.
 
-        servo = M^+ torque,  M^+ the pseudo-inverse of the CA_SV_CSk_TRQ, (axes, surfaces)
+        servo = M^+ torque, M^+ the pseudo-inverse of the CA_SV_CSk_TRQ, (axes, surfaces)
 
     A servo of 1 is the end stop, so the largest entry in the column of an axis must be 1. If the
-    row of an axis is multiplied by a factor, its column is divided by it. Source: PX4 1.16,
-    ActuatorEffectivenessControlSurfaces.cpp, ControlAllocationPseudoInverse.cpp.
+    row of an axis in M is multiplied by a factor, its column in M^+ is divided by this factor.
+    Source: PX4 1.16, ActuatorEffectivenessControlSurfaces.cpp, ControlAllocationPseudoInverse.cpp.
     """
     surfaces = int(parameters.get("CA_SV_CS_COUNT", MOST_SURFACES))
     axes = []
@@ -173,14 +174,14 @@ def scaled_torques(parameters: Mapping[str, float]) -> list[str]:
 
 
 def broadened(recorded: FlightData, cutoff: float) -> tuple[FlightData, float]:
-    """Replace the gyro's low-pass at `cutoff` by one at BROAD, Hz.
+    """Replace the low-pass of the gyro, with its cut-off at `cutoff`, by one at BROAD, Hz.
 
         y' = F_BROAD(z) / F_cutoff(z) y,  F of Butterworth's, of second order
 
-    The second result is the time in s by which y is earlier.
+    Returns the flight with the new y, and the time in s by which this y is earlier.
 
-    Behind a narrow filter the noise of y is coloured, and so are the innovations. The zeros of both
-    filters at z = -1 cancel. A sample counts as lost if it depends on a lost sample.
+    Behind a narrow filter the noise of y is coloured, and so are the innovations. The zeros of the
+    two filters at z = -1 cancel. A sample counts as lost if it depends on a lost sample.
     """
     rate = 1.0 / recorded.period
     narrow = signal.butter(2, cutoff, fs=rate)

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The input-output response of an aircraft, from a log of y and u, without a model.
+"""Identify the input-output response of an aircraft from a log of y and u, without a model.
 
-Omega, lags and delays have standard errors.
+The results are Omega, lags and delays with standard errors.
 
-A predictor of every sample of y from earlier samples and from u is fitted by least squares. It is
-long enough to include the disturbances. Its step response is the step response of the aircraft. A
-second-order response with a delay and a lag is fitted to the beginning of the step response, and
-has Omega, the lag and the delay. Sources: L. Ljung, "System Identification", 1999, 7.3 and 13.4
-(direct identification in closed loop); U. Forssell, L. Ljung, Automatica 35, 1999; Y. Zhu,
-"Multivariable System Identification for Process Control", 2001, 6 (a high-order ARX model, then a
-reduced one).
+A predictor gives every sample of y from earlier samples of y and from u. Least squares fit it. The
+predictor is long enough to include the disturbances. Its step response is the step response of the
+aircraft. A second-order response with a delay and a lag is fitted to the beginning of this step
+response, and yields Omega, the lag and the delay. Sources: L. Ljung, "System Identification", 1999,
+7.3 and 13.4 (direct identification in closed loop); U. Forssell, L. Ljung, Automatica 35, 1999; Y.
+Zhu, "Multivariable System Identification for Process Control", 2001, 6 (a high-order ARX model,
+then a reduced one).
 """
 
 import math
@@ -34,67 +34,73 @@ from flight_design.identification.step_response_fit import (
     no_column,
 )
 
-# s, width of the windows over which u and older y are averaged; it is shorter than a servo's lag
+# s, width of the windows over which u and older samples of y are averaged; shorter than the lag of
+# a servo
 WINDOW = 0.02
-RECENT = 4  # newest samples of y, which the predictor takes one by one
-# s before a sample that windows of equal width cover. It contains the longest delay and a lag.
+RECENT = 4  # number of the newest samples of y, which the predictor takes one by one
+# s, time before a sample that windows of equal width cover. It contains the longest delay and a
+# lag.
 FINE_Y = 0.2
 FINE_U = 0.45
-# s before a sample that windows of doubling width cover. It contains the memory of disturbances and
-# of a controller.
+# s, time before a sample that windows of doubling width cover. It contains the memory of
+# disturbances and of a controller.
 FAR = 2.0
 HORIZON = 0.8  # s, length of the step response
-DRAWS = 200  # draws of the predictor's coefficients, for the covariance of the step response
-# Standard deviation of a coefficient before the fit. Such a coefficient turns a typical y or u into
-# this many typical changes of y within a window.
+# number of random draws of the predictor's coefficients, from which the covariance of the step
+# response follows
+DRAWS = 200
+# Prior standard deviation of a coefficient. Such a coefficient turns a typical y or u into this
+# many typical changes of y within a window.
 PRIOR = 10.0
-MEMORY = 0.2  # s, decay of the coefficients of the predictor before the fit
+MEMORY = 0.2  # s, decay of the prior standard deviations of the predictor's coefficients
 MIN_ROWS_PER_COEFFICIENT = 5.0
-# Share of the motion in a closed loop that the excitation must explain. The feedback of
-# disturbances is then too small to be taken for a response.
+# Share of the motion in a closed loop that the excitation must explain. The response to
+# disturbances through the feedback is then too small to be taken for the response of the aircraft.
 MIN_SHARE = 0.9
-# Factor on the estimated errors in a closed loop: up to a tenth of the motion is feedback, which
-# gives a bias as large as the errors.
+# Factor on the estimated errors in a closed loop: up to a tenth of the motion comes from feedback,
+# and the bias is then as large as the errors.
 CLOSED_LOOP_ERRORS = 2.0
-LOOP_MEMORY = 8.0  # s before an instant in which the excitation has an effect on it
-LOOP_FINE = 6  # number of windows of PERIOD
+LOOP_MEMORY = 8.0  # s, time before an instant in which the excitation has an effect at this instant
+LOOP_FINE = 6  # number of windows that are a PERIOD wide
 PERIOD = 0.05  # s
-FOLDS = 6  # parts of a flight, each of which is predicted from the others
-# The ridge that predicts better is used. The first one is for few commands, the other for many
-# disturbances.
+FOLDS = 6  # number of parts of a flight, each of which is predicted from the other parts
+# Regularisation of the fit; the value that predicts better is used. The first one suits flights
+# with few commands, the second one flights with many disturbances.
 RIDGES = (1e-4, 1e-2)
-# s, in a closed loop. An earlier response is the reaction of u to y, because no servo is as fast.
+# s, least delay in a closed loop. An earlier response would be the reaction of u to y, because no
+# servo is as fast.
 LEAST_DELAY = 0.01
 ITERATIONS = 3  # number of times that the variance and then the coefficients are estimated
-# s without a sample of y that a straight line bridges; no prediction looks across a longer gap
+# s, longest gap in y that a straight line bridges; no prediction looks across a longer gap
 BRIDGED = 0.1
-MIN_RATIO = 5.0  # the sign of Omega is certain if the response is this many standard errors
+# the sign of Omega is certain if the response has at least this many standard errors
+MIN_RATIO = 5.0
 
 
 Spans = Sequence[tuple[int, int]]
 
 
 class Response(NamedTuple):
-    """The response of m outputs to m inputs, where input i drives output i; SI.
+    """The response of m outputs to m inputs, where input i drives output i, in SI.
 
         y_i_dot = sum_j Omega_ij v_j + slower terms,   lag_j v_j_dot = u_j(t - delay_j) - v_j
 
-    A channel that is refused has NaN in its rows.
+    The rows of a channel that is refused are NaN.
     """
 
     outputs: tuple[str, ...]
     inputs: tuple[str, ...]
-    Omega: FloatArray  # (m, m) rows as outputs, columns as inputs
-    Omega_deviation: FloatArray  # (m, m) standard errors
+    Omega: FloatArray  # (m, m), a row for each output and a column for each input
+    Omega_deviation: FloatArray  # (m, m) standard errors of Omega
     lag: FloatArray  # (m,) s, lag of each input
-    lag_deviation: FloatArray  # (m,)
-    delay: FloatArray  # (m,) s, from u to the stamp of y
-    delay_deviation: FloatArray  # (m,)
+    lag_deviation: FloatArray  # (m,) standard errors of the lags, s
+    delay: FloatArray  # (m,) s, delay from u to the stamp of y
+    delay_deviation: FloatArray  # (m,) standard errors of the delays, s
     refusal: tuple[Refusal | None, ...]  # (m,) why Omega_ii must not be used
     seconds: float  # how many seconds of the log were used
     share: FloatArray  # (m,) share of the motion that the excitation explains; 1 in open loop
-    # (m,) response i to input i in standard errors; from MIN_RATIO on, the sign of Omega_ii is
-    # certain
+    # (m,) response of output i to input i, in standard errors; the sign of Omega_ii is certain from
+    # MIN_RATIO on
     sign_ratio: FloatArray
 
     def reason_against_sign(self, i: int) -> Refusal | None:
@@ -122,15 +128,15 @@ def identify_response(
     excitation: Signal | None = None,
     engaged: Spans | None = None,
 ) -> Response:
-    """Return Omega, lag and delay of every channel of a log with standard errors, or a refusal.
+    """Return Omega, lag and delay of every channel of a log with standard errors, or refuse it.
 
     Args:
-        y: The outputs at their stamps, at regular intervals or not.
-        u: The inputs after their limits, at regular intervals or not.
+        y: The outputs. Their stamps may have irregular intervals.
+        u: The inputs after their limits. Their stamps may have irregular intervals.
         outputs: The outputs of the channels.
         inputs: The inputs of the channels, in pairs with the outputs.
-        excitation: What moves u from outside in a closed loop, such as y_m. It is None if u
-            itself is the excitation, as in an open-loop experiment.
+        excitation: The signal that moves u from outside in a closed loop, such as y_m. It is None
+            if u itself is the excitation, as in an open-loop experiment.
         engaged: The spans in ns in which u acts on the aircraft; by default the whole log.
 
     Raises:
@@ -170,10 +176,10 @@ def identify_response(
 class Layout(NamedTuple):
     """The regressors of the predictor of y(k): samples of y, and windows of samples before k.
 
-    The ends of the windows are in sample periods.
+    The ends of the windows count sample periods.
     """
 
-    period: float  # s, of y
+    period: float  # s, period of y
     recent: int  # number of the newest samples of y, taken one by one
     y_windows: tuple[tuple[int, int], ...]  # (a, b): the mean of y(k - a - 1) to y(k - b)
     # (a, b): the mean of u from t_k - b period to t_k - a period
@@ -181,7 +187,7 @@ class Layout(NamedTuple):
 
     @classmethod
     def from_period(cls, period: float) -> "Layout":
-        """Return the layout for a period of y, s."""
+        """Return the layout for a given period of y, s."""
 
         def windows(first: int, fine: float) -> tuple[tuple[int, int], ...]:
             width = max(round(WINDOW / period), 1)
@@ -195,19 +201,20 @@ class Layout(NamedTuple):
 
     @property
     def past(self) -> int:
-        """Number of samples of y before the first one that is predicted."""
+        """Number of samples of y before the first sample that is predicted."""
         return self.y_windows[-1][1]
 
     def y_decay(self) -> FloatArray:
-        """Return the relative standard deviations of the coefficients of y before the fit."""
+        """Return the relative prior standard deviations of the coefficients of y."""
         middles = [*range(1, self.recent + 1), *((a + b + 1) / 2.0 for a, b in self.y_windows)]
         return np.asarray(np.exp(-self.period * np.array(middles) / MEMORY))
 
     def u_root(self) -> FloatArray:
-        """Return a root of the relative covariance of the coefficients of u before the fit.
+        """Return a root of the relative prior covariance of the coefficients of u.
 
-        The coefficients are smooth and decay. The kernel is exp(-max(s, t) / MEMORY) over window
-        times s and t. Source: T. Chen, H. Ohlsson, L. Ljung, Automatica 48, 2012.
+        The prior expects coefficients that are smooth and decay. Its kernel is exp(-max(s, t) /
+        MEMORY) for two windows at the times s and t. Source: T. Chen, H. Ohlsson, L. Ljung,
+        Automatica 48, 2012.
         """
         ends = np.array(self.u_windows)
         late = self.period * np.mean(ends, axis=1)
@@ -233,7 +240,7 @@ def _within(
 def bridged(
     t: FloatArray, values: FloatArray, period: float
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Fill gaps of at most BRIDGED by straight lines; tell which samples (N, m) were recorded."""
+    """Fill gaps of at most BRIDGED by straight lines; tell which samples, (N, m), were recorded."""
     missing = np.rint(np.diff(t) / period).astype(np.int64) - 1
     counts = 1 + np.where(missing * period <= BRIDGED, np.maximum(missing, 0), 0)
     before = np.repeat(np.arange(len(counts)), counts)
@@ -246,7 +253,7 @@ def bridged(
 
 
 def _integral(t: FloatArray, steps: FloatArray, instants: FloatArray) -> FloatArray:
-    """Integrate a signal, with the means `steps` between the times t, from t[0] to `instants`."""
+    """Integrate a signal from t[0] to `instants`; `steps` are its means between the times t."""
     sums = np.concatenate(
         [np.zeros((1, steps.shape[1])), np.cumsum(steps * np.diff(t)[:, None], axis=0)]
     )
@@ -286,7 +293,7 @@ def _rows(
 
 
 class _Predictor(NamedTuple):
-    """y(k) = coefficients' regressors + e."""
+    """The predictor y(k) = coefficients' regressors + e, with its uncertainty."""
 
     layout: Layout
     coefficients: FloatArray  # (m lags, m), rows in the order of the regressors
@@ -295,8 +302,8 @@ class _Predictor(NamedTuple):
     def step_responses(self) -> FloatArray:
         """Return the responses of every output to a step of every input, (1 + DRAWS, K, m, m).
 
-        The step has size 1. The estimate comes first, then the draws, at K whole periods after the
-        step, up to HORIZON.
+        The step has size 1. The first response is that of the estimate, and those of the draws
+        follow. The K instants are whole periods after the step, up to HORIZON.
         """
         m = self.coefficients.shape[1]
         layout = self.layout
@@ -358,12 +365,12 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
 
 
 def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: Spans) -> FloatArray:
-    """Return the share of the variance of the channels that the excitation explains, (k,).
+    """Return the share of each channel's variance that the excitation explains, (k,).
 
-    Without disturbances it is 1. The channel is modelled as a sum of means of the excitation over
-    earlier windows, up to LOOP_MEMORY. FOLDS parts of the flight are each predicted with
-    coefficients from the rest. Source of the cross-validation: M. Stone, J. Royal Statistical
-    Society B 36, 1974.
+    Without disturbances the share is 1. A channel is modelled as a sum of means of the excitation
+    over earlier windows, up to LOOP_MEMORY. The flight has FOLDS parts. Each part is predicted with
+    coefficients that were fitted to the rest. Source of the cross-validation: M. Stone, J. Royal
+    Statistical Society B 36, 1974.
     """
     residual = np.zeros((len(RIDGES), len(names)))
     total = np.zeros(len(names))
@@ -391,7 +398,7 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
         Z = Z / np.maximum(np.linalg.norm(Z, axis=0), np.finfo(float).tiny)
         X = values[np.searchsorted(t, instants, side="right") - 1]
         X = X - X.mean(axis=0)
-        # Predict each fold from the others, with both ridges.
+        # Predict each fold from the others, with each of the ridges.
         fold = np.arange(len(instants)) * FOLDS // len(instants)
         for number in range(FOLDS):
             others = Z[fold != number]
@@ -500,9 +507,9 @@ def _too_little_share(output: str, name: str, share: float) -> str:
 
 
 def _more_excitation(name: str, ratio: float) -> str:
-    """Say how much more excitation is needed.
+    """Say how much more excitation is needed for a certain result.
 
-    Errors fall with the excitation, and with the root of time.
+    The standard errors fall in proportion to the size of the excitation, and with the root of time.
     """
     factor = MIN_RATIO / max(ratio, 0.5)
     return f"excite {name} {factor:.1f} times as strongly, or for {factor**2:.1f} times as long"

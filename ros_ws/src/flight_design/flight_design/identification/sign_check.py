@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Check whether D of the controller agrees with what moves the aircraft.
+"""Check whether D of the controller agrees with the signs by which the inputs move the aircraft.
 
-D is compared with the signs of a channel map, an airframe and a recorded flight.
+D is compared with the signs of a channel map, of an airframe and of a recorded flight.
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,28 +28,28 @@ from flight_design.identification.response_identification import (
 from flight_log.tape_reader import read_run
 from rise_di_controller.law.decomposition import signs
 
-OPEN_LOOP = "excitation"  # the law that does not use y
+OPEN_LOOP = "excitation"  # the law that makes no use of y
 
 
 class ChannelSign(NamedTuple):
-    """The signs of a channel of the law, as they follow from the map."""
+    """The signs of a channel of the law, from the map, the airframe and a recorded flight."""
 
     output: str
     input: str
-    effect: float  # Omega_ii of the controller's channels, SI
+    effect: float  # Omega_ii between the channels of the controller, SI
     D: int  # sign that follows from the airframe and the map
     D_controller: int
-    measured: float | None  # Omega_ii of a recorded flight, NaN if the input never moves
-    # response in the recorded flight, in standard errors; if it is MIN_RATIO or more, the sign is
-    # certain
+    measured: float | None  # Omega_ii from a recorded flight; NaN if the input never moves
+    # response in the recorded flight in standard errors; the sign is certain from MIN_RATIO on
     ratio: float | None
 
 
 class SignCheck(NamedTuple):
-    """The result of the check."""
+    """The result of a check of the signs."""
 
     channels: tuple[ChannelSign, ...]
-    contradictions: tuple[str, ...]  # sentences
+    # sentences on channels whose D contradicts the map or the flight
+    contradictions: tuple[str, ...]
     # sentences on the channels whose sign the recorded flight does not show
     uncertain: tuple[str, ...]
     seconds: float  # how many seconds of the recorded flight were used
@@ -74,10 +74,10 @@ def check_scenario(
     bag: Path | None,
     namespace: str | None = None,
 ) -> SignCheck:
-    """Check a channel map against a scenario's controller, for an airframe.
+    """Check a channel map against the controller of a scenario, for an airframe.
 
-    If there is a recorded flight, it is checked too. `namespace` selects the aircraft if the log
-    has several.
+    If there is a recorded flight, the check includes it. `namespace` selects the aircraft if the
+    log has several.
     """
     controller = scenario.controller
     outputs = controller.outputs
@@ -119,11 +119,11 @@ def recorded_response(
 ) -> Response:
     """Identify the response of the aircraft in a log, from the time in which u acted.
 
-    This time is the whole flight, or the engagements of a bridge. In a flight under a law, y_m
-    excites the loop. Without y_m, and under the law `excitation`, u itself is the excitation.
-    Raises ParameterError if the log has no y and u, if its bridge was never engaged, if the flight
-    was under guidance, whose y_m follows y, or if the log was imported by other rows than those of
-    `channel_map`.
+    This time is the whole flight, or with a bridge the time of its engagements. In a flight under a
+    law, y_m excites the loop. Without y_m, and under the law `excitation`, u itself is the
+    excitation. Raises ParameterError if the log has no y and u, or if its bridge was never engaged.
+    It is also raised for a flight under guidance, because its y_m follows y, and for a log that was
+    imported by other rows than those of `channel_map`.
     """
     recorded = read_run(bag, namespace)
     tape = recorded.tape
@@ -176,9 +176,9 @@ def check_signs(
 ) -> SignCheck:
     """Compare D of diag(output signs) Omega diag(input signs) with the controller's D.
 
-    If there is a recorded flight, it is compared too. Omega = C B of the airframe, (m, m), is in
-    the map's order. The channels and D are in the controller's order. Raises ParameterError if the
-    map does not fit the airframe, or if Omega has no D.
+    With a recorded flight, its signs are compared too. Omega = C B of the airframe, (m, m), has its
+    channels in the map's order. `outputs`, `inputs` and `D` are in the controller's order. Raises
+    ParameterError if the map does not fit the airframe, or if Omega has no D.
     """
     mapped = _through(channel_map, Omega, outputs, inputs)
     D_mapped = [int(sign) for sign in signs(mapped)]
@@ -239,8 +239,9 @@ def check_effectors(
 ) -> SignCheck:
     """Check the signs of the effectors against the `effect` of an allocation, (m, p).
 
-    Each effector is checked by the output that it moves most, relative to the largest effect on
-    this output. `Omega` is as in `check_signs`, (m, p). D of a channel is the sign of its effect.
+    The check of an effector uses the output that it moves most, relative to the largest effect on
+    this output. `Omega`, (m, p), is that of `check_signs`, with a column for each effector. D of a
+    channel in the result is the sign of its effect.
     """
     mapped = _through(channel_map, Omega, outputs, effectors)
     largest = np.argmax(np.abs(effect) / np.abs(effect).max(axis=1, keepdims=True), axis=0).tolist()
@@ -273,7 +274,7 @@ def check_effectors(
 def _through(
     channel_map: ChannelMap, Omega: FloatArray, outputs: Sequence[str], inputs: Sequence[str]
 ) -> FloatArray:
-    """Return Omega `through` the map, between some of its channels."""
+    """Return Omega `through` the map, for the given outputs and inputs."""
     rows = _places(outputs, channel_map.outputs)
     columns = _places(inputs, channel_map.inputs)
     return through(channel_map, Omega)[np.ix_(rows, columns)]
@@ -286,10 +287,10 @@ def _places(names: Iterable[str], among: Iterable[str]) -> list[int]:
 def output_signs(channel_map: ChannelMap) -> FloatArray:
     """Return +1 for each output with the sign of the stack and -1 for any other, (m,).
 
-    The signs of the stack are q nose up, p roll right, r nose right, V faster, climb up. The order
-    is the map's. If a channel has another name, the motion of its row says what it is. Raises
-    ParameterError if q, p, r or V has the motion of another channel, or if two channels have the
-    same motion.
+    The signs of the stack are q nose up, p roll right, r nose right, V faster, climb up. The result
+    is in the map's order. For a channel with another name, the motion of its row says which
+    quantity it is. Raises ParameterError if q, p, r or V has the motion of another channel, or if
+    two channels have the same motion.
     """
     signs: dict[str, int] = {}
     for name, row in channel_map.outputs.items():
@@ -314,7 +315,7 @@ def output_signs(channel_map: ChannelMap) -> FloatArray:
 def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
     """Return +1 for each input whose effect has the sign of Omega = C B, and -1 for others, (m,).
 
-    Omega (m, m) has rows and columns in the map's order. Raises ParameterError if an input has no
+    Omega, (m, m), has rows and columns in the map's order. Raises ParameterError if an input has no
     effect on its output.
     """
     signs = []
@@ -334,12 +335,12 @@ def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
 def through(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
     """Return Omega between the channels of the map, (m, m).
 
-    It is diag(output signs) Omega diag(input signs).
+    The result is diag(output signs) Omega diag(input signs).
     """
     return output_signs(channel_map)[:, None] * Omega * input_signs(channel_map, Omega)
 
 
 def motion_as_channel_grows(row: OutputRow | InputRow) -> str:
-    """Return how the aircraft moves as the channel grows, not its raw value."""
+    """Return how the aircraft moves as the channel grows, whatever its raw value does."""
     motions = list(MOTIONS)  # each motion stands next to its opposite
     return row.positive if row.sign > 0 else motions[motions.index(row.positive) ^ 1]

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sketch of an aircraft without an airframe file.
+"""Build a sketch of an aircraft that has no airframe file.
 
-It is a rough model from Omega and the trim speed, for a learner.
+A sketch is a rough model from Omega and the trim speed, with which a learner begins.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ def sketch(
 ) -> Airframe:
     """Sketch a rough airframe that has the zeros of a rigid symmetric aircraft.
 
-    It comes from Omega = C B and the trim speed V0, m/s.
+    The sketch needs only Omega = C B and the trim speed V0, m/s.
 
         V_dot     = -0.26 n V + Omega_V u                          n = g / V0
         alpha_dot = -11 n alpha + q
@@ -47,11 +47,11 @@ def sketch(
         p_dot     = -2.3 |Omega_p| beta - P p + 0.37 P r + Omega_p u,  P = 1.4 sqrt(11 n |Omega_p|)
         r_dot     = 6 |Omega_r| beta - 0.05 P p - R r + Omega_r u,  R = 0.95 sqrt(11 n |Omega_r|)
 
-    11 is the lift slope divided by the lift coefficient, 0.17 is in 1/s, and 0.05 is the angle of
-    attack in trim, rad. V depends on no other state. The airspeed contains the wind itself, so y
-    hardly shows what alpha and theta do to V. The factors are geometric means
-    over the twelve aircraft of `benchmarks.jsbsim_gains`, from differences of their accelerations
-    in trim. The entries of a single aircraft differ from them by a factor of 1.3 to 3. Omega (m, m)
+    In these equations, 11 is the lift slope divided by the lift coefficient, 0.17 is in 1/s, and
+    0.05 is the angle of attack in trim, rad. V depends on no other state, since y hardly shows what
+    alpha and theta do to V beside the wind in the airspeed. The factors are geometric means over
+    the twelve aircraft of `benchmarks.jsbsim_gains`, from differences of their accelerations in
+    trim. The entries of a single aircraft differ from them by a factor of 1.3 to 3. Omega (m, m)
     has rows `outputs` and columns `inputs`; input i drives output i. Raises ParameterError for
     other outputs than q, V, p, r.
     """
@@ -96,8 +96,8 @@ def sketch(
 def sketched(name: str, controller: ControllerConfig, speed: float) -> Airframe:
     """Return the airframe of a controller's feedforward; `speed` is the trim speed V0, m/s.
 
-    Wind acts through the columns V, alpha and beta of A. Raises ParameterError if the controller
-    has no feedforward, or if its states are not those of a sketch.
+    The wind acts on the states through the columns V, alpha and beta of A. Raises ParameterError if
+    the controller has no feedforward, or if its states are not those of a sketch.
     """
     model = controller.feedforward
     require(
@@ -139,7 +139,7 @@ def with_sketch(
     noise: FloatArray,
     margin: float,
 ) -> RiseDiConfig:
-    """Return a controller with the feedforward and observer of a sketch, which do not fly yet.
+    """Return a controller with the feedforward and observer of a sketch, which do not act yet.
 
     Omega (m, m) and `noise`, (m,), are in the law's order; `margin` is the least delay margin, s.
     Raises ParameterError.
@@ -156,7 +156,7 @@ def with_sketch(
 
 
 def _positive(name: str) -> str:
-    """Say what a positive input does."""
+    """Say how a positive value of an input moves the aircraft."""
     return INPUTS[name].positive if name in INPUTS else f"more {name}"
 
 

@@ -10,12 +10,13 @@ from scipy.optimize import least_squares
 
 from flight_core.vectors import FloatArray
 
-MAX_DELAY = 0.3  # s
-# An eigenvalue of the normal equations below this fraction of the largest one is rounding.
+MAX_DELAY = 0.3  # s, largest delay in the fit
+# An eigenvalue of the normal equations below this fraction of the largest eigenvalue is a rounding
+# error.
 RANK = 1e-10
-MAX_LAG = 1.0  # s
-RESOLUTION = 0.025  # s between the points of the step response that are fitted
-# error that windows and a linear model leave, as a share of a step response's largest value
+MAX_LAG = 1.0  # s, largest lag in the fit
+RESOLUTION = 0.025  # s, time between the points of the step response that are fitted
+# error that the windows and the linear model leave, as a share of the step response's largest value
 FLOOR = 0.01
 STARTS_DELAY = (0.02, 0.1, 0.2)  # s
 STARTS_LAG = (0.03, 0.2)  # s; the search starts from each pair
@@ -24,22 +25,23 @@ STARTS_LAG = (0.03, 0.2)  # s; the search starts from each pair
 LOWER = np.array([0.0, 0.003, -np.inf, -2.0, -20.0, -np.inf])
 UPPER = np.array([MAX_DELAY, MAX_LAG, np.inf, 300.0, 5000.0, np.inf])
 SCALE = np.array([0.05, 0.05, 5.0, 5.0, 50.0, 50.0])
-SPREAD = np.array([1.0, 0.2, 1e3, 50.0, 2500.0, 5000.0])  # standard deviations before the fit
-# Which of these parameters are free: in an integrator, in a first and in a second order.
+SPREAD = np.array([1.0, 0.2, 1e3, 50.0, 2500.0, 5000.0])  # prior standard deviations
+# Which of these parameters are free in an integrator, in a model of first order, and in one of
+# second order.
 ORDERS = ((1, 1, 1, 0, 0, 0), (1, 1, 1, 1, 0, 0), (1, 1, 1, 1, 1, 1))
-MIN_GAIN = 6.0  # decrease of chi squared that a higher order must bring per additional parameter
-# Relative change of chi squared at which a search ends. It is far below what MIN_GAIN or a standard
-# error can show.
+MIN_GAIN = 6.0  # decrease of chi squared per additional parameter that a higher order must bring
+# Relative change of chi squared at which a search ends. It has no effect on MIN_GAIN or on a
+# standard error.
 TOLERANCE = 1e-6
-EARLY = 0.3  # s after delay and lag, in which the sign of a response shows
-COUPLING_SPAN = 0.25  # s after delay and lag, in which Omega shows in other outputs
+EARLY = 0.3  # s after delay and lag; until then the sign of a response shows
+COUPLING_SPAN = 0.25  # s after delay and lag; until then Omega shows in the other outputs
 
 
 class ResponseColumn(NamedTuple):
-    """The responses of m outputs to one input, and the lag and delay of the input, s."""
+    """The responses of m outputs to one input, and the lag and delay of this input, s."""
 
-    Omega: FloatArray  # (m,)
-    deviation: FloatArray  # (m,)
+    Omega: FloatArray  # (m,) column of Omega
+    deviation: FloatArray  # (m,) standard errors of this column
     lag: float
     lag_deviation: float
     delay: float
@@ -48,7 +50,7 @@ class ResponseColumn(NamedTuple):
 
 
 def no_column(m: int) -> ResponseColumn:
-    """Return a column of NaN for an input without a result."""
+    """Return a column of NaN, for an input without a result."""
     return ResponseColumn(
         Omega=np.full(m, np.nan),
         deviation=np.full(m, np.nan),
@@ -63,14 +65,14 @@ def no_column(m: int) -> ResponseColumn:
 def second_order_response(
     t: FloatArray, delay: float, lag: float, damping: float, stiffness: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the step responses of a second order behind a lag and a delay, from rest, (N,) each.
+    """Return two step responses of a second order behind a lag and a delay, from rest, (N,) each.
 
         y'' + damping y' + stiffness y = v' and = v,   lag v' = u(t - delay) - v
 
-    The first response has v' on the right-hand side, the second has v.
+    The first response has v' on the right-hand side, and the second has v.
     """
     begin = np.maximum(t - delay, 0.0)
-    # z, z', v; y = z' or z
+    # the state z, z', v; the output is z' for the first response, z for the second
     A = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]])
     # The small terms make the eigenvalues distinct.
     values, vectors = np.linalg.eig(A + np.diag([0.0, 1e-3, 2e-3]))
@@ -87,8 +89,8 @@ def second_order_response(
 def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColumn:
     """Fit delay, lag and Omega_jj of input j to output j, then Omega_ij to the other outputs.
 
-    The other outputs have the same delay and lag. t is (N,); responses are (1 + DRAWS, N, m), with
-    the estimate first.
+    The fit takes the same delay and lag for the other outputs. t has shape (N,), and `responses` (1
+    + DRAWS, N, m). The first of the responses is the estimate.
     """
     step = responses[0]
     size = max(float(np.max(np.abs(step[:, j]))), np.finfo(float).tiny)
@@ -101,7 +103,7 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
         ) and begins_with_Omega(t, trial.theta):
             best = trial
     inside = (np.array(best.free) > 0) & (best.theta > LOWER + 1e-6) & (best.theta < UPPER - 1e-6)
-    # R. T. Birge, Phys. Rev. 40, 1932
+    # source: R. T. Birge, Phys. Rev. 40, 1932
     misfit = max(best.chi_squared / max(len(t) - sum(best.free), 1), 1.0)
     deviation = np.array([RESOLUTION, RESOLUTION, *np.zeros(4)])
     J = best.jacobian[:, inside]
@@ -132,10 +134,10 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
 
 
 def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
-    """Return whether a fitted response has the sign of Omega up to EARLY after delay and lag.
+    """Return whether a fitted response has the sign of Omega until EARLY after delay and lag.
 
-    If it does not, the slow part is the whole response. Two poles then stand for a pole and a lag,
-    and Omega is about 0.
+    If it does not, the slow part makes up the whole response. Its two poles then stand for a pole
+    and a lag, and Omega is about 0.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     first, second = second_order_response(
@@ -145,7 +147,7 @@ def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 -
 
 
 def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size: float) -> float:
-    """Return by how much a fitted response lowers chi squared, minus the number of parameters.
+    """Return how much a fitted response lowers chi squared, minus its number of parameters.
 
     Only the time up to EARLY after delay and lag counts.
     """
@@ -161,9 +163,10 @@ def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size:
 
 
 def _whitener(responses: FloatArray) -> FloatArray:
-    """Return W such that W (s - true s) has covariance I, (N, N), for responses (1 + DRAWS, N).
+    """Return W, (N, N), with which the error W (s - true s) of a response s has covariance I.
 
-    W is exact to FLOOR of the largest value. It is 0 for the responses of a constant output.
+    The covariance follows from responses, (1 + DRAWS, N). W is exact to FLOOR of the largest value.
+    It is 0 for the responses of a constant output.
     """
     values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(responses[1:].T)))
     floor = (FLOOR * np.max(np.abs(responses[0]))) ** 2 + RANK * values[-1]
@@ -172,10 +175,10 @@ def _whitener(responses: FloatArray) -> FloatArray:
 
 
 class _Curve(NamedTuple):
-    """A fitted step response. theta is delay, lag, Omega, damping, stiffness, slow part."""
+    """A fitted step response; theta is delay, lag, Omega, damping, stiffness, slow part."""
 
     theta: FloatArray
-    free: tuple[int, ...]  # 1 if the entry of theta is fitted
+    free: tuple[int, ...]  # 1 for each entry of theta that is fitted, else 0
     chi_squared: float
     jacobian: FloatArray
 
@@ -188,7 +191,10 @@ def _search(
     free: tuple[int, ...],
     start: FloatArray | None,
 ) -> _Curve:
-    """Fit the free entries by least squares, from several delays and lags and from `start`."""
+    """Fit the free entries of theta by least squares, from several starts.
+
+    The starts are several delays and lags, and `start`.
+    """
     fitted = np.array(free, dtype=bool)
 
     def expanded(theta: FloatArray) -> FloatArray:
@@ -203,7 +209,7 @@ def _search(
             [size * (whiten @ (Omega * first + slow * second - step)), theta / SPREAD[fitted]]
         )
 
-    # Start at each pair of delay and lag, with the slope by least squares.
+    # Start at each pair of delay and lag, with the other entries by least squares.
     starts = [] if start is None else [start]
     for delay in STARTS_DELAY:
         for lag in STARTS_LAG:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in flight: A and B are identified from the controller's ticks, and designs proposed.
+"""Learn an aircraft in flight: identify A and B from the controller's ticks, and propose designs.
 
 Between two identifications the aircraft is tested for damage.
 """

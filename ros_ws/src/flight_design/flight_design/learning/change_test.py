@@ -30,10 +30,11 @@ from flight_design.identification.likelihood_search import (
 )
 from flight_design.identification.model_refusals import MAX_DEVIATION
 
-# s, length of the flight that is tested. With 10 s, losses showed up to 4 s later, and halved
-# effects did not show at all.
+# s, length of the record that is tested. With 10 s, losses were found up to 4 s later, and halved
+# effects were not found at all.
 RECORD = 4.0
-# Share of an input's effect. A loss up to this, two deviations of an accepted model, is no change.
+# Share of an input's effect. A loss of at most this share counts as no change: it is two deviations
+# of an accepted model.
 LOSS = 2.0 * MAX_DEVIATION
 # Gain of log-likelihood above which a change is found. It stands for 4.9 standard deviations, see
 # `change_test`. Healthy surfaces with a gust every 3 s had gains up to 10.3, and once 17.4, because
@@ -41,18 +42,20 @@ LOSS = 2.0 * MAX_DEVIATION
 MAX_GAIN = 12.0
 # rad, standard deviation of pitch and bank at the beginning of the record, which may be in a turn
 ANGLE = 0.3
-# rad, the same for alpha and beta. With 0.3 rad, a gust before the record looked like a loss.
+# rad, standard deviation of alpha and beta at the beginning. With 0.3 rad, a gust before the record
+# looked like a loss.
 FLOW = 0.03
-# Standard deviation of the relative change of an effect, in both hypotheses: half of the effect
-# and none of it are about as probable.
+# Prior standard deviation of the relative change of an effect, in both hypotheses. With it, half of
+# the effect and none of it are about equally probable.
 FACTOR = 1.0
 REVERSED = -2.0  # least relative change of an effect: the input acts the other way
 DEAD = -1.0  # relative change of an effect that is lost
 MOST = 2.0  # largest relative change of an effect
 NONE = MAX_DEVIATION  # share of an effect that counts as none: it is known no better than that
-# Share of a reversed effect that counts as none. No surface reverses in flight, but one that is
-# jammed off centre pushes steadily, against the u that is to balance it: at 5 deg beside a u at its
-# stop of 30 deg it looks like -17 %. The deviation of that share falls to 1 %, so it does not do.
+# Share of a reversed effect that counts as none. No surface reverses in flight, but a surface that
+# is jammed off centre pushes steadily against the u that shall balance it. Jammed at 5 deg, beside
+# a u at its stop of 30 deg, it looks like an effect of -17 %. The deviation of the effect would be
+# no limit here, because it falls to 1 %.
 OFF_CENTRE = 0.25
 # Difference of log-likelihood up to which an input without effect explains the flight as well as
 # the best loss does.
@@ -60,13 +63,13 @@ DEAD_WITHIN = 4.0
 
 
 class Change(NamedTuple):
-    """The test of a part of the aircraft that does not couple with the rest."""
+    """The result of the test of one part of the aircraft, which does not couple with the rest."""
 
     outputs: tuple[str, ...]
-    gain: float  # gain of log-likelihood if losses of effect above LOSS are allowed
-    # the most probable effect of each input, as a share of its effect in the model
+    gain: float  # gain of log-likelihood if effects may be lost by more than LOSS
+    # most probable effect of each input, as a share of its effect in the model
     left: Mapping[str, float]
-    dead: str  # the input without any effect; empty if there is none
+    dead: str  # the input that has no effect any more; empty if there is none
 
     @property
     def is_found(self) -> bool:
@@ -88,19 +91,19 @@ def change_test(
         G = min J(kappa_j >= -LOSS) - min J(kappa_j >= -2)
 
     with the normalised innovations e and their covariance S, as in `Search.fit`. A fault of an
-    effector changes its column by a factor, so that a part has as many unknowns as inputs. A is
-    known. The winds and the angles at the beginning are free in both minima, but both have the same
+    effector multiplies its column of B by a factor, so a part has as many unknowns as inputs. A is
+    known. The winds and the angles at the beginning are free too, but the two minima have the same
     winds.
 
-    G is 0 while the losses are within LOSS. If a loss is z standard deviations larger than LOSS,
-    2 G = z^2, by S. S. Wilks (Ann. Math. Statist. 9(1), 1938). In one test a single input with a
-    loss of LOSS exceeds G = 12 with a probability of 5e-7, two of them together with 2e-6, and
+    G is 0 while the losses are within LOSS. If a loss is z standard deviations larger than LOSS, 2
+    G = z^2, by S. S. Wilks (Ann. Math. Statist. 9(1), 1938). In one test a single input with a loss
+    of LOSS exceeds G = 12 with a probability of 5e-7, two such inputs together with 2e-6, and
     inputs with smaller losses even more seldom.
 
-    The input j is dead if J with -OFF_CENTRE <= kappa_j + 1 <= NONE is lower than the first minimum
-    by more than MAX_GAIN, and at most DEAD_WITHIN above the second one. `delays` are the delays of
-    u, s, by the outputs of a part. The default is the delay of `actuation`. `drift` is the noise of
-    the disturbances, as in `Unknown`.
+    The input j is dead if J with -OFF_CENTRE <= kappa_j + 1 <= NONE meets two conditions: it is
+    lower than the first minimum by more than MAX_GAIN, and at most DEAD_WITHIN above the second
+    minimum. `delays` has the delays of u, s, by the outputs of a part. The default is the delay of
+    `actuation`. `drift` is the noise of the disturbances, as in `Unknown`.
     """
     changes = []
     flown = in_rolling_air(flown)
@@ -113,7 +116,7 @@ def change_test(
         dead = ""
         lost = effects.most_probable()
         if lost.theta[: len(inputs)].min() < -LOSS:
-            # A loss that another wind explains is no change.
+            # A loss that another wind explains as well is no change.
             kept = least_of(
                 effects.most_probable(-LOSS), effects.least(lost.theta, -LOSS, levels=lost.levels)
             )
@@ -130,16 +133,16 @@ def change_test(
 
 
 class Least(NamedTuple):
-    """The least J of a hypothesis, and where it lies."""
+    """The least J under a hypothesis, with the parameters at which it lies."""
 
     J: float
-    # (p,) kappa of the inputs, logarithms of the strengths of the winds, angles at the beginning
+    # (p,) kappa of each input, logarithm of the strength of each wind, angles at the beginning
     theta: FloatArray
     levels: NDArray[np.int64]  # (spans,) levels of the wind
 
 
 class Effects(Search):
-    """The search for a factor on every column of B of a part."""
+    """The search for a factor on every column of B in a part of the aircraft."""
 
     def __init__(
         self,
@@ -150,7 +153,7 @@ class Effects(Search):
         delay: float | FloatArray,
         drift: float = DRIFT,
     ) -> None:
-        """Set up the search for the delay of u, s, and `drift`, the noise of the disturbances."""
+        """Set up the search; `delay` is that of u, s, and `drift` the noise of the disturbances."""
         model = filter_model(flown, actuation, recorded)
         unknown = Unknown(angle=ANGLE, drift=drift)
         super().__init__(recorded, model, block, flown, delay, unknown, factor=1)
@@ -177,7 +180,7 @@ class Effects(Search):
         self.prior[self._begin] = np.where(turned, 1.0, FLOW / ANGLE)
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
-        """Return the flown model with other effects of its inputs, thetas (N, p)."""
+        """Return the flown model with the effects of its inputs changed by thetas, (N, p)."""
         A, wind = (
             np.repeat(matrix, len(thetas), axis=0) for matrix in (self._flown.A, self._flown.wind)
         )
@@ -186,11 +189,10 @@ class Effects(Search):
         )
 
     def most_probable(self, lower: float = REVERSED) -> Least:
-        """Find the least J with kappa >= `lower`.
+        """Find the least J under the condition kappa >= `lower`.
 
-        The flown model takes a loss of effect for gusts. So the search begins with the winds of
-        this model, then with the same wind in every span, and also with a dead input if its J is
-        CLOSE.
+        The flown model takes a loss of effect for gusts. So the search has several starts: the
+        winds that fit this model, the same wind in every span, and a dead input if its J is CLOSE.
         """
         same = self.least(lower=lower, levels=np.full(len(self._spans), TURBULENT))
         best = least_of(self.least(lower=lower), self.least(same.theta, lower))
@@ -207,9 +209,9 @@ class Effects(Search):
         dead: int | None = None,
         levels: NDArray[np.int64] | None = None,
     ) -> Least:
-        """Minimise J from theta, (p,), or from 0 without one.
+        """Minimise J, beginning at theta, (p,), or at 0 if theta is None.
 
-        Every kappa is at least `lower`. If an input `dead` is given, it has no effect. At each step
+        Every kappa is at least `lower`. The input with the index `dead` has no effect. At each step
         the levels of the wind follow from theta, unless `levels` gives them.
         """
         self._lower[: self.count] = lower
@@ -232,5 +234,5 @@ class Effects(Search):
 
 
 def least_of(first: Least, second: Least) -> Least:
-    """Return the one with the lesser J."""
+    """Return the result with the lower J."""
     return min(first, second, key=lambda least: least.J)

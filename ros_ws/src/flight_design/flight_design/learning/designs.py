@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The inputs of a design that come from the learner: margins to keep, and deviations of B."""
+"""Derive from a learner's models what a design needs: margins to keep, and deviations of B."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -19,23 +19,24 @@ from flight_design.identification.likelihood import PRIOR
 from rise_di_controller.learning.learned_channels import with_channels_of
 from rise_di_controller.rise_di_config import LEAST_MARGIN, RiseDiConfig
 
-# s, delay margin beyond the latest delay. A loop with 30 ms flew well while u was 20 ms late.
+# s, delay margin that is kept beyond the latest delay. A loop with 30 ms flew well while u was 20
+# ms late.
 DELAY_LEFT = 0.01
-# Weight of the activity of u in the cost of a design for a learned model. For a model with errors
-# it is 1. With 1 for learned models, the loops had 5 ms more delay margin than the loop of the
-# file, and 2 % more error. 0 was no better than 0.5.
+# Weight of the activity of u in the cost of a design for a learned model. A design for a model with
+# errors has 1. If learned models had 1 too, the loops would have 5 ms more delay margin than the
+# loop of the file, and 2 % more error. A weight of 0 was no better than 0.5.
 ACTIVITY = 0.5
-SPEED = "V"  # the output whose observer presupposes the others
-ROUNDED = 1.001  # factor on the margins of a loop, so that the loop keeps them despite rounding
+SPEED = "V"  # the output whose observer needs the observers of the other outputs
+ROUNDED = 1.001  # factor on the required margins of a loop, so that it has them despite rounding
 
 
 class Goal(NamedTuple):
-    """What the design of a learned model must keep."""
+    """The requirements on the design for a learned model."""
 
     margin: FloatArray  # (m,) delay margin of each input, s
     needed: Requirement
     beside: SelectedObserver | None = None  # the design for the file, from which the search begins
-    is_free: Sequence[bool] | None = None  # (m,) channels whose gains may change; None: all
+    is_free: Sequence[bool] | None = None  # (m,) channels whose gains may change; if None, all may
 
 
 def margin_of(controller: RiseDiConfig) -> float:
@@ -45,22 +46,25 @@ def margin_of(controller: RiseDiConfig) -> float:
 
 
 def asked_margin(start: RiseDiConfig) -> float:
-    """Return the delay margin of `learn.margin`, or else that of the controller at the start, s."""
+    """Return `learn.margin`, or else the delay margin of the controller at the start, s."""
     asked = None if start.learn is None else start.learn.margin
     return margin_of(start) if asked is None else asked
 
 
 def is_late(start: RiseDiConfig, latest: Mapping[str, float]) -> bool:
-    """Return whether the latest delay of an input needs more than the margin of the start.
+    """Return whether the latest delay of an input requires more than the margin of the start.
 
-    `latest` has the delay of each input, s, by name. If `learn.margin` is set, it replaces the
-    margin of the start.
+    `latest` has the latest delay of each input, s, by name. If `learn.margin` is set, it replaces
+    the margin of the start.
     """
     return max(latest.values(), default=0.0) + DELAY_LEFT > asked_margin(start)
 
 
 def price(selected: SelectedObserver, margin: float, beside: SelectedObserver, kept: float) -> str:
-    """Say what a design's delay margin, s, costs compared with a design that keeps another one."""
+    """Say what the delay margin of a design costs in error, compared with the design `beside`.
+
+    `margin` is the delay margin of the first design, and `kept` that of the second, in s.
+    """
     ratio = math.exp((selected.cost - beside.cost) / len(selected.relaxation))
     return (
         f"{ratio:.2f} times the error of {1e3 * kept:.0f} ms of delay margin, "
@@ -78,12 +82,13 @@ def goal(
 ) -> Goal:
     """Return the goal of a design for a model of which some parts are learned.
 
-    A part keeps the delay margin that the loop of the file has around the model, but at least
-    LEAST_MARGIN and at most the margin of the start. Without a file it keeps the margin of the
-    start. If `learn.margin` is set, it keeps this margin. Each input keeps at least DELAY_LEFT
-    beyond its latest delay, s, by name. A `dead` output flies without this design, so it needs no
-    margin. With a file, the sensitivity is at most 2, or that of the loop of the file. This bounds
-    the phase and gain margins (Astrom, Murray, "Feedback Systems", 10.5).
+    A part must keep the delay margin that the loop of the file has around the model. It is at least
+    LEAST_MARGIN and at most the margin of the start. Without a design for the file it is the margin
+    of the start, and if `learn.margin` is set, it is this margin. Each input must keep at least
+    DELAY_LEFT beyond its `latest` delay, s. A `dead` output flies without this design, so it needs
+    no margin. With a design for the file, the sensitivity is at most 2, or that of the file's loop
+    if it is larger. This bounds the phase and gain margins (Astrom, Murray, "Feedback Systems",
+    10.5).
     """
     outputs = start.outputs
     margin = np.full(len(outputs), margin_of(start))
@@ -104,7 +109,7 @@ def goal(
             if part in parts:
                 kept = max(kept, min(LEAST_MARGIN, margin_of(start)))
             else:
-                kept -= RESOLUTION  # the gains of this part stay, and so its margin stays
+                kept -= RESOLUTION  # The gains of this part stay, and with them its margin.
             margin = np.where(share > 0.0, max(kept, 0.0), margin)
         margins = input_margins(linear.nominal, linear.law, linear.loop, together=False)
         if margins.stable:
@@ -119,7 +124,7 @@ def goal(
     if asked is not None:
         margin = np.full(len(outputs), asked)
     margin = np.where([output in dead for output in outputs], 0.0, margin)
-    # 0.1 ms, as few digits as the file of a scenario has
+    # 0.1 ms is the resolution of delays in the file of a scenario
     late = [round(latest[name] + DELAY_LEFT, 4) if name in latest else 0.0 for name in start.inputs]
     return Goal(np.maximum(margin, late), needed, file, is_free)
 
@@ -129,10 +134,11 @@ def by_law_of_start(
 ) -> set[str]:
     """Return the outputs that fly by the law of the start, given the dead input of each part.
 
-    A part without a dead input, "", has been given up. If the design for the file flies, a part
-    with a dead input gives up the output of this input, and V: in flights without an elevator the
-    observer of V erred four times as much as the law. Its other outputs keep the design, whose
-    inputs are whole: without a rudder p then erred half as much as by the law.
+    A part whose dead input is "" has been given up. If the design for the file flies, a part with a
+    dead input leaves the output of this input to the law, and V too. In flights without an
+    elevator, the observer of V erred four times as much as the law. The other outputs of the part
+    keep the design, because their inputs work. Without a rudder, the error of p was then half of
+    that under the law.
     """
     own = dict(zip(start.inputs, start.outputs, strict=True))
     return {
@@ -150,9 +156,10 @@ def with_flown_channels(
     flying: Collection[str],
     dead: Mapping[tuple[str, ...], str],
 ) -> RiseDiConfig:
-    """Let the outputs `flying` fly a design, and the others the law of the start.
+    """Let the outputs `flying` fly a design, and all other outputs the law of the start.
 
-    Dead inputs are held. If a part has given up or has a dead input, the loop has its own margin.
+    The inputs that are dead are held at a constant value. If a part has been given up or has a dead
+    input, the margin in the controller is set to that of its loop.
     """
     bare = [output not in flying for output in start.outputs]
     mixed = with_channels_of(
@@ -163,7 +170,7 @@ def with_flown_channels(
 
 
 def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> RiseDiConfig:
-    """Set a controller's margin to the one that its loop has around a model, at most to `most`."""
+    """Set the margin in a controller to the margin of its loop around a model, at most `most`."""
     linear = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
     undelayed = linear.loop._replace(delay=0.0)
     kept = delay_margin(linear.nominal, linear.law, undelayed) - RESOLUTION
@@ -175,8 +182,8 @@ def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> R
 def with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:
     """Put the standard deviations of B into the model of a controller's feedforward.
 
-    They are relative, and `deviation` has them by the names of the entries. An entry that no flight
-    has shown gets PRIOR.
+    `deviation` has the relative deviation of each entry, by the entry's name. An entry that no
+    flight has shown gets PRIOR.
     """
     model = designed.feedforward
     assert model is not None  # noqa: S101 - a design has one

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The record of a learner: y, u and the flown parameters of the ticks in the last seconds."""
+"""Keep the record of a learner: y, u and the flown parameters of the last seconds' ticks."""
 
 from collections import deque
 from collections.abc import Collection
@@ -18,27 +18,27 @@ from flight_design.identification.innovation_filters import FlightData
 from rise_di_controller.learning import divergence
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# Largest rms deviation of the airspeed from its mean, relative to the mean, in a record of one
+# Largest rms deviation of the airspeed from its mean, relative to this mean, in a record at one
 # speed. The effects of the surfaces then vary by 4 %.
 SPREAD = 0.02
 
 
 class Sample(NamedTuple):
-    """A tick of the record, with y and u in the law's order."""
+    """A tick in the record, with y and u in the law's order."""
 
     stamp_ns: int
     y: FloatArray  # (m,)
-    u: FloatArray  # (m,), after its limits
-    flown: int  # digest of the parameters
+    u: FloatArray  # (m,) inputs after their limits
+    flown: int  # digest of the parameters that flew in this tick
 
 
 class FlightRecord:
     """The last samples of a flight, within a window."""
 
     def __init__(self, controller: RiseDiConfig, airframe: Airframe, window: float) -> None:
-        """Make an empty record that is `window` s long.
+        """Make an empty record that covers a window of `window` s.
 
-        Samples come in the controller's order, recordings are in the airframe's.
+        Samples come in the controller's order, and recordings are in the airframe's order.
         """
         self._rows = [controller.outputs.index(name) for name in airframe.outputs]
         self._columns = [controller.inputs.index(name) for name in airframe.inputs]
@@ -49,17 +49,17 @@ class FlightRecord:
 
     @property
     def end_ns(self) -> int:
-        """Stamp of the last sample, or 0 if there is none."""
+        """Stamp of the last sample; 0 if there is no sample."""
         return self._samples[-1].stamp_ns if self._samples else 0
 
     @property
     def flown(self) -> int | None:
-        """Digest of the parameters of the last sample, or None if there is none."""
+        """Digest of the parameters in the last sample; None if there is no sample."""
         return self._samples[-1].flown if self._samples else None
 
     @property
     def length(self) -> float:
-        """The time that the record covers, lost ticks included, s."""
+        """Time that the record covers, including lost ticks, s."""
         if not self._samples:
             return 0.0
         return seconds(self.end_ns - self._samples[0].stamp_ns) + self.period
@@ -70,20 +70,20 @@ class FlightRecord:
         return nanoseconds(self.length + self.period / 2.0) >= self._window_ns
 
     def take(self, sample: Sample) -> None:
-        """Take a sample, if it is later than the last, and forget those older than the window."""
+        """Take a sample if it is later than the last, and forget samples before the window."""
         if not self._samples or sample.stamp_ns > self.end_ns:
             self._samples.append(sample)
         while sample.stamp_ns - self._samples[0].stamp_ns >= self._window_ns:
             self._samples.popleft()
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Keep only what is later than an instant."""
+        """Forget all samples up to an instant."""
         self._samples = deque(self._after(stamp_ns))
 
     def recording(self, after_ns: int = -1) -> FlightData:
         """Return the record after an instant in equal periods, in the airframe's order.
 
-        If a tick was lost, its y is NaN and its u is held.
+        In a lost tick, y is NaN and u is held.
         """
         record = self._after(after_ns)
         stamp_ns = np.array([sample.stamp_ns for sample in record])
@@ -100,8 +100,8 @@ class FlightRecord:
     def fell_back(self, after_ns: int, proposals: Collection[int]) -> bool:
         """Return whether the law fell back after an instant.
 
-        It did if the parameters that flew changed to parameters that are no proposal. `proposals`
-        has the digests of the proposals.
+        It fell back if other parameters began to fly that are no proposal. `proposals` has the
+        digests of the proposals.
         """
         flown = [sample.flown for sample in self._after(after_ns)]
         return any(new != old and new not in proposals for old, new in pairwise(flown))
@@ -116,10 +116,10 @@ class FlightRecord:
 
 
 def steady_end(recorded: FlightData, airframe: Airframe) -> tuple[FlightData, float]:
-    """Return the longest end of a record on which a linear model holds, and its airspeed over V0.
+    """Return the longest end of a record with a steady airspeed, and this airspeed divided by V0.
 
-    The rms deviation of the airspeed from its mean is at most SPREAD of the mean. The effects of
-    the surfaces vary twice as much.
+    A linear model holds there: the rms deviation of the airspeed from its mean is at most SPREAD of
+    the mean. The effects of the surfaces vary twice as much.
     """
     V = recorded.y[:, airframe.outputs.index("V")] / airframe.speed
     known = np.isfinite(V)[::-1]
@@ -135,16 +135,16 @@ def steady_end(recorded: FlightData, airframe: Airframe) -> tuple[FlightData, fl
 
 
 def about(recorded: FlightData, airframe: Airframe, x: FloatArray, u: FloatArray) -> FlightData:
-    """Return a record as deviations from a trim, x (n,) and u (m,) in the airframe's order."""
+    """Return a record as deviations from a trim, x, (n,), and u, (m,), in the airframe's order."""
     return recorded._replace(y=recorded.y - airframe.matrix_c() @ x, u=recorded.u - u)
 
 
 def at_trim(
     entries: tuple[Entry, ...], airframe: Airframe, powers: Exponents, ratio: float
 ) -> tuple[Entry, ...]:
-    """Convert entries from a speed, given as its ratio to the trim speed, to the trim speed.
+    """Convert entries of A and B from another speed to the trim speed.
 
-    Their relative errors and deviations stay.
+    `ratio` is the other speed divided by the trim speed. The relative errors and deviations stay.
     """
     states = list(airframe.states)
     columns = {"A": states, "B": list(airframe.inputs)}

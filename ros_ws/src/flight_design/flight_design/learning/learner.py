@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in the air: identify A and B from the last seconds of a flight, check and design.
+"""Learn in the air: identify A and B from the last seconds of a flight, check them, and design.
 
 A log is identified in the same way (`model_identification.identify_model`), from a rough airframe.
-The design is an observer and a feedforward. If a check fails, the model is refused with a sentence.
-The controller checks the parameters again when it loads them, and may refuse them.
+The design is an observer and a feedforward. If a check fails, a sentence says why the model is
+refused. The controller checks the parameters again when it loads them, and may refuse them.
 """
 
 from collections import deque
@@ -72,15 +72,16 @@ from rise_di_controller.learning.learned_channels import (
 from rise_di_controller.learning.proposals import UNVERIFIED
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# number of entries that may lie at a bound: the right model may have one, wrong ones have 2 to 6
+# number of entries that may lie at a bound: the right model may have one, wrong models have 2 to 6
 AT_BOUND = 1
 # s, shortest record: it has two of the six held-out seconds that `identify` needs
 SHORTEST = 20.0 * TRANSIENT
-# s, from a fallback to the next identification, whose record is of what flies after the fallback
+# s from a fallback to the next identification, whose record then shows the parameters that fly
+# after the fallback
 AFTER_FALLBACK = 4.0
 # s, from one identification to an unplanned one; also the length of a record tested for oscillation
 RETRY = 10.0
-# Gain of log-likelihood that is needed after a fallback. Dead surfaces had 46 to 656.
+# Gain of log-likelihood that finds a change after a fallback. Dead surfaces had 46 to 656.
 SURE_GAIN = 40.0
 
 Design = Callable[[RiseDiConfig, Airframe, Goal], SelectedObserver]
@@ -94,7 +95,7 @@ PartName = tuple[str, ...]
 
 
 class Known(NamedTuple):
-    """A part of the aircraft whose model flies."""
+    """What is known about a part of the aircraft whose learned model flies."""
 
     deviation: Mapping[str, float]  # relative deviation of each entry, by name
     latest: Mapping[str, float]  # delay of each input plus two standard deviations, s
@@ -102,20 +103,20 @@ class Known(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """The model that shall fly after an identification, and sentences about its parts."""
+    """The model that flies after an identification, and sentences about its parts."""
 
-    model: Airframe  # the flown model itself if no part has a new one
+    model: Airframe  # the model in flight if no part has a new model
     known: dict[PartName, Known]
     sentences: list[str]
     refusals: list[Refusal]
-    tried: Airframe  # `model`, with first models that later samples must still show to be better
+    tried: Airframe  # `model`, with first models of parts that later samples must prove
 
 
 class Learner:
     """The record of y and u over a window, and the proposals made from it.
 
-    The parts of the aircraft are learned one by one. A part without a model flies either by a
-    design for the airframe file that allows for errors, or by the law of the start.
+    The parts of the aircraft are learned one by one. A part without a learned model flies by the
+    design for the airframe file, which allows for errors, or by the law of the start.
     """
 
     def __init__(
@@ -132,8 +133,8 @@ class Learner:
         """Make a learner with an empty record.
 
         `airframe` is the rough model, the prior. `delay` is the delay of the loop, s, beyond
-        sampling and lags. `design_of_rough` designs for a model with errors. With it, the rough
-        model flies from the start, and later in the parts that have no learned model. If it is
+        sampling and lags. `design_of_rough` designs for a model with errors. With this design, the
+        rough model flies from the start, and later in the parts without a learned model. If it is
         None, these parts fly by the law of the start.
 
         `rough` has the deviation of B in the rough model, and the noise of the disturbances, which
@@ -144,7 +145,7 @@ class Learner:
         self._controller = controller
         self._rough = airframe
         self._design = design
-        # It becomes None if the rough model does not fly, or if the law falls back.
+        # None if the rough model does not fly, or after the law fell back from it.
         self._design_of_rough = design_of_rough
         self._has_proposed_rough = False
         self._believed = rough
@@ -158,31 +159,31 @@ class Learner:
         self._window_ns = nanoseconds(settings.window)
         self._latency_ns = nanoseconds(settings.latency)
         self._planned = deque(map(nanoseconds, settings.updates))
-        self._tolerance_ns = nanoseconds(settings.check / 2.0)  # of planned times, as y may be old
+        self._tolerance_ns = nanoseconds(settings.check / 2.0)  # for planned times, as y may be old
         self._first_ns: int | None = None
         self._prior = airframe  # prior of the next identification
         self._model = airframe  # the model that flies
         self._tried = airframe  # the model that the next identification tests
         self._tried_ns = -nanoseconds(RETRY)  # end of the record of the last identification
         self._known: dict[PartName, Known] = {}
-        # Parts that fly the law of the start for good, each with its dead input, or "" if its
-        # outputs are those of `learn.without`.
+        # Parts that fly the law of the start for good, with their dead input each, or with "" if
+        # the outputs are those of `learn.without`.
         self._dead: dict[PartName, str] = {}
-        self._start = controller  # with the `learn.without` of what flies
-        # Inputs without effect in the last test. A gust alone can hide an effect once.
+        self._start = controller  # with the `learn.without` of the parameters in flight
+        # Inputs that had no effect in the last test. In a single test a gust can hide an effect.
         self._suspected: dict[PartName, str] = {}
         self._has_ended = False
         self._give_up(outputs_without(controller))
-        self._changed: set[PartName] = set()  # parts whose model is from before a change
+        self._changed: set[PartName] = set()  # parts whose model was identified before a change
         self._last = controller  # the last proposal
         self._proposed = controller.digest()  # digest of the last proposal
-        self._proposed_ns = -self._latency_ns  # end of its record
+        self._proposed_ns = -self._latency_ns  # end of the record of the last proposal
         self._proposals = set[int]()  # digests of all proposals
-        self.identification: Identification | None = None  # the last one
+        self.identification: Identification | None = None  # the last identification
 
     @property
     def model(self) -> Airframe | None:
-        """The rough airframe with the models of the known parts, or None if no part is known."""
+        """The rough airframe with the learned models of its parts, or None if no part has one."""
         return self._model if self._known else None
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
@@ -197,21 +198,21 @@ class Learner:
         """Propose parameters for the identified model, or return the sentence of a refusal.
 
         The first proposal needs no record. It is a design for the rough airframe that allows for
-        errors. Parts that are refused later also fly by this design. If this proposal does not fly,
-        or if the law falls back, they fly the law of the start.
+        errors. Parts whose models are refused later also fly by this design. If this proposal does
+        not fly, or if the law falls back, those parts fly the law of the start.
 
         The last RECORD seconds are tested for a loss of effect. If an input has no effect any more,
-        its part flies the law of the start without it. After a loss, the older record is left out
-        and the flown model is the prior. If nothing is due, there is no sentence.
+        its part flies the law of the start without this input. After a loss of effect, older
+        samples are left out, and the flown model becomes the prior. If nothing is due, there is no
+        sentence.
 
         While the rough model flies, the first model of a part is only on trial. The next
-        identification proposes a model if the samples since then show an advantage over the rough
-        one.
+        identification proposes it if the samples since then show its advantage over the rough one.
 
         If the digest `flown` is not that of the last proposal after the latency, the proposal was
         refused, or the controller fell back. An identification is then due. Outputs that the
-        controller has `given_up` are not proposed again. If no part is left, nothing is identified,
-        and the sentence says so once.
+        controller has `given_up` are not proposed again. If no part is left to learn, a sentence
+        says so once.
         """
         is_first = not self._has_proposed_rough
         self._has_proposed_rough = True
@@ -227,7 +228,7 @@ class Learner:
         end_ns = self._record.end_ns
         self._note_given_up(flown, given_up)
         lost = flown != self._proposed
-        # A proposal does not act if the law fell back from the parameters that flew before it.
+        # The last proposal cannot act any more if the law fell back from the parameters before it.
         has_fallen = self._record.fell_back(self._proposed_ns, self._proposals)
         if lost and end_ns < self._proposed_ns + self._latency_ns and not has_fallen:
             return LearnerResult(None, None)  # the last proposal has yet to act
@@ -257,7 +258,7 @@ class Learner:
         verdict = self._verdict(self.identification, lost=lost)
         self._tried = verdict.tried
         self._tried_ns = end_ns
-        # after a lost proposal, the next one has to leave out the dead inputs again
+        # after a lost proposal, the next proposal has to leave out the dead inputs again
         leaves_out_again = lost and any(self._dead.values())
         if verdict.model is self._model and not leaves_out_again:
             nothing = Refusal("each part flies the law of the start from before on")
@@ -269,9 +270,9 @@ class Learner:
         return LearnerResult(self._last, told)
 
     def _damaged(self, changes: Sequence[Change], end_ns: int) -> LearnerResult:
-        """Decide on changed parts. A part with a dead input flies without this input at once.
+        """Decide on parts that have changed; one with a dead input flies without it at once.
 
-        A part without a dead input is identified from the record since the change, about the flown
+        Any other part is identified again, from the record since the change and about the flown
         model.
         """
         self._record.forget_before(end_ns - nanoseconds(RECORD))
@@ -286,7 +287,7 @@ class Learner:
         try:
             price_text = self._adopt(self._model, known, self._dead | dead)
         except ParameterError as error:
-            # Tell the loss, although no controller without the input can be proposed.
+            # Report the loss, although no controller without the input can be proposed.
             self._changed |= set(dead)
             losses = [f"{name} has no effect" for name in dead.values()]
             return LearnerResult(None, "; ".join([*losses, *weaker_parts, f"refused: {error}"]))
@@ -294,7 +295,7 @@ class Learner:
         return LearnerResult(self._last, told)
 
     def _verdict(self, identified: Identification, *, lost: bool) -> Verdict:
-        """Decide which parts of an identification shall fly."""
+        """Decide which parts fly by their new models after an identification."""
         known = dict(self._known)
         model = self._model
         told = list[str]()
@@ -369,7 +370,7 @@ class Learner:
         return price_text
 
     def _propose(self, proposed: RiseDiConfig) -> None:
-        """Note what is proposed."""
+        """Note the parameters that are proposed."""
         self._last = proposed
         self._proposed = proposed.digest()
         self._proposed_ns = self._record.end_ns
@@ -382,7 +383,7 @@ class Learner:
             self._design_of_rough = None
 
     def _rough_proposal(self) -> LearnerResult:
-        """Propose a design for the rough airframe that allows for errors. Raises ParameterError."""
+        """Propose a design for the rough airframe. Raises ParameterError if there is none."""
         name = self._rough.name
         try:
             proposed, _ = self._designed(self._rough, {}, self._dead)
@@ -395,7 +396,7 @@ class Learner:
     def _note_given_up(self, flown: int, outputs: Sequence[str]) -> None:
         """Note that the controller gave up outputs.
 
-        If the flown parameters are otherwise those of the last proposal, that proposal flies.
+        The last proposal flies if the flown parameters differ from it only in these outputs.
         Otherwise it was refused.
         """
         if set(outputs) <= set(outputs_without(self._start)):
@@ -407,7 +408,7 @@ class Learner:
             self._proposed = flown
 
     def _give_up(self, outputs: Sequence[str]) -> None:
-        """Leave outputs to the law of the start, by `learn.without`."""
+        """Leave outputs to the law of the start from now on, by `learn.without`."""
         self._start = without_models(self._controller, self._controller, outputs)
         if outputs:
             part = outputs_without(self._start)
@@ -419,8 +420,8 @@ class Learner:
     def _is_due(self, end_ns: int, *, lost: bool) -> bool:
         """Return whether an identification is due: at `learn.updates`, then once in every window.
 
-        One is also due RETRY after the last one, if the last proposal does not fly or a part has
-        changed. None is due within AFTER_FALLBACK of a fallback.
+        An identification is also due RETRY after the last one if the last proposal does not fly or
+        a part has changed, but not within AFTER_FALLBACK of a fallback.
         """
         is_planned = False
         elapsed_ns = -1 if self._first_ns is None else end_ns - self._first_ns
@@ -436,11 +437,11 @@ class Learner:
         return is_planned or (is_wanted and is_rested and not has_fallen)
 
     def _identified(self) -> Identification:
-        """Identify A and B from the record, about the prior, and also start at the flown model.
+        """Identify A and B from the record, with starts at the prior and at the flown model.
 
-        With models at several speeds, the record and the prior have a steady speed, and the entries
-        are reduced to the trim speed. Raises ParameterError if the speed is not steady over
-        SHORTEST.
+        With models at several speeds, the record and the prior are those at a steady speed, and the
+        result is converted to the trim speed. Raises ParameterError if no steady stretch is as long
+        as SHORTEST.
         """
         recorded, ratio = self._steady(self._record.recording())
         length = self._record.period * len(recorded.t)
@@ -477,10 +478,10 @@ class Learner:
         return identified._replace(parts=tuple(parts))
 
     def _steady(self, recorded: FlightData) -> tuple[FlightData, float]:
-        """Return the record, and its speed over V0.
+        """Return the record, and its speed divided by V0.
 
-        With models at several speeds, it is the steady end of the record, about the trim at that
-        speed.
+        With models at several speeds, the record is the steady end of the whole record, as
+        deviations from the trim at its speed.
         """
         if not self._has_speeds:
             return recorded, 1.0
@@ -488,14 +489,14 @@ class Learner:
         return about(steady, self._rough, *level_flight(self._model, ratio, self._thrust)), ratio
 
     def _at_speed(self, model: Airframe, ratio: float) -> Airframe:
-        """Return a model at the speed that `_steady` returns."""
+        """Return a model at the speed ratio that `_steady` returns."""
         return at_speed(model, ratio, self._thrust) if self._has_speeds else model
 
     def _changes(self, end_ns: int) -> list[Change]:
-        """Find changes, over the last RECORD, in the parts that have a learned model.
+        """Find changes in the last RECORD seconds, in the parts that have a learned model.
 
-        An input counts as dead only in the second test in a row, unless the law fell back. There is
-        no change if the speed was not steady over the record, if an output stood still, or if one
+        An input counts as dead only in the second test in a row, unless the law fell back. No
+        change is found if the speed was not steady, if an output stood still, or if an output
         oscillated over RETRY, since no model with a stable loop explains such an oscillation.
         """
         suspected, self._suspected = self._suspected, {}
@@ -537,8 +538,8 @@ class Learner:
     ) -> tuple[RiseDiConfig, str | None]:
         """Design the controller for a model, and say what `learn.margin` costs.
 
-        Parts without a learned model have the law of the start, or the rough model while it flies.
-        Raises ParameterError.
+        Parts without a learned model fly by the law of the start, or by the rough model if it
+        flies. Raises ParameterError.
         """
         start = self._controller
         without_learning = start.model_copy(update={"learn": None})
@@ -581,7 +582,7 @@ class Learner:
         latest: Mapping[str, float],
         dead: Collection[str],
     ) -> str | None:
-        """Say what `learn.margin` costs beside the margin of the file's loop, if both are there."""
+        """Say what `learn.margin` costs compared with the file's margin; None if one is missing."""
         start = self._controller
         settings = start.learn
         if settings is None or settings.margin is None or self._design_of_rough is None:
@@ -592,6 +593,6 @@ class Learner:
         kept = goal(plain, file, model, parts, latest, dead)
         try:
             beside = self._design(without_learning, model, kept)
-        except ParameterError:  # what was asked for flies: there is nothing to compare with
+        except ParameterError:  # the proposal flies, but there is nothing to compare it with
             return None
         return price(selected, settings.margin, beside, float(kept.margin.min()))

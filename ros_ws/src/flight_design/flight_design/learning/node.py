@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner node: it makes proposals of feedforward and observer from the controller's ticks.
+"""The learner node: it proposes feedforward and observer from the ticks of the controller.
 
 The search runs in a thread of low priority. In real time the loop does not wait for it.
 """
@@ -31,7 +31,7 @@ from rise_di_controller.internals import GIVEN_UP
 from rise_di_controller.learning.proposals import Updates
 
 PERIOD_NS = NANOSECONDS // 10
-NICE = 10  # nice value of a search in real time, which must not delay the loop for seconds
+NICE = 10  # nice value of a search in real time, which must not delay the loop
 
 
 class LearnerNode(FlightNode[LearnerConfig]):
@@ -39,8 +39,8 @@ class LearnerNode(FlightNode[LearnerConfig]):
 
     While a search runs, the samples wait in the queue of the subscription. So the record of a
     search does not change, and in lockstep the proposals equal those of the loop in one process. In
-    real time a search begins with the newest sample. If several identifications became due
-    meanwhile, only the last is made.
+    real time a search begins with the newest sample. If several identifications became due during a
+    search, only the last of them is made.
     """
 
     def __init__(self) -> None:
@@ -76,7 +76,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
         self._begin()
 
     def _begin(self) -> None:
-        """Begin with an empty record."""
+        """Begin a new record, which is empty."""
         self._learner, self._updates = self._new_learner(), Updates(self._settings)
         self._identifications = Identifications(self._learner, self._start.outputs)
         self._has_record = self._is_due = False
@@ -99,7 +99,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
         return max_age_ns, max_age_ns + nanoseconds(self._start.hold + self._start.ramp)
 
     def _advance(self, now_ns: int) -> bool:
-        """Publish the proposal of a search that has ended, and take samples until the next search.
+        """Publish the proposal of a finished search, and take samples until the next search begins.
 
         Return whether there was a sample or a proposal.
         """
@@ -130,7 +130,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
         return advanced
 
     def _begin_search(self) -> None:
-        """Begin the search that is due, if there is one, on the record so far."""
+        """Begin a search on the record so far, if one is due."""
         if self._is_due and self._search is None:
             self._is_due = False
             # A daemon thread does not delay the end of the node.
@@ -156,19 +156,19 @@ class LearnerNode(FlightNode[LearnerConfig]):
 
     def _propose(self) -> None:
         if not self.parameters.lockstep:
-            os.nice(NICE)  # Linux: of this thread alone
+            os.nice(NICE)  # on Linux for this thread alone
         try:
             self._proposal = self._learner.propose(self._flown, self._given_up)
-        except Exception as error:  # the flight goes on; in lockstep it waits for a proposal
+        except Exception as error:  # the flight continues; in lockstep it waits for a proposal
             self.get_logger().error(f"unexpected exception: {traceback.format_exc()}")
             self._proposal = LearnerResult(
                 None, f"the identification failed: {' '.join(str(error).split())}"
             )
 
     def close(self) -> None:
-        """In lockstep, complete the searches that are due.
+        """Complete the searches that are due, in lockstep.
 
-        The log then has their entries, as a log of one process has.
+        The log then has their entries, as the log of a simulation in one process has.
         """
         if self.parameters.lockstep:
             self._advance(0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of a part's model against the model that flies, and sentences about the part."""
+"""Check the model of a part against the model in flight, and write sentences about the part."""
 
 from collections.abc import Collection, Iterable, Mapping
 
@@ -15,28 +15,28 @@ from flight_design.identification.model_quality import MAX_WHITENESS
 from flight_design.identification.model_refusals import MAX_DEVIATION, best_known
 from flight_design.learning.change_test import Change
 
-# level of both tests of a model against the file, in standard deviations: a normal value exceeds it
-# with a probability of 5 %
+# level of the two tests of a model against the file, in standard deviations. A normal value exceeds
+# it with a probability of 5 %.
 LIKELIER = 1.645
-# s, standard deviation of the delay. A host, a bridge or a servo that is 30 ms later than the file
-# says is found.
+# s, standard deviation of the delay. It suffices to find a host, a bridge or a servo that is 30 ms
+# later than the file says.
 DELAY_DEVIATION = 0.015
 
 
 def is_within(part: Iterable[str], outputs: Iterable[str]) -> bool:
-    """Return whether the outputs of a part are among those of another."""
+    """Return whether the outputs of a part are among `outputs`, those of another part."""
     return set(part) <= set(outputs)
 
 
 def change_sentence(change: Change) -> str:
-    """Say which part has changed, and name its weakest input."""
+    """Say which part of the aircraft has changed, and name its weakest input."""
     name, effectiveness = min(change.left.items(), key=lambda effect: effect[1])
     weakest = f"{name} has {100 * effectiveness:.0f} % of its effect"
     return f"{' and '.join(change.outputs)} changed, log-likelihood {change.gain:.3g}: {weakest}"
 
 
 def reason_against_innovations(part: Part) -> Refusal | None:
-    """Refuse the output with the least white innovations if it is above MAX_WHITENESS."""
+    """Refuse a part if the whiteness of its least white innovations is above MAX_WHITENESS."""
     worst = int(np.argmax(part.after.whiteness))
     white = float(part.after.whiteness[worst])
     if white <= MAX_WHITENESS:
@@ -51,13 +51,13 @@ def reason_against_innovations(part: Part) -> Refusal | None:
 def reason_against_delays(part: Part, delay: float) -> Refusal | None:
     """Refuse a part if the delay of an input is at the bound of the search.
 
-    The search starts from the known `delay` of the loop, s.
+    `delay` is the known delay of the loop, s, from which the search starts.
     """
     bound = delay + MAX_DELAY_ERROR * DELAY_DEVIATION
     late = [
         name
         for name, delay in zip(part.inputs, part.delays, strict=False)
-        if delay >= bound - 1e-6  # s, of rounding
+        if delay >= bound - 1e-6  # the rounding tolerance is in s
     ]
     if not late:
         return None
@@ -68,19 +68,20 @@ def reason_against_delays(part: Part, delay: float) -> Refusal | None:
 
 
 def is_file_better(part: Part) -> bool:
-    """Return whether the nominal model predicts later samples better than the one that flies.
+    """Return whether the nominal model predicts later samples better than the model in flight.
 
-    If both models are equally near to the aircraft, the result is True in at most 5 % of cases.
+    If the two models are equally near to the aircraft, the result is True in at most 5 % of cases.
     """
     return part.advantage < -LIKELIER
 
 
 def reason_against_first_model(part: Part, name: str, *, flies: bool) -> Refusal | None:
-    """Refuse a first model that has not proved itself beside the airframe of a name.
+    """Refuse the first model of a part until it has proved itself against the airframe `name`.
 
-    The model was chosen by the record, so only later samples count. Against a file that `flies`, it
-    needs an advantage that two equally good models show with a probability of at most 5 %. A sketch
-    does not fly. Against a sketch, the model is only refused if it has such a disadvantage.
+    The model was chosen by the record, so only later samples count. Against an airframe file that
+    `flies`, the model needs an advantage that two equally good models show with a probability of at
+    most 5 %. A sketch does not fly. Against a sketch, the model is refused only if its disadvantage
+    is that large.
     """
     limit = LIKELIER if flies else -LIKELIER
     if part.advantage == 0.0:
@@ -97,9 +98,9 @@ def reason_against_first_model(part: Part, name: str, *, flies: bool) -> Refusal
 
 
 def return_to_file(part: Part, name: str | None) -> str:
-    """Say what flies after the airframe file predicted better than the model that flew.
+    """Say by what a part flies after the file predicted better than the model in flight.
 
-    The airframe `name` flies, or the law of the start if `name` is None.
+    It flies by the airframe `name`, or by the law of the start if `name` is None.
     """
     flies = "the law of the start" if name is None else f"the airframe {name} as it is"
     return f"{' and '.join(part.outputs)} by {flies}: {_file_advantage(part)}"
@@ -110,12 +111,12 @@ def _file_advantage(part: Part) -> str:
 
 
 def entries_of_file(part: Part) -> tuple[Entry, ...]:
-    """Return the entries of a part as they are in the airframe file."""
+    """Return the entries of a part with the values of the airframe file."""
     return tuple(entry._replace(error=0.0) for entry in part.entries)
 
 
 def reason_against_part_alone(part: Part, known: Iterable[tuple[str, ...]]) -> Refusal | None:
-    """Refuse the model of a part alone if the flown model couples it with another part."""
+    """Refuse a part's separate model if the model in flight couples this part with another."""
     if not any(is_within(part.outputs, outputs) for outputs in known if outputs != part.outputs):
         return None
     return Refusal(
@@ -125,15 +126,15 @@ def reason_against_part_alone(part: Part, known: Iterable[tuple[str, ...]]) -> R
 
 
 def forgotten_coupling(part: Part) -> str:
-    """Say why a model with coupling is forgotten."""
+    """Say why a model that couples two parts is given up."""
     return f"no coupling any more: {_file_advantage(part)}"
 
 
 def reason_against_effects(part: Part, flown: Airframe | None) -> Refusal | None:
     """Refuse an effect that gusts make weaker than in the flown model by more than MAX_DEVIATION.
 
-    Gusts hide what the inputs do. The identified effects are then too weak, and the gains of a
-    design with these effects are too high.
+    Gusts hide the effects of the inputs. The identified effects are then too weak, and the gains of
+    a design with these effects would be too high.
     """
     if flown is None or not part.gusts:
         return None
@@ -151,7 +152,7 @@ def reason_against_effects(part: Part, flown: Airframe | None) -> Refusal | None
 
 
 def effect_sentence(part: Part) -> str:
-    """Say which effects of inputs on outputs the flight shows.
+    """Say which effects of the inputs on the outputs the flight has shown.
 
     The effects are relative to those of the rough airframe, and are given with their deviations.
     """

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner of a scenario, whose airframe file is the rough model.
+"""Make the learner of a scenario, whose rough model is the airframe file or a sketch.
 
-Its observers have the gains of `rise-di gains`.
+The observers of its designs have the gains of `rise-di gains`.
 """
 
 from pathlib import Path
@@ -39,20 +39,20 @@ from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiCo
 
 
 def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False) -> Learn | None:
-    """Return what `simulate` and `fly_and_report` take as `learn`, or None without learning.
+    """Return the function that `simulate` and `fly_and_report` take as `learn`, or None.
 
     The rough model is the published airframe, not the aircraft in flight. For an aircraft of JSBSim
-    it is the feedforward of the controller. In real time the loop has the delay in the section of
-    the controller. In one process and in lockstep u acts at once.
+    it is the feedforward of the controller. In real time the loop has the delay of the section
+    controller. In one process and in lockstep u acts at once.
 
     Args:
         scenario: The flight.
         real_time: Whether the learner works beside a controller in real time.
-        quick: Whether an identification begins its search only once if the air is the same in
-            every second, as in a campaign.
+        quick: Whether an identification needs only one start if the air is the same in every
+            second, as in a campaign.
 
     Returns:
-        A function that makes a learner from the parameters of the controller, or None.
+        A function that makes a learner from the controller's parameters; None without learning.
 
     Raises:
         ParameterError: The schedule or the rough model does not fit the airframe.
@@ -100,7 +100,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
     of_rough: dict[RiseDiConfig, SelectedObserver] = {}
 
     def design_of_rough(start: RiseDiConfig) -> SelectedObserver:
-        """Design for an airframe with errors, once for the learners of many aircraft."""
+        """Design for an airframe with errors, only once for the learners of many aircraft."""
         if start not in of_rough:
             margin = asked_margin(controller)
             of_rough[start] = selected_observer(start, scenario, airframe, margin, speeds=speeds)
@@ -118,12 +118,13 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
 
 
 def that_learns(scenario: Scenario) -> Scenario:
-    """Turn a scenario with the law alone into a scenario that learns, without an airframe file.
+    """Turn a scenario with only the law into a scenario that learns, without an airframe file.
 
         Omega = diag(D omega / input_scale),   V0 the trim speed
 
-    The law gives the signs and sizes of Omega. The rough model is the sketch of Omega and V0.
-    Raises ParameterError if the controller has an observer, or if a sketch lacks an output.
+    The parameters of the law give the signs and sizes of Omega. The rough model is the sketch of
+    Omega and V0. Raises ParameterError if the controller has an observer, or if the sketch lacks an
+    output.
     """
     start = scenario.rise_di()
     expected = "none: a scenario of the law alone, whose signs and sizes are the rough model"
@@ -132,7 +133,7 @@ def that_learns(scenario: Scenario) -> Scenario:
     channels = aircraft.channels()
     measured = aircraft.sensors.noise or (0.0,) * len(channels.outputs)
     by_name = dict(zip(channels.outputs, measured, strict=True))
-    # An output that NOISE lacks is refused by with_sketch.
+    # with_sketch refuses an output that NOISE lacks
     noise = np.array([by_name[name] or NOISE.get(name, 0.0) for name in start.outputs])
     Omega = np.diag(np.array(start.D) * start.omega / start.input_scale)
     name = Path(aircraft.airframe.removeprefix(PREFIX)).stem
@@ -142,12 +143,12 @@ def that_learns(scenario: Scenario) -> Scenario:
 
 
 def quick_learner(scenario: Scenario) -> Learn | None:
-    """Return the learner of a campaign."""
+    """Return the learner for a campaign, which needs less time for an identification."""
     return learner(scenario, quick=True)
 
 
 def with_law_inputs(airframe: Airframe, controller: RiseDiConfig) -> Airframe:
-    """Return the airframe with the inputs of the law, in the order of its outputs."""
+    """Return the airframe with the inputs of the law, in the order of the airframe's outputs."""
     if controller.allocation is None:
         return airframe
     order = [controller.outputs.index(name) for name in airframe.outputs]
@@ -156,9 +157,10 @@ def with_law_inputs(airframe: Airframe, controller: RiseDiConfig) -> Airframe:
 
 
 def _speeds(controller: RiseDiConfig, airframe: Airframe) -> tuple[float, float] | None:
-    """Return the speeds of a schedule's models over the trim speed, or None without a schedule.
+    """Return the speeds of the models in a schedule divided by the trim speed, slow and fast.
 
-    Raises ParameterError if the schedule is about another speed than the rough model.
+    Returns None if there is no schedule. Raises ParameterError if the speed of the schedule is not
+    that of the rough model.
     """
     if controller.schedule is None:
         return None
@@ -184,7 +186,7 @@ def _prior(path: str, flown: Airframe) -> Airframe:
 
 
 class LearnStep(NamedTuple):
-    """What the learner found at a flight time."""
+    """The finding of the learner at a flight time."""
 
     t: float  # s
     proposed: bool
@@ -192,11 +194,11 @@ class LearnStep(NamedTuple):
 
 
 class LearnResult(NamedTuple):
-    """The learner's steps over a log, and the model at its end; None if nothing was learned."""
+    """The learner's steps over a log, and its model at the end; None if nothing was learned."""
 
     steps: tuple[LearnStep, ...]
     model: Airframe | None
-    entries: tuple[Entry, ...]  # those of the last identification
+    entries: tuple[Entry, ...]  # the entries of the last identification
 
 
 class _Ticks(NamedTuple):
@@ -207,11 +209,11 @@ class _Ticks(NamedTuple):
     mode: FloatArray
     y: FloatArray  # (N, m)
     u: FloatArray  # (N, m)
-    flown: FloatArray | None  # digests; None if the log has other settings of the learner
+    flown: FloatArray | None  # digests; None if the learner in the log had other settings
     given_up: Signal
 
     def left(self, k: int) -> tuple[str, ...]:
-        """Return the outputs that the controller had given up at a tick."""
+        """Return the outputs that the controller had given up at the tick k."""
         names = self.given_up.names
         return tuple(name for name in names if self.flown is not None and self.given_up[name][k])
 
@@ -244,9 +246,9 @@ def _ticks(tape: Tape, controller: RiseDiConfig) -> _Ticks:
 def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
     """Step the learner of a scenario with y and u of the engaged ticks of a log.
 
-    If the law is deactivated, the record ends, as in flight. If the log has no settings of the
-    learner, or has other settings than the scenario, each proposal is taken as flown. Raises
-    ParameterError if nothing can be learned from the log.
+    As in flight, the record ends if the law is deactivated. If the learner in the log had other
+    settings than the scenario, or none, each proposal counts as flown. Raises ParameterError if
+    nothing can be learned from the log.
     """
     # Simulated time begins at 0.
     make = learner(scenario, real_time=tape.start_ns > 0)
@@ -282,7 +284,7 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
             proposal = learned.propose(flown, ticks.left(k))
             proposed = proposed if proposal.controller is None else proposal.controller.digest()
             t = (now_ns - tape.start_ns) / NANOSECONDS
-            # The rough model is proposed before there is a record, and teaches nothing.
+            # The rough model is proposed before there is a record, so it has taught nothing.
             if proposal.sentence is not None and now_ns > begin_ns:
                 steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
     first = f"{settings.updates[0]:g} s or more, the first of learn.updates"
@@ -293,7 +295,7 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
 
 
 def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
-    """Return a scenario with the parameters that flew last in one of its runs, without `learn`.
+    """Return a scenario with the parameters that flew last in one of its runs, and without `learn`.
 
     Raises ParameterError if the run had another controller.
     """
@@ -308,7 +310,7 @@ def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
 
 
 def learned_yaml(result: LearnResult, origin: str) -> str:
-    """Write the model of a result as the text of an airframe file, whose header lists the steps.
+    """Write the learned model as the text of an airframe file, whose header lists the steps.
 
     Raises ParameterError if there is no model.
     """
