@@ -2,5 +2,5 @@
 # SPDX-License-Identifier: Apache-2.0
 """Guidance of the RISE-DI flight stack, outside the control law.
 
-It commands attitude, altitude and course, and flies routes.
+Guidance commands attitude, altitude and course, and flies routes.
 """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clients of guidance, for `rise-di guide` and the live page."""
+"""Command the guidance of a running flight, for `rise-di guide` and the live page."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -31,11 +31,12 @@ from flight_ros.topics import (
     Topic,
 )
 
-TARGET_TIMEOUT = 3.0  # s, in which guidance takes a target at one of its ticks
-TARGET_PERIOD = 0.2  # s, between two equal targets
-LINK_PERIOD = 1.0  # s, between two targets without channels, which keep the operator's link
+TARGET_TIMEOUT = 3.0  # s, longest wait until guidance takes a target at one of its ticks
+TARGET_PERIOD = 0.2  # s, time between two equal targets
+# s, time between two targets without channels, which keep the operator's link alive
+LINK_PERIOD = 1.0
 REFUSED = "sample refused: "  # text before the reason in the log of a node
-ROUTE_TIMEOUT = 3.0  # s, in which the middleware of guidance confirms a route
+ROUTE_TIMEOUT = 3.0  # s, longest wait until the middleware of guidance confirms a route
 ROUTE_POLL_PERIOD = Duration(seconds=0.05)
 NAME = "guidance"
 
@@ -43,7 +44,7 @@ NAME = "guidance"
 class GuidanceClient(Client):
     """Commands the guidance of a running flight.
 
-    A method returns the reason if guidance refuses the command, else None.
+    A method returns the reason if guidance refuses its command, and None if not.
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class GuidanceClient(Client):
         self._log = PolledSubscription(self._node, ROSOUT, RECORD_FOREIGN)
 
     def call(self, service: str) -> Refusal | None:
-        """Call a service of guidance without arguments: hold, skip, resume, home."""
+        """Call a service of guidance that has no arguments: hold, skip, resume or home."""
         message = self._call(
             Trigger, f"{NAME}/{service}", Trigger.Request(), "a flight with guidance"
         ).message
@@ -84,13 +85,13 @@ class GuidanceClient(Client):
             )
             return self._reason_against(ROUTE, lambda: self._has_taken({"leg": 0.0}), None)
         finally:
-            # Guidance that starts later must not receive the route and fly it.
+            # A guidance node that starts later must not receive the route and fly it.
             self._node.destroy_publisher(publisher)
 
     def _reaches_guidance(self, publisher: Publisher) -> bool:
-        """Return whether guidance is among the subscribers in the graph.
+        """Return whether guidance is among the matched subscribers of a topic.
 
-        Every subscriber must be matched, too.
+        The result is False as long as a subscriber in the graph is not matched.
         """
         names = [
             endpoint.node_name
@@ -103,7 +104,7 @@ class GuidanceClient(Client):
     ) -> Refusal | None:
         """Wait until guidance has taken a message or refused it, and return the reason.
 
-        If guidance has done neither within TARGET_TIMEOUT, return `unknown`.
+        Returns `unknown` if guidance has neither taken nor refused it within TARGET_TIMEOUT.
         """
         reasons: list[Refusal] = []
 
@@ -141,7 +142,7 @@ class GuidanceClient(Client):
         ]
 
     def _has_taken(self, values: Mapping[str, float]) -> bool:
-        """Return whether a sample of guidance since the last call has taken these commands."""
+        """Return whether a sample of guidance since the last call shows these commands."""
         mask = sum(1 << TARGETS.index(name) for name in values)
 
         def has_taken(sample: Mapping[str, float]) -> bool:
@@ -158,7 +159,7 @@ class GuidanceClient(Client):
 
 
 class TargetClient(GuidanceClient):
-    """Commands the targets that guidance holds, and keeps the operator's link."""
+    """Commands the targets of guidance, and keeps the operator's link alive."""
 
     def __init__(self, namespace: str = "", parent: Client | None = None) -> None:
         super().__init__("operator", namespace, parent)
@@ -169,9 +170,9 @@ class TargetClient(GuidanceClient):
         )
 
     def send(self, values: Mapping[str, float]) -> Refusal | None:
-        """Publish commands by channel until guidance has them in force.
+        """Publish commands by channel until guidance has taken them.
 
-        Returns the reason if guidance does not take them, else None.
+        Returns the reason if guidance does not take them, and None if it does.
         """
         self._spin_until(lambda: bool(self._received()), self._silent)
         self._log.take()
@@ -179,11 +180,11 @@ class TargetClient(GuidanceClient):
         return self._reason_against(TARGET, lambda: self._published(values), unknown)
 
     def keep_link(self) -> None:
-        """Publish a target without channels, which says that an operator is there."""
+        """Publish a target without channels, by which guidance knows that an operator is there."""
         self._publish({})
 
     def hold_link(self) -> NoReturn:
-        """Keep the link by a message each LINK_PERIOD.
+        """Keep the link by a message every LINK_PERIOD.
 
         Raises ParameterError if no guidance flies in the domain.
         """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Feasibility: a route beyond the aircraft's performance is refused before the flight.
+"""Refuse a route beyond the performance of the aircraft before the flight.
 
 The refusal names the nearest feasible value.
 """
@@ -27,25 +27,25 @@ sixth of the airspeed."""
 
 
 class Performance(NamedTuple):
-    """Performance of the aircraft, and the largest wind."""
+    """Performance of the aircraft, and the largest wind in which it must fly the route."""
 
-    speed: float  # airspeed if the route names none, m/s
+    speed: float  # m/s, airspeed for waypoints that name none
     stall_speed: float  # m/s
     bank: float  # largest bank, rad
     roll_rate: float  # largest phi_dot, rad/s
     climb: float  # largest climb rate, m/s
     sink: float  # largest sink rate, m/s
-    wind: float  # largest wind from any side, m/s
+    wind: float  # m/s, largest wind from any direction
     largest_speed: float = math.inf  # m/s
     lowest: float = -math.inf  # m, least altitude
-    highest: float = math.inf  # m
+    highest: float = math.inf  # m, largest altitude
 
 
 def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
-    """Return the airspeeds on the legs to the waypoints, m/s.
+    """Return the airspeed on the leg to each waypoint, m/s.
 
-    It is the airspeed of the waypoint. If this has none, it is that of the leg before, and on the
-    first leg `first`.
+    It is the airspeed of the waypoint. A waypoint without an airspeed has that of the previous leg,
+    and on the first leg it has `first`.
     """
     leg_speeds = []
     for waypoint in waypoints:
@@ -56,9 +56,10 @@ def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class FlyableRoute:
-    """The legs of a route, and the waypoints that they fly.
+    """The legs of a route, and the waypoints through which they lead.
 
-    Waypoints that are left out for short legs are missing, and steep legs have loiters.
+    Waypoints that were left out because of short legs are missing. Legs that were too steep have
+    loiters.
     """
 
     legs: tuple[Leg, ...]
@@ -66,20 +67,21 @@ class FlyableRoute:
     notes: tuple[str, ...]  # sentences on what differs from the given waypoints
 
 
-@lru_cache(maxsize=8)  # checks, nodes, replay and report ask for the same route
+@lru_cache(maxsize=8)  # checks, nodes, replay and report all ask for the same route
 def flyable(
     waypoints: tuple[Waypoint, ...], radius: float, period: float, can: Performance
 ) -> FlyableRoute:
     """Plan the legs of a route with fillets of `radius`, m, and path following with `period`, s.
 
-    If a leg is too short for the fillets, one waypoint is left out, provided that the route still
-    passes it within `radius` or within 1 s of flight. If a change of altitude exceeds the climb or
-    sink along the straight part of the leg with a tailwind, it is flown on a circle: a climb round
-    the waypoint at the start of the leg, a descent round the waypoint at its end. Raises
-    ParameterError for a waypoint that is not finite or beyond LARGEST, an altitude or a speed
-    beyond the bounds, a speed of at most HEADWIND times the wind, a period below the rule, a radius
-    below (V + W)^2 / (g tan(0.8 phi_max)), and a leg too short for the fillets. phi_max is the
-    largest bank at V for the stall speed.
+    If a leg is too short for the fillets, one of its waypoints is left out. The route must still
+    pass this waypoint within `radius` or within 1 s of flight. A change of altitude may exceed the
+    climb or sink along the straight part of its leg with a tailwind. It is then flown on a circle:
+    a climb at the start of the leg, and a descent at its end.
+
+    Raises ParameterError for a waypoint that is not finite or beyond LARGEST, for an altitude or a
+    speed out of bounds, and for a speed of at most HEADWIND times the wind. It is also raised for a
+    period below the rule, a radius below (V + W)^2 / (g tan(0.8 phi_max)), and a leg that is too
+    short for the fillets. phi_max is the largest bank at V for the stall speed.
     """
     require_bounds(waypoints, can)
     leg_speeds = speeds(waypoints, can.speed)
@@ -107,10 +109,10 @@ def as_route(
     slopes: bool,
     notes: tuple[str, ...] = (),
 ) -> Route:
-    """Make the route of legs through waypoints; `speed`, m/s, holds if no waypoint names one.
+    """Make a Route from legs through waypoints; `speed`, m/s, holds if no waypoint names one.
 
-    A fillet belongs to the way to the next waypoint, and a leg starts at the waypoint before. In an
-    orbit the altitude changes at its waypoint.
+    A fillet counts as a part of the way to the next waypoint. A leg starts at the previous
+    waypoint. In an orbit the altitude changes at its waypoint.
     """
     leg_speeds = speeds(waypoints, speed)
     numbers = path.leads(legs)
@@ -147,7 +149,7 @@ def _legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[L
 def _without_short_legs(
     waypoints: Sequence[Waypoint], radius: float, least: float
 ) -> tuple[list[tuple[int, Waypoint]], tuple[str, ...]]:
-    """Return the waypoints with their numbers, except those left out for short legs.
+    """Return the waypoints with their numbers, without those that make legs too short.
 
     A note names each waypoint that is left out. Raises ShortLegError if none can be left out.
     """
@@ -175,7 +177,7 @@ def _without_short_legs(
                 )
             ]
         except ParameterError as error:
-            # Without the waypoint there are other corners, and their legs may be too short.
+            # Without this waypoint the corners are different, and their legs may be too short.
             raise refusal or error from None
     numbers = {number for number, _ in remaining}
     notes = []
@@ -193,7 +195,7 @@ def _without_short_legs(
 
 
 def _offset(before: Point, point: Point, after: Point) -> float:
-    """Return the distance of a point from the line between two others, m."""
+    """Return the distance of a point from the line between two other points, m."""
     line = Line(before, after)
     share = path.nearest(line, point) / max(path.length(line), 1e-9)
     return math.dist(point, path.along(before, after, share))
@@ -206,9 +208,10 @@ def _with_circles(
     least: float,
     can: Performance,
 ) -> FlyableRoute:
-    """Add a circle to the route for each change of altitude that the leg does not allow.
+    """Return a route with a circle for each change of altitude that its leg does not allow.
 
-    Such a change exceeds the climb or sink along the leg. `by_number` has the waypoints by number.
+    Such a change exceeds the climb or sink along the leg. `by_number` has the waypoints by their
+    numbers.
     """
     numbers = list(by_number)
     waypoints = list(by_number.values())
@@ -251,7 +254,7 @@ def _with_circles(
 
 
 def require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
-    """Refuse a waypoint, an altitude or an airspeed out of bounds."""
+    """Refuse waypoints, altitudes and airspeeds that are out of bounds."""
     for k, waypoint in enumerate(waypoints):
         north, east, altitude = waypoint[:3]
         is_plausible = all(
@@ -295,9 +298,9 @@ def require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
 
 
 def require_inside(route: Route, fence: Fence, margin: float) -> None:
-    """Refuse a leg nearer to the fence than `margin`, m.
+    """Refuse a leg that comes nearer to the fence than `margin`, m.
 
-    The sentence names the place that is farthest outside.
+    The sentence names the place where the clearance is least.
     """
     start: Point = (0.0, 0.0)
     for number, leg in enumerate(route.legs):

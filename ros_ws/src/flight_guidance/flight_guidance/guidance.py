@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance without ROS: the step of `modes` with its state, the last samples and the program.
+"""Run guidance without ROS: `modes.step` with its state, the last samples and the program.
 
 The node and the simulation in one process use the same class `Guidance`.
 """
@@ -46,10 +46,10 @@ from flight_guidance.steering.path import Line, Route
 
 
 class GuidanceOutput(NamedTuple):
-    """Output of a step."""
+    """Output of a step of guidance."""
 
     u_m: FloatArray  # the commands in the order of the parameters' outputs, then ATTITUDE
-    log: FloatArray  # in the order of `guidance_log.names`
+    log: FloatArray  # values of the log, in the order of `guidance_log.names`
     notices: tuple[str, ...] = ()
 
 
@@ -64,18 +64,18 @@ def u_m(state: GuidanceState) -> FloatArray:
 def step(
     state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
 ) -> tuple[GuidanceState, StepCommands]:
-    """Take a step by `modes.step`, or by `multicopter.step` for a multicopter."""
+    """Take a step, by `modes.step` for an airplane or `multicopter.step` for a multicopter."""
     step_of_kind = modes.step if params.multicopter is None else multicopter.step
     return step_of_kind(state, inputs, route, params)
 
 
 def digest(route: Route | None) -> int:
-    """Return a number that distinguishes routes; 0 for none."""
+    """Return a number that identifies a route; 0 for no route."""
     return 0 if route is None else zlib.crc32(repr(route).encode())
 
 
 class Guidance:
-    """Guidance with its state, the last pose and y, the route and the program of targets."""
+    """Guidance with its state, the last pose and y, the route and the program of commands."""
 
     def __init__(self, parameters: GuidanceConfig) -> None:
         self._params: GuidanceParams = parameters.params()
@@ -91,18 +91,19 @@ class Guidance:
         self._pose: StampedVector | None = None
         self._y: StampedVector | None = None
         self._commands: dict[str, float] = {} if self.route is None else {"leg": 0.0}
-        self._route_waits = self.route is not None  # whether no step has flown it yet
+        self._route_waits = self.route is not None  # whether no step has flown the route yet
         self._state: GuidanceState | None = None
         self._is_engaged = True
         self._paused = False
         self._begin = Begin.HOLD
         self._notices = parameters.notices()
-        # The instant from which guidance has waited for a pose that is young enough, or for a step
-        # that does not fail; None if it does not wait.
+        # Instant since which guidance has waited for a young pose, or for a step that does not
+        # fail. It is None if guidance does not wait.
         self._waits_from_ns: int | None = None
         self._failures = Failures()
-        self._failure: str | None = None  # why the last step failed; None if it waits for a pose
-        # The instant of the operator's last message, or of the first step.
+        # why the last step failed; None if guidance waits for a pose
+        self._failure: str | None = None
+        # Instant of the operator's last message; before the first message, that of the first step.
         self._operated_ns: int | None = None
         self._link_lost = False
         self._authority = Authority()
@@ -128,8 +129,9 @@ class Guidance:
     def take_pose(self, sample: StampedVector, now_ns: int) -> None:
         """Take a pose in the order of `channels.POSE`.
 
-        Raises ChannelError if the stamp is not newer than the last or is in the future, if a value
-        is beyond LARGEST, and if the pose equals the last in every value.
+        Raises ChannelError if the stamp is not newer than that of the last pose, or is in the
+        future. It is also raised if a value is beyond LARGEST, and if every value is that of the
+        last pose.
         """
         last = self._pose
         newest = self._newest(self._pose, sample, now_ns)
@@ -142,12 +144,12 @@ class Guidance:
     def take_y(self, sample: StampedVector, now_ns: int) -> None:
         """Take a y in the order of the parameters' outputs.
 
-        Raises ChannelError as `take_pose` does, except for equal values.
+        Raises ChannelError as `take_pose` does, but equal values are allowed.
         """
         self._y = self._newest(self._y, sample, now_ns)
 
     def take_authority(self, channels: Mapping[str, float]) -> None:
-        """Limit the steps from now on by what the inputs can do.
+        """Limit the steps from now on by the authority of the inputs.
 
         The channels are those of the topic `authority`.
         """
@@ -167,12 +169,12 @@ class Guidance:
         return sample
 
     def take_target(self, values: Mapping[str, float]) -> None:
-        """Take commands by channel of Target; commands of the same instant come in one call.
+        """Take commands by channel of Target; commands of one instant must come in one call.
 
-        Raises ChannelError.
+        Raises ChannelError for a command that guidance cannot fly.
         """
         targets.read_target(values, self._params, self.route, degrees=True)
-        # A lateral or vertical command replaces the waiting command of another mode.
+        # A new lateral or vertical command replaces one of another mode that still waits.
         channels = self._params.channels
         for table in (channels.lateral, channels.vertical):
             if any(name in table for name in values):
@@ -182,13 +184,13 @@ class Guidance:
         self._commands |= values
 
     def take_route(self, route: Route) -> None:
-        """Fly a route from its first leg on.
+        """Fly a new route, beginning with its first leg.
 
-        While guidance is off, the route waits for the engagement. Earlier commands that
-        no step has taken yet are void, and so are the legs in the program.
+        While guidance is off, the route waits for the engagement. Earlier commands that no step has
+        taken yet become void, and so do the legs in the program.
         """
         self.route = route
-        self._lander = None  # the lander is only for the route of the parameters
+        self._lander = None  # the lander belongs to the route of the parameters
         self._digest = digest(route)
         self._commands = {}
         self._route_waits = True
@@ -201,14 +203,14 @@ class Guidance:
         self.take_target({"leg": 0.0})
 
     def keep_link(self) -> None:
-        """Note a message of the operator: the age of the link counts from the next step on."""
+        """Note a message of the operator; from the next step on, the link's age counts from now."""
         self._operated_ns = None
         self._link_lost = False
 
     def hold(self) -> bool:
         """Hold the present heading, altitude and airspeed, or the place of a multicopter.
 
-        Returns False if guidance does not fly.
+        Returns False if guidance is not flying.
         """
         if self.mode is not GuidanceMode.ENGAGED or self._pose is None or self._y is None:
             return False
@@ -218,7 +220,7 @@ class Guidance:
         return True
 
     def home(self) -> bool:
-        """Fly home and orbit there. Returns False if guidance does not fly."""
+        """Fly home and orbit there. Returns False if guidance is not flying."""
         if self.mode is not GuidanceMode.ENGAGED or self._pose is None:
             return False
         params = targets.within_reach(self._params, self._authority)
@@ -249,9 +251,9 @@ class Guidance:
         return True
 
     def resume(self) -> bool:
-        """Fly the last leg again from the nearest point.
+        """Fly the last leg of the route again, from its nearest point on.
 
-        Returns False if the route is being flown, or if there is none.
+        Returns False if the route is already flown, or if there is no route.
         """
         state = self._state
         route = self.route
@@ -268,7 +270,7 @@ class Guidance:
         return True
 
     def engage(self, *, engaged: bool) -> None:
-        """Engage with the present heading, altitude and airspeed, or command nothing."""
+        """Engage with the present heading, altitude and airspeed, or stop all commands."""
         if engaged and not self._is_engaged:
             self._begin = Begin.HOLD
             self._forget_commands()
@@ -277,8 +279,8 @@ class Guidance:
     def pause(self, *, paused: bool, forget: bool) -> None:
         """Command nothing while the controller does not fly.
 
-        With `forget`, guidance then holds the heading, altitude and airspeed that it measures when
-        it flies again; otherwise it goes on as before.
+        With `forget`, guidance holds the measured heading, altitude and airspeed when it flies
+        again. Otherwise it then continues with its last commands.
         """
         if forget:
             self._begin = Begin.HOLD
@@ -287,7 +289,7 @@ class Guidance:
         self._paused = paused
 
     def _forget_commands(self) -> None:
-        """Forget commands given while guidance did not fly, except a route.
+        """Forget all commands except a route that were given while guidance did not fly.
 
         Commands from before the first step are kept.
         """
@@ -299,17 +301,17 @@ class Guidance:
             }
 
     def pose(self) -> dict[str, float]:
-        """Return the last pose by channel; empty before the first pose."""
+        """Return the last pose by channel; empty if no pose has come yet."""
         return {} if self._pose is None else dict(zip(POSE, self._pose.value.tolist(), strict=True))
 
     def y(self) -> dict[str, float]:
-        """Return the last y by channel; empty before the first y."""
+        """Return the last y by channel; empty if no y has come yet."""
         if self._y is None:
             return {}
         return dict(zip(self._params.outputs, self._y.value.tolist(), strict=True))
 
     def ages(self, now_ns: int) -> dict[str, float]:
-        """Return the ages of the last y and pose, s; a channel that never came is absent."""
+        """Return the ages of the last y and pose, s; a signal that never came is absent."""
         samples = {"y": self._y, "pose": self._pose}
         return {
             name: seconds(now_ns - sample.stamp_ns)
@@ -318,10 +320,10 @@ class Guidance:
         }
 
     def reason_to_wait(self, now_ns: int) -> Refusal | None:
-        """Return why there is no u_m, or None.
+        """Return why guidance publishes no u_m, or None.
 
-        There is a reason if guidance has waited for STALE_TIME: for a young pose, or for a step
-        that does not fail.
+        The result is None until guidance has waited for STALE_TIME. It waits for a young pose, or
+        for a step that does not fail.
         """
         since = self._waits_from_ns
         pose = self._pose
@@ -334,21 +336,21 @@ class Guidance:
         return Refusal(f"no u_m: pose is {age:.2f} s old, guidance.max_age {limit:g} s")
 
     def _watch_link(self, now_ns: int) -> None:
-        """Begin to fly home if the age of the operator's link exceeds the limit."""
+        """Begin to fly home if the age of the operator's link is above the limit."""
         if not self._params.link_timeout_ns:
             return
         if self._operated_ns is None:
             self._operated_ns = now_ns
         if now_ns - self._operated_ns > self._params.link_timeout_ns and not self._link_lost:
-            # If guidance does not fly, try `home` again at the next step.
+            # If guidance does not fly, the next step tries `home` again.
             self._link_lost = self.home()
 
     def _link_age(self, now_ns: int) -> float:
-        """Return the age of the operator's link, s, 0 without a limit."""
+        """Return the age of the operator's link, s; 0 if it has no limit."""
         return 0.0 if self._operated_ns is None else seconds(now_ns - self._operated_ns)
 
     def _test_roll(self, y: Sequence[float]) -> None:
-        """Test whether p follows the command of the last step, and add this to the authority."""
+        """Test whether p follows the last command, and put the result into the authority."""
         state = self._state
         params = self._params
         if state is None or params.multicopter is not None:
@@ -359,7 +361,7 @@ class Guidance:
         self._authority = self._authority._replace(roll=0.0 if self._roll.ignored else UNKNOWN)
 
     def _land(self) -> None:
-        """Add the commands of the landing, unless the operator or the program gives other ones."""
+        """Add the commands of the landing, unless the operator or the program gives others."""
         state = self._state
         if self._lander is None or self.route is None or state is None:
             return
@@ -372,22 +374,22 @@ class Guidance:
             self._commands |= self._lander.commands(state, self.pose(), self.route)
 
     def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
-        """Take a step at an instant and flight time t.
+        """Take a step at the instant `now_ns` and the flight time `t_ns`.
 
         Returns None if y is not fresh, if no pose has come yet, or while disengaged. After such
         steps the filters start again at the measured values. If a step raises an exception or gives
-        a value that is not finite, the state stays, commands wait for the next step, and the last
-        u_m goes on until the age limit.
+        a value that is not finite, the state stays and commands wait for the next step. The last
+        u_m is then repeated until the age limit.
         """
         try:
             return self._step(now_ns, t_ns)
         except Exception as error:
-            # Whatever the error is, try the next step.
+            # Whatever the error is, the next step tries again.
             is_said = self._failures.add(seconds(t_ns))
             return self._last_goes_on(now_ns, sentence(error), is_said=is_said)
 
     def _last_goes_on(self, now_ns: int, cause: str, *, is_said: bool) -> GuidanceOutput | None:
-        """Return the output of a failed step: the last u_m, or None beyond the age limit."""
+        """Return the output after a failed step: the last u_m, or None beyond the age limit."""
         state = self._state
         pose = self._pose
         y = self._y
@@ -405,7 +407,7 @@ class Guidance:
     def _row(
         self, inputs: Inputs, state: GuidanceState, commands: StepCommands, now_ns: int
     ) -> FloatArray:
-        """Return the row that guidance logs for a step at an instant."""
+        """Return the row of the log for a step at an instant."""
         sample = guidance_log.GuidanceSample(
             inputs=inputs,
             state=state,
@@ -417,7 +419,7 @@ class Guidance:
         return guidance_log.row(sample, self._params.outputs)
 
     def _inputs(self, now_ns: int, pose: StampedVector, y: StampedVector) -> Inputs:
-        """Collect what a step takes at an instant."""
+        """Collect the inputs of a step at an instant."""
         return Inputs(
             t_ns=now_ns,
             begin=self._begin,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The log of guidance: writes a step as a row of channels, and restores the step from a row."""
+"""Write a step of guidance as a row of the log, and restore a step from such a row."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import chain
@@ -36,13 +36,13 @@ WIND = ("north", "east")
 
 
 class GuidanceSample(NamedTuple):
-    """Content of the log for a step: its inputs, the state after it, and its commands."""
+    """A step as the log holds it: its inputs, the state after it, and its commands."""
 
     inputs: Inputs
     state: GuidanceState
     commands: StepCommands
     route: int  # `guidance.digest` of the route
-    link_age: float  # s since the last message of an operator, 0 without a limit
+    link_age: float  # s since the last message of an operator; 0 if the link has no limit
     failed: int  # number of failed steps
 
     @property
@@ -52,7 +52,7 @@ class GuidanceSample(NamedTuple):
 
     @property
     def given(self) -> int:
-        """New commands, as `bits`."""
+        """Channels of the new commands, encoded by `bits`."""
         return guidance_state.bits(self.inputs.commands)
 
 
@@ -61,24 +61,24 @@ def _tuple(*values: float) -> tuple[float, ...]:
 
 
 class LogChannels(NamedTuple):
-    """Channels of the log, and the attribute of a `GuidanceSample` that they hold."""
+    """Channels of the log, and the attribute of a `GuidanceSample` that they store."""
 
     names: Sequence[str]
     attribute: str
-    kind: Callable[..., Any] = float  # builds the attribute from the logged numbers
+    kind: Callable[..., Any] = float  # builds the attribute from the numbers in the log
 
     def logged(self, sample: GuidanceSample) -> Sequence[float]:
-        """Return the numbers of the channels."""
+        """Return the numbers of the channels for a sample."""
         value = attrgetter(self.attribute)(sample)
         return value if isinstance(value, tuple) else (value,)
 
     def restored(self, numbers: Mapping[str, float]) -> Any:
-        """Rebuild the attribute."""
+        """Rebuild the attribute from the numbers by channel."""
         return self.kind(*(numbers[name] for name in self.names))
 
 
 def channels(outputs: Sequence[str]) -> tuple[LogChannels, ...]:
-    """Return the channels of the log, in its order."""
+    """Return the groups of channels of the log, in the order of the log."""
     return (
         LogChannels(["mode"], "state.mode", GuidanceMode),
         LogChannels(["mode.lateral"], "state.lateral", Lateral),
@@ -120,13 +120,13 @@ def names(outputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def require_channels(logged: Collection[str]) -> None:
-    """Refuse a log of guidance that lacks one of the channels of `names`."""
+    """Refuse a log of guidance that lacks a channel of `names`."""
     missing = [name for name in names(()) if name not in logged]
     require(not missing, "guidance", f"a log without {', '.join(missing)}", "all of its channels")
 
 
 def row(sample: GuidanceSample, outputs: Sequence[str]) -> FloatArray:
-    """Write a sample of the log, in the order of `names`."""
+    """Return a sample as a row of the log, in the order of `names`."""
     values = chain.from_iterable(each.logged(sample) for each in channels(outputs))
     return np.array([*values], dtype=np.float64)
 
@@ -134,7 +134,7 @@ def row(sample: GuidanceSample, outputs: Sequence[str]) -> FloatArray:
 def restored(
     t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]
 ) -> tuple[Inputs, GuidanceState]:
-    """Rebuild the inputs of a step and the state after it from a sample of the log."""
+    """Rebuild the inputs of a step and the state after it from a row of the log."""
     attributes = {each.attribute: each.restored(logged) for each in channels(outputs)}
 
     def group(prefix: str) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Types of guidance: modes, targets, parameters, and the inputs and the state of a step."""
+"""Types of guidance: modes, targets, parameters, and the inputs and state of a step."""
 
 from collections.abc import Collection, Mapping
 from enum import IntEnum
@@ -26,27 +26,27 @@ the moon is 4e8 m away."""
 
 
 class GuidanceMode(IntEnum):
-    """What guidance does."""
+    """The mode of guidance."""
 
-    OFF = 0  # no u_m
+    OFF = 0  # no u_m is published
     ENGAGED = 1
-    DEAD_RECKONING = 2  # pose is stale: wings level, attitude from the rates of y
-    POSE_LOST = 3  # pose is stale for longer: rates are zero
+    DEAD_RECKONING = 2  # the pose is stale: wings level, with an attitude from the rates in y
+    POSE_LOST = 3  # the pose has been stale for longer: rates are zero
 
 
 class Lateral(IntEnum):
-    """What the bank controls."""
+    """The quantity that the bank controls."""
 
     PHI = 0
     HEADING = 1
     COURSE = 2
     ORBIT = 3
     ROUTE = 4
-    PLACE = 5  # only of a multicopter: fly to a place, and hover there
+    PLACE = 5  # a place to fly to and hover at; only for a multicopter
 
 
 class Vertical(IntEnum):
-    """What the pitch controls."""
+    """The quantity that the pitch controls."""
 
     THETA = 0
     CLIMB = 1
@@ -55,7 +55,7 @@ class Vertical(IntEnum):
 
 
 class Target(NamedTuple):
-    """Commands by channel, of which those of the active modes take effect."""
+    """Commands by channel; the commands of the active modes take effect."""
 
     phi: float = 0.0  # rad
     heading: float = 0.0  # rad from true north
@@ -68,9 +68,9 @@ class Target(NamedTuple):
     climb: Scalar = 0.0  # m/s
     altitude: Scalar = 0.0  # m
     V: Scalar = 0.0  # airspeed, m/s, absolute
-    # m, distance from the start of a line of the route at which the aircraft joins the line.
+    # m, distance along a line of the route from its start at which the aircraft joins the line
     along: float = 0.0
-    r: float = 0.0  # rad/s, with phi: added to the r of a coordinated turn
+    r: float = 0.0  # rad/s, in the mode of phi: added to the r of a coordinated turn
 
 
 TARGETS = Target._fields
@@ -93,15 +93,15 @@ VERTICAL: Mapping[str, Vertical] = {
 
 
 class TargetChannels(NamedTuple):
-    """The channels of Target that a kind of aircraft takes."""
+    """The channels of Target that an airplane or a multicopter takes."""
 
     lateral: Mapping[str, Lateral]
     vertical: Mapping[str, Vertical]
     further: tuple[str, ...]  # channels that belong to no mode
-    together: Mapping[Lateral, tuple[str, ...]]  # channels of a mode that must come together
+    together: Mapping[Lateral, tuple[str, ...]]  # channels of a mode that must come in one message
 
     def known(self) -> tuple[str, ...]:
-        """Return all of these channels, in the order of TARGETS."""
+        """Return all these channels, in the order of TARGETS."""
         names = {*self.lateral, *self.vertical, *self.further}
         return tuple(name for name in TARGETS if name in names)
 
@@ -135,16 +135,16 @@ class MulticopterParams(NamedTuple):
 
 
 class Home(NamedTuple):
-    """The place to which an aircraft flies home."""
+    """The place to which an aircraft flies home, and its altitude."""
 
     north: float = 0.0  # m
     east: float = 0.0  # m
-    altitude: float | None = None  # m; None: the altitude at which it turns home
-    after_loss: bool = False  # whether the aircraft flies home when pose returns after a loss
+    altitude: float | None = None  # m; if None, the altitude at which the aircraft turns home
+    after_loss: bool = False  # whether the aircraft flies home when the pose returns after a loss
 
 
 class CommandLimits(NamedTuple):
-    """Limits of commands."""
+    """Limits of the commands that guidance takes."""
 
     bank: float  # rad
     least_pitch: float  # rad
@@ -158,9 +158,9 @@ class CommandLimits(NamedTuple):
 
 
 class GuidanceParams(NamedTuple):
-    """Parameters of the step."""
+    """Parameters of a step of guidance."""
 
-    outputs: tuple[str, ...]  # order of u_m
+    outputs: tuple[str, ...]  # names of y and u_m, in their order
     period_ns: int
     speed: float  # trim speed V0, m/s
     k_chi: float  # gain of heading and course, 1/s
@@ -168,42 +168,44 @@ class GuidanceParams(NamedTuple):
     vertical: VerticalParams
     path: PathParams
     limits: CommandLimits
-    slew: tuple[float, ...]  # largest derivatives of u_m
+    slew: tuple[float, ...]  # largest derivative of each value of u_m
     max_age_ns: int
     hold_ns: int
-    turn_lag: float = 0.0  # s, lag of the turn behind the bank that `attitude.turn_lead` leaves
+    # s, lag of the turn behind the bank that remains after `attitude.turn_lead`
+    turn_lag: float = 0.0
     fence: Fence | None = None
     home: Home = Home()
-    link_timeout_ns: int = 0  # largest age of the operator's link; 0: no limit
-    dead: tuple[str, ...] = ()  # outputs whose inputs have no effect, which get no command
-    rolls: bool = True  # whether the ailerons roll; if not, the yaw rate controls the bank
+    link_timeout_ns: int = 0  # ns, largest age of the operator's link; 0 without a limit
+    dead: tuple[str, ...] = ()  # outputs whose input has no effect; they get no command
+    # whether the ailerons roll the aircraft; if not, the yaw rate controls the bank
+    rolls: bool = True
     channels: TargetChannels = AIRPLANE
-    multicopter: MulticopterParams | None = None  # None: an airplane
+    multicopter: MulticopterParams | None = None  # None for an airplane
 
 
 class Begin(IntEnum):
-    """Whether the filters start again at the measured values."""
+    """Whether and how the filters start again at the measured values."""
 
     NO = 0
-    AGAIN = 1  # modes and commands stay (bumpless transfer)
+    AGAIN = 1  # keep modes and commands (bumpless transfer)
     HOLD = 2  # hold the present heading, altitude and airspeed
 
 
 class Inputs(NamedTuple):
-    """Inputs of a step."""
+    """Inputs of a step of guidance."""
 
     t_ns: int
     begin: Begin
     pose: tuple[float, ...]  # the last pose, in the order of POSE
     pose_age_ns: int
     y: tuple[float, ...]  # the last y, in the order of u_m
-    # New commands by channel of Target. Their channels also choose the modes.
+    # New commands by channel of Target. The channels also choose the modes.
     commands: Mapping[str, float]
-    authority: Authority = Authority()  # what the inputs can do, as learned and tested in flight
+    authority: Authority = Authority()  # authority of the inputs, as learned and tested in flight
 
 
 class GuidanceState(NamedTuple):
-    """State after a step."""
+    """State of guidance after a step."""
 
     t_ns: int
     mode: GuidanceMode
@@ -211,35 +213,36 @@ class GuidanceState(NamedTuple):
     vertical: Vertical
     target: Target
     leg: int  # number of the leg of the route
-    phi: float  # attitude, by dead reckoning while pose is stale, rad
+    phi: float  # rad, bank of the attitude, by dead reckoning while the pose is stale
     theta: float
     alpha: float  # estimated angle of attack, rad
-    alpha_trim: float  # the same at the first step
-    slip: float  # acceleration of a turn that a sideslip takes away, m/s^2
-    climb_c: float  # m/s
-    V_c: float  # m/s
+    alpha_trim: float  # estimated angle of attack at the first step, rad
+    slip: float  # acceleration of a turn that is lost by sideslip, m/s^2
+    climb_c: float  # commanded climb rate, m/s
+    V_c: float  # commanded airspeed, m/s
     u_m: tuple[float, ...]
-    joining: Side = Side.NONE  # side of the circle onto the leg
+    joining: Side = Side.NONE  # side of the circle that leads onto the leg
     wind: Wind = (0.0, 0.0)  # estimated velocity of the air: north, east, m/s
     fence: FenceAction = FenceAction.NONE
-    loitered: float = 0.0  # fraction of the turns or the wait of a loiter that is flown
+    loitered: float = 0.0  # fraction of a loiter's turns or wait that is flown
     psi: Scalar = 0.0  # estimated heading, rad
-    # velocity in the pose of this step, for the wind of a multicopter, m/s
+    # velocity in the pose of this step, m/s, from which the wind of a multicopter follows
     velocity: Wind = (0.0, 0.0)
 
 
 class StepCommands(NamedTuple):
-    """Results of a step beside the state, for the log."""
+    """Results of a step that are no part of the state, for the log."""
 
     phi_c: float = 0.0
     theta_c: float = 0.0
     xtrack: float = 0.0  # cross-track error, m, positive to the right of the path
-    to_go: float = 0.0  # m, to the end of the leg, or to the point where the aircraft joins the leg
+    # m, distance to the end of the leg, or to the point where the aircraft joins it
+    to_go: float = 0.0
     track: float = 0.0  # course of the path at the nearest point, rad
-    # m, distance from the end of a leg that ended at this step and was missed, else 0.
+    # m, distance from the end of a leg that ended at this step and counts as missed, else 0
     missed: float = 0.0
     clearance: float = LARGEST  # m, distance from the fence
-    predicted: float = LARGEST  # m, least clearance of the better turn away from the fence
+    predicted: float = LARGEST  # m, least clearance that the better turn away from the fence keeps
     bank_limited: bool = False
     theta_limited: bool = False
     climb_limited: bool = False
@@ -248,7 +251,7 @@ class StepCommands(NamedTuple):
 
 
 def bits(names: Collection[str]) -> int:
-    """Encode the names of targets as the channel `given` of the log: bit k for TARGETS[k]."""
+    """Encode the names of commands as the channel `given` of the log: bit k for TARGETS[k]."""
     return sum(1 << k for k, name in enumerate(TARGETS) if name in names)
 
 
@@ -264,9 +267,10 @@ def begun_again(
     params: GuidanceParams,
     *further: str,
 ) -> GuidanceState:
-    """Return the state `holding` with the fields CARRIED and `further` of an earlier state.
+    """Return the state `holding`, with the fields CARRIED and `further` taken from `state`.
 
-    Up to the age limit of u_m, the reference model still flies the last u_m.
+    `state` is the earlier state. Until the age limit of u_m, the reference model still flies its
+    u_m.
     """
     if state is None or inputs.begin is Begin.HOLD:
         return holding

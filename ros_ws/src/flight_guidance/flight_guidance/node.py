@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The guidance node: from pose, y, target and route to u_m, in real time or in lockstep."""
+"""The guidance node: it turns pose, y, target and route into u_m, in real time or in lockstep."""
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -66,11 +66,13 @@ from flight_ros.topics import (
 # The package comes with a full ROS 2, or from `make messages`.
 TFMessage: Any = resolve_name("tf2_msgs.msg:TFMessage") if find_spec("tf2_msgs") else None
 
-TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # as in tf2_ros
-MAX_TARGETS = 16  # messages of target per tick; later ones wait, so that a flood delays no u_m
+TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # the same as in tf2_ros
+# messages of target per tick; further messages wait, so that a flood delays no u_m
+MAX_TARGETS = 16
 MAX_ROUTE_SIZE = 65_536  # bytes, for 900 waypoints: decoding takes 0.14 ms per waypoint
 CONTROLLER = "controller"  # the node of `internals` and `authority`
-FEWEST_AUTHORITIES = 3  # periods: one sample may be late, and one lost
+# periods without a sample after which `authority` is void: one sample may be late, and one lost
+FEWEST_AUTHORITIES = 3
 ODOMETRY_PERIOD_NS = NANOSECONDS // 10
 PATH_PERIOD_NS = NANOSECONDS
 PATH_LENGTH = 120  # number of poses of the flown path, one per second
@@ -89,12 +91,12 @@ LEVELS = {
 
 
 class GuidanceNode(FlightNode[GuidanceConfig]):
-    """Takes the inputs at every tick, steps `guidance.Guidance` and publishes u_m and guidance.
+    """Steps `guidance.Guidance` at every tick, and publishes u_m and the topic guidance.
 
-    The inputs are the received y, pose, target and route. In real time guidance flies while the
-    controller is ENGAGED. In lockstep the number of samples of y gives the time. A step waits for
-    the y and the pose of its instant and publishes exactly one u_m, which has no channels if
-    guidance has no command.
+    The inputs of a step are the received y, pose, target and route. In real time guidance flies
+    while the controller is ENGAGED. In lockstep the number of samples of y gives the time. A step
+    then waits for the y and the pose of its instant, and publishes exactly one u_m. This u_m has no
+    channels if guidance has no command.
     """
 
     def __init__(self) -> None:
@@ -104,13 +106,14 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._y = self._receive(Y, Decoder(outputs).decode, self._guidance.take_y)
         self._named = NamedDecoder()
         self._pose = self._receive(POSE, self._decode_pose, self._guidance.take_pose)
-        # An operator uses the system clock, so with simulated time there is no age limit. Otherwise
-        # a target from before a stop of guidance is void, because the operator knows of the stop.
+        # An operator uses the system clock, so there is no age limit with simulated time. Without
+        # simulated time, a target that was sent before guidance stopped is void, because the
+        # operator knows of the stop.
         max_age_ns = None if self.parameters.lockstep or self.simulated else self._max_age_ns
         self._target = self.receive(
             TARGET, self._named.decode, self._take_target, max_age_ns=max_age_ns, qos=NEWEST_SAMPLES
         )
-        self._route_subscription = self.subscribe(ROUTE, STATE)  # the newest route alone
+        self._route_subscription = self.subscribe(ROUTE, STATE)  # only the newest route
         self._publish_u_m, self._publish_log = self.advertise(U_M), self.advertise(GUIDANCE)
         self._u_m_encoder = self.encoder((*outputs, *channels.ATTITUDE))
         self._log_encoder = self.encoder(self._guidance.names)
@@ -119,7 +122,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._wait_reason: Refusal | None = None
         self._authority = self._receive_authority()
         self._authorities = deque[StampedVector]()
-        # stamp of the last `authority`; -1 if there is none, or if it is void
+        # stamp of the last `authority`; -1 if none has come, or if the last one is void
         self._authority_ns = -1
         self._has_authority = True
         if self.parameters.lockstep:
@@ -140,7 +143,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             self._view, (ODOMETRY, IMU, FIX, WIND)
         )
         self._path, self._markers = (self._view(topic, PATH_PERIOD_NS) for topic in (PATH, MARKERS))
-        # REP 105: with several aircraft, each body frame has a prefix, and they share the map
+        # REP 105: with several aircraft, each body frame has a prefix, and the aircraft share the
+        # map
         self._body = f"{self.get_namespace()}/{BODY}".lstrip("/")
         if TFMessage is None:
             self._broadcast = None
@@ -189,7 +193,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             if y is not None:
                 self._y.accept(y, now_ns)
             for pose in poses:
-                # A pose without channels says that there is no pose of this instant.
+                # A pose without channels means that this instant has no pose.
                 if pose.value.size:
                     self._pose.accept(pose, now_ns)
             if due and (output := self._step(now_ns, now_ns)) is not None:
@@ -205,9 +209,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return (self._pose if self._inputs.has_y else self._y).name
 
     def _receives_authority(self, now_ns: int) -> bool:
-        """In lockstep, return whether the last `authority` that is due before a step has arrived.
+        """In lockstep, return whether the last `authority` that a step needs has arrived.
 
-        A controller that learns sends `authority`.
+        A controller that learns sends `authority` in equal periods.
         """
         if self._authority is None or not now_ns:
             return True
@@ -218,8 +222,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self._has_authority
 
     def _step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
-        # An `authority` with the stamp of this step may come before or after the step. In lockstep
-        # it therefore acts from the next step on.
+        # An `authority` with the stamp of this step may arrive before or after the step. So in
+        # lockstep it acts from the next step on.
         while self._authorities and (
             self._authorities[0].stamp_ns < now_ns or not self.parameters.lockstep
         ):
@@ -268,7 +272,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self.receive(topic, decode, take, max_age_ns=self._max_age_ns, lock=lock)
 
     def _decode_pose(self, raw: bytes) -> StampedVector:
-        """Decode a pose in the order of `channels.POSE`, without sideslip if there is none."""
+        """Decode a pose in the order of `channels.POSE`; it may lack the sideslip."""
         sample = self._named.decode(raw)
         if self.parameters.lockstep and not sample.channels:
             return StampedVector(sample.stamp_ns, np.array(()), sample.sender)
@@ -281,11 +285,11 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return nanoseconds(self.parameters.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Return the ages above which a publisher of y, pose or internals has timed out, ns."""
+        """Return the ages above which y or pose, and internals, have timed out, ns."""
         return self._max_age_ns(), self._max_age_ns() + nanoseconds(self.parameters.hold)
 
     def _take_target(self, sample: NamedSample, now_ns: int) -> None:
-        # A target without channels only keeps the operator's link.
+        # A target without channels only keeps the operator's link alive.
         if sample.channels:
             self._guidance.take_target(sample.channels)
         self._guidance.keep_link()
@@ -318,7 +322,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     def _receive_authority(self) -> Receiver[StampedVector] | None:
         """Make the receiver of `authority`; None in a flight without a learner.
 
-        Without a learner only an unexpected publisher would send it.
+        In a flight without a learner, only an unexpected publisher would send it.
         """
         rate = self.parameters.authority_rate
         self._authority_period_ns = period_ns(rate, "authority_rate") if rate else 0
@@ -329,20 +333,20 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             Decoder(AUTHORITY_CHANNELS).decode,
             self._take_authority,
             max_age_ns=None if self.parameters.lockstep else self._max_age_ns,
-            # In real time, `_take_authority` takes it only from the publisher of `internals`.
+            # In real time, `_take_authority` accepts it only from the publisher of `internals`.
             lock=LockstepLock() if self.parameters.lockstep else None,
             qos=LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES,
         )
 
     def _controller(self) -> str | None:
-        """Return the name of the controller that flies, or None before its first sample."""
-        # In lockstep the sender has no process in its name.
+        """Return the name of the controller that flies; None before its first sample."""
+        # In lockstep a sender's name has no process.
         if self.parameters.lockstep:
             return f"{self.get_namespace().rstrip('/')}/{CONTROLLER}"
         return None if self._internals.lock is None else self._internals.lock.publisher
 
     def _poll_authority(self, now_ns: int) -> None:
-        """In real time, take `authority`.
+        """In real time, take the `authority` that has arrived.
 
         The last sample is void after FEWEST_AUTHORITIES periods plus the age limit.
         """
@@ -373,10 +377,10 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._authority_ns = sample.stamp_ns
 
     def _take_mode(self, sample: StampedVector, now_ns: int) -> None:
-        """Fly while the controller is ENGAGED.
+        """Take the mode of the controller: guidance flies while it is ENGAGED.
 
         After INACTIVE, guidance holds the measured heading, altitude and airspeed. After a failsafe
-        it continues.
+        it continues with its last commands.
         """
         try:
             mode = Mode(int(sample.value[0]))
@@ -413,7 +417,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             setattr(pose_of_message.orientation, key, value)
         for key, value in zip("xyz", body_velocity(pose), strict=True):
             setattr(message.twist.twist.linear, key, value)
-        speed = self.parameters.speed + y.get("V", 0.0)  # a multicopter has no V but measures r
+        speed = self.parameters.speed + y.get("V", 0.0)  # a multicopter has no V, but measures r
         r = yaw_rate(y, pose["phi"], pose["theta"], speed)
         for key, value in zip("xyz", (y["p"], -y["q"], -r), strict=True):
             setattr(message.twist.twist.angular, key, value)
@@ -424,16 +428,16 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self.create_publisher(topic.type, topic.name, publisher_qos(period_ns))
 
     def _publish_sensors(self, odometry: Odometry) -> None:
-        """Publish attitude and rates, the place on the Earth, and the estimated wind.
+        """Publish attitude and rates, the position on the Earth, and the estimated wind.
 
-        The place is published only if an origin is given. The wind is the velocity of the air.
+        The position is published only if an origin is given. The wind is the velocity of the air.
         """
         place = odometry.pose.pose
         twist = odometry.twist.twist
         imu = Imu(orientation=place.orientation, angular_velocity=twist.angular)
         imu.header.stamp = odometry.header.stamp
         imu.header.frame_id = self._body
-        # -1 stands for no estimate, as the definition of the message says.
+        # -1 means no estimate, by the definition of the message
         imu.linear_acceleration_covariance[0] = -1.0
         self._imu.publish(imu)
         wind = Vector3Stamped(header=odometry.header)
@@ -494,9 +498,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
 def _service(
     answer: Callable[[Any], bool | str], called: Callable[[], None]
 ) -> Callable[[Any, Any], Any]:
-    """Make a service callback whose response is True, or a sentence of refusal.
+    """Make a service callback that answers True, or a sentence of refusal.
 
-    `called` is called first at each call of the service.
+    Each call of the service first calls `called`.
     """
 
     def callback(request: Any, response: Any) -> Any:

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Notices of guidance.
+"""Write the notices of guidance: sentences on events of a flight.
 
 They report a missed leg, a go-around, the fence, a flight carried back, a strong wind, a lost link,
-and new limits. The node logs the sentences as warnings, and the summary of a flight takes the same
+and new limits. The node logs the sentences as warnings. The summary of a flight makes the same
 sentences from the log.
 """
 
@@ -50,9 +50,10 @@ class Notice(NamedTuple):
 
 
 def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
-    """Return whether an aircraft that flies ahead along a path goes back along it over ground.
+    """Return whether the wind carries an aircraft back along its path, although it flies ahead.
 
-    Through the air it flies ahead. `log` has the channels of `guidance`, as values or arrays.
+    It flies ahead through the air, but goes back over ground. `log` has the channels of `guidance`,
+    as values or arrays.
     """
     track = log["track"]
     lateral = log["mode.lateral"]
@@ -69,9 +70,9 @@ TURNS = {FenceAction.RIGHT, FenceAction.LEFT}
 
 
 class _Lasting:
-    """Decides when a notice is due, because a condition has lasted for `dwell`.
+    """Decides when a notice is due, because a condition has lasted for the time `dwell`.
 
-    The notice is due once, and again only after the condition has been over for `dwell`.
+    The notice is due once. It is due again only after the condition has been over for `dwell`.
     """
 
     def __init__(self, dwell: float = DWELL) -> None:
@@ -93,12 +94,12 @@ class _Lasting:
 
 
 class Notices:
-    """The notices of a flight, sample by sample of the log of guidance.
+    """The notices of a flight, made from the log of guidance row by row.
 
-    `wind` is guidance.wind, m/s; `max_age` is guidance.max_age, s; `largest_wind` gives, for an
-    airspeed command in m/s, the wind up to which circles fit into the bank; `link_timeout` is
-    guidance.home.link_timeout, s; `reach` is `targets.reach_sentence`; `largest_tilt` is that of a
-    multicopter, rad; `landing` is that of the route.
+    `wind` is guidance.wind, m/s, and `max_age` is guidance.max_age, s. `largest_wind` returns, for
+    a commanded airspeed in m/s, the wind up to which circles fit into the largest bank.
+    `link_timeout` is guidance.home.link_timeout, s. `reach` is `targets.reach_sentence`.
+    `largest_tilt` is that of a multicopter, rad. `landing` is that of the route.
     """
 
     CHANNELS = (
@@ -146,7 +147,7 @@ class Notices:
         self._strong = _Lasting()
         self._leg = 0
         self._action = FenceAction.NONE
-        # flight time of leaving the fence, s; NaN while inside
+        # flight time at which the aircraft left the fence, s; NaN while it is inside
         self._outside_from = math.nan
         self._farthest = 0.0
 
@@ -155,7 +156,7 @@ class Notices:
         before = self._leg
         self._leg = int(log["leg"])
         texts = []
-        # The events of this step: a leg, the landing, the fence, new limits.
+        # The events of this step are a leg, the landing, the fence and new limits.
         if log["missed"] > 0.0:
             texts.append(f"leg {before} missed by {log['missed']:.0f} m")
         if self._landing is not None and before == self._landing.leg < self._leg:
@@ -178,7 +179,7 @@ class Notices:
             self._reach_text = self._reach(authority)
             if self._reach_text != earlier:
                 texts.append(f"from now on {self._reach_text or 'own limits again'}")
-        # The conditions that must last: the link, the pose, the tilt, the wind.
+        # The conditions that must last are those of the link, the pose, the tilt and the wind.
         if self._link.due(t, holds=log[LINK_AGE] > self._link_timeout):
             texts.append(f"no message of an operator for {self._link_timeout:g} s: home")
         if self._stale.due(t, holds=log["age.pose"] > self._max_age):
@@ -207,7 +208,7 @@ class Notices:
     def _outside(self, t: float, clearance: float) -> list[str]:
         """Return the sentence if the aircraft leaves the fence, or is back inside.
 
-        While pose is lost, there is no sentence, because neither is known.
+        While the pose is lost, there is no sentence, because the position is unknown.
         """
         if clearance >= LARGEST:
             return []
@@ -227,7 +228,7 @@ class Notices:
         return []
 
     def read_log(self, t: Array, log: Mapping[str, Array]) -> list[Notice]:
-        """Return the notices of a whole log, with arrays as channels."""
+        """Return the notices of a whole log, whose channels are arrays."""
         columns = [log[name].tolist() for name in self.CHANNELS]
         notices: list[Notice] = []
         for instant, *row in zip(t.tolist(), *columns, strict=True):

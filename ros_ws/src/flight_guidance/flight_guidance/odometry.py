@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Pose as odometry of REP 103.
+"""Convert a pose to odometry by REP 103.
 
-The axes of the map frame are east, north and up; those of the body frame forward, left and up.
+The axes of the map frame are east, north and up. Those of the body frame are forward, left and up.
 """
 
 import math
 from collections.abc import Mapping
 
-# Frames of REP 105: east, north, up; forward, left, up.
+# Frames of REP 105, with axes east, north, up and forward, left, up.
 MAP = "map"
 BODY = "base_link"
 ROUTE_FRAMES = (MAP, "")  # frames of a route that guidance takes
@@ -17,7 +17,7 @@ ROUTE_FRAMES = (MAP, "")  # frames of a route that guidance takes
 def quaternion(phi: float, theta: float, psi: float) -> tuple[float, float, float, float]:
     """Compute the orientation x, y, z, w of forward-left-up in east-north-up.
 
-    It is R_z(pi/2 - psi) R_y(-theta) R_x(phi), with angles in rad.
+    The rotation is R_z(pi/2 - psi) R_y(-theta) R_x(phi), with angles in rad.
     """
     (cr, sr), (cp, sp), (cy, sy) = (
         (math.cos(angle / 2.0), math.sin(angle / 2.0))
@@ -32,7 +32,7 @@ def quaternion(phi: float, theta: float, psi: float) -> tuple[float, float, floa
 
 
 def body_velocity(pose: Mapping[str, float]) -> tuple[float, float, float]:
-    """Return the velocity over ground forward, left and up in the body frame, m/s, from a pose."""
+    """Return the velocity over ground of a pose in the body frame, m/s: forward, left, up."""
     phi = pose["phi"]
     theta = pose["theta"]
     psi = pose["psi"]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the guidance node: steering, targets, route, fence, landing and home."""
+"""Parameters of the guidance node: steering, commands, route, fence, landing and home."""
 
 import math
 from collections.abc import Sequence
@@ -99,7 +99,7 @@ class GuidanceConfig(SteeringConfig):
             self._check_multicopter()
         else:
             self._check_airplane()
-        # Check route, landing and program. For this the numbers of the equations are needed.
+        # Check route, landing and program, which needs the numbers of the equations.
         params = self.params()
         route = None if self.route is None else self.plan(self.waypoints())
         if self.landing is not None:
@@ -110,7 +110,7 @@ class GuidanceConfig(SteeringConfig):
             read_target(target, params, route, f"program at {start:g} s")
 
     def _check_multicopter(self) -> None:
-        """Refuse what only an airplane has, and a home outside the fence."""
+        """Refuse parameters that only an airplane has, and a home outside the fence."""
         for key in ("stall_speed", "landing", "touchdown", "throttle_authority"):
             require(not getattr(self, key), key, getattr(self, key), "none of a multicopter")
         inside = self.fence_clearance(self.home.north, self.home.east)
@@ -158,7 +158,7 @@ class GuidanceConfig(SteeringConfig):
             require(False, "home", turn, f"at least {margin:.0f} m inside; {size}")
 
     def _at_home(self) -> Motion:
-        """Return the motion in level flight over home, from which turns are predicted."""
+        """Return the motion in level flight over home, from which the fence predicts turns."""
         params = self.params()
         limits = params.limits
         bank = protection.bank_limit(limits.bank, limits.stall_speed, self.speed)
@@ -176,7 +176,7 @@ class GuidanceConfig(SteeringConfig):
         )
 
     def fence_zones(self) -> Fence | None:
-        """Return the fence as the equations use it; None if there are no zones."""
+        """Return the fence for the equations; None without zones."""
         zones = tuple(zone.zone() for zone in self.fence.values())
         if not zones:
             return None
@@ -184,7 +184,7 @@ class GuidanceConfig(SteeringConfig):
         return Fence(zones, (self.home.north, self.home.east), radius)
 
     def fence_clearance(self, north: float, east: float) -> float:
-        """Return the distance of a place from the fence, m, negative outside; infinite if none."""
+        """Return a place's distance from the fence, m, negative outside, infinite without one."""
         fence = self.fence_zones()
         if fence is None:
             return math.inf
@@ -193,12 +193,12 @@ class GuidanceConfig(SteeringConfig):
     def fence_margin(self, speed: float) -> float:
         """Return the least distance that a route must keep from the fence at an airspeed, m.
 
-        It is MARGIN of flight with a tailwind.
+        It is the distance flown in the time MARGIN with a tailwind.
         """
         return MARGIN * (speed + self.wind)
 
     def params(self) -> GuidanceParams:
-        """Return the numbers that the equations use."""
+        """Return the numbers that the equations of guidance use."""
         return GuidanceParams(
             outputs=self.outputs,
             period_ns=period_ns(self.rate, "rate"),
@@ -238,7 +238,7 @@ class GuidanceConfig(SteeringConfig):
         )
 
     def waypoints(self) -> tuple[Waypoint, ...]:
-        """Return the waypoints of the section's route; none without a route."""
+        """Return the waypoints of the section route; none if there is no route."""
         return () if self.route is None else self.route.waypoints()
 
     def plan(self, waypoints: Sequence[Waypoint]) -> Route:
@@ -307,8 +307,8 @@ class GuidanceConfig(SteeringConfig):
     def landing_on(self, route: Route) -> Landing | None:
         """Find the landing at the end of a line of a route; None if there is none.
 
-        Raises ParameterError for a waypoint that no line leads to or from which none goes straight
-        on, a line that does not descend, and an airspeed out of bounds.
+        Raises ParameterError if no line leads to the waypoint, if no line goes straight on from it,
+        if the line does not descend, and for an airspeed out of bounds.
         """
         if (section := self.landing) is None:
             return None
@@ -328,12 +328,12 @@ class GuidanceConfig(SteeringConfig):
         return landing_at(waypoints[number].point, route, section, box, self.params())
 
     def lander(self, route: Route | None) -> Lander | None:
-        """Return the lander for the route of the parameters; None if there is no landing."""
+        """Return the lander for the route of the parameters; None without a landing."""
         landing = None if route is None else self.landing_on(route)
         return None if landing is None else Lander(landing, self.params())
 
     def program_steps(self) -> list[tuple[float, dict[str, float]]]:
-        """Return the targets of the program by instant, in order: (s, {channel: value})."""
+        """Return the commands of the program in order of time: (s, {channel: value})."""
         for name in self.program:
             require(name in TARGETS, f"program.{name}", "a channel", f"one of {', '.join(TARGETS)}")
         steps: dict[float, dict[str, float]] = {}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of commands that follow from the authority of the inputs.
+"""Derive limits of commands from the authority of the inputs.
 
-At the start the authority is given by rule, later by a model that is learned in flight.
+At the start the authority is given by rule. Later a model that is learned in flight gives it.
 """
 
 import math
@@ -51,7 +51,7 @@ rolls with up to half of the command."""
 
 
 class Authority(NamedTuple):
-    """Rate at which each input can at least change its output from trim, units of y / s.
+    """Least rate at which each input can change its output from trim, units of y / s.
 
     It is 0 if the input has no effect, and UNKNOWN if no model is learned.
     """
@@ -68,7 +68,8 @@ class RollTest(NamedTuple):
 
         a_dot = p_m^2 - a / MEMORY,   f_dot = p_m p - f / MEMORY
 
-    By least squares, f / a is the fraction of the command that the aircraft follows.
+    By least squares, f / a is the fraction of the command that the aircraft follows. The evidence,
+    on which the test decides, is a.
     """
 
     asked: float = 0.0  # a, rad^2/s
@@ -78,7 +79,7 @@ class RollTest(NamedTuple):
     def after(self, dt: float, command: float, p: float, largest: float) -> "RollTest":
         """Return the test after a step of a command, at most `largest`, and a measured p, rad/s.
 
-        If there is less evidence than ASKED, the verdict stays.
+        If the evidence a is below ASKED, the verdict stays.
         """
         memory = math.exp(-dt / MEMORY)
         asked = memory * self.asked + dt * command**2
@@ -94,14 +95,14 @@ AUTHORITY = tuple(f"{side}.{name}" for side, name in product(SIDES, ("q", "p", "
 
 
 def authority_of(channels: Mapping[str, float]) -> Authority:
-    """Read the channels of the topic; for q and p the lesser of both directions counts."""
+    """Read the authority from the topic's channels; q and p have the lesser of two directions."""
     q = min(channels[f"{side}.q"] for side in SIDES)
     p = min(channels[f"{side}.p"] for side in SIDES)
     return Authority(q, p, *(channels[f"{side}.V"] for side in SIDES))
 
 
 def climb_rates(down: float, up: float, speed: float) -> tuple[float, float]:
-    """Compute the climb and sink rate that full throttle up and down gives, m/s.
+    """Compute the climb rate at full throttle and the sink rate at no throttle, m/s.
 
     They are a V0 / g times the fractions CLIMB and SINK; a is the authority of the throttle.
     """
@@ -109,14 +110,14 @@ def climb_rates(down: float, up: float, speed: float) -> tuple[float, float]:
 
 
 def roll_rate(authority: float, frequency: float) -> float:
-    """Compute the roll rate p_max, rad/s.
+    """Compute the roll rate p_max for an authority of the aileron, rad/s.
 
-    0.4 w p_max, the largest p_m_dot of the reference after a step, is then a third of the
-    authority.
+    With it, the largest p_m_dot of the reference after a step, 0.4 w p_max, is a third of the
+    authority. w is the natural frequency of the reference.
     """
     return authority / (3.0 * 0.4 * frequency)
 
 
 def least_period(bank: float, rate: float) -> float:
-    """Compute the least period of path following for reversals of a bank at a roll rate, s."""
+    """Compute the least period of path following in which a bank can be reversed, s."""
     return REVERSALS * bank / rate

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sections of the parameters of guidance: commands over time, route, zones, home, landing."""
+"""Sections of guidance's parameters: commands over time, route, zones, home, landing."""
 
 from typing import Annotated
 
@@ -19,7 +19,7 @@ from flight_guidance.routes.route_file import Waypoint
 
 
 class Steps(Config):
-    """Successive commands of a channel of `target`."""
+    """Commands of a channel of `target`, one after another in time."""
 
     start: Annotated[tuple[NonNegative, ...], Field(min_length=1)] = Field(description="times, s")
     value: Numbers = Field(description="values, in the channel's unit")
@@ -33,7 +33,7 @@ class Steps(Config):
 
 
 class RouteConfig(Config):
-    """Waypoints in the local tangent plane of `pose`."""
+    """A route by waypoints in the local tangent plane of `pose`."""
 
     north: Numbers = Field(description="distance to the north of the origin, m")
     east: Numbers = Field(description="distance to the east of the origin, m")
@@ -76,7 +76,7 @@ class RouteConfig(Config):
         )
 
     def waypoints(self) -> tuple[Waypoint, ...]:
-        """Return the waypoints that the equations use."""
+        """Return the waypoints for the equations."""
         count = len(self.north)
         columns = (
             self.V or (None,) * count,
@@ -129,7 +129,7 @@ class ZoneConfig(Config):
         )
 
     def zone(self) -> Zone:
-        """Return the zone that the equations use."""
+        """Return the zone for the equations."""
         return Zone(
             north=self.north,
             east=self.east,
@@ -140,10 +140,10 @@ class ZoneConfig(Config):
 
 
 class HomeConfig(Config):
-    """Where the aircraft goes at a fence and by `guidance/home`.
+    """The place to which the aircraft flies at a fence and by `guidance/home`.
 
-    By `after_loss` and `link_timeout` it also goes there after a loss of pose or of the operator's
-    link.
+    It also flies there after a loss of pose (`after_loss`) or of the operator's link
+    (`link_timeout`).
     """
 
     north: Number = Field(default=0.0, description="distance to the north of the origin, m")
@@ -161,9 +161,9 @@ class HomeConfig(Config):
 
 
 class LandingConfig(Config):
-    """A landing at a waypoint of the route; the line to the waypoint is the glide path.
+    """A landing at a waypoint of the route. The line to the waypoint is the glide path.
 
-    The next line must go straight on. The aircraft flies along it in a go-around.
+    The next line must go straight on, because the aircraft flies along it in a go-around.
     """
 
     waypoint: Annotated[int, Field(ge=1, le=10_000)] = Field(

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of steering: limits and gains of an aircraft.
+"""Parameters of steering: the limits and gains of guidance for an aircraft.
 
-A parameter that is left out follows by rule from the reference model, the throttle and the speeds.
+A parameter that a file leaves out follows by rule from the reference model, the throttle and the
+speeds.
 """
 
 import math
@@ -55,7 +56,7 @@ STEEPEST = 0.1
 
 
 class SteeringConfig(NodeConfig):
-    """Parameters of steering, and the numbers of its equations."""
+    """Parameters of steering, and the numbers of the equations that follow from them."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(
         default=50.0, description="rate at which u_m is published, Hz"
@@ -157,7 +158,7 @@ class SteeringConfig(NodeConfig):
         return self.speed_limit or protection.FASTEST * self.speed
 
     def altitudes(self) -> tuple[float, float]:
-        """Return least and largest altitude, m."""
+        """Return the least and the largest altitude, m."""
         return (
             -math.inf if self.altitude_floor is None else self.altitude_floor,
             math.inf if self.ceiling is None else self.ceiling,
@@ -166,8 +167,8 @@ class SteeringConfig(NodeConfig):
     def largest_roll_rate(self) -> float:
         """Return the largest roll rate p_max, rad/s.
 
-        It is 0.35, or less if 0.4 w p_max, the largest p_m_dot after a step, would exceed a third
-        of the authority.
+        It is 0.35, but less if 0.4 w p_max would exceed a third of the authority. This product is
+        the largest p_m_dot after a step, and w is the natural frequency of the reference of p.
         """
         frequency = self._frequency()["p"]
         authority = math.inf if self.roll_authority is None else self.roll_authority
@@ -195,9 +196,9 @@ class SteeringConfig(NodeConfig):
     def climb_limits(self) -> tuple[float, float]:
         """Return the largest climb and sink rate, m/s.
 
-        By rule they are 0.7 and 0.5 of the rates a V0 / g that full throttle gives, and at most a
-        tenth of V0. The rest of the throttle holds the airspeed. If this rest is too small,
-        `protection.climb_range` reduces the climb.
+        By rule the climb and sink rates are 0.7 and 0.5 of the rates a V0 / g, where a is the
+        authority of the throttle, and at most a tenth of V0. The rest of the throttle holds the
+        airspeed. If this rest is too small, `protection.climb_range` reduces the climb.
         """
         steepest = STEEPEST * self.speed
         down, up = self.throttle_authority or (math.inf, math.inf)
@@ -214,7 +215,7 @@ class SteeringConfig(NodeConfig):
         climb, sink = self.climb_limits()
         roll = frequency["p"] / 4.0
         pitch = frequency["q"] / 4.0
-        # Without a rudder the turn follows the bank.
+        # without a rudder the turn follows the bank
         yaw = frequency.get("r", frequency["p"])
         lead = TURN_LEAD / yaw if "r" in frequency else 0.0
         turn = GRAVITY * math.tan(self.bank) / self.speed
@@ -304,10 +305,10 @@ class SteeringConfig(NodeConfig):
         }
 
     def _vertical(self, climb: float, sink: float) -> VerticalParams:
-        """Return the altitude loop.
+        """Return the parameters of the altitude loop.
 
-        If the lag T_L of the flight path is known, then by rule T >= T_L and k_h <= 0.4 / T_L. The
-        flight path then has a damping of at least 0.5, and the altitude a gain margin of 2.5 by
+        If the lag T_L of the flight path is known, the rule requires T >= T_L and k_h <= 0.4 / T_L.
+        The flight path then has a damping of at least 0.5, and the altitude a gain margin of 2.5 by
         Routh's criterion.
         """
         lag = path_lag(self.stall_speed, self.speed) if self.stall_speed else 0.0

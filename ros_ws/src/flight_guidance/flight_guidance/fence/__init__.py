@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fence: zones, the last safe turn, and the ways home inside the fence."""
+"""Keep an aircraft inside a fence: zones, the last safe turn, and the ways home."""

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fence: zones to stay in and zones to keep out of, enforced by the last safe turn.
+"""Enforce a fence, which has zones to stay in and zones to keep out of, by the last safe turn.
 
-Each step predicts the turn at the largest bank to either side, until the course points along the
-way home. Once the better of the two turns comes nearer to the fence than MARGIN of flight, the
-aircraft flies that turn, then home. If it is outside, it first flies the shortest way back inside,
-then home. Functions take Python floats, or arrays with an element per aircraft of a fleet.
+Each step predicts the turns at the largest bank to the right and to the left. A turn lasts until
+the course points along the way home. Once the better of the two turns comes nearer to the fence
+than MARGIN of flight, the aircraft flies this turn, and then home. An aircraft outside first flies
+the shortest way back inside, and then home. Functions take Python floats, or arrays with an element
+for each aircraft of a fleet.
 """
 
 import math
@@ -52,22 +53,22 @@ every entry of A and B is off by up to 30 %, and of 0.09 on JSBSim's f16.
 
 
 class Motion(NamedTuple):
-    """What the prediction needs to know of an aircraft, and the limits of the turn."""
+    """The motion of an aircraft from which a turn is predicted, and the limits of the turn."""
 
     north: Scalar  # m
     east: Scalar  # m
-    phi: Scalar  # rad, bank after a roll that is under way has ended
+    phi: Scalar  # rad, bank at the end of a roll that is under way
     heading: Scalar  # rad, psi + beta
     speed: Scalar  # airspeed, m/s
     wind: tuple[Scalar, Scalar]  # velocity of the air: north, east, m/s
     bank: Scalar  # largest bank, rad
     roll_rate: float  # rad/s
-    # s, lag of the turn behind the commanded bank: half of 1 / k_phi, plus `turn_lag`.
+    # s, lag of the turn behind the commanded bank, which is 1 / (2 k_phi) plus `turn_lag`.
     lag: float
 
 
 def _remaining(side: Array, bearing: Array, course: Array) -> Array:
-    """Return the angle of a turn to a side from the course to a bearing, rad, 0 to 2 pi."""
+    """Return the angle of a turn to the given side from the course to a bearing, rad, 0 to 2 pi."""
     return side * (bearing - course) % (2.0 * math.pi)
 
 
@@ -78,13 +79,14 @@ def _bearing(chart: Ways, fence: Fence, north: Array, east: Array) -> Array:
 
 
 def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
-    """Compute the least clearance of the turn to the right and to the left, m.
+    """Compute the least clearance from the fence in a turn to the right and to the left, m.
 
         phi' = p_max after the lag, to the largest bank;  chi' = share g tan(phi) / V;
             [n, e]' = V [cos, sin](chi) + W
 
-    The turn ends when the course is HOMEWARD short of the way home, at the latest after nearly a
-    full turn at LEAST_TURN or more. It is integrated by the trapezoidal rule over POINTS.
+    The turn ends when the course is HOMEWARD short of the bearing home, and at the latest after
+    nearly a full turn at a rate of LEAST_TURN or more. It is integrated by the trapezoidal rule
+    over POINTS. The lesser clearance over the SHARES counts.
     """
     xp = array_namespace(motion.phi)
     axes = (1,) * np.ndim(motion.phi)
@@ -123,9 +125,9 @@ COURSES = 24
 def room_at_home(fence: Fence, motion: Motion, wind: float) -> float:
     """Compute the least clearance of the better turn from home onto the orbit, m.
 
-    It is the least over COURSES courses and COURSES directions of a wind, m/s. `motion` is that of
-    the aircraft at home. An aircraft may come over home on any course, and its turn onto the orbit
-    may lead outside of the orbit by up to twice the radius of the turn.
+    The result is the least value over COURSES courses and COURSES directions of a wind of `wind`,
+    m/s. `motion` is that of the aircraft at home. An aircraft may come over home on any course, and
+    its turn onto the orbit may lead outside of the orbit by up to twice the radius of the turn.
     """
     angles = np.linspace(0.0, 2.0 * math.pi, COURSES, endpoint=False)
     from_sides = angles if wind else angles[:1]
@@ -141,9 +143,9 @@ def room_at_home(fence: Fence, motion: Motion, wind: float) -> float:
 
 
 def _integral(rate: Array, longest: Array) -> Array:
-    """Integrate a rate from 0 over axis 1, given at POINTS equal times up to `longest`.
+    """Integrate a rate over axis 1 by the trapezoidal rule, from 0 on.
 
-    The trapezoidal rule is used.
+    The rate is given at POINTS equally spaced times up to `longest`.
     """
     xp = array_namespace(rate)
     steps = 0.5 * (rate[:, 1:] + rate[:, :-1]) * (longest / (POINTS - 1))
@@ -151,34 +153,34 @@ def _integral(rate: Array, longest: Array) -> Array:
 
 
 class FenceAction(IntEnum):
-    """What the fence makes the aircraft do. A turn has the sign of its bank."""
+    """The action of the fence on an aircraft. A turn has the sign of its bank."""
 
     NONE = 0
     RIGHT = 1
     LEFT = -1
-    HOME = 2  # the way home in a straight line
-    BACK = 3  # the shortest way back from outside
+    HOME = 2  # the straight way home
+    BACK = 3  # the shortest way back inside
     AROUND = 4  # the way home around a zone or a corner
 
 
 class Escape(NamedTuple):
-    """Result of `last_safe_turn`."""
+    """The action that `last_safe_turn` chooses, with the clearances on which it depends."""
 
     action: Any  # FenceAction, or an array of its values
-    begins: Any  # whether the fence begins to act at this step
+    begins: Any  # whether the action begins at this step
     clearance: Any  # m, present clearance
-    predicted: Any  # m, least clearance along the best way
+    predicted: Any  # m, least predicted clearance on the best way
     course: Any  # rad, course of the way home over ground
 
 
 def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
-    """Choose the action of the fence after a step, given the action before.
+    """Choose the action of the fence after a step; `action` is that of the previous step.
 
-    A turn begins when the better turn comes nearer to the fence than MARGIN of flight. It ends
-    when the course is HOMEWARD short of the way home, or later if this way is not free yet. On the
-    way home a turn begins only if it keeps a larger clearance than the way, and if both clearances
-    are below MARGIN of flight and below the present clearance. Outside no turn begins: the aircraft
-    flies back until it is MARGIN inside.
+    A turn begins when the better of the two turns comes nearer to the fence than MARGIN of flight.
+    It ends when the course is HOMEWARD short of the bearing home, or later if the way home is not
+    free yet. On the way home, a turn begins only if it keeps a larger clearance than this way. The
+    clearances of turn and way must also be below MARGIN of flight and below the present clearance.
+    Outside the fence no turn begins, and the aircraft flies back until it is MARGIN inside.
     """
     if isinstance(motion.phi, float):
         north, east, phi = map(np.float64, (motion.north, motion.east, motion.phi))

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ways home inside a fence, and back inside from outside.
+"""Compute the ways home inside a fence, and the ways back inside from outside.
 
-The ways are stored in a map of square cells, which is made once for a fence. It has the shortest
-ways over cells that stay inside the fence and, where possible, leave room for a turn. Each cell has
-an aim, a place on the way about a radius ahead. An aircraft comes home if it always flies the
-course to the aim of the cell that it is in.
+A map of square cells stores the ways. It is made once for a fence. The map has the shortest ways
+over cells that stay inside the fence and, where possible, leave room for a turn. Each cell has an
+aim, which is a place on the way about a radius ahead. An aircraft comes home if it always flies the
+course to the aim of the cell in which it is.
 """
 
 import math
@@ -33,19 +33,19 @@ POINTS = 64
 
 
 class Ways(NamedTuple):
-    """The map: the aim of each cell, and whether the straight way home from it is free.
+    """The map of a fence: the aim of each cell, and whether its straight way home is free.
 
-    The straight way leads onto the orbit round home. Shapes are (rows, columns).
+    The straight way leads onto the orbit round home. The arrays have shape (rows, columns).
     """
 
     corner: tuple[float, float]  # north, east of the first cell, m
-    cell: float  # m
-    north: FloatArray  # m
-    east: FloatArray  # m
+    cell: float  # m, length of a cell's side
+    north: FloatArray  # m, north of the aims
+    east: FloatArray  # m, east of the aims
     straight: NDArray[np.bool_]
 
     def aim(self, fence: Fence, north: Array, east: Array) -> tuple[Array, Array, Array]:
-        """Return the aim of places, north and east, m, and whether the straight way home is free.
+        """Return the aim of places, north and east, m, and whether the way home is straight.
 
         For a place outside of the map, the aim is the nearest cell.
         """
@@ -72,14 +72,14 @@ class Ways(NamedTuple):
 def onto_orbit(fence: Fence, north: Array, east: Array) -> tuple[Array, Array]:
     """Return where the tangent from a place touches the clockwise orbit round home.
 
-    Within the orbit the result is the place 1 m ahead along it.
+    For a place inside the orbit, the result is the place 1 m ahead along the orbit.
     """
     xp = array_namespace(north)
     x = fence.home[0] - north
     y = fence.home[1] - east
     distance = xp.maximum(xp.hypot(x, y), 1e-6)
-    # Home is to the right of the tangent. Within the orbit the course is across the bearing of
-    # home.
+    # Home is to the right of the tangent. Inside the orbit the course is perpendicular to the
+    # bearing of home.
     offset = xp.asin(xp.minimum(fence.radius / distance, 1.0))
     length = xp.maximum(xp.sqrt(xp.maximum(distance**2 - fence.radius**2, 0.0)), 1.0)
     along = xp.cos(offset) * length / distance
@@ -90,7 +90,7 @@ def onto_orbit(fence: Fence, north: Array, east: Array) -> tuple[Array, Array]:
 def line_clearance(
     fence: Fence, north: Array, east: Array, to_north: Array, to_east: Array
 ) -> Array:
-    """Return the least clearance of straight lines, m."""
+    """Return the least clearance along each of some straight lines, m."""
     share = np.linspace(0.0, 1.0, POINTS).reshape(-1, *(1,) * np.ndim(north))
     on_north = north + share * (to_north - north)
     on_east = east + share * (to_east - east)
@@ -101,14 +101,14 @@ def line_clearance(
 def ways(fence: Fence) -> Ways:
     """Make the map of a fence.
 
-    A cell is open if its centre has a clearance of more than half a cell. A way leads from one open
-    cell to the next if their circles of clearance overlap, so that the line between them stays
-    inside. A metre of the way costs `radius / clearance`, at least 1.
+    A cell is open if the clearance at its centre exceeds half a cell. A way leads from an open cell
+    to another if their circles of clearance overlap, because the line between them is then inside.
+    A metre of a way costs `radius / clearance`, but at least 1.
 
-    The aim of an open cell is on the way home, about a radius ahead. If there is no way home, the
-    aim leads to a cell with the largest clearance around, where the aircraft holds. From a closed
-    cell inside, the way leads away from the border. The aim of a cell outside is the nearest cell
-    with a way home.
+    The aim of an open cell is on the way home, about a radius ahead. If there is no way home, it
+    leads to the cell with the largest clearance nearby, where the aircraft holds. In a closed cell
+    inside the fence, the way leads away from the border. The aim of a cell outside is the nearest
+    cell with a way home.
     """
     north, east, cell = _cells(fence)
     room = clearance(fence.zones, north, east)
@@ -176,7 +176,7 @@ def _cells(fence: Fence) -> tuple[FloatArray, FloatArray, float]:
 
 
 def _neighbours(values: FloatArray, fill: float) -> list[FloatArray]:
-    """Return the values of the neighbours at STEPS, with `fill` outside of the map."""
+    """Return the values of the neighbours at STEPS; a neighbour outside of the map has `fill`."""
     padded = np.pad(values, 1, constant_values=fill)
     rows, columns = values.shape
     return [
@@ -185,7 +185,7 @@ def _neighbours(values: FloatArray, fill: float) -> list[FloatArray]:
 
 
 def _uphill(values: FloatArray) -> NDArray[np.intp]:
-    """Return the neighbour of each cell towards rising values; at a peak the cell itself."""
+    """Return for each cell the neighbour in whose direction the values rise; at a peak the cell."""
     slopes = np.gradient(values)
     steepness = np.maximum(np.hypot(*slopes), 1e-6)
     last = np.array(values.shape).reshape(2, 1, 1) - 1
@@ -198,10 +198,10 @@ def _uphill(values: FloatArray) -> NDArray[np.intp]:
 def _shortest(
     seeds: NDArray[np.bool_], room: FloatArray, cost: FloatArray, cell: float
 ) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Find the weighted length of the shortest way to a seed, and the next cell on the way.
+    """Find the weighted length of each cell's shortest way to a seed, and the next cell on it.
 
-    For a seed, or if there is no way, the next cell is the cell itself. The method is that of
-    Bellman and Ford: update the lengths of all cells at once, until none becomes shorter.
+    For a seed, and for a cell without a way, the next cell is the cell itself. The method of
+    Bellman and Ford updates the lengths of all cells at once, until no length changes.
     """
     lengths = [cell * math.hypot(*step) for step in STEPS]
     costs = _neighbours(cost, math.inf)
@@ -228,7 +228,7 @@ def _shortest(
 def _nearest(
     north: FloatArray, east: FloatArray, to_north: FloatArray, to_east: FloatArray
 ) -> NDArray[np.intp]:
-    """Return for each place the index of the nearest of the other places."""
+    """Return the index of the nearest place of the second set for each place of the first."""
     rows = [
         np.argmin((to_north - n) ** 2 + (to_east - e) ** 2)
         for n, e in zip(north, east, strict=True)
@@ -239,9 +239,9 @@ def _nearest(
 def _is_straight(
     fence: Fence, north: FloatArray, east: FloatArray, room: FloatArray, cell: float
 ) -> NDArray[np.bool_]:
-    """Return whether the line onto the orbit round home has a cell of clearance.
+    """Return whether the line from each cell onto the orbit round home is free.
 
-    If the ends have less, it must have the clearance of the ends.
+    The line must have a clearance of a cell. If its ends have less, it must have their clearance.
     """
     to_north, to_east = onto_orbit(fence, north, east)
     at_end = clearance(fence.zones, to_north, to_east)

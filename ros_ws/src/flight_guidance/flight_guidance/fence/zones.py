@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Zones of a fence, and the distance from the fence.
+"""Define the zones of a fence, and compute the distance from the fence.
 
 The functions take NumPy or JAX arrays of any shape.
 """
@@ -24,19 +24,21 @@ of positions is smaller."""
 
 
 class Zone(NamedTuple):
-    """A polygon, or a circle: a single point and a radius."""
+    """A zone of a fence: a polygon, or a circle as a single point with a radius."""
 
     north: tuple[float, ...]  # m
     east: tuple[float, ...]  # m
     radius: float = 0.0  # m, 0 for a polygon
-    exclude: bool = False  # whether the aircraft must keep out
-    group: int | None = None  # number of the group of a zone to stay in; None: its own group
+    exclude: bool = False  # whether the aircraft must keep out of the zone
+    # number of its group for a zone to stay in; None for a group of its own
+    group: int | None = None
 
 
 class Fence(NamedTuple):
-    """The zones, and home.
+    """A fence: its zones, and home.
 
-    The aircraft stays inside every zone of at least one group, and out of each zone with `exclude`.
+    The aircraft must stay inside all zones of at least one group, and outside each zone with
+    `exclude`.
     """
 
     zones: tuple[Zone, ...]
@@ -45,7 +47,7 @@ class Fence(NamedTuple):
 
 
 def inside(zone: Zone, north: Array, east: Array) -> Array:
-    """Return the distance from the border of a zone, m, positive inside the polygon or circle."""
+    """Return the distance from the border of a zone, m, positive in the polygon or circle."""
     xp = array_namespace(north)
     if zone.radius:
         return zone.radius - xp.hypot(north - zone.north[0], east - zone.east[0])
@@ -56,9 +58,9 @@ def inside(zone: Zone, north: Array, east: Array) -> Array:
     distance = _distance(start_north, start_east, edge_north, edge_east, north, east)
     x = north[..., None] - start_north
     y = east[..., None] - start_east
-    # An edge that runs east crosses no line to the east.
+    # An edge that runs east crosses no ray to the east.
     level = np.where(edge_north == 0.0, 1.0, edge_north)
-    # Count the edges that a ray to the east crosses: even-odd rule.
+    # Count the edges that a ray to the east crosses, by the even-odd rule.
     crossed = ((x < 0.0) != (x < edge_north)) & (y < x * edge_east / level)
     return xp.where(xp.sum(crossed, axis=-1) % 2 == 1, distance, -distance)
 
@@ -80,7 +82,7 @@ def _distance(
 
 
 def clearance(zones: tuple[Zone, ...], north: Array, east: Array) -> Array:
-    """Return the distance from the fence, m, negative outside of it."""
+    """Return the distance from the fence, m, negative outside."""
     xp = array_namespace(north)
     groups = _groups(zones)
     out = [-inside(zone, north, east) for zone in zones if zone.exclude]
@@ -96,7 +98,7 @@ def clearance(zones: tuple[Zone, ...], north: Array, east: Array) -> Array:
 
 
 def _groups(zones: tuple[Zone, ...]) -> tuple[tuple[Zone, ...], ...]:
-    """Collect the zones to stay in, by group."""
+    """Return the zones to stay in, one tuple for each group."""
     groups: dict[tuple[int | None, int], tuple[Zone, ...]] = {}
     for k, zone in enumerate(zones):
         if not zone.exclude:
@@ -106,9 +108,9 @@ def _groups(zones: tuple[Zone, ...]) -> tuple[tuple[Zone, ...], ...]:
 
 
 def _deepest(groups: tuple[tuple[Zone, ...], ...], north: Array, east: Array) -> Array:
-    """Return the distance from the border of the group in which a place lies deepest, m.
+    """Return the distance from the border of the group inside which a place is deepest, m.
 
-    It is negative outside of all groups.
+    The distance is negative for a place outside of all groups.
     """
     xp = array_namespace(north)
     depths = []
@@ -122,10 +124,11 @@ def _deepest(groups: tuple[tuple[Zone, ...], ...], north: Array, east: Array) ->
 def _border(
     groups: tuple[tuple[Zone, ...], ...],
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Compute the border of all groups together: starts and lengths of edges, m, shapes (M,).
+    """Compute the border of all groups together as M edges.
 
-    All have a north and an east part. Each edge of a zone is cut where other edges cross or
-    touch it. A piece belongs to the border if only one side of it is inside.
+    Returns the north and east of their starts, and their lengths to the north and to the east, m,
+    (M,) each. Each edge of a zone is cut where other edges cross or touch it. A piece belongs to
+    the border if only one of its sides is inside.
     """
     groups = tuple(tuple(map(_polygon, group)) for group in groups)
     corners = [np.column_stack([zone.north, zone.east]) for zone in chain.from_iterable(groups)]
@@ -146,7 +149,7 @@ def _border(
 
 
 def _polygon(zone: Zone) -> Zone:
-    """Return the zone, with a circle as a polygon of CHORDS."""
+    """Return a zone as a polygon; a circle becomes a polygon of CHORDS edges."""
     if not zone.radius:
         return zone
     angles = [2.0 * math.pi * k / CHORDS for k in range(CHORDS)]
@@ -158,9 +161,9 @@ def _polygon(zone: Zone) -> Zone:
 def _cut(
     start: FloatArray, end: FloatArray, starts: FloatArray, ends: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Cut an edge into pieces, and return their starts and ends, shapes (P, 2).
+    """Cut an edge into P pieces, and return their starts and ends, shapes (P, 2).
 
-    The cuts are where other edges cross it or begin on it.
+    The edge is cut where another edge crosses it or begins on it.
     """
     edge = end - start
     edges = ends - starts

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A landing on a line of a route: the flare by height, the nose along the line, the go-around.
+"""Fly a landing on a line of a route: flare, alignment of the nose, and go-around.
 
-The line to a waypoint on the ground is the glide path, which the modes of a route hold. From the
-height of the flare on, each step has commands of its own. They are in the log, so a landing can be
+The line to a waypoint on the ground is the glide path, which the modes of a route hold. Below the
+height of the flare, each step has commands of the landing. They are in the log, so a landing can be
 computed again from the log like any flight.
 """
 
@@ -43,31 +43,32 @@ FASTEST_YAW = math.radians(6.0)
 
 
 class Landing(NamedTuple):
-    """A landing at the end of a line of a route."""
+    """The numbers of a landing at the end of a line of a route."""
 
-    leg: int  # number of the line that is the glide path
-    around: int  # number of the line that a go-around flies
+    leg: int  # number of the leg that is the glide path
+    around: int  # number of the leg that a go-around flies
     place: Point  # end of the glide path, on the ground
     ground: float  # m, altitude of this place
     course: float  # rad, course of the glide path
-    slope: float  # slope of the glide path, 1, below 0
+    slope: float  # slope of the glide path (climb over distance), which is below 0
     flare: float  # m, height at which the flare begins
     sink: float  # m/s, sink rate at touchdown
-    decrab: float  # m, height below which the nose turns along the line
+    decrab: float  # m, height below which the nose is turned along the line
     V: float  # m/s, airspeed from the flare on
-    box: Zone | None  # where the aircraft must touch down; None: anywhere
+    box: Zone | None  # the zone in which the aircraft must touch down; None for any place
 
 
 def landing_at(
     place: Point, route: Route, section: LandingConfig, box: Zone | None, params: GuidanceParams
 ) -> Landing:
-    """Find the landing at a place.
+    """Return the landing at a place on a route.
 
-    Raises ParameterError if no line of the route descends to the place and goes straight on.
+    Raises ParameterError unless a line of the route descends to the place and the next line goes
+    straight on.
     """
     key = f"landing.waypoint {section.waypoint}"
     lines = [k for k, leg in enumerate(route.legs) if isinstance(leg, Line)]
-    # The fillet of the largest permitted corner cuts off this much of the line, m.
+    # m of a line that the fillet of the largest permitted corner cuts off
     fillet = max(route.radius * math.tan(STRAIGHT / 2.0), 1.0)
     pairs = [
         (leg, around)
@@ -97,22 +98,22 @@ def landing_at(
 
 
 def flare_climb(height: float, path_sink: float, landing: Landing) -> float:
-    """Compute the climb rate commanded in the flare, m/s.
+    """Compute the climb rate that is commanded in the flare, m/s.
 
-    In proportion to the height, m, it changes from the rate of the glide path to -sink.
+    It changes with the height, m, linearly from the rate on the glide path to -sink.
     """
     share = min(max(height / landing.flare, 0.0), 1.0)
     return -(landing.sink + max(path_sink - landing.sink, 0.0) * share)
 
 
 def time_to_touch(height: float, path_sink: float, landing: Landing) -> float:
-    """Compute the time of `flare_climb` to the ground, s: the integral of dh / sink(h)."""
+    """Compute the time to the ground by `flare_climb`, s: the integral of dh / sink(h)."""
     rate = max(path_sink - landing.sink, 1e-3) / landing.flare
     return math.log1p(rate * max(height, 0.0) / landing.sink) / rate
 
 
 class Lander:
-    """The commands of a landing, step by step."""
+    """Gives the commands of a landing, step by step."""
 
     def __init__(self, landing: Landing, params: GuidanceParams) -> None:
         self._landing = landing
@@ -126,7 +127,7 @@ class Lander:
     def commands(
         self, state: GuidanceState, pose: Mapping[str, float], route: Route
     ) -> dict[str, float]:
-        """Return the commands of the step after a state; none above the flare."""
+        """Return the commands for the step after `state`; none above the flare."""
         landing = self._landing
         height = pose["altitude"] - landing.ground
         if state.mode is not GuidanceMode.ENGAGED:
@@ -151,7 +152,7 @@ class Lander:
         return commands | self._along_line(pose, math.sin(course - landing.course) * ground_speed)
 
     def _misses(self, height: float, path_sink: float, pose: Mapping[str, float]) -> bool:
-        """Return whether the aircraft would touch down outside of the box."""
+        """Return whether the aircraft would touch down outside of the zone `box`."""
         if self._landing.box is None:
             return False
         time = time_to_touch(height, path_sink, self._landing)
@@ -161,7 +162,7 @@ class Lander:
         return float(clearance((self._landing.box,), north, east)[0]) < 0.0
 
     def _go_around(self, pose: Mapping[str, float], route: Route) -> dict[str, float]:
-        """Return the commands to fly the line of the go-around, from its nearest point on."""
+        """Return the commands to fly the line of the go-around from its nearest point on."""
         leg = self._landing.around
         along = path.nearest(route.legs[leg], (pose["north"], pose["east"]))
         return {"leg": float(leg), "along": along}
@@ -169,7 +170,7 @@ class Lander:
     def _along_line(self, pose: Mapping[str, float], drift: float) -> dict[str, float]:
         """Return the commands that turn the nose along the line and lower the upwind wing.
 
-        `drift` is the speed across the line, m/s, positive to the right:
+        `drift` is the speed across the line, m/s, positive to the right. The law is
 
         r = k (course - psi),  g tan(phi) = -w^2 e - 2 zeta w drift,  w = 2 pi / P
         """

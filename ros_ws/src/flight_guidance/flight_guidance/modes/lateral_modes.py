@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bank of a lateral mode.
+"""Compute the bank for a lateral mode.
 
 The mode is a heading or a course, an orbit, a leg of a route, or the action of the fence.
 """
@@ -40,7 +40,7 @@ def lateral_bank(
     route: Route | None,
     params: GuidanceParams,
 ) -> tuple[float, PathError, float]:
-    """Compute the bank of the lateral mode, rad, with the error from the path.
+    """Compute the bank of the lateral mode, rad, and the error from its path.
 
     Also returns the distance to the end of the leg, m.
     """
@@ -68,7 +68,7 @@ def lateral_bank(
 
 
 def _wide_enough(orbit: Arc, params: GuidanceParams) -> Arc:
-    """Widen an orbit to the least radius, which grows as the largest bank falls in flight."""
+    """Widen an orbit to the least radius, which grows if the largest bank falls in flight."""
     return orbit._replace(
         radius=math.copysign(max(abs(orbit.radius), params.limits.radius), orbit.radius)
     )
@@ -81,7 +81,7 @@ def _onto_leg(
     route: Route,
     params: GuidanceParams,
 ) -> tuple[float, PathError, float]:
-    """Compute the `lateral_bank` on the circle onto a leg."""
+    """Compute the `lateral_bank` on the joining circle, by which the aircraft reaches a leg."""
     position = (pose["north"], pose["east"])
     course_over_ground, _ = course_and_speed(pose)
     start, course = route.start(state.leg, state.target.along)
@@ -136,10 +136,11 @@ def follow(
 ) -> Scalar:
     """Compute the bank that follows a path, rad, before protection.
 
-    `entry` is the curvature of the following leg at its start, 1/m. Because the bank lags, it
-    replaces the curvature of the leg early: as soon as `is_entered` is true for the position a mean
-    lag ahead. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi), for the
-    ramp and for the loop of the bank. `turn_lag`, of the turn behind the bank, is added.
+    `entry` is the curvature of the next leg at its start, 1/m. Because the bank lags, this
+    curvature replaces that of the present leg early, as soon as `is_entered` is true for the
+    position that the aircraft will have after a mean lag. For a change d of the bank, the mean lag
+    is abs(d) / (2 p_max) of the ramp, plus 1 / (2 k_phi) of the bank loop, plus `turn_lag` of the
+    turn behind the bank.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)
@@ -163,8 +164,8 @@ def escaping_bank(
 ) -> Scalar:
     """Compute the bank for the action of the fence, rad.
 
-    It is the bank of a turn, or of a course home. If the fence does not act, it is `bank`, that of
-    the lateral mode.
+    It is the bank of a turn, or of a course home. If the fence does not act, the result is `bank`,
+    the bank of the lateral mode.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)

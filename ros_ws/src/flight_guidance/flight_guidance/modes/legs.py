@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A route in flight: how the legs are joined, followed and ended."""
+"""Fly along a route: join its legs, follow them, and go on to the next leg."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -29,9 +29,9 @@ LEVEL = 5.0
 def along_route(
     state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
 ) -> tuple[GuidanceState, float]:
-    """Put the state on the leg once it is joined, and on the next leg once it is passed.
+    """Put the state on the leg once it is joined, and on the next leg once the leg is passed.
 
-    Also returns the distance by which the end of the leg is missed, m, else 0.
+    Also returns the distance by which the end of the leg was missed, m, or 0.
     """
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
@@ -59,7 +59,7 @@ def along_route(
 def _loitering(
     state: GuidanceState, leg: Arc, loiter: Loiter, pose: Mapping[str, float], dt: float
 ) -> GuidanceState:
-    """Update the fraction of a loiter that is flown.
+    """Return the state with the fraction of a loiter that is flown by now.
 
     The loiter begins when the aircraft is within 1 s of flight of the circle.
     """
@@ -77,14 +77,14 @@ def _loitering(
 
 
 def has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) -> bool:
-    """Return whether the loiter of the leg is over, at the altitude of the leg."""
+    """Return whether the loiter is over, with the aircraft at the altitude of the leg."""
     return state.loitered >= 1.0 and abs(pose["altitude"] - route.altitude[state.leg]) <= LEVEL
 
 
 def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
-    """Return whether a position is beyond the end of a circle, and the course fits.
+    """Return whether an aircraft may leave a circle, because it is at its end on the right course.
 
-    `reach` is the largest distance from the end, m.
+    It must be beyond the end, and within `reach`, m, of the end.
     """
     return leg.end is not None and bool(
         path.is_joined(leg.end, path.end_course(leg), reach, position, course_and_speed(pose)[0])
@@ -100,12 +100,12 @@ def with_commands(
     follow: Callable[[GuidanceState, Route], tuple[GuidanceState, float]],
     join: Callable[[GuidanceState, int, float, Route], GuidanceState],
 ) -> tuple[GuidanceState, float]:
-    """Put the modes and commands in force.
+    """Return the state with new modes and commands in force.
 
-    If a leg is passed, `follow` first sets those of the next leg; then the given commands are set.
-    `join` returns the state on the way to a point of a leg. With a lateral command the leg is not
-    followed any more, because the command may come with a new route and so with new legs. Also
-    returns the distance by which the end of a leg is missed at this step, m.
+    If a leg is passed, `follow` first sets the commands of the next leg. Then the given commands
+    replace them. `join` returns the state on the way to a point of a leg. If there is a lateral
+    command, the present leg is not followed any more, because the command may come with a new
+    route. Also returns the distance by which the end of a leg was missed at this step, m.
     """
     lateral_names = channels.lateral.keys() & commands.keys()
     miss = 0.0
@@ -132,7 +132,7 @@ def with_commands(
         if channels.vertical.keys() & commands.keys():
             state = state._replace(vertical=vertical)
     if state.vertical is Vertical.PROFILE and state.lateral is not Lateral.ROUTE:
-        state = state._replace(vertical=Vertical.ALTITUDE)  # at the present altitude
+        state = state._replace(vertical=Vertical.ALTITUDE)  # hold the present altitude
     return on_profile(state, pose, route), miss
 
 
@@ -147,9 +147,9 @@ def on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
 def on_profile(
     state: GuidanceState, pose: Mapping[str, float], route: Route | None
 ) -> GuidanceState:
-    """Set the altitude and the climb rate of the leg.
+    """Return the state with the altitude and the climb rate of the leg as commands.
 
-    They are those at the nearest point of the leg, or at the point where the aircraft joins it.
+    They are taken at the nearest point of the leg, or at the point where the aircraft joins it.
     """
     flies = (
         state.mode is GuidanceMode.ENGAGED
@@ -174,13 +174,13 @@ def on_profile(
 def joining_state(
     state: GuidanceState, leg: int, along: float, pose: Mapping[str, float], route: Route
 ) -> GuidanceState:
-    """Return the state on the way to a point of a leg, at the altitude and the airspeed there.
+    """Return the state on the way to a point of a leg, with this point's altitude and airspeed.
 
     If the point is near, the state is already on the leg.
     """
     state = on_leg(state, leg, route)
     leg_path = route.legs[leg]
-    # Path following leads to an orbit from afar, without a joining circle.
+    # Path following reaches an orbit from any distance, without a joining circle.
     if path.is_orbit(leg_path):
         return state
     start, course = route.start(leg, along)

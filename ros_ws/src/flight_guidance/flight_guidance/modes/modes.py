@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Modes of guidance: a step from pose, y and target to u_m.
+"""Step the guidance of an airplane from pose, y and target to u_m.
 
-Laterally they hold a bank, a heading or a course, or follow an orbit or a route. Vertically they
-hold a pitch, a climb rate or an altitude. The law holds the airspeed; guidance limits its command.
-The step has no clock and no hidden state: the state is in the log, so that you can compute a sample
-of the log again from the sample before.
+Laterally, the modes hold a bank, a heading or a course, or follow an orbit or a route. Vertically,
+they hold a pitch, a climb rate or an altitude. The law holds the airspeed, and guidance limits its
+command. A step has no clock and no hidden state. Its state is in the log, so you can compute a row
+of the log again from the previous row.
 """
 
 import math
@@ -58,7 +58,7 @@ change within a second."""
 def holding(
     t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams
 ) -> GuidanceState:
-    """Return the state before the first step, at t.
+    """Return the state before the first step, at the instant t_ns.
 
     It holds the present heading, altitude and airspeed.
     """
@@ -84,7 +84,7 @@ def holding(
 
 
 def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -> GuidanceState:
-    """Return the state before a step, with the measured values if the filters start again."""
+    """Return the state before a step, at the measured values if the filters start again."""
     if state is not None and inputs.begin is Begin.NO:
         return state
     holding_state = holding(
@@ -96,7 +96,7 @@ def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -
 def hold_now(
     pose: Mapping[str, float], y: tuple[float, ...], params: GuidanceParams
 ) -> dict[str, float]:
-    """Return commands to hold the heading, the altitude and the airspeed of a pose and a y."""
+    """Return the commands to hold the heading, altitude and airspeed of a pose and a y."""
     return hold(pose, airspeed(y, params), params)
 
 
@@ -111,7 +111,7 @@ def true_airspeed(V: Scalar, params: GuidanceParams) -> Scalar:
 
 
 def yaw_rate(y: Mapping[str, Scalar], phi: Scalar, theta: Scalar, speed: Scalar) -> Scalar:
-    """Return the measured r, rad/s; without a rudder that of a coordinated turn."""
+    """Return the measured r, rad/s, or without a rudder the r of a coordinated turn."""
     return y["r"] if "r" in y else turn_rate(phi, theta, 0.0, speed)
 
 
@@ -120,16 +120,17 @@ def step(
 ) -> tuple[GuidanceState, StepCommands]:
     """Take a step: attitude, commands, u_m.
 
-    1. The attitude is phi and theta of pose, brought forward over the age of pose by Euler's
-    kinematics with p, q, r of y, and psi by `heading_estimate`. While pose is stale, only Euler's
-    kinematics act (`Mode.DEAD_RECKONING`). After `hold` the attitude is unknown (`Mode.POSE_LOST`)
-    until pose returns; then the wings are levelled at the altitude of that moment. 2. The commands
-    are those of the next leg once a leg ends, then those given. A leg is joined by a circle that
-    touches it at its start, unless the aircraft is near. If the aircraft passes the end of a leg
-    far away, the leg counts as missed. 3. The fence replaces the lateral mode by the last safe
-    turn, then home. 4. Protection follows in this order: bank, airspeed, climb, pitch; roll rate
-    and load in `attitude.body_rates`; slew of u_m. 5. u_m is p, q, r by `attitude.body_rates`, and
-    V_m = V_c - V0. In POSE_LOST p, q, r are 0.
+    1. Euler's kinematics with p, q, r of y carry phi and theta of the pose forward over its age.
+    psi follows by `heading_estimate`. While the pose is stale, only Euler's kinematics act
+    (`Mode.DEAD_RECKONING`). After `hold` the attitude is unknown (`Mode.POSE_LOST`) until the pose
+    returns. Then the wings are levelled at the present altitude.
+    2. When a leg ends, the commands of the next leg apply, and then the given commands. The
+    aircraft joins a leg by a circle that touches the leg at its start, unless it is near. If it
+    passes the end of a leg far away, the leg counts as missed.
+    3. The fence replaces the lateral mode by the last safe turn, and then by the way home.
+    4. Protection limits bank, airspeed, climb and pitch, in this order; `attitude.body_rates`
+    limits roll rate and load; the slew of u_m is limited last.
+    5. u_m is p, q, r by `attitude.body_rates`, and V_m = V_c - V0. In POSE_LOST p, q, r are 0.
     """
     params = within_reach(params, inputs.authority)
     state = begin(state, inputs, params)
@@ -171,7 +172,7 @@ def _wanted_rates(
 ) -> BodyRates:
     """Compute the body rates that lead to the commanded attitude, rad/s.
 
-    They are 0 after the loss of the pose, and for a dead output.
+    They are 0 after the loss of the pose. The rate of a dead output is 0 too.
     """
     flies = state.mode is GuidanceMode.ENGAGED
     attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
@@ -180,7 +181,7 @@ def _wanted_rates(
     rates = body_rates(
         phi_c, theta_c, state.phi, state.theta, r, 0.0 if flat else beta, speed, attitude
     )
-    # In this case the sideslip is intended.
+    # The sideslip is intended here.
     if flat:
         rates = rates._replace(r=rates.r + state.target.r)
     if state.mode is GuidanceMode.POSE_LOST:
@@ -201,8 +202,8 @@ def command(
 ) -> tuple[GuidanceState, StepCommands]:
     """Apply protection and compute u_m of `step`, from the bank of the lateral mode, rad.
 
-    `t_ns` of the state stays. The values may be arrays with an element per aircraft of a fleet; all
-    aircraft then have the same modes.
+    `t_ns` of the state stays as it is. The values may be arrays with an element for each aircraft
+    of a fleet; then all aircraft have the same modes.
     """
     speed = true_airspeed(y["V"], params)
     limits = params.limits
@@ -255,7 +256,7 @@ def _with_estimates(
     dt: float,
     params: GuidanceParams,
 ) -> GuidanceState:
-    """Update the estimates of the angle of attack, the slip and the wind."""
+    """Return the state with new estimates of the angle of attack, the slip and the wind."""
     alpha = alpha_estimate(state.alpha, state.theta, pose["climb"], speed, dt, params.vertical)
     turn = GRAVITY * array_namespace(speed).tan(tilt(state.phi))
     r = yaw_rate(y, state.phi, state.theta, speed)
@@ -272,10 +273,10 @@ def _with_estimates(
 def _with_attitude(
     state: GuidanceState, inputs: Inputs, dt: float, params: GuidanceParams
 ) -> GuidanceState:
-    """Update the mode and the attitude, from pose or by dead reckoning."""
+    """Return the state with its mode and attitude from the pose, or by dead reckoning."""
     pose = dict(zip(POSE, inputs.pose, strict=True))
     if inputs.pose_age_ns <= params.max_age_ns:
-        # While pose was lost, the aircraft may have flown anywhere.
+        # The aircraft may have flown anywhere while the pose was lost.
         if state.mode is GuidanceMode.POSE_LOST:
             if params.home.after_loss:
                 after_loss = home(pose, params)
@@ -343,9 +344,10 @@ def _within_fence(
     speed: float,
     params: GuidanceParams,
 ) -> tuple[GuidanceState, Escape]:
-    """Apply the action of the fence to the state; home becomes the target once the action begins.
+    """Return the state under the action of the fence; when the action begins, home is the target.
 
-    A lateral command during a turn is flown after the turn, unless the aircraft is outside.
+    A lateral command that comes during a turn is flown after the turn, unless the aircraft is
+    outside.
     """
     if params.fence is None or state.mode is not GuidanceMode.ENGAGED:
         return state, Escape(
@@ -388,7 +390,7 @@ def _climb(
 ) -> tuple[Scalar, Any]:
     """Return the commanded climb rate, m/s, and whether protection limits it."""
     if state.vertical is Vertical.THETA:
-        # In the mode THETA this is only the start value for the modes CLIMB and ALTITUDE.
+        # In the mode THETA this is only the start value for a later mode CLIMB or ALTITUDE.
         return pose["climb"], False
     vertical = params.vertical
     target = state.target
@@ -417,9 +419,9 @@ def _climb(
 def _pitch_within(
     state: GuidanceState, altitude: Scalar, speed: Scalar, params: GuidanceParams
 ) -> Scalar:
-    """Return the commanded pitch, rad, within the range that the altitudes allow.
+    """Return the commanded pitch, rad, within the range that the altitude limits allow.
 
-    It is the range of pitch for the climb rates of `_climb_within`.
+    The range is that of the pitch for the climb rates of `_climb_within`.
     """
     if not any(map(math.isfinite, (params.limits.lowest, params.limits.highest))):
         return state.target.theta
@@ -433,7 +435,7 @@ def _pitch_within(
 def _climb_within(altitude: Scalar, params: GuidanceParams) -> tuple[Scalar, Scalar]:
     """Return the least and the largest climb rate that the altitude limits allow, m/s.
 
-    They are the rates of `climb_for` towards these limits.
+    They are the rates of `climb_for` towards the two limits.
     """
     vertical = params.vertical
     limits = params.limits

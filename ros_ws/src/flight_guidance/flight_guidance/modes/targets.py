@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The targets that an operator may command, and those to hold and to fly home.
+"""Check the commands of an operator, and make those to hold and to fly home.
 
-Their limits follow from the parameters and from a learned model.
+The limits of the commands follow from the parameters and from a learned model.
 """
 
 import math
@@ -21,14 +21,14 @@ from flight_guidance.steering.path import Route
 
 
 def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams:
-    """Lower the limits of the parameters to those of a model learned in flight.
+    """Lower the limits in the parameters to those of a model that was learned in flight.
 
-    The rules hold for an airplane; the limits of a multicopter stay. Climb and sink
-    follow from the throttle, and the roll rate from the aileron, by the rules of the parameters.
-    Reversals of the bank fit into the period of path following, and orbits have the radius for the
-    bank. If the aileron has no effect, or p ignores its command, the largest bank is YAWED_BANK.
-    If the throttle has no effect, there is no climb, and the limit of the sink stays: the pitch
-    then controls the airspeed at the floor.
+    The rules hold for an airplane; the limits of a multicopter stay. By the rules of the
+    parameters, climb and sink follow from the authority of the throttle, and the roll rate follows
+    from that of the aileron. The bank is limited so that its reversals fit into the period of path
+    following, and orbits have the radius for this bank. If the aileron has no effect, or p ignores
+    its command, the largest bank is YAWED_BANK. If the throttle has no effect, there is no climb,
+    and the limit of the sink stays, because the pitch then controls the airspeed at its floor.
     """
     if authority == Authority() or params.multicopter is not None:
         return params
@@ -46,7 +46,7 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
     if rolls:
         rate = min(rate, reach.roll_rate(authority.p, 4.0 * attitude.k_phi))
         bank = limits.bank * min(1.0, params.path.period / reach.least_period(limits.bank, rate))
-    # The airspeed controls the climb, so its command may change at the bandwidth of V for each m/s.
+    # The airspeed controls the climb here, so its command may change as fast as V follows.
     if "q" in dead:
         faster = tuple(
             4.0 * rate if name == "V" else rate
@@ -64,9 +64,9 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
 
 
 def reach_sentence(params: GuidanceParams, authority: Authority) -> str | None:
-    """Write the limits that follow from what is learned in flight, in words.
+    """Write in words the limits that follow from the authority learned in flight.
 
-    Returns None if the limits of the parameters are lower.
+    Returns None if these limits are not below those of the parameters.
     """
     now = within_reach(params, authority)
     parts = [
@@ -114,10 +114,9 @@ def read_target(
 ) -> None:
     """Refuse commands that guidance cannot fly, by ChannelError.
 
-    These are commands that belong to no mode or to two modes, that name a leg which the route does
-    not have, or that are beyond the limits.
-    With `degrees`, the message gives angles in degrees, as an operator types them; otherwise in
-    rad.
+    A command is refused if it belongs to no mode or to two modes, if it names a leg that the route
+    does not have, or if it is beyond the limits. With `degrees`, the message gives angles in
+    degrees, as an operator types them, and otherwise in rad.
     """
     channels = params.channels
     lateral_modes = {mode for name, mode in channels.lateral.items() if name in values}
@@ -214,16 +213,15 @@ def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> d
 
 
 def permitted_speed(speed: Scalar, params: GuidanceParams) -> Scalar:
-    """Limit an airspeed, m/s."""
+    """Return an airspeed within its limits, m/s."""
     xp = array_namespace(speed)
     return xp.minimum(xp.maximum(speed, params.limits.floor), params.limits.largest_speed)
 
 
 def permitted(commands: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
-    """Return commands made from a pose, each limited to what `read_target` accepts.
+    """Return commands made from a pose, each limited to values that `read_target` accepts.
 
-    An aircraft that holds or flies home may be above its highest altitude. It then descends to
-    this altitude.
+    An aircraft that holds or flies home may be above its highest altitude, and then descends to it.
     """
     limits = params.limits
     inside = {name: min(max(value, -LARGEST), LARGEST) for name, value in commands.items()}
@@ -233,9 +231,9 @@ def permitted(commands: Mapping[str, float], params: GuidanceParams) -> dict[str
 
 
 def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
-    """Return commands to orbit home clockwise on the least radius, or to hover there.
+    """Return commands to orbit home clockwise on the least radius, or to hover at home.
 
-    A multicopter hovers. The altitude is that of home; if home has none, it is the present one.
+    A multicopter hovers. The altitude is that of home, or the present altitude if home has none.
     """
     place = params.home
     altitude = pose["altitude"] if place.altitude is None else place.altitude

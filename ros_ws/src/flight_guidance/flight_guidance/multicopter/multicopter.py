@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance of a multicopter: place, velocity, acceleration, direction of the thrust, body rates.
+"""Step the guidance of a multicopter from a place to body rates.
 
-The heading is separate, because no lateral mode needs the nose to point anywhere. Like
-`modes.step`, the step has no clock and no hidden state.
+A place gives a velocity, the velocity an acceleration, the acceleration a direction of the thrust,
+and this direction the body rates. The heading is separate, because no lateral mode needs the nose
+to point anywhere. As in `modes.step`, a step has no clock and no hidden state.
 """
 
 import cmath
@@ -60,13 +61,13 @@ LONGEST_LEAD = 0.5
 
 
 class MotionCommand(NamedTuple):
-    """The motion that a lateral mode commands; complex numbers are vectors, north + i east."""
+    """The motion that a lateral mode commands. Complex numbers are vectors, north + i east."""
 
     velocity: complex = 0.0  # m/s, over ground
-    ahead: complex = 0.0  # m/s, velocity at the time when the tilt has followed
+    ahead: complex = 0.0  # m/s, velocity at the time when the tilt will have followed
     acceleration: complex = 0.0  # m/s^2, acceleration of the path itself
     error: PathError = PathError(0.0, 0.0, 0.0)
-    to_go: float = 0.0  # m
+    to_go: float = 0.0  # m, distance to the place or to the end of the leg
 
 
 def _gains(params: GuidanceParams) -> MulticopterParams:
@@ -77,9 +78,9 @@ def _gains(params: GuidanceParams) -> MulticopterParams:
 def hold(
     pose: Mapping[str, float], _y: tuple[float, ...], params: GuidanceParams
 ) -> dict[str, float]:
-    """Return commands to hover where the aircraft stops, v abs(v) / (2 a) ahead.
+    """Return commands to hover where the aircraft can stop, v abs(v) / (2 a) ahead.
 
-    Heading and altitude are the present ones.
+    Heading and altitude stay at their present values.
     """
     stop = _stop(pose, _gains(params))
     place = {"north": stop.real, "east": stop.imag}
@@ -113,14 +114,13 @@ def step(
         a_c = a_ff + k_v (v_c - v) + d (v_ff - W),  within g tan(bank)
         [p, q] = k_tilt (angle from the thrust to [a_c, g]),  r = k_psi (heading - psi)
 
-    1. The attitude is that of pose, brought forward to the present by p, q, r of y. While pose is
-    stale, the thrust is vertical; after `hold` the rates are 0 until pose returns. 2. The commands
-    are those of the next leg once a leg ends, then those given. 3. The fence acts on the place
-    where the aircraft stops: if it is not inside, the aircraft flies the way home. 4. W, the wind,
-    follows by `_with_wind`: an unexplained deceleration is drag in a wind. 5. The climb rate
-    follows from the altitude, as for an airplane.
-
-    a_ff and v_ff are those of the path `lead` ahead, because the tilt follows later by this time.
+    The attitude is that of the pose; p, q, r of y carry it forward to the present. While the pose
+    is stale, the thrust is vertical. After `hold` the rates are 0 until the pose returns. When a
+    leg ends, the next leg's commands apply, and then the given commands. The fence acts on the
+    place where the aircraft can stop. If this place is not inside, the aircraft flies home. The
+    wind W follows by `_with_wind`, since an unexplained deceleration is drag in a wind. The climb
+    rate follows from the altitude, as for an airplane. a_ff and v_ff are the acceleration and the
+    velocity of the path `lead` later, because the tilt follows its command with this delay.
     """
     gains = _gains(params)
     pose = dict(zip(POSE, inputs.pose, strict=True))
@@ -134,12 +134,13 @@ def step(
         route,
         params.channels,
         lambda state, route: _along_route(state, pose, dt, route),
-        # The aircraft flies straight to the leg. Either side would say that it is on the way.
+        # The aircraft flies straight to the leg. A side, whichever it is, shows that it is on the
+        # way.
         lambda state, leg, _, route: on_leg(state, leg, route)._replace(joining=Side.RIGHT),
     )
     state = _with_wind(state, pose, dt, params)
     state, escape = _within_fence(state, pose, params)
-    # Speed, tilt and climb follow from the way to fly.
+    # Speed, tilt and climb follow from the motion that the mode commands.
     flies = state.mode is GuidanceMode.ENGAGED
     speed = min(max(state.target.V, 0.0), params.limits.largest_speed)
     state = state._replace(V_c=slewed(state.V_c, speed, gains.braking, dt))
@@ -148,7 +149,7 @@ def step(
         state = state._replace(V_c=min(state.V_c, abs(motion.velocity)))
     phi_c, theta_c, limited = _attitude_for(state, pose, motion, params)
     state, climb_limited = _with_climb(state, pose, dt, params)
-    # The body rates and the climb are u_m, within the rates of the reference model.
+    # u_m has the body rates and the climb, within the rates of the reference model.
     rates = _rates(state, phi_c, theta_c, gains)
     name = vertical(params.outputs)
     values = rates | {name: VERTICAL[name] * state.climb_c}
@@ -184,7 +185,7 @@ def _begin(
 ) -> GuidanceState:
     """Return the state before a step.
 
-    If the filters start again, it is the state of a hover at the place where the aircraft stops.
+    If the filters start again, the aircraft hovers at the place where it can stop.
     """
     if state is not None and inputs.begin is Begin.NO:
         return state
@@ -218,9 +219,9 @@ def _with_attitude(
     dt: float,
     params: GuidanceParams,
 ) -> GuidanceState:
-    """Update the mode and the attitude, from pose or by dead reckoning.
+    """Return the state with its mode and attitude from the pose, or by dead reckoning.
 
-    When pose returns after a loss, the aircraft hovers or flies home.
+    When the pose returns after a loss, the aircraft hovers or flies home.
     """
     age_ns = inputs.pose_age_ns
     since = dt
@@ -265,10 +266,10 @@ def _stops(route: Route, number: int) -> bool:
 def _along_route(
     state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
 ) -> tuple[GuidanceState, float]:
-    """Put the state on the leg once its start is reached, and on the next leg once it ends.
+    """Put the state on the leg once its start is reached, and on the next leg at its end.
 
-    A leg ends when the aircraft has passed its end or, if the leg waits there, when the wait is
-    over. Also returns the distance by which the end of the leg is missed, m, else 0.
+    A leg is over when the aircraft has passed its end. If the aircraft waits at the end, the leg is
+    over after the wait. Also returns the distance by which the end of the leg was missed, m, or 0.
     """
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
@@ -295,9 +296,10 @@ def _along_route(
 def _within_fence(
     state: GuidanceState, pose: Mapping[str, float], params: GuidanceParams
 ) -> tuple[GuidanceState, Escape]:
-    """Apply the action of the fence to the state; home becomes the target once the action begins.
+    """Return the state under the action of the fence; when the action begins, home is the target.
 
-    It begins when the stopping distance comes nearer to the fence than MARGIN of flight.
+    The action begins when the place where the aircraft can stop is nearer to the fence than MARGIN
+    of flight.
     """
     fence = params.fence
     if fence is None or state.mode is not GuidanceMode.ENGAGED:
@@ -323,7 +325,7 @@ def _within_fence(
 
 
 def _action(fence: Fence, position: tuple[Any, Any], now: float) -> FenceAction:
-    """Choose the action of the fence: home in a straight line, home around, or back inside."""
+    """Choose the action of the fence: home straight, home around a zone, or back inside."""
     if now < 0.0:
         return FenceAction.BACK
     is_straight = bool(ways(fence).aim(fence, *position)[2])
@@ -337,7 +339,7 @@ def _wanted(
     escape: Escape,
     params: GuidanceParams,
 ) -> MotionCommand:
-    """Return the motion that the lateral mode commands, or else the way around a fence."""
+    """Return the motion that the lateral mode commands, or that of the way around a fence."""
     gains = _gains(params)
     target = state.target
     place = (target.north, target.east)
@@ -361,7 +363,7 @@ def _wanted(
 def _approach(distance: float, speed: float, gains: MulticopterParams) -> tuple[float, float]:
     """Return the speed towards a place at a distance, m/s, and its slope over distance, 1/s.
 
-    It follows by `climb_for` with the gain `k_p` and the deceleration `braking`.
+    The speed is that of `climb_for` with the gain `k_p` and the deceleration `braking`.
     """
     params = VerticalParams(
         k_h=gains.k_p, acceleration=2.0 * gains.braking, climb=speed, sink=speed, alpha_time=0.0
@@ -402,7 +404,8 @@ def _on_path(
     if _stops(route, state.leg):
         speed, slope = _approach(max(to_go, 0.0), speed, gains)
     across = -clip(gains.k_p * error.e, ACROSS * speed)
-    velocity = complex(math.sqrt(speed**2 - across**2), across)  # along the path + i to the right
+    # complex numbers have the direction along the path + i to the right
+    velocity = complex(math.sqrt(speed**2 - across**2), across)
     later = _parts(_place(pose) + gains.lead * _velocity(pose))
     entered_leg = leg
     if path.is_passed(leg, later) and not _stops(route, state.leg):
@@ -419,7 +422,7 @@ def _on_path(
 def _by_tilt(
     attitude: Mapping[str, float], pose: Mapping[str, float], gains: MulticopterParams
 ) -> complex:
-    """Compute the acceleration at an attitude, (g + d climb) tan(tilt), m/s^2."""
+    """Compute the acceleration that a tilt causes, (g + d climb) tan(tilt), m/s^2."""
     angles = (tilt(attitude["phi"]), tilt(attitude["theta"]), attitude["psi"])
     north, east, up = thrust_axis(*angles)
     return _lift(pose, gains) / up * complex(north, east)
@@ -428,13 +431,13 @@ def _by_tilt(
 def _with_wind(
     state: GuidanceState, pose: Mapping[str, float], dt: float, params: GuidanceParams
 ) -> GuidanceState:
-    """Advance the estimated wind by a step, m/s.
+    """Return the state with the estimate of the wind a step later, m/s.
 
         W' = (v' - (g + d climb) tan(tilt) + d (v - W)) / (d T)
 
-    This is a low-pass of the wind that explains the acceleration of the pose. The tilt is that of
-    the pose, so commands that are not flown do not change the wind. W stays within the wind in
-    which the largest tilt can still hover.
+    This is a low-pass of the wind that explains the acceleration of the pose. The tilt is that in
+    the pose, so commands that are not flown have no effect on the estimate. W stays within the wind
+    in which the largest tilt can still hover.
     """
     gains = _gains(params)
     v = _velocity(pose)
@@ -460,7 +463,7 @@ def _lift(pose: Mapping[str, float], gains: MulticopterParams) -> float:
 def _attitude_for(
     state: GuidanceState, pose: Mapping[str, float], motion: MotionCommand, params: GuidanceParams
 ) -> tuple[float, float, bool]:
-    """Return bank and pitch for the wanted acceleration, rad, and whether the tilt is limited."""
+    """Return bank and pitch for the commanded acceleration, rad, and whether a limit applies."""
     gains = _gains(params)
     largest = params.limits.bank
     if state.mode is not GuidanceMode.ENGAGED:
@@ -487,7 +490,7 @@ def _attitude_for(
 def _with_climb(
     state: GuidanceState, pose: Mapping[str, float], dt: float, params: GuidanceParams
 ) -> tuple[GuidanceState, bool]:
-    """Set the commanded climb rate, and return whether the altitude limits reduce it."""
+    """Set the commanded climb rate; also return whether the altitude limits reduce it."""
     vertical_params = params.vertical
     climb = 0.0
     bounded_climb = 0.0
@@ -508,12 +511,12 @@ def _rates(
 ) -> dict[str, float]:
     """Compute the body rates that turn the thrust to its direction by the shortest way, rad/s.
 
-    r turns the heading at the rate for it, by the inverse of `kinematics.heading_rate`:
+    r turns the heading at the commanded rate, by the inverse of `kinematics.heading_rate`.
 
         [p, q] = k_tilt angle [d_y, -d_x] / sqrt(d_x^2 + d_y^2),  angle = atan2(sqrt(..), -d_z)
 
-    with d, the direction [phi_c, theta_c] in body axes. This is the reduced quaternion error, which
-    has no singularity short of a thrust downwards. Source: D. Brescianini, R. D'Andrea,
+    Here d is the direction [phi_c, theta_c] in body axes. This is the reduced quaternion error,
+    which has no singularity short of a thrust downwards. Source: D. Brescianini, R. D'Andrea,
     Tilt-prioritized quadrocopter attitude control, IEEE Trans. Control Systems Technology 28
     (2020).
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers by rule of a multicopter's guidance, and the routes that a multicopter flies."""
+"""Choose gains and limits of a multicopter's guidance by rule, and plan its routes."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -31,9 +31,9 @@ def gains(
         k_tilt = w / 4,  k_v = k_tilt / 3,  k_p = k_v / 2,  lead = 1 / k_tilt,  k_psi = w_r / 4,
             braking = BRAKING g tan(bank)
 
-    w is the lesser frequency of p and q. With a reference of damping 0.9 the tilt has a phase
-    margin of 65 deg; velocity and place together have 44 deg and a largest sensitivity of 1.5. The
-    lead is the delay of the tilt behind a ramp.
+    w is the lesser frequency of p and q. With a reference model of damping 0.9, the loop of the
+    tilt has a phase margin of 65 deg. The loops of velocity and place together have 44 deg and a
+    largest sensitivity of 1.5. The lead is the delay of the tilt behind a ramp.
     """
     w = min(frequency["p"], frequency["q"])
     k_tilt = w / 4.0
@@ -55,10 +55,10 @@ def gains(
 def route_through(
     waypoints: Sequence[Waypoint], radius: float | None, braking: float, can: Performance
 ) -> Route:
-    """Plan lines with fillets through waypoints, with a hover at the last one and at each `wait`.
+    """Plan lines with fillets through waypoints, and hovers at the last one and at each `wait`.
 
     The aircraft reaches a hover by a line without a fillet. The leg of a hover is a circle with the
-    radius of the fillets; its centre is the place of the hover. Altitudes change along the lines.
+    radius of the fillets, and the aircraft hovers at its centre. Altitudes change along the lines.
     `braking`, m/s^2, bounds the curvature. Raises ParameterError for a waypoint beyond the bounds,
     and for circles, which a multicopter does not fly.
     """
@@ -77,7 +77,7 @@ def route_through(
 
 
 def _legs(waypoints: Sequence[Waypoint], radius: float) -> list[Leg]:
-    """Plan lines with fillets between the hovers; the last hover has no end."""
+    """Plan lines with fillets between the hovers. The last hover lasts for ever."""
     points = [waypoint.point for waypoint in waypoints]
     legs: list[Leg] = []
     first = 0

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of routes, missions and fences, read into waypoints of the local tangent plane."""
+"""Read files of routes, missions and fences as waypoints in the local tangent plane."""

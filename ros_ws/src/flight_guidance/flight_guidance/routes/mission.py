@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Items of a mission of MAVLink, in the order of flight (MAVLink guide, MAV_CMD and MAV_FRAME)."""
+"""Read the items of a MAVLink mission in order of flight (MAVLink guide, MAV_CMD, MAV_FRAME)."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -57,16 +57,16 @@ MEANINGS = {
     179: "heights above the home stay above the first home, and not above that of DO_SET_HOME",
     601: "DO_JUMP_TAG repeats items, which are flown once here",
 }
-# Commands after which an autopilot flies no other item: endless loiter, return, landings.
+# Commands after which an autopilot flies no further item: endless loiter, return and landings.
 LAST = (UNLIMITED, 20, LAND, 85)
-OTHER_WAYS = (34, 35, 36, 94)  # other ways to a place, neither a line nor a loiter
+OTHER_WAYS = (34, 35, 36, 94)  # other ways to a place, which are no line and no loiter
 
 
 @dataclass(frozen=True, kw_only=True)
 class Item:
     """An item of a mission."""
 
-    name: str  # "NAV_LAND (item 5)"
+    name: str  # name with number, such as "NAV_LAND (item 5)"
     frame: int
     command: int
     params: Sequence[Any]  # its seven parameters
@@ -75,9 +75,9 @@ class Item:
 
 
 def named(command: int, number: int) -> str:
-    """Name a command with the number of its item.
+    """Return the name of a command, with the number of its item.
 
-    If COMMANDS lacks the command, the name is that of pymavlink.
+    If the command is not in COMMANDS, pymavlink gives its name.
     """
     name = COMMANDS.get(command, f"MAV_CMD {command}")
     if command not in COMMANDS:
@@ -96,13 +96,13 @@ MOST_ITEMS = 20_000
 def _in_order(key: str, items: Sequence[Item]) -> list[int]:
     """Return the positions of the items in the order of flight, up to an item of LAST.
 
-    Jumps are followed. A DO_JUMP leads to its item as often as it says, or for ever if the number
-    is negative. An endless jump back ends the order. Raises ParameterError for a jump to no item,
-    for a loop inside a loop, which PX4 starts again but ArduPilot does not, and for more than
-    MOST_ITEMS steps.
+    Jumps are followed. A DO_JUMP states how often it jumps to its item; a negative number means for
+    ever. An endless jump back ends the order. Raises ParameterError for a jump to no item, for a
+    loop inside a loop, which PX4 starts again but ArduPilot does not, and for more than MOST_ITEMS
+    steps.
     """
     places = {items[k].number: k for k in reversed(range(len(items)))}
-    repetitions: dict[int, float] = {}  # how often each jump has been repeated
+    repetitions: dict[int, float] = {}  # remaining repetitions of each jump
     order: list[int] = []
     k = steps = 0
     while k < len(items) and not (order and items[order[-1]].command in LAST):
@@ -153,7 +153,7 @@ def mission_route(
     """
     places: list[Place] = []
     route_items: set[int] = set()
-    circles: list[str] = []  # circles with their own radius
+    circles: list[str] = []  # circles whose radius the mission gives
     speed: Any = None
     for k in _in_order(key, items):
         item = items[k]
@@ -183,7 +183,7 @@ def mission_route(
         elif item.command != JUMP:
             continue
         route_items.add(k)
-    # The notes say what is flown differently from the mission, or not at all.
+    # The notes name all items that are not flown, or not flown as in the mission.
     skipped_names = [_skipped_name(item) for k, item in enumerate(items) if k not in route_items]
     sentences = [f"not flown: {', '.join(dict.fromkeys(skipped_names))}"] * bool(skipped_names)
     sentences += [
@@ -206,7 +206,7 @@ def _skipped_name(item: Item) -> str:
 
 
 def _mission_place(key: str, item: Item, speed: Any, before: Place | None) -> Place:
-    """Return the place of an item; a loiter without a position takes that of `before`."""
+    """Return the place of an item; a loiter without a position is at the place `before`."""
     latitude, longitude, altitude = item.params[4:7]
     if not (latitude or longitude) and before is not None:
         latitude = before.latitude

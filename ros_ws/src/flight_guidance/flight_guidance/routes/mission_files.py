@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Missions and fences in files: plans of QGroundControl, QGC WPL 110, and fences of GeoJSON.
+"""Read missions and fences from files: QGroundControl plans, QGC WPL 110, and GeoJSON fences.
 
 Sources: QGroundControl guide, Plan File Format; MAVLink guide, File Formats.
 """
@@ -37,12 +37,12 @@ FENCE_NOTE = "the fence and the rally points of the plan are no part of the rout
 
 
 def read_plan(content: bytes, key: str, line: str | None = None) -> Places:
-    """Read the mission of a plan of QGroundControl."""
+    """Read the mission in the content of a QGroundControl plan."""
     return read_plan_tree(parsed_json(content, key), key, line)
 
 
 def read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
-    """Read the mission of a plan that is already parsed."""
+    """Read the mission of a QGroundControl plan that is already parsed."""
     require(line is None, "line", f"a mission, {key}", "a file with several lines")
     mission = member(tree, "mission")
     rows = member(mission, "items")
@@ -86,7 +86,7 @@ def _plan_item(entry: Any, number: int, key: str) -> Item:
     )
 
 
-SAME_ANGLE = 1e-6  # deg, about 0.1 m: programs write six digits or more
+SAME_ANGLE = 1e-6  # deg, about 0.1 m, because programs write six digits or more
 SAME_ALTITUDE = 0.01  # m
 FRAMES_OF_MODES = MappingProxyType({2: (0, 5), 3: (0, 5), 4: (10, 11)})
 """Permitted frames by AltitudeMode of QGroundControl: 2 is above the sea, 3 above the sea by a
@@ -95,7 +95,7 @@ before version 4."""
 
 
 def _require_one_place(entry: Any, params: Sequence[Any], frame: int, key: str) -> None:
-    """Refuse an item whose further members state another place than its params and its frame.
+    """Refuse an item if other members give another place than its params and frame.
 
     QGroundControl reads only the params. Other programs also write `coordinate`, or change only one
     of the two.
@@ -134,7 +134,7 @@ FIRST_FENCE = (
 
 
 def has_first_fence(tree: Any) -> bool:
-    """Return whether a plan has a fence of version 1, with a polygon and no list of polygons."""
+    """Return whether a plan has a fence of version 1: a polygon, but no list of polygons."""
     fence = member(tree, "geoFence")
     return (
         any(member(place, "polygon") is not None for place in (fence, tree))
@@ -142,9 +142,9 @@ def has_first_fence(tree: Any) -> bool:
     )
 
 
-# values of complexItemType whose items are the waypoints that QGroundControl made
+# Values of complexItemType of items that contain the waypoints made by QGroundControl.
 TRANSECTS = ("survey", "CorridorScan")
-LANDINGS = ("fwLandingPattern", "vtolLandingPattern")  # like NAV_LAND, not flown
+LANDINGS = ("fwLandingPattern", "vtolLandingPattern")  # they are not flown, like NAV_LAND
 
 
 def _plan_items(as_list: Sequence[Any], key: str) -> Iterator[tuple[int, Any]]:
@@ -168,7 +168,7 @@ def _plan_items(as_list: Sequence[Any], key: str) -> Iterator[tuple[int, Any]]:
 
 WPL = "QGC WPL"
 WPL_COLUMNS = 12
-COMMA = re.compile(r"-?\d+,\d+")  # a number written in a language with decimal commas
+COMMA = re.compile(r"-?\d+,\d+")  # a number with a decimal comma, as some languages write it
 
 
 def read_wpl(content: bytes, key: str, line: str | None = None) -> Places:
@@ -183,7 +183,7 @@ def read_wpl(content: bytes, key: str, line: str | None = None) -> Places:
 
 
 def wpl_items(content: bytes, key: str) -> tuple[list[Item], HomePlace | None]:
-    """Read the items of a QGC WPL 110, and the home in its item 0."""
+    """Read the items of a QGC WPL 110, and the home from its item 0."""
     encoding = (
         "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
     )
@@ -231,7 +231,7 @@ def wpl_items(content: bytes, key: str) -> tuple[list[Item], HomePlace | None]:
 
 
 class Area(NamedTuple):
-    """A zone of a fence in a file: the corners of a polygon, or the centre of a circle."""
+    """A zone of a fence in a file, which is a polygon by its corners, or a circle by its centre."""
 
     places: list[Place]
     radius: Any  # m; None for a polygon
@@ -240,12 +240,12 @@ class Area(NamedTuple):
 
 
 class FencePlaces(NamedTuple):
-    """The fence of a file."""
+    """The zones, rally points and return point that a fence file contains."""
 
     zones: list[Area]
     rally: list[Place] = []  # noqa: RUF012 - never changed
     home: HomePlace | None = None
-    back: Place | None = None  # where a breach sends the aircraft
+    back: Place | None = None  # the place to which a breach sends the aircraft
 
 
 def plan_fence(tree: Any, key: str) -> FencePlaces:
@@ -272,20 +272,20 @@ def plan_fence(tree: Any, key: str) -> FencePlaces:
 
 
 def _grouped(area: Area, group: Any = 0) -> Area:
-    """Put a zone of an autopilot into its group, if the aircraft must stay in it.
+    """Put a zone from an autopilot into its group if the aircraft must stay in the zone.
 
-    In a plan every zone is in group 0. MAVLink, MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION and
-    MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION, parameter 2, Inclusion Group: "Vehicle must be inside ALL
-    inclusion zones in a single group, vehicle must be inside at least one group".
+    In a plan every zone is in group 0. Source: MAVLink, MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION
+    and MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION, parameter 2, Inclusion Group: "Vehicle must be inside
+    ALL inclusion zones in a single group, vehicle must be inside at least one group".
     """
     return area if area.exclude else area._replace(group=group)
 
 
 def json_fence(tree: Any, key: str) -> FencePlaces:
-    """Read polygons, whose holes are excluded, and Points with the property `radius`.
+    """Read a fence of polygons and circles; circles are Points with the property `radius`.
 
-    The property `exclude` excludes a zone. Zones with the same property `group` form a group;
-    without this property, each zone is a group by itself.
+    Holes of a polygon are zones to keep out of, and so are zones with the property `exclude`. Zones
+    with the same property `group` form a group; a zone without it is a group by itself.
     """
     require_wgs84(tree, key)
     zones: list[Area] = []
@@ -368,7 +368,7 @@ def wpl_fence(content: bytes, key: str) -> FencePlaces:
 
 
 def _group(item: Item, key: str) -> int:
-    """Return the inclusion group of an item; 0 for a zone to keep out of, which has none."""
+    """Return the inclusion group of an item; 0 for a zone to keep out of, which has no group."""
     if item.command in {FENCE_OUT, CIRCLE_OUT}:
         return 0
     group = float(item.params[1])
@@ -383,7 +383,7 @@ def _group(item: Item, key: str) -> int:
 
 
 def lat_lon(position: Any, above: Above = Above.AS_POSE) -> Place:
-    """Read a position of a plan: latitude, longitude and perhaps altitude."""
+    """Read a position in a plan, which is latitude, longitude and perhaps altitude."""
     require(is_position(position), "fence", short_repr(position), "latitude and longitude")
     latitude, longitude, *altitude = position
     return Place("fence", latitude, longitude, altitude[0] if altitude else None, above=above)

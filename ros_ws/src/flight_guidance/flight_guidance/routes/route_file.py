@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Route files as waypoints in the local tangent plane.
+"""Read route files as waypoints in the local tangent plane.
 
 `route_formats` reads the formats with latitudes and longitudes. A YAML file holds the list `route`.
-Each entry is [north, east, altitude], [north, east, altitude, V] or a mapping. The mapping has
-north and east, or latitude and longitude, then altitude, and perhaps V, turns, wait, leave and left
-of `Waypoint`.
+Each entry is [north, east, altitude], [north, east, altitude, V] or a mapping. A mapping has north
+and east, or latitude and longitude. It also has the altitude, and may have V, turns, wait, leave
+and left, which are those of `Waypoint`.
 """
 
 import math
@@ -40,14 +40,15 @@ class Waypoint(NamedTuple):
 
     north: float  # m from the origin
     east: float  # m from the origin
-    altitude: float  # m, counted as in `pose`
-    # Airspeed on the leg to the waypoint, m/s; None: as on the leg before.
+    altitude: float  # m, altitude with the reference of `pose`
+    # Airspeed on the leg to the waypoint, m/s; if None, as on the previous leg.
     speed: float | None = None
     turns: float = 0.0  # number of turns round the waypoint before the aircraft flies on
     wait: float = 0.0  # time on the circle round the waypoint, or in a hover, s
-    # Altitude at which the aircraft leaves a circle round the waypoint, m; None: `altitude`.
+    # Altitude at which the aircraft leaves a circle round the waypoint, m; if None, `altitude`.
     leave: float | None = None
-    # Whether circles round the waypoint are counter-clockwise; None: not given, so clockwise.
+    # Whether circles round the waypoint are counter-clockwise; None if not given, which means
+    # clockwise.
     left: bool | None = None
 
     @property
@@ -70,17 +71,17 @@ class RouteFile(NamedTuple):
     """The content of a route file."""
 
     waypoints: tuple[Waypoint, ...]
-    notes: tuple[str, ...]  # sentences on the content of the file that is not flown
+    notes: tuple[str, ...]  # sentences on content of the file that is not flown
 
 
 class Origin(NamedTuple):
-    """Position at which north and east are 0."""
+    """Position on the Earth at which north and east are 0."""
 
     latitude: float  # deg
     longitude: float  # deg
 
 
-POSITIONS = (("north", "east"), ("latitude", "longitude"))  # keys of a waypoint of a YAML file
+POSITIONS = (("north", "east"), ("latitude", "longitude"))  # keys of a position in a YAML waypoint
 FURTHER = ("V", "turns", "wait", "leave", "left")
 
 
@@ -92,8 +93,8 @@ def local(latitude: float, longitude: float, origin: Origin) -> Point:
         [x, y, z] = N(lat) [cos(lat) cos(lon), cos(lat) sin(lon), (1 - e^2) sin(lat)],
             N = a / sqrt(1 - e^2 sin(lat)^2)
 
-    The difference of two vectors [x, y, z] is turned to north and east at the origin. Altitude
-    is not used, because the altitude of an aircraft follows the curved Earth. Source: IOGP
+    The vector [x, y, z] of the position minus that of the origin is rotated into north and east.
+    Altitude is not used, because the altitude of an aircraft follows the curved Earth. Source: IOGP
     publication 373-7-2, methods EPSG:9602 and 9836.
     """
     lat = math.radians(origin.latitude)
@@ -104,10 +105,10 @@ def local(latitude: float, longitude: float, origin: Origin) -> Point:
 
 
 def geographic(north: float, east: float, origin: Origin) -> Origin:
-    """Compute latitude and longitude, deg, of a position north and east of the origin, m.
+    """Compute latitude and longitude, deg, of a position in m north and east of the origin.
 
-    This is the inverse of `local`, for a position on the ellipsoid. Each step of the iteration
-    leaves a hundredth of the error within 50 km of an origin below 80 deg of latitude.
+    This is the inverse of `local`, for a position on the ellipsoid. Within 50 km of an origin below
+    80 deg of latitude, each step of the iteration reduces the error to a hundredth.
     """
     latitude, longitude = origin
     for _ in range(8):
@@ -119,7 +120,7 @@ def geographic(north: float, east: float, origin: Origin) -> Origin:
 
 
 def _is_above(latitude: float, longitude: float, origin: Origin) -> bool:
-    """Return whether a position is on the half of the Earth around the origin.
+    """Return whether a position is on the half of the Earth that surrounds the origin.
 
     A position on the other half would have the same north and east as one on this half.
     """
@@ -130,7 +131,7 @@ def _is_above(latitude: float, longitude: float, origin: Origin) -> bool:
 
 
 def _meridian(latitude: float) -> tuple[float, float]:
-    """Return the distance of a position on the ellipsoid from the Earth's axis and equator, m."""
+    """Return the distances of a position on the ellipsoid from the Earth's axis and equator, m."""
     e_squared = FLATTENING * (2.0 - FLATTENING)
     normal = SEMI_MAJOR / math.sqrt(1.0 - e_squared * math.sin(latitude) ** 2)
     return normal * math.cos(latitude), normal * (1.0 - e_squared) * math.sin(latitude)
@@ -157,14 +158,14 @@ def read_route_file(
     """Read the waypoints of a route file, whose ending is one of ENDINGS.
 
     Latitudes and longitudes are turned to north and east of the origin, by default the home in the
-    file. `altitude` is the height to fly at, m, if the file has no altitudes. If the file counts
-    altitudes from the ground or from the home, it is the height of these. `above_sea` says whether
-    the altitudes of `pose` count from the sea; if not, they count from the start, which is the home
-    in the file. It is None if neither this nor the start is known. Equal successive positions are
-    one waypoint. Waypoints within `simplify`, m, of the line without them are left out. In a file
-    with several lines, `line` chooses one by its number from 1 on, or by its name. Raises
-    ParameterError for an unreadable file, a geometry that is no route, a value missing or out of
-    range, and latitudes without an origin.
+    file. If the file has no altitudes, `altitude` is the altitude to fly at, m. If the file counts
+    altitudes from the ground or from the home, `altitude` is that of the ground or of the home.
+    `above_sea` says whether the altitudes of `pose` count from the sea. If not, they count from the
+    start, which is the home in the file. It is None if the reference of `pose` is unknown.
+    Successive equal positions become one waypoint. A waypoint is left out if the line without it
+    passes within `simplify`, m. In a file with several lines, `line` chooses one by its number from
+    1 on, or by its name. Raises ParameterError for an unreadable file, for a geometry that is no
+    route, for a value that is missing or out of range, and for latitudes without an origin.
     """
     suffix = path.suffix.lower()
     require(
@@ -203,10 +204,10 @@ def read_route_file(
 
 
 def _merged(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
-    """Merge successive waypoints at one place into a single waypoint with all circles.
+    """Merge successive waypoints at one place into a single waypoint with all of their circles.
 
-    The aircraft leaves it at the altitude of the last one, and with its airspeed.
-    Raises ParameterError for circles in both directions at a place.
+    The aircraft leaves it at the altitude and with the airspeed of the last of them. Raises
+    ParameterError for circles in both directions at one place.
     """
     places: list[Waypoint] = []
     speed: float | None = None
@@ -237,9 +238,9 @@ def read_fence_file(
     """Read the sections `fence` and `home` of guidance from a file.
 
     The arguments are as for `read_route_file`. Home is the rally point nearest to the origin.
-    If there is none, it is the return point of the fence, or else the home in the file. If the file
-    has none of them, the result has no home. Raises ParameterError for an unreadable file, a file
-    without a zone, and a number missing or out of range.
+    Without rally points it is the return point of the fence, and without a return point it is the
+    home in the file. If the file has none of them, the result has no home. Raises ParameterError
+    for an unreadable file, a file without a zone, and a number that is missing or out of range.
     """
     suffix = path.suffix.lower()
     require(
@@ -281,10 +282,10 @@ def read_fence_file(
 
 
 def placed_lines(content: bytes, key: str, origin: Origin) -> list[list[Point]]:
-    """Read the lines, rings and points of a GeoJSON as north and east of the origin, m.
+    """Read the lines, rings and points of a GeoJSON file as north and east of the origin, m.
 
-    Raises ParameterError for unreadable content, no position, a coordinate system other than WGS84
-    and a position out of range.
+    Raises ParameterError for unreadable content, for content without a position, for a coordinate
+    system other than WGS84, and for a position out of range.
     """
     lines = [line for line in read_lines(content, key) if line]
     require(bool(lines), key, "no position", "lines, polygons or points")
@@ -297,11 +298,11 @@ def placed_lines(content: bytes, key: str, origin: Origin) -> list[list[Point]]:
 
 
 def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
-    """Drop the waypoints within a distance in m of the line between the others.
+    """Leave out each waypoint within `tolerance`, m, of the line between the remaining ones.
 
-    Waypoints with circles, and those at which the airspeed changes, stay. Each waypoint has the
-    airspeed of its leg. Source: Douglas and Peucker (1973), Algorithms for the reduction of the
-    number of points required to represent a line.
+    Waypoints with circles stay, and so do waypoints at which the airspeed changes. Each waypoint in
+    the result has the airspeed of its leg. Source: Douglas and Peucker (1973), Algorithms for the
+    reduction of the number of points required to represent a line.
     """
     speed: float | None = None
     waypoints_with_speed = [
@@ -332,7 +333,7 @@ def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
 
 
 class _Heights:
-    """Converts the altitude of a place to an altitude counted as in `pose`."""
+    """Converts the altitude of a place in a file to an altitude with the reference of `pose`."""
 
     def __init__(
         self,
@@ -343,7 +344,7 @@ class _Heights:
     ) -> None:
         self._fixed = fixed
         self._sea = None if home is None else home.altitude
-        self._zero = fixed  # altitude of the home, counted as in `pose`
+        self._zero = fixed  # altitude of the home with the reference of `pose`
         if fixed is None and above_sea is not None:
             self._zero = self._sea if above_sea else 0.0
         self._above_sea = above_sea
@@ -351,7 +352,7 @@ class _Heights:
     def altitude(self, place: Place) -> Any:
         """Return the altitude in m, not validated yet.
 
-        Raises ParameterError if it does not follow from the file.
+        Raises ParameterError if the file does not say what the altitude counts from.
         """
         altitude = place.altitude
         above = place.above
@@ -383,7 +384,7 @@ class _Heights:
 def _home_of_fence(
     places: FencePlaces, origin: Origin | None, heights: _Heights
 ) -> dict[str, Any] | None:
-    """Return the section `home` by the rule of `read_fence_file`; None if there is none."""
+    """Return the section `home` by the rule of `read_fence_file`; None if there is no home."""
     rally = [_placed(place._replace(key="rally point"), origin, heights) for place in places.rally]
     if rally:
         nearest = min(rally, key=lambda point: math.hypot(*point.point))
@@ -403,9 +404,9 @@ def _home_of_fence(
 
 
 def _require_order(places: Sequence[Place], origin: Origin | None) -> None:
-    """Refuse latitudes and longitudes that are exchanged.
+    """Refuse latitudes and longitudes that seem to be exchanged.
 
-    They count as exchanged if the places are near the origin only with both exchanged.
+    They seem so if the places are near the origin only after an exchange.
     """
     if origin is None:
         return
@@ -542,7 +543,7 @@ def _waypoint(key: str, north: float, east: float, altitude: Any, speed: Any = N
 
 
 def _number(key: str, value: Any, name: str, largest: float = 1e9) -> float:
-    """Return a value as a finite number within +-largest. Raises ParameterError."""
+    """Return a value as a finite number within +-`largest`. Raises ParameterError."""
     fits = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= largest
     expected = "a finite number" + (f" from {-largest:g} to {largest:g}" if largest < 1e9 else "")
     require(fits, f"{key}.{name}", "nothing" if value is None else short_repr(value), expected)

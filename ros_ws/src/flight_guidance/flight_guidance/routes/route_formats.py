@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Formats of routes with latitudes and longitudes of WGS84.
+"""Read routes in formats with latitudes and longitudes of WGS84.
 
-They are GeoJSON, KML, KMZ, GPX, plans of QGroundControl, and QGC WPL 110. A file holds one route: a
-line, or points in the order of the file. Anything else in a file is refused, or named in a note.
-Sources: RFC 7946 (GeoJSON); OGC 12-007r2 (KML); GPX 1.1 schema; QGroundControl guide, Plan File
-Format; MAVLink guide, File Formats and MAV_FRAME.
+The formats are GeoJSON, KML, KMZ, GPX, QGroundControl plans, and QGC WPL 110. A file holds one
+route, which is a line, or points in the order of the file. Any other content is refused, or named
+in a note. Sources: RFC 7946 (GeoJSON); OGC 12-007r2 (KML); GPX 1.1 schema; QGroundControl guide,
+Plan File Format; MAVLink guide, File Formats and MAV_FRAME.
 """
 
 from collections.abc import Callable, Mapping
@@ -41,7 +41,7 @@ def read_places(content: bytes, key: str, suffix: str, line: str | None = None) 
 
 
 def read_fence(content: bytes, key: str, suffix: str) -> FencePlaces:
-    """Read the zones and rally points of a plan of QGroundControl, a QGC WPL 110 or a GeoJSON.
+    """Read zones and rally points from a QGroundControl plan, a QGC WPL 110 or a GeoJSON file.
 
     Raises ParameterError.
     """

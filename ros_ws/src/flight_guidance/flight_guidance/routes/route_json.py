@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""GeoJSON (RFC 7946), and members of a JSON file."""
+"""Read routes from GeoJSON (RFC 7946), and members of JSON objects."""
 
 import json
 import re
@@ -28,7 +28,7 @@ def parsed_json(content: bytes, key: str) -> Any:
 def _whole(digits: str) -> int | float:
     """Read a whole number, as a float if it has more digits than a float holds.
 
-    If it is beyond the range of a float, it is infinite.
+    The result is infinite if the number is beyond the range of a float.
     """
     return int(digits) if len(digits) < 16 else float(digits)
 
@@ -43,7 +43,7 @@ def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def json_route(tree: Any, key: str, line: str | None) -> Places:
-    """Read the route of a GeoJSON."""
+    """Read the route in a parsed GeoJSON file."""
     require_wgs84(tree, key)
     geometries: list[Geometry] = []
     others: list[str] = []
@@ -65,7 +65,7 @@ def json_route(tree: Any, key: str, line: str | None) -> Places:
 
 
 def read_lines(content: bytes, key: str) -> list[list[Place]]:
-    """Read the lines, rings and points of a GeoJSON, in the order of the file.
+    """Read the lines, rings and points of a GeoJSON file, in the order of the file.
 
     Raises ParameterError for invalid JSON, another coordinate system or an unknown geometry.
     """
@@ -92,9 +92,9 @@ def read_lines(content: bytes, key: str) -> list[list[Place]]:
 
 
 def _ring(rings: list[Any]) -> list[list[Any]]:
-    """Return the outer ring of a Polygon, which is a route if it is the only line.
+    """Return the rings of a Polygon as lines.
 
-    For a Polygon with holes, return every ring.
+    The outer ring is a route if it is the only line. Further rings are holes.
     """
     return [ring for ring in rings if isinstance(ring, list)]
 
@@ -138,9 +138,9 @@ def nodes(tree: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def require_wgs84(tree: Any, key: str) -> None:
-    """Refuse a member `crs` of another system.
+    """Refuse a member `crs` with another coordinate system than WGS84.
 
-    RFC 7946 permits only WGS84, but older versions of GDAL wrote others.
+    RFC 7946 permits only WGS84, but older versions of GDAL wrote other systems.
     """
     crs = member(tree, "crs")
     name = str(member(member(crs, "properties"), "name") or "")
@@ -161,7 +161,7 @@ def member(tree: Any, name: str) -> Any:
 
 
 def entries(tree: Any, name: str, key: str) -> list[Any]:
-    """Return a member of a JSON object that must be a list; empty if it is absent."""
+    """Return a member of a JSON object as a list; an absent member is an empty list."""
     value = member(tree, name)
     require(value is None or isinstance(value, list), key, f"{name}: {short_repr(value)}", "a list")
     return list(value or ())
@@ -178,6 +178,6 @@ def flag(tree: Any, name: str, absent: bool | None, key: str) -> bool:
 
 
 def as_list(value: Any, key: str) -> list[Any]:
-    """Return a list that is not empty. Raises ParameterError."""
+    """Return a value that is a list with entries. Raises ParameterError for any other value."""
     require(isinstance(value, list) and bool(value), key, short_repr(value), "a list of positions")
     return list(value)

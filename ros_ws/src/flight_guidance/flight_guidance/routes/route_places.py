@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Positions of a route file, not validated yet, and the choice of the route among its lines."""
+"""Hold positions of a route file before validation, and choose the route among its lines."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -18,27 +18,28 @@ A_ROUTE = "a route file"
 class Above(Enum):
     """The reference from which an altitude counts."""
 
-    AS_POSE = 0  # as in `pose`, so the number is not converted
+    AS_POSE = 0  # the number needs no conversion to the reference of `pose`
     SEA = 1
     HOME = 2
     GROUND = 3
 
 
 class Place(NamedTuple):
-    """A position of a file, not validated yet."""
+    """A position in a file, before it is validated."""
 
-    key: str  # "route[0]"
+    key: str  # key of the position, such as "route[0]"
     latitude: Any  # deg
     longitude: Any  # deg
-    altitude: Any  # m; None without an altitude
+    altitude: Any  # m; None if the file gives no altitude
     speed: Any = None  # m/s
     above: Above = Above.AS_POSE
-    altitude_text: str = ""  # what the file has in place of an altitude, for messages
+    altitude_text: str = ""  # text of the file in place of an altitude, for messages
     turns: Any = 0.0  # number of turns round the place
     wait: Any = 0.0  # time on a circle round the place, s
-    # Whether the aircraft climbs or sinks to the altitude round the place, not on the way to it.
+    # Whether the aircraft climbs or sinks to the altitude on a circle round the place, instead of
+    # on the way to it.
     climbs: bool = False
-    left: bool | None = None  # whether circles are counter-clockwise; None: not given
+    left: bool | None = None  # whether circles are counter-clockwise; None if not given
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,27 +52,28 @@ class HomePlace:
 
 
 class Places(NamedTuple):
-    """The route of a file."""
+    """The places of the route in a file."""
 
     places: list[Place]
-    notes: tuple[str, ...] = ()  # sentences on what is not flown
+    notes: tuple[str, ...] = ()  # sentences on content that is not flown
     home: HomePlace | None = None
 
 
 class Geometry(NamedTuple):
-    """A line or points of a file."""
+    """A line, or points, in a file."""
 
-    kind: str  # name of its kind in the format
+    kind: str  # name of the kind of geometry in the format
     places: list[Place]
-    name: str = ""  # name that the user gave it
+    name: str = ""  # name that the user gave to it
 
 
 def one_route(
     key: str, geometries: Sequence[Geometry], others: Sequence[str] = (), line: str | None = None
 ) -> Places:
-    """Return the only line, or the one that `line` chooses; if there is no line, the points.
+    """Return the route of a file: its only line, the line that `line` chooses, or its points.
 
-    Otherwise raises a ParameterError that lists what the file has.
+    The points are the route if the file has no line. Otherwise raises a ParameterError that lists
+    the content of the file.
     """
     joined_lines = _joined([geometry for geometry in geometries if geometry.kind not in POINTS])
     lines = [geometry for geometry in joined_lines if geometry.places]
@@ -112,7 +114,7 @@ def one_route(
 
 
 def _choice(lines: Sequence[Geometry]) -> str:
-    """Write what `--line` can choose: "--line 1 (north), 2 or 3 (south)"."""
+    """Write the choices of `--line`, as in "--line 1 (north), 2 or 3 (south)"."""
     names = [
         f"{k} ({geometry.name})" if geometry.name else f"{k}"
         for k, geometry in enumerate(lines[:SHOWN], start=1)
@@ -124,11 +126,11 @@ SHOWN = 5
 """Number of lines of a file that a refusal names."""
 
 POINTS = ("Point", "MultiPoint", "wpt")
-GPX = ("rte", "trk", "wpt")  # names of elements, without a plural
+GPX = ("rte", "trk", "wpt")  # names of elements, which have no plural
 
 
 def _counted(kinds: Sequence[str]) -> str:
-    """Count kinds in words: "2 LineStrings and 1 Polygon"."""
+    """Count the kinds of geometry in words, as in "2 LineStrings and 1 Polygon"."""
     counts = []
     for kind, count in Counter(kinds).items():
         noun, *suffix = kind.split(" ", 1)
@@ -155,7 +157,7 @@ def _joined(lines: Sequence[Geometry]) -> list[Geometry]:
 
 
 def _meets(end: Place, begin: Place) -> bool:
-    """Return whether both are the same position on the antimeridian."""
+    """Return whether two places are the same position on the antimeridian."""
     try:
         return bool(
             abs(end.longitude) == 180.0
@@ -181,7 +183,7 @@ def is_position(value: Any) -> bool:
 def lon_lat(
     position: Any, speed: Any = None, above: Above = Above.AS_POSE, altitude_text: str = ""
 ) -> Place:
-    """Read a position of GeoJSON or KML: longitude, latitude and perhaps altitude."""
+    """Read a position of GeoJSON or KML, which is longitude, latitude and perhaps altitude."""
     require(is_position(position), "route", short_repr(position), "longitude, latitude, altitude")
     longitude, latitude, *altitude = position
     return Place(

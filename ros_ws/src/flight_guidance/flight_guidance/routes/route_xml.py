@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""KML, KMZ (OGC 12-007r2) and GPX (GPX 1.1 schema)."""
+"""Read routes from KML, KMZ (OGC 12-007r2) and GPX (GPX 1.1 schema)."""
 
 import io
 import math
@@ -27,7 +27,7 @@ from flight_guidance.routes.route_places import (
 
 
 class _NoDoctype(TreeBuilder):
-    """Refuses a document type, because entities can be declared only there.
+    """An XML tree builder that refuses a document type, the only place where entities are declared.
 
     So no entity is ever expanded or fetched.
     """
@@ -37,7 +37,7 @@ class _NoDoctype(TreeBuilder):
 
 
 def _parsed_xml(content: bytes, key: str, kind: str) -> Element:
-    parser = XMLParser(target=_NoDoctype())  # noqa: S314 - without a document type there is nothing to expand
+    parser = XMLParser(target=_NoDoctype())  # noqa: S314 - nothing can be expanded without a document type
     try:
         parser.feed(content)
         root: Element = parser.close()
@@ -53,9 +53,9 @@ def _kind(element: Element) -> str:
 
 
 KML_LINES = ("LineString", "LinearRing", "Track")
-KML_OTHERS = ("Model", "NetworkLink")  # their geometry is in another file
-KML_VIEWS = ("Tour", "GroundOverlay", "PhotoOverlay", "ScreenOverlay")  # no geometry
-# part of the namespace of DJI's missions, which write heights and speeds in their own elements
+KML_OTHERS = ("Model", "NetworkLink")  # elements whose geometry is in another file
+KML_VIEWS = ("Tour", "GroundOverlay", "PhotoOverlay", "ScreenOverlay")  # elements without geometry
+# part of the namespace of DJI's missions, which have elements of DJI for heights and speeds
 DJI = "dji.com/wpmz"
 KML_MODES = {
     "absolute": Above.AS_POSE,
@@ -88,7 +88,8 @@ def read_kml(content: bytes, key: str, line: str | None = None) -> Places:
     geometries: list[Geometry] = []
     for kind, element in kinds:
         if kind == "Point" and has_line:
-            geometries.append(Geometry(kind, []))  # only a mark beside the line, at any altitude
+            # only a mark beside the line; its altitude does not matter
+            geometries.append(Geometry(kind, []))
         elif kind in (*KML_LINES, "Point"):
             # The altitudeMode of a Polygon holds for its rings.
             name = _text(marks.get(element), "name") or ""
@@ -101,7 +102,7 @@ def read_kml(content: bytes, key: str, line: str | None = None) -> Places:
 
 
 def _outer_elements(kinds: Sequence[tuple[str, Element]], outer: str) -> dict[Element, Element]:
-    """Return for each element inside an element of the kind `outer` the outer element."""
+    """Return the enclosing element of the kind `outer` for each element inside such an element."""
     outers: dict[Element, Element] = {}
     for kind, element in kinds:
         if kind == outer:
@@ -144,7 +145,7 @@ def _kml_places(key: str, kind: str, element: Element, polygon: Element | None) 
 
 
 def read_kmz(content: bytes, key: str, line: str | None = None) -> Places:
-    """Read the route in the KML file of a KMZ archive: doc.kml, or the only one.
+    """Read the route in the KML file of a KMZ archive, which is doc.kml or the only KML file.
 
     Files in the root of the archive come before those in folders (OGC 12-007r2, Annex C).
     """
@@ -190,7 +191,7 @@ receiver has lost its satellites."""
 
 
 def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
-    """Read a route (rte); if there is none a track (trk), or else the waypoints (wpt).
+    """Read the route (rte) of a GPX file, or else its track (trk), or else its waypoints (wpt).
 
     `line` chooses one of all routes and tracks.
     """
@@ -246,7 +247,7 @@ def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
 
 
 def _gpx_segments(line: Element, kind: str) -> list[list[Place]]:
-    """Return the segments of a track that have a position; a route counts as one segment."""
+    """Return the segments of a track that have positions; a route is a single segment."""
     parts = [line] if kind == "rte" else [element for element in line if _kind(element) == "trkseg"]
     return [places for element in parts if (places := _gpx_places(element, f"{kind}pt"))]
 
@@ -254,7 +255,7 @@ def _gpx_segments(line: Element, kind: str) -> list[list[Place]]:
 def _gap(end: Place, begin: Place) -> float:
     """Return the distance between two near positions on a sphere, m.
 
-    It is 0 if one of them is no valid position, because this is refused later.
+    The distance is 0 if a position is not valid, because such a position is refused later.
     """
     values = (end.latitude, end.longitude, begin.latitude, begin.longitude)
     if not all(isinstance(value, float) and math.isfinite(value) for value in values):

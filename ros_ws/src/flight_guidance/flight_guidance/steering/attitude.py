@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Attitude: body rates that reach and hold a bank and a pitch, in a coordinated turn."""
+"""Compute body rates that reach and hold a bank and a pitch, in a coordinated turn."""
 
 import math
 from typing import NamedTuple
@@ -28,12 +28,12 @@ deflected by half of its range."""
 class AttitudeParams(NamedTuple):
     """Gains and limits of the attitude loop."""
 
-    k_phi: float  # 1/s, a quarter of the natural frequency of p in the model: damping 0.74
-    k_theta: float  # 1/s, a quarter of the natural frequency of q
+    k_phi: float  # 1/s, a quarter of the reference's natural frequency of p; damping 0.74
+    k_theta: float  # 1/s, a quarter of the reference's natural frequency of q
     roll_rate: float  # largest phi_dot, rad/s
-    load: float  # largest change of the load factor, 1
+    load: float  # largest change of the load factor, without unit
     n_alpha: Scalar  # slope of the load factor over the angle of attack, 1/rad
-    k_beta: float  # 1/s, 0 if beta is not measured
+    k_beta: float  # 1/s; 0 if beta is not measured
     turn_lead: float = 0.0  # s, time by which r leads the bank
 
 
@@ -57,7 +57,7 @@ def body_rates(
 ) -> BodyRates:
     """Compute the rates that bring phi and theta to their commands.
 
-    They follow by the inverse of Euler's equations in a coordinated turn:
+    The inverse of Euler's equations in a coordinated turn gives the rates:
 
         phi_dot_c   = clip(k_phi (phi_c - phi), +-roll_rate),
             theta_dot_c = clip(k_theta (theta_c - theta), +-load g/V)
@@ -66,10 +66,11 @@ def body_rates(
         q_m = (theta_dot_c + r sin(phi)) / cos(phi) + phi_dot_c tan(phi) / (cos(phi) n_alpha)
         p_m = phi_dot_c - tan(theta) (q_m sin(phi) + r cos(phi))
 
-    q_m and p_m use the measured r, in case r is not tracked exactly. `turn_lead` makes up for the
-    lag of the turn behind the bank, caused by the reference model of r and by the sideslip in a
-    roll. The last term of q_m leads the angle of attack of the turn. Angles are in rad, `speed` V
-    in m/s. Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters 2 and 9.
+    q_m and p_m use the measured r, in case r is not tracked exactly. `turn_lead` compensates the
+    lag of the turn behind the bank. This lag comes from the reference model of r and from the
+    sideslip in a roll. The last term of q_m anticipates the angle of attack that the turn needs.
+    Angles are in rad, `speed` V in m/s. Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft
+    (2012), chapters 2 and 9.
     """
     speed = forward(speed)
     phi_dot = clip(params.k_phi * (phi_c - phi), params.roll_rate)
@@ -83,12 +84,13 @@ def body_rates(
 def yaw_for_bank(phi_c: Scalar, phi: Scalar, speed: Scalar) -> Scalar:
     """Compute the yaw rate for a bank without an aileron, rad/s, within +-g tan(LARGEST_YAW) / V.
 
-    It is the yaw rate of the turn, and more of it to roll the aircraft to the bank:
+    It is the yaw rate of the turn, plus a yaw rate that rolls the aircraft to the bank:
 
         r_m = g tan(phi_c) / V + k (SKIDDING phi_c - phi),  k = YAW_TO_BANK
 
-    phi_c is the bank of a coordinated turn at the same rate. A yaw rolls an aircraft to the same
-    side: the outer wing is faster, and the dihedral makes the sideslip roll it there, too.
+    phi_c is the bank of a coordinated turn at the same rate. A yaw rolls an aircraft to the side of
+    the yaw, because the outer wing is faster. The sideslip rolls it to the same side through the
+    dihedral.
     """
     xp = array_namespace(phi)
     turn = GRAVITY / forward(speed)

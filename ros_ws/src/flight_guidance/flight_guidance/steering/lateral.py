@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lateral guidance: the acceleration to the right, and the bank that gives it.
+"""Compute the acceleration to the right, and the bank that gives it.
 
-It holds a heading or course, or follows a path.
+The acceleration holds a heading or course, or follows a path.
 """
 
 import math
@@ -14,8 +14,8 @@ from flight_core.vectors import Scalar, array_namespace
 from flight_guidance import reach
 from flight_guidance.steering.protection import forward
 
-# Largest fraction of a turn that a sideslip takes away. It is 0.09 for the f16 of JSBSim in an
-# orbit, with the rudder at its stop.
+# Largest fraction of a turn that may be lost by sideslip. The fraction is 0.09 for the f16 of
+# JSBSim in an orbit, with the rudder at its stop.
 LARGEST_SLIP = 0.2
 
 HEADING_TIME = 2.0
@@ -35,12 +35,12 @@ class PathParams(NamedTuple):
     """Parameters of path following."""
 
     period: float  # P, s
-    damping: float  # zeta, 1
-    capture: float  # largest angle at which the path is approached, rad
+    damping: float  # zeta, without unit
+    capture: float  # rad, largest angle to the path at which the aircraft approaches it
 
 
 def turn_towards(difference: Scalar) -> Scalar:
-    """Return the turn for a difference of courses: its sine up to 90 deg, and +-1 beyond.
+    """Return the turn for a difference of courses, -1 to 1: its sine up to 90 deg, beyond that +-1.
 
     With the sine alone, an aircraft on the opposite course would not turn.
     """
@@ -57,7 +57,7 @@ def heading_estimate(psi: float, measured: float | None, psi_dot: float, dt: flo
 
         psi+ = psi + dt psi_dot + (1 - exp(-dt/T)) (measured - psi - dt psi_dot),  T = HEADING_TIME
 
-    This is a complementary filter: it smooths the noise of pose, and through the gyro it has no
+    This is a complementary filter. It smooths the noise of the pose, and the gyro keeps it free of
     lag. A bias of the gyro causes an error of T times the bias.
     """
     heading = psi + dt * psi_dot
@@ -68,7 +68,7 @@ def heading_estimate(psi: float, measured: float | None, psi_dot: float, dt: flo
 
 
 def course_acceleration(course_c: float, course: float, speed: float, k: float) -> float:
-    """Compute a = k V turn_towards(course_c - course), m/s^2, for a course or a heading."""
+    """Compute the acceleration a = k V turn_towards(course_c - course), m/s^2."""
     return float(k * speed * turn_towards(math.remainder(course_c - course, 2.0 * math.pi)))
 
 
@@ -82,10 +82,10 @@ def path_acceleration(
         a = (4 pi zeta / P) v_g turn_towards(bearing - course) + sin(l)^2 kappa / (1 - kappa e)
         v_g^2 cos(course - track)
 
-    Outside a circle of radius R, at the distance d from the centre, 1 - kappa e = d / R. acos(R /
-    d) is the angle between the tangent to the circle and the track, so an aircraft from afar flies
-    along the tangent. Near a line e'' + 2 zeta w e' + w^2 e = 0 with w = 2 pi / P. The velocity is
-    that over ground, so the same equations hold in a wind. On the inner side of an arc, e is
+    Outside a circle of radius R, at the distance d from its centre, 1 - kappa e = d / R. The angle
+    between the tangent to the circle and the track is acos(R / d), so a distant aircraft flies
+    along the tangent. Near a line e'' + 2 zeta w e' + w^2 e = 0 with w = 2 pi / P. The equations
+    use the velocity over ground, so they also hold in a wind. On the inner side of an arc, e is
     limited to half of the radius. Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp,
     without the adaptation to wind.
     """
@@ -112,17 +112,18 @@ def path_acceleration(
 def slip_estimate(
     slip: Scalar, turn: Scalar, acceleration: Scalar, rolling: Scalar, dt: float, time: float
 ) -> Scalar:
-    """Advance the estimate of the turn that a sideslip takes away at a bank, m/s^2.
+    """Advance the estimate of the acceleration that a turn loses by sideslip, m/s^2.
 
     `turn` = g tan(phi), `acceleration` = V psi_dot:
 
         slip+ = slip + (1 - exp(-dt/T)) max(1 - rolling / 0.2, 0) (turn - acceleration - slip),
         within +-LARGEST_SLIP abs(turn)
 
-    `rolling` is abs(p) / p_max. Since the turn lags the bank by the reference model of r, a roll
-    looks like a sideslip. A bias of the gyro of r looks like a sideslip, too. The bound is 0 in
-    straight flight, so there the bias has no effect. Path following adds the estimate to its
-    acceleration, so that an aircraft stays on an arc in a turn that is not coordinated.
+    `rolling` is abs(p) / p_max. Because the turn lags the bank by the reference model of r, a roll
+    looks like a sideslip, so the estimate rests while the aircraft rolls. A bias of the gyro of r
+    looks like a sideslip, too. In straight flight the bound is 0, so the bias has no effect. Path
+    following adds the estimate to its acceleration, so that an aircraft stays on an arc in a turn
+    that is not coordinated.
     """
     steady = array_namespace(slip).maximum(1.0 - rolling / 0.2, 0.0)
     return clip(
@@ -148,9 +149,9 @@ def least_period(speed: float, bank: float, roll_rate: float) -> float:
 
 
 def largest_wind(speed: float, wind: float, bank: float) -> float:
-    """Compute the wind in which a circle of `least_radius` for `wind` needs the whole bank, m/s.
+    """Compute the wind in which the circle of `least_radius` for `wind` needs the largest bank.
 
-    (V + W) sqrt(tan(b) / tan(0.8 b)) - V.
+    The result is (V + W) sqrt(tan(b) / tan(0.8 b)) - V, m/s.
     """
     return (speed + wind) * math.sqrt(math.tan(bank) / math.tan(0.8 * bank)) - speed
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Paths: lines and arcs in the local tangent plane, and routes of waypoints.
+"""Define paths of lines and arcs in the local tangent plane, and routes of waypoints.
 
 The corners of a route are fillets.
 """
@@ -48,9 +48,9 @@ class Line(NamedTuple):
 
 
 class Loiter(NamedTuple):
-    """What an aircraft does on a circle before it flies on.
+    """The circles that an aircraft flies before it goes on.
 
-    It flies on only at the altitude of the leg.
+    It goes on only at the altitude of the leg.
     """
 
     turns: float = 0.0  # number of turns
@@ -58,9 +58,10 @@ class Loiter(NamedTuple):
 
 
 class Arc(NamedTuple):
-    """A leg on a circle, less than a full turn.
+    """A leg on a circle that is less than a full turn, or an orbit.
 
-    Without an end it is an orbit for ever. With a loiter it is an orbit until the loiter is over.
+    An arc without an end is an endless orbit. An arc with a loiter is an orbit until the loiter is
+    over.
     """
 
     centre: Point
@@ -73,14 +74,15 @@ Leg = Line | Arc
 
 
 class Route(NamedTuple):
-    """Legs with an altitude and an airspeed each, those of the waypoint at the end of the leg."""
+    """The legs of a route, each with the altitude and airspeed of the waypoint at its end."""
 
     legs: tuple[Leg, ...]
-    altitude: tuple[float, ...]  # m
-    V: tuple[float, ...]  # m/s
+    altitude: tuple[float, ...]  # m, altitude of each leg
+    V: tuple[float, ...]  # m/s, airspeed of each leg
     from_altitude: tuple[float, ...] = ()  # m, altitude at the waypoint where the leg begins
     from_V: tuple[float, ...] = ()  # m/s, airspeed at this waypoint
-    slopes: bool = False  # whether the altitude changes along a line; if not, at its start
+    # whether the altitude changes linearly along a line instead of at its start
+    slopes: bool = False
     notes: tuple[str, ...] = ()  # sentences on what is flown differently from the waypoints
 
     @property
@@ -91,12 +93,12 @@ class Route(NamedTuple):
     def near(self, leg: int) -> float:
         """Return the distance from the end of a leg within which the leg counts as flown, m.
 
-        It is the radius, at least 1 s of flight.
+        The distance is the radius, but at least 1 s of flight.
         """
         return max(self.radius, self.V[leg])
 
     def start(self, leg: int, along: float = 0.0) -> tuple[Point, float]:
-        """Return the start of a leg and the course there, rad; for an orbit its centre.
+        """Return the start of a leg and the course at it, rad; for an orbit its centre.
 
         For a line the start is the point at the distance `along`, m.
         """
@@ -106,11 +108,11 @@ class Route(NamedTuple):
             return _along(path.start, course, along), course
         if is_orbit(path):
             return path.centre, 0.0
-        before = self.legs[leg - 1]  # an arc follows a line
+        before = self.legs[leg - 1]  # the leg before an arc is a line
         return before.end or path.centre, end_course(before)
 
     def profile(self, leg: int, along: float) -> tuple[float, float]:
-        """Return the altitude at a distance along a leg, m, and its slope, 1.
+        """Return the altitude at a distance along a leg, m, and the leg's slope, climb / distance.
 
         With `slopes` the altitude changes linearly from waypoint to waypoint, otherwise in a step.
         """
@@ -122,7 +124,7 @@ class Route(NamedTuple):
         return altitude - slope * (distance - along), slope
 
     def joining_altitude(self, leg: int, along: float) -> float:
-        """Return the altitude at which the aircraft joins a leg at a distance along it, m."""
+        """Return the altitude for joining a leg at a distance `along` it, m."""
         if along or not self.from_altitude:
             return self.profile(leg, along)[0]
         return self.from_altitude[leg]
@@ -159,9 +161,9 @@ def course_of(start: Point, end: Point) -> float:
 
 
 def error(leg: Leg, position: Point) -> PathError:
-    """Compute the cross-track error of a position.
+    """Compute the cross-track error of a position from a leg.
 
-    It comes with the course and the curvature of the leg at the nearest point.
+    The result also has the course and the curvature of the leg at the nearest point.
     """
     if isinstance(leg, Line):
         return line_error(leg.start, course_of(leg.start, leg.end), position)
@@ -169,7 +171,7 @@ def error(leg: Leg, position: Point) -> PathError:
 
 
 def line_error(start: Point, track: Scalar, position: Point) -> PathError:
-    """Compute the `error` from a line through a point with a course, rad."""
+    """Compute the `error` from the line through a point on a course, rad."""
     xp = array_namespace(track)
     north = position[0] - start[0]
     east = position[1] - start[1]
@@ -190,7 +192,7 @@ def circle_error(centre: Point, radius: Scalar, position: Point) -> PathError:
 
 
 def end_course(leg: Leg) -> float:
-    """Return the course at the end of a leg, rad, or raise ValueError for an orbit."""
+    """Return the course at the end of a leg, rad. Raises ValueError for an orbit."""
     if isinstance(leg, Line):
         return course_of(leg.start, leg.end)
     if leg.end is None:
@@ -199,9 +201,9 @@ def end_course(leg: Leg) -> float:
 
 
 def is_passed(leg: Leg, position: Point) -> bool:
-    """Return whether a position lies beyond the line through the end of a leg, across its course.
+    """Return whether a position has passed the end of a leg.
 
-    For an orbit, return False.
+    It lies beyond the line through the end, perpendicular to the course. An orbit is never passed.
     """
     return (
         leg.end is not None
@@ -211,7 +213,7 @@ def is_passed(leg: Leg, position: Point) -> bool:
 
 
 def is_beyond(end: Point, course: Scalar, position: Point) -> Any:
-    """Return whether a position lies beyond the half plane through a point across a course, rad."""
+    """Return whether a position lies beyond the line through a point across a course, rad."""
     xp = array_namespace(course)
     north = position[0] - end[0]
     east = position[1] - end[1]
@@ -219,14 +221,14 @@ def is_beyond(end: Point, course: Scalar, position: Point) -> Any:
 
 
 def is_entered(leg: Leg, following: Leg | None, position: Point) -> bool:
-    """Return whether a position lies beyond the end of a leg, but not beyond a following arc."""
+    """Return whether a position lies beyond the end of a leg, but not beyond a `following` arc."""
     return is_passed(leg, position) and not (
         isinstance(following, Arc) and is_passed(following, position)
     )
 
 
 def to_go(leg: Leg, position: Point) -> float:
-    """Return the distance along a leg from the point nearest to a position to the end, m."""
+    """Return the distance along a leg to its end, m, from the point nearest to a position."""
     if leg.end is None or is_orbit(leg):
         return 0.0
     if isinstance(leg, Line):
@@ -239,20 +241,20 @@ def to_go(leg: Leg, position: Point) -> float:
     return leg.radius * math.remainder(turn, 2.0 * math.pi)
 
 
-# Joining a leg: the aircraft flies along the tangent to a circle that touches the leg at a point,
-# and round the circle onto it.
+# Joining a leg: the joining circle touches the leg at a point. The aircraft flies along a tangent
+# to this circle, and then round the circle onto the leg.
 
 
 class Side(IntEnum):
     """Side of the joining circle, which is the sign of its radius."""
 
-    NONE = 0  # on the leg, or near its point: no circle
+    NONE = 0  # no circle, because the aircraft is on the leg or near its point
     RIGHT = 1
     LEFT = -1
 
 
 def joining_centre(point: Point, course: Scalar, radius: Scalar) -> Point:
-    """Return the centre of the circle that touches a course, rad, at a point.
+    """Return the centre of the circle that touches the line through a point on a course, rad.
 
     The radius is positive to the right, m.
     """
@@ -263,11 +265,12 @@ def joining_centre(point: Point, course: Scalar, radius: Scalar) -> Point:
 def joining_length(
     point: Point, course: Scalar, radius: Scalar, position: Point, course_flown: Scalar
 ) -> Scalar:
-    """Compute the length of the way onto a course, m: R abs(turn) + sqrt(d^2 - R^2) + R sweep.
+    """Compute the length of the way by a joining circle onto a course at a point, m.
 
-    turn is the angle from the course flown to the tangent, and d the distance from the centre of
-    the joining circle. sweep is the angle on the circle from the point where the tangent touches it
-    to the point of the leg. `course_flown` and `course` are in rad.
+    The length is R abs(turn) + sqrt(d^2 - R^2) + R sweep. turn is the angle from the course flown
+    to the tangent, and d is the distance from the centre of the joining circle. sweep is the angle
+    on the circle from the point where the tangent touches it to the point of the leg.
+    `course_flown` and `course` are in rad.
     """
     xp = array_namespace(radius)
     centre = joining_centre(point, course, radius)
@@ -291,10 +294,10 @@ def joining(
     position: Point,
     course_flown: Scalar,
 ) -> Scalar:
-    """Choose the side of the shorter joining circle onto a course at a point.
+    """Choose the side of the joining circle with the shorter way onto a course at a point.
 
-    Return a value of `Side` for each place. No circle is needed if the place is within `near`, m,
-    and the course flown within OPPOSITE of the course.
+    Returns a value of `Side` for each position. No circle is needed if the position is within
+    `near`, m, of the point, and the course flown is within OPPOSITE of the course.
     """
     right_way, left_way = (
         joining_length(point, course, side * radius, position, course_flown)
@@ -312,7 +315,7 @@ def is_joined(
 ) -> Any:
     """Return whether an aircraft is beyond a point of a leg, and near the leg.
 
-    Near means within `near`, m, and within JOINED of the course of the leg.
+    Near means within `near`, m, of the leg, and on a course within JOINED of the leg's course.
     """
     xp = array_namespace(course)
     is_near = xp.hypot(position[0] - point[0], position[1] - point[1]) <= near
@@ -359,7 +362,7 @@ def route_outline(route: Route) -> list[tuple[float, float, float]]:
 
 
 def lengths_after(route: Route) -> list[float]:
-    """Return the length of the legs after each leg, m; the last orbit has none."""
+    """Return the total length of the legs that follow each leg, m; the last orbit counts as 0."""
     lengths = []
     point = route.start(0)[0]
     for leg in route.legs[:-1]:
@@ -385,7 +388,7 @@ def leg_places(route: Route) -> list[Point]:
 
 
 def distance_from(legs: Sequence[Leg], point: Point) -> float:
-    """Return the distance of a point from lines, fillets and the endless orbit of a route, m."""
+    """Return the distance of a point from the lines, fillets and endless orbit of a route, m."""
     distances = []
     for leg in legs:
         if isinstance(leg, Line):
@@ -400,16 +403,16 @@ def distance_from(legs: Sequence[Leg], point: Point) -> float:
 
 
 def turns_back(leg: Leg, following: Leg | None) -> bool:
-    """Return whether a corner between two lines is beyond SHARPEST."""
+    """Return whether the corner between two lines is sharper than SHARPEST."""
     if not isinstance(leg, Line) or not isinstance(following, Line):
         return False
     return abs(math.remainder(end_course(following) - end_course(leg), 2.0 * math.pi)) > SHARPEST
 
 
 def leads(legs: Sequence[Leg]) -> list[int]:
-    """Return the numbers of the waypoints at the ends of the legs of a route.
+    """Return the number of the waypoint to which each leg of a route leads.
 
-    For a fillet at a waypoint, this is the next waypoint.
+    A fillet leads to the waypoint after the corner.
     """
     numbers = []
     number = 0
@@ -424,7 +427,7 @@ class ShortLegError(ParameterError):
 
     def __init__(self, sentence: str, number: int) -> None:
         super().__init__(sentence)
-        self.number = number  # of the waypoint at the end of the leg
+        self.number = number  # number of the waypoint at the end of the leg
 
 
 def route(
@@ -436,14 +439,15 @@ def route(
 ) -> tuple[Leg, ...]:
     """Plan legs through waypoints, then an orbit round the last waypoint.
 
-    The corners have fillets of a radius, m. The fillet of a turn tau begins and ends at radius
-    tan(tau / 2) from the waypoint; a corner beyond SHARPEST has no fillet. At a waypoint of
-    `loiters`, by number, a circle round the waypoint replaces the fillet. Circles and the orbit
-    are clockwise, but counter-clockwise at the waypoints of `left`. Lines are tangents to them; a
-    line too short for a tangent leads to the waypoint. Raises ParameterError for fewer than two
-    waypoints, a radius below `least` (`lateral.least_radius`), a waypoint within the circle of a
-    loiter, and circles of opposite sides that overlap; ShortLegError for a leg too short for the
-    fillets. Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
+    The corners have fillets of `radius`, m. The fillet of a turn tau begins and ends at radius
+    tan(tau / 2) from the waypoint. A corner sharper than SHARPEST has no fillet. `loiters` has
+    waypoints by number, at which a circle round the waypoint replaces the fillet. Circles and the
+    orbit are clockwise, but counter-clockwise at the waypoints of `left`. Lines are tangents to the
+    circles, but a line that is too short for a tangent leads to the waypoint. Raises ParameterError
+    for fewer than two waypoints, for a radius below `least` (`lateral.least_radius`), for a
+    waypoint inside the circle of a loiter, and for circles of opposite sides that overlap. Raises
+    ShortLegError for a leg that is too short for the fillets. Source: R. W. Beard, T. W. McLain,
+    Small Unmanned Aircraft (2012), algorithm 8.
     """
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
     require(
@@ -455,7 +459,7 @@ def route(
     legs: list[Leg] = []
     first = 0
     last = len(waypoints) - 1
-    before = 0  # side of the circle before: 1 right, -1 left, 0 if there is none
+    before = 0  # side of the previous circle: 1 right, -1 left, 0 without a circle
     for k in [*sorted(number for number in loiters if number < last), last]:
         side = -1 if k in left else 1
         if k > 0:
@@ -472,10 +476,10 @@ def route(
 
 
 def tangent(centres: tuple[Point, Point], radius: float, sides: tuple[int, int]) -> Line:
-    """Compute the line from one circle to the next, each of a radius in m.
+    """Compute the line that is tangent to two circles of a radius in m.
 
     Sides are 1 for a clockwise circle, -1 for a counter-clockwise one, 0 for a point. With the
-    bearing and the distance of the second centre from the first,
+    bearing and the distance from the first centre to the second,
 
         course = bearing - asin((side_2 - side_1) radius / distance),
 
@@ -492,10 +496,10 @@ def tangent(centres: tuple[Point, Point], radius: float, sides: tuple[int, int])
 def _between_circles(
     waypoints: Sequence[Point], radius: float, first: int, sides: tuple[int, int]
 ) -> list[Leg]:
-    """Plan lines and fillets from a circle round the first waypoint to one round the last.
+    """Plan lines and fillets between a circle round the first waypoint and one round the last.
 
-    `sides` are as for `tangent`; the first is 0 if there is no circle. `first` is the number of the
-    first waypoint.
+    `sides` are as for `tangent`; the first side is 0 without a circle at the first waypoint.
+    `first` is the number of the first waypoint.
     """
     points = list(waypoints)
     if sides[0]:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Protection: limits of the bank, the airspeed and the climb rate, applied in this order.
+"""Limit the bank, the airspeed and the climb rate, in this order.
 
-They follow from the stall speed and the commanded airspeed.
+The limits follow from the stall speed and the commanded airspeed.
 """
 
 from flight_core.units import GRAVITY
@@ -28,15 +28,14 @@ no flow."""
 
 
 def forward(speed: Scalar) -> Scalar:
-    """Make a speed usable as a divisor, m/s: max(V, LEAST_SPEED)."""
+    """Return a speed that can be a divisor, m/s: max(V, LEAST_SPEED)."""
     return array_namespace(speed).maximum(speed, LEAST_SPEED)
 
 
 def bank_limit(limit: float, stall_speed: float, speed: Scalar) -> Scalar:
     """Compute the largest bank, rad: min(phi_max, acos((1.1 V_s / V)^2)).
 
-    The load factor of a level turn is 1 / cos(phi). At a V of 1.1 V_s and below the bank is 0: the
-    wings are level.
+    The load factor of a level turn is 1 / cos(phi). At a V of 1.1 V_s or less the bank is 0.
     """
     xp = array_namespace(speed)
     ratio = STALL_MARGIN * stall_speed / forward(speed)
@@ -56,8 +55,8 @@ def _share(value: Scalar) -> Scalar:
 def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scalar:
     """Compute the largest climb rate, m/s: ratio climb - (1 - ratio) sink.
 
-    ratio = clip((V - 0.9 V_floor) / (0.1 V_floor), 0, 1). Below the floor, the pitch controls the
-    airspeed: at nine tenths of the floor the aircraft sinks at the largest rate.
+    ratio = clip((V - 0.9 V_floor) / (0.1 V_floor), 0, 1). So below the floor the pitch controls the
+    airspeed. At nine tenths of the floor the aircraft sinks at its largest rate.
     """
     ratio = _share((speed - 0.9 * floor) / (0.1 * floor))
     return ratio * climb - (1.0 - ratio) * sink
@@ -66,8 +65,8 @@ def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scala
 def sink_limit(climb: float, sink: float, speed: Scalar, largest: float) -> Scalar:
     """Compute the least climb rate, m/s: (1 - ratio) climb - ratio sink.
 
-    ratio = clip((1.1 V_max - V) / (0.1 V_max), 0, 1). This mirrors `climb_limit`: above the
-    largest airspeed, the pitch controls the airspeed.
+    ratio = clip((1.1 V_max - V) / (0.1 V_max), 0, 1). This is the counterpart of `climb_limit`:
+    above the largest airspeed V_max, the pitch controls the airspeed.
     """
     ratio = _share((1.1 * largest - speed) / (0.1 * largest))
     return (1.0 - ratio) * climb - ratio * sink
@@ -76,9 +75,9 @@ def sink_limit(climb: float, sink: float, speed: Scalar, largest: float) -> Scal
 def climb_range(
     climb: float, sink: float, shortfall: Scalar, speed: float
 ) -> tuple[Scalar, Scalar]:
-    """Compute least and largest climb rate, m/s, from the shortfall V_c - V of the airspeed, m/s.
+    """Compute the least and the largest climb rate, m/s, for an airspeed error V_c - V, m/s.
 
-    A shortfall arises when a throttle at its stop cannot hold V:
+    The error, called shortfall, arises when a throttle at its stop cannot hold V:
 
         -sink clip(2 + shortfall / d, 0, 1),  climb clip(2 - shortfall / d, 0, 1),
             d = max(0.05 V0, g climb / (0.4 V0))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Vertical guidance: the climb rate for an altitude, and the pitch for a climb rate."""
+"""Compute the climb rate for an altitude, and the pitch for a climb rate."""
 
 import math
 from typing import NamedTuple
@@ -33,7 +33,7 @@ class VerticalParams(NamedTuple):
 def climb_for(error: Scalar, params: VerticalParams) -> Scalar:
     """Compute the climb rate, m/s, for an altitude error (command minus altitude), m.
 
-    It stays within -sink and climb:
+    It stays between -sink and climb:
 
         k_h e  near,  sign(e) sqrt(a (abs(e) - e_l / 2))  from e_l = a / (2 k_h^2) on
 
@@ -58,12 +58,12 @@ def slewed(value: Scalar, target: Scalar, rate: float, dt: float) -> Scalar:
 def alpha_estimate(
     alpha: Scalar, theta: Scalar, climb: Scalar, speed: Scalar, dt: float, params: VerticalParams
 ) -> Scalar:
-    """Advance the low-pass of theta - gamma by a step, gamma = asin(climb / V).
+    """Advance the estimate of the angle of attack by a step, rad.
 
         alpha+ = alpha + (1 - exp(-dt/T)) (theta - gamma - alpha)
 
-    The filter replaces an integrator. It is bumpless, has no windup, and is correct at any bank,
-    airspeed or trim.
+    It is a low-pass of theta - gamma, where gamma = asin(climb / V). The filter replaces an
+    integrator. It is bumpless, has no windup, and is correct at any bank, airspeed or trim.
     """
     return alpha + (1.0 - math.exp(-dt / params.alpha_time)) * (
         theta - path_angle(climb, speed) - alpha
@@ -76,10 +76,11 @@ def pitch_for(climb: Scalar, speed: Scalar, alpha: Scalar) -> Scalar:
 
 
 def climb_speed(error: Scalar, speed: Scalar) -> Scalar:
-    """Compute by how much to raise the airspeed, m/s, for an error of the climb rate, m/s.
+    """Compute the increase of the airspeed, m/s, that corrects an error of the climb rate, m/s.
 
-    It is K V / (2 g) error, for an aircraft without an elevator. At a constant angle of attack the
-    lift grows with V^2, so h_ddot = 2 g dV / V, and the error decays at K = CLIMB_BANDWIDTH.
+    An aircraft without an elevator uses it. The increase is K V / (2 g) error. At a constant angle
+    of attack the lift grows with V^2, so h_ddot = 2 g dV / V, and the error decays at K =
+    CLIMB_BANDWIDTH.
     """
     return CLIMB_BANDWIDTH * speed / (2.0 * GRAVITY) * error
 
@@ -89,8 +90,8 @@ def path_lag(stall_speed: float, speed: float) -> float:
 
         T_L = V alpha_1 / g,  alpha_1 = 0.3 rad (V_s / V)^2
 
-    V gamma_dot = g (alpha - alpha_1) / alpha_1 near level flight. alpha_1 is the angle of attack
-    in level flight, counted from zero lift.
+    alpha_1 is the angle of attack in level flight, measured from zero lift. Near level flight, V
+    gamma_dot = g (alpha - alpha_1) / alpha_1.
     """
     return STALL_ANGLE * stall_speed**2 / (GRAVITY * speed)
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Wind: the velocity over ground minus the velocity through the air.
+"""Compute the wind, which is the velocity over ground minus the velocity through the air.
 
-It has a north and an east part.
+The wind has a north and an east part.
 """
 
 import math
@@ -19,8 +19,8 @@ Wind = tuple[Scalar, Scalar]  # velocity of the air: north, east, m/s
 def wind_of(v_north: Scalar, v_east: Scalar, climb: Scalar, heading: Scalar, speed: Scalar) -> Wind:
     """Compute the wind from the velocity over ground and the airspeed, m/s.
 
-    It is v_g - sqrt(V^2 - climb^2) [cos, sin](heading), where `heading` is psi + beta, rad, the
-    direction of the flight through the air.
+    The wind is v_g - sqrt(V^2 - climb^2) [cos, sin](heading). `heading` is psi + beta, rad, the
+    direction of flight through the air.
     """
     xp = array_namespace(speed)
     level = xp.sqrt(xp.maximum(speed**2 - climb**2, 0.0))
@@ -28,7 +28,7 @@ def wind_of(v_north: Scalar, v_east: Scalar, climb: Scalar, heading: Scalar, spe
 
 
 def wind_estimate(wind: Wind, measured: Wind, dt: float) -> Wind:
-    """Advance the low-pass of the wind by a step.
+    """Advance the estimate of the wind by a step; it is a low-pass.
 
     wind+ = wind + (1 - exp(-dt/T)) (measured - wind), T = WIND_TIME
     """
