@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The u that the aircraft applies.
+"""Compute the u that the aircraft applies from the u that it receives.
 
-It follows the received u, the failsafe if u times out, and a bumpless return.
+If u times out, the failsafe acts, and a later u takes over without a bump.
 """
 
 import numpy as np
@@ -12,14 +12,14 @@ from flight_core.vectors import FloatArray
 
 
 class AppliedInput:
-    """The applied u, shape (m,).
+    """The u that the aircraft applies, shape (m,).
 
         u_applied(t) = s(t - t_u) u + r(t - t_0) offset,    offset = u_applied(t_0) - u(t_0)
 
-    u is the last received u and t_u the instant of receipt. s is 1 for `hold_ns`, then falls to 0
-    within `ramp_ns`. t_0 is the instant of the last bumpless transfer: to a new publisher, or to a
-    u after the ramp has begun. r falls from 1 to 0 within `ramp_ns`, so that u_applied does not
-    jump at t_0.
+    u is the last received u, and t_u is the instant of its receipt. s is 1 for `hold_ns`, and then
+    falls to 0 within `ramp_ns`. t_0 is the instant of the last bumpless transfer, which is made to
+    a new publisher, and to a u that arrives after the ramp has begun. r falls from 1 to 0 within
+    `ramp_ns`, so that u_applied does not jump at t_0.
     """
 
     def __init__(self, m: int, hold_ns: int, ramp_ns: int) -> None:
@@ -29,7 +29,7 @@ class AppliedInput:
         self._u_ns = self._transfer_ns = 0
 
     def take(self, u: FloatArray, now_ns: int, *, transfer: bool) -> None:
-        """Take a received u; `transfer` says that its publisher is new."""
+        """Take a received u; `transfer` is true if its publisher is new."""
         if transfer or self._scale(now_ns) < 1.0:
             self._offset = self.u_at(now_ns) - u
             self._transfer_ns = now_ns

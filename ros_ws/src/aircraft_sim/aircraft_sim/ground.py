@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The end of a flight on the ground: a landing, or a crash."""
+"""End a flight on the ground as a landing or as a crash."""
 
 import math
 
@@ -18,10 +18,10 @@ of height touches the ground at 22 deg."""
 
 
 def touch(title: str, t_ns: int, sink: float, *, is_on_wheels: bool) -> FlightEnded:
-    """End a flight that touches the ground with a sink, m/s.
+    """Return the end of a flight that touches the ground at a sink rate `sink`, m/s.
 
-    It has landed if it is on its wheels and the sink is at most SOFT; otherwise it has hit the
-    ground.
+    The aircraft has landed if it is on its wheels and the sink rate is at most SOFT. Otherwise it
+    has hit the ground.
     """
     has_landed = is_on_wheels and sink <= SOFT
     verb = "landed" if has_landed else "hit the ground"

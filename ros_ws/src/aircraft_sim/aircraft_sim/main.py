@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `aircraft`."""
+"""The entry point of the executable `aircraft`."""
 
 from flight_ros.startup import start_nodes
 
@@ -8,7 +8,7 @@ PARAMETERS = ("aircraft", "aircraft_sim.params:AircraftConfig")
 
 
 def main() -> None:
-    """Start the node."""
+    """Start the node of the simulated aircraft."""
     start_nodes("aircraft_sim.node:AircraftNode", parameters=PARAMETERS)
 
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A multicopter: the linear model of an airframe for rates and climb.
+"""Simulate a multicopter by the linear model of an airframe for rates and climb.
 
-The tilt of the thrust moves it over ground.
+The tilt of the thrust moves the multicopter over ground.
 """
 
 from collections.abc import Sequence
@@ -26,9 +26,10 @@ class MulticopterModel(StateSpaceModel):
         c_dot = A[c, c] c + T_c + (n_up - 1) T,  T = g + T_c,  T_c = (B u)[c]
         v_dot = T [n_north, n_east] + A[c, c] v
 
-    The attitude follows Euler's equations, and n is its `thrust_axis`. The damping of the climb
-    acts in every direction. If A has the states phi and theta, they do not act on the pose, because
-    the model integrates an attitude of its own. n and the rates are taken in the middle of a step.
+    The attitude follows Euler's equations, and n is the `thrust_axis` of the attitude. The damping
+    of the climb acts in every direction. If A has the states phi and theta, they have no effect on
+    the pose, because the model integrates a separate attitude. n and the rates are taken in the
+    middle of a step.
     """
 
     def __init__(self, parameters: AircraftConfig) -> None:
@@ -39,21 +40,21 @@ class MulticopterModel(StateSpaceModel):
         self._into_climb = self._up * np.eye(len(states))[self._climb]
         self._phi = 0.0
         self._theta = 0.0
-        self._level = np.zeros(2)  # v through the air, to the north and to the east, m/s
+        self._level = np.zeros(2)  # m/s, velocity through the air, to the north and to the east
         super().__init__(parameters)
 
     def _thrust(self) -> float:
-        """Return T, m/s^2."""
+        """Return the specific thrust T, m/s^2."""
         row = self._plant.aircraft.B[self._climb]
         return GRAVITY + self._up * float(row @ self._state.position)
 
     def _tilted(self, forced: Forcing) -> Forcing:
-        """See StateSpaceModel."""
+        """Return the forcing of a step with the loss of lift in a tilt."""
         up = thrust_axis(self._phi, self._theta, self._psi)[2]
         return forced._replace(rate=forced.rate + (up - 1.0) * self._thrust() * self._into_climb)
 
     def _fly_on(self, dt: float) -> None:
-        """See StateSpaceModel."""
+        """Integrate attitude and horizontal velocity over a step."""
         p, q, r = self._state.x[self._rates].tolist()
         phi_dot, theta_dot = euler_rates(self._phi, self._theta, p, q, r)
         half = dt / 2.0
@@ -70,13 +71,13 @@ class MulticopterModel(StateSpaceModel):
         )
 
     def _states(self) -> list[float]:
-        """See StateSpaceModel."""
+        """Return the POSE_STATES, deviations from trim."""
         states = super()._states()
         states[PHI] = self._phi
         states[THETA] = self._theta
         return states
 
     def _air_velocity(self, states: Sequence[float]) -> tuple[float, float, float]:
-        """See StateSpaceModel."""
+        """Return the velocity relative to the air mass: north, east, up, m/s."""
         north, east = self._level.tolist()
         return north, east, self._up * float(self._state.x[self._climb])

@@ -3,7 +3,7 @@
 """The node of the simulated aircraft, in real time or in lockstep.
 
 It subscribes to u, and publishes y, pose and truth. A watchdog measures the age of u. If u times
-out, the failsafe holds the last value, then ramps to trim.
+out, the failsafe holds the last value, and then ramps it to trim.
 """
 
 from collections.abc import Sequence
@@ -32,24 +32,24 @@ recorder that overruns."""
 
 
 class AircraftNode(FlightNode[AircraftConfig]):
-    """Integrates at tick k from t(k-1) to t(k), with the last u held.
+    """Flies the simulated aircraft from sample to sample.
 
-    Then it publishes y and truth, and takes the newest u. In lockstep this node sets the time: y,
-    truth and pose come at their instants. At each instant of the controller the node waits for u,
-    then publishes clock with the next instant. Each instant has exactly one y, which has no
-    channels if no sample arrives.
+    At tick k the node integrates from t(k-1) to t(k) with the last u held. Then it publishes y and
+    truth, and takes the newest u. In lockstep this node sets the time, and publishes y, truth and
+    pose at their instants. At each instant of the controller, the node waits for u and then
+    publishes clock with the next instant. Each instant has exactly one y, which has no channels if
+    no sample arrives.
     """
 
     def __init__(self) -> None:
         super().__init__("aircraft", AircraftConfig)
         self._simulator = Simulator(self.parameters)
-        self._u = np.zeros(len(self._simulator.inputs))  # the newest
+        self._u = np.zeros(len(self._simulator.inputs))  # the newest u
         held_ns = nanoseconds(self.parameters.max_age + self.parameters.hold)
         self._applied = AppliedInput(len(self._u), held_ns, nanoseconds(self.parameters.ramp))
         self._publisher_lock = self.publisher_lock(self._timeouts_ns)
         self._timeout_logged = False
-        # ns, since the last diagnostics, by the node's own clock, because a u has the stamp of its
-        # y.
+        # ns since the last diagnostics, by the node's clock: the stamp of a u is that of its y
         self._ages_of_u: list[int] = []
         decode = Decoder(self._simulator.inputs).decode
         self._u_receiver = self.receive(
@@ -78,7 +78,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return (self._u_receiver.subscription,)
 
     def on_parameters(self, parameters: AircraftConfig) -> None:
-        """Begin and end faults between two samples."""
+        """Let faults begin or end between two samples."""
         self._simulator.retune(parameters)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
@@ -89,7 +89,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._take_u(now_ns)
 
     def _fly_to(self, number: int, start_ns: int, u: FloatArray) -> list[bytes]:
-        """Fly to a sample, and return the messages of the y that arrive."""
+        """Fly to a sample, and return the messages with the samples of y that arrive."""
         return [
             self._y_encoder.encode(start_ns + y.stamp_ns, y.value)
             for y in self._simulator.sample(number, u)
@@ -102,7 +102,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
             self._publish_pose(self._pose_encoder.encode(start_ns + pose.stamp_ns, pose.value))
         awaited = self.parameters.lockstep and number % every(self.parameters.rate) == 0
         if awaited and not (poses and start_ns + poses[-1].stamp_ns == stamp_ns):
-            # No pose of this instant comes later.
+            # No later pose belongs to this instant.
             self._publish_pose(self._empty_encoder.encode(stamp_ns, NO_CHANNELS))
         self._publish_truth(self._truth_encoder.encode(stamp_ns, self._simulator.truth()))
 
@@ -115,11 +115,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
             return False
         if self._ahead_of_log():
             return False
-        # The next instant that needs a u.
+        # The next instant that needs a u follows.
         waits_ns = -(-self._number * self.period_ns() // self._control_ns) * self._control_ns
         until_ns = min(waits_ns, self._end_ns or waits_ns)
-        # The clock comes first, so that the reference model computes y_m while the aircraft
-        # integrates.
+        # The clock comes first, so that the reference model can compute y_m during the integration.
         self._publish_clock(instant(until_ns))
         messages: list[bytes] = []
         while (t_ns := self._number * self.period_ns()) <= until_ns:
@@ -128,7 +127,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
             ]
             self._publish_motion(self._number, 0)
             self._number += 1
-        # Send the messages together, because each y by itself would wake up the controller.
+        # Send the messages together, because each single y would wake up the controller.
         for message in messages:
             self._publish_y(message)
         self._u_received = until_ns % self._control_ns != 0
@@ -160,12 +159,12 @@ class AircraftNode(FlightNode[AircraftConfig]):
     def _take_u(self, now_ns: int) -> bool:
         """Take the received u, and return whether there was a valid message.
 
-        A message without channels is valid: the controller then has no output at this instant of a
-        lockstep flight.
+        A message without channels is valid, too. It says that the controller has no output at this
+        instant of a lockstep flight.
         """
         publisher = self._publisher_lock.publisher
         u = self._u
-        # In lockstep there is one u for each y, and a refused one does not count.
+        # In lockstep there is one u for each y, and a refused u does not count.
         most = 1 if self.parameters.lockstep else None
         valid = self._u_receiver.poll(now_ns, most)
         while most and valid == [False]:
@@ -190,7 +189,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
             self._ages_of_u.append(now_ns - sample.stamp_ns)
 
     def _max_u_age_ns(self) -> int:
-        """Return the age limit of a u by its stamp, which is the stamp of the y it came from.
+        """Return the age limit of u, ns; the age counts from the stamp of the y that led to it.
 
         The limit is needed because the middleware of a controller that was stopped sends the last u
         when the process continues.
@@ -202,7 +201,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return nanoseconds(self.parameters.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Return the timeouts of the publisher of u.
+        """Return the times after which the publisher of u has timed out, ns.
 
         Another node can take over after u has reached trim.
         """

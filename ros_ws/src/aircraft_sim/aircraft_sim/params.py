@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the simulated aircraft, validated once.
 
-They convert themselves to the arrays of the equations.
+Their methods convert them to the arrays of the equations.
 """
 
 from collections.abc import Sequence
@@ -70,20 +70,20 @@ from flight_core.parameters import (
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray
 
-SHORTEST_STEP = 1e-5  # s; 100,000 integrations for a second of flight take about 5 s
+SHORTEST_STEP = 1e-5  # s; then a second of flight takes about 5 s
 
 
 class AircraftChannels(NamedTuple):
-    """Outputs and inputs of an aircraft of any kind."""
+    """Outputs and inputs of an aircraft, whatever its kind."""
 
     outputs: dict[str, Unit]  # in the order of y
-    inputs: dict[str, Unit]  # in the order of u, with units for display (topics are in SI)
-    positive: dict[str, str]  # what a positive value of each input does, such as "nose down"
+    inputs: dict[str, Unit]  # in the order of u, with the units for display (topics are in SI)
+    positive: dict[str, str]  # effect of a positive value of each input, such as "nose down"
     speed: float  # trim speed V0, m/s
 
 
 class AircraftConfig(NodeConfig):
-    """Parameters of the aircraft's node."""
+    """Parameters of the node of the simulated aircraft."""
 
     airframe: str = Field(description="name, path of a file, jsbsim:NAME or jsbsim:PATH")
     speed: Positive | None = Field(
@@ -174,7 +174,7 @@ class AircraftConfig(NodeConfig):
     def tunable(cls) -> frozenset[str]:
         """Return the parameters of faults that can begin and end in flight.
 
-        They are faults of effectors and sensors, gusts, and the start of a drift.
+        These are the faults of effectors and sensors, the gusts, and the start of a drift.
         """
         gusts = {f"gusts.{axis}.{key}" for axis, key in product(AXES, Gust.model_fields)}
         sensors = {f"sensors.{key}" for key in ("bias", "noise", "dropout")} | {
@@ -311,11 +311,11 @@ class AircraftConfig(NodeConfig):
         )
 
     def _stops(self) -> dict[str, Sequence[float]]:
-        """Return the end stops by their keys."""
+        """Return the end stops of the actuators by key."""
         return {end: getattr(self.actuators, end) for end in effector_faults.ENDS}
 
     def _no_thrust(self) -> FloatArray:
-        """Return the value of each input at which it gives no thrust, from trim, SI.
+        """Return the value of each input at which it gives no thrust, as deviation from trim, SI.
 
         It is nan if unknown, and -1 for JSBSim's throttle until the model knows its trim.
         """
@@ -382,16 +382,16 @@ class AircraftConfig(NodeConfig):
 
     @property
     def has_rotary_gusts(self) -> bool:
-        """Whether the air turns."""
+        """Whether rotary gusts act, which means that the air turns."""
         return self.turbulence is not None and self.turbulence.rotary
 
     def nominal_airframe(self) -> Airframe:
-        """Return the named airframe, with the axes of rotary gusts if these act."""
+        """Return the named airframe, with the axes of rotary gusts if there are rotary gusts."""
         airframe = load_airframe(self.airframe)
         return airframe.with_rotary_gusts() if self.has_rotary_gusts else airframe
 
     def sampled_airframe(self) -> Airframe:
-        """Return the airframe in flight.
+        """Return the airframe in flight at the start.
 
         It is the named airframe, or a sample of `uncertainty` around it.
         """
@@ -407,7 +407,7 @@ class AircraftConfig(NodeConfig):
         )
 
     def drifted_airframe(self) -> Airframe:
-        """Return the airframe after its drift, or the airframe in flight if it does not drift."""
+        """Return the airframe after its drift; without a drift, the airframe in flight."""
         airframe = self.sampled_airframe()
         section = self.drift
         if section is None:
@@ -417,7 +417,7 @@ class AircraftConfig(NodeConfig):
         )
 
     def drift_factors(self) -> Drift | None:
-        """Return the drift as factors on the matrices of equation (1)."""
+        """Return the drift as factors on the matrices of equation (1); None without a drift."""
         if self.drift is None:
             return None
         matrices = (
@@ -431,7 +431,7 @@ class AircraftConfig(NodeConfig):
         return Drift(self.drift.start, self.drift.duration, *factors)
 
     def load(self) -> tuple[Airframe, Aircraft]:
-        """Return the airframe in flight and the arrays of equation (1) with the disturbances.
+        """Return the airframe in flight, and the arrays of equation (1) with the disturbances.
 
         The disturbances act along the axes of the airframe's gusts.
         """
@@ -503,23 +503,23 @@ class AircraftConfig(NodeConfig):
         )
 
     def wind_model(self) -> WindModel:
-        """Return the wind of an aircraft of JSBSim, on every axis."""
+        """Return the wind along every axis for an aircraft of JSBSim."""
         turbulence = self._turbulence(self.flight_condition().speed, AXES, None)
         return WindModel(self.gust_arrays(AXES), turbulence, self.relative_wind())
 
     def ground(self) -> float | None:
-        """Return the altitude of the ground in `pose`, m, or None if no section states it."""
+        """Return the altitude of the ground, m, as in `pose`; None if no section states it."""
         section = self.microburst if self.shear is None else self.shear
         return None if section is None else section.ground
 
     def relative_wind(self) -> RelativeWind | None:
-        """Return the wind that depends on the place, or None if the wind is the same everywhere."""
+        """Return the wind that varies with the position; None if it is the same everywhere."""
         field = wind_field_of(self.wind, self.shear, self.microburst)
         start = Start(**self.start.model_dump())
         return None if field is None else RelativeWind(field, start, self.altitude or 0.0)
 
     def gust_arrays(self, axes: Sequence[str]) -> Gusts:
-        """Return the gusts as arrays along these axes."""
+        """Return the gusts along the given axes as arrays."""
         gusts = [self.gusts.get(axis, STILL_AIR) for axis in axes]
         start = np.array([gust.start for gust in gusts])
         speed = np.array([gust.speed for gust in gusts])
@@ -531,7 +531,7 @@ class AircraftConfig(NodeConfig):
         self, speed: float, axes: Sequence[str], span: float | None
     ) -> Turbulence | None:
         section = self.turbulence
-        # The turbulence is off, or has the intensity 0.
+        # The turbulence is off, or its intensity is 0.
         if section is None or not (section.wind or section.sigma):
             return None
         # An intensity is None at an altitude where it has no effect.
@@ -557,14 +557,14 @@ class AircraftConfig(NodeConfig):
         )
 
     def pose_every(self) -> int:
-        """Return the period of pose as a number of the aircraft's periods."""
+        """Return the period of pose, as a multiple of the aircraft's period."""
         rate = self.pose.rate
         if rate is None:
             return every(self.rate)
         return divide(period_ns(rate, "pose.rate"), period_ns(self.rate, "rate"), "rate", "")
 
     def pose_sensors(self) -> Sensors | None:
-        """Return the errors of pose, ordered as `channels.POSE` and independent of those of y."""
+        """Return the errors of pose in the order of `channels.POSE`, independent of those of y."""
         pose = self.pose
         if not (
             pose.delay
@@ -591,7 +591,7 @@ STILL_AIR = Gust(start=0.0, speed=0.0, length=1.0)
 
 
 def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:
-    """Return the values as an array, or None if none are given, or zeros with `zero_is_none`."""
+    """Return the values as an array; None for no values, or for zeros if `zero_is_none`."""
     if not values or (zero_is_none and not any(values)):
         return None
     return np.array(values, dtype=np.float64)

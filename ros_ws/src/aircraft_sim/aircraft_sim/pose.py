@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Pose of the aircraft: attitude, position and velocity over ground as absolute values.
+"""Compute the pose of the aircraft: attitude, position and velocity over ground, all absolute.
 
-Guidance and the log take the pose. Position is in a local tangent plane whose origin is below the
-aircraft at t = 0, unless the aircraft starts elsewhere. A steady wind moves the air mass as a
-whole, so the flight relative to the air is as in still air, and only the pose includes the wind
-(Galilean invariance).
+Guidance and the log use the pose. The position is in a local tangent plane. Its origin is below the
+aircraft at t = 0, unless a scenario starts the aircraft elsewhere. A steady wind moves the air mass
+as a whole. So the flight relative to the air is the same as in still air, and only the pose
+includes the wind (Galilean invariance).
 """
 
 import math
@@ -23,12 +23,12 @@ instant, with the least k for which the rate is not higher."""
 
 
 def every(rate: float) -> int:
-    """Return the number k of instants from pose to pose, given the aircraft's rate in Hz."""
+    """Return the number of the aircraft's samples from pose to pose, given its rate in Hz."""
     return max(1, math.ceil(rate / RATE))
 
 
 def wrapped(angle: float) -> float:
-    """Wrap an angle to (-pi, pi], rad."""
+    """Return an angle wrapped to (-pi, pi], rad."""
     return angle - 2.0 * math.pi * math.ceil(angle / (2.0 * math.pi) - 0.5)
 
 
@@ -37,7 +37,7 @@ def velocity(
 ) -> tuple[Scalar, Scalar, Scalar]:
     """Compute the velocity to the north, to the east and up, m/s.
 
-    The aircraft has this airspeed, m/s, and these angles, rad:
+    `speed` is the airspeed, m/s, and the angles are in rad:
 
         [v_north, v_east, -climb] = R_z(psi) R_y(theta) R_x(phi) V [cos(alpha) cos(beta), sin(beta),
         sin(alpha) cos(beta)]
@@ -61,7 +61,7 @@ def velocity(
 
 
 class Start(NamedTuple):
-    """Where the aircraft is at t = 0: to the north and to the east, m, with a heading, rad."""
+    """The position of the aircraft at t = 0, to the north and to the east, m; its heading, rad."""
 
     north: float = 0.0
     east: float = 0.0
@@ -69,10 +69,11 @@ class Start(NamedTuple):
 
 
 def over_ground(pose: FloatArray, t: float, wind: Sequence[float], start: Start) -> FloatArray:
-    """Turn a pose relative to the air mass into one over ground after t s of a steady wind.
+    """Convert a pose relative to the air mass into a pose over ground, after t s of steady wind.
 
     The wind is in m/s to the north and to the east. The given pose is that of a flight that starts
-    at the origin and heads north. It is turned by the heading of the start, and moved to its place.
+    at the origin and heads north. The pose is rotated by the heading at the start, and moved to the
+    place of the start.
     """
     pose_over_ground = pose.copy()
     if start.heading:

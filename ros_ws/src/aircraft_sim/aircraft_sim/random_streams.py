@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Counter-based random numbers (Philox).
+"""Draw counter-based random numbers (Philox).
 
-A draw depends only on seed, stream and number, not on earlier draws. Two flights of a scenario
-therefore agree, even if samples are missing in the second one. NumPy's generator is not called in
-functions that also take other array types.
+A draw depends only on seed, stream and number, and not on earlier draws. So two flights of a
+scenario agree, even if samples are missing in the second flight. Functions that also take other
+array types than NumPy's do not call NumPy's generator.
 """
 
 import numpy as np
@@ -16,9 +16,9 @@ ROTARY, ROTARY_START = range(8, 10)
 """Streams, one for each use. Under the same seed they are independent of each other."""
 
 
-# The type is a string, so that np.random is loaded only when it is used.
+# The type is a string, so that np.random is loaded only if it is used.
 def generator(number: int, stream: int, seed: int) -> "np.random.Generator":
-    """Make the generator of draw `number` >= 0 of a stream, with seed >= 0.
+    """Return the generator for draw `number` >= 0 of a stream, with seed >= 0.
 
     Source: Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC11 (Philox).
     """
@@ -27,10 +27,10 @@ def generator(number: int, stream: int, seed: int) -> "np.random.Generator":
 
 
 def uniform(first: int, count: int, width: int, stream: int, seed: int) -> FloatArray:
-    """Draw `width` numbers first, first + 1, ..., uniform in [0, 1), shape (count, width).
+    """Return the draws first, first + 1, ... of `width` uniform numbers in [0, 1), (count, width).
 
-    Each draw takes a whole number of counter steps of four numbers, so that a single generator
-    gives every draw.
+    Each draw takes a whole number of counter steps, which have four numbers each, so that one
+    generator can make all draws.
     """
     steps = -(-width // 4)
     generator = np.random.Generator(

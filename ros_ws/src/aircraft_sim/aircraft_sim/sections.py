@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sections of the parameters of the simulated aircraft."""
+"""The sections in the parameters of the simulated aircraft."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -39,7 +39,7 @@ class Gust(Config):
 class TurbulenceConfig(Config):
     """Dryden turbulence of MIL-F-8785C.
 
-    `wind` sets the intensity at low altitude, `sigma` at high altitude.
+    `wind` sets the intensity at low altitude, and `sigma` sets it at high altitude.
     """
 
     altitude: Number = Field(ge=LOWEST, description="altitude above the ground, m")
@@ -82,7 +82,7 @@ NEEDS = {
 class ShearConfig(Config):
     """The steady wind as a function of the height above the ground.
 
-    Either `aircraft.wind` holds at `reference`, or a table gives the wind.
+    Either `aircraft.wind` is the wind at the height `reference`, or a table gives the wind.
     """
 
     law: Literal["log", "power", "table"] = Field(description="how the wind depends on the height")
@@ -118,7 +118,7 @@ class ShearConfig(Config):
             require(above, "reference", f"{self.reference:g} m", expected)
 
     def profile(self) -> wind_field.Log | wind_field.Power | wind_field.Table:
-        """Return the profile that the equations use."""
+        """Return the profile for the equations."""
         if self.law == "table":
             return wind_field.Table(self.height, self.north, self.east)
         reference = self.reference or math.inf
@@ -138,7 +138,7 @@ class MicroburstConfig(Config):
     height: Positive = Field(description="height of the largest outflow above the ground, m")
 
     def model(self) -> wind_field.Microburst:
-        """Return the microburst that the equations use."""
+        """Return the microburst for the equations."""
         values = self.model_dump(exclude={"ground"})
         return wind_field.Microburst(**values)
 
@@ -146,7 +146,7 @@ class MicroburstConfig(Config):
 def require_one_wind(
     wind: Sequence[float], shear: ShearConfig | None, burst: MicroburstConfig | None
 ) -> None:
-    """Refuse a steady wind in addition to a table of the wind, and two altitudes of the ground."""
+    """Refuse a steady wind beside a table of the wind, and two altitudes of the ground."""
     if shear is not None and shear.law == "table":
         expected = "0 beside shear.law table, which has the whole wind"
         require(not any(wind), "wind", list(wind), expected)
@@ -159,7 +159,7 @@ def require_one_wind(
 def wind_field_of(
     wind: Sequence[float], shear: ShearConfig | None, burst: MicroburstConfig | None
 ) -> wind_field.WindField | None:
-    """Return the wind as a function of place, or None if it is the same everywhere."""
+    """Return the wind as a function of place; None if it is the same everywhere."""
     section = burst if shear is None else shear
     if section is None:
         return None
@@ -172,7 +172,7 @@ def wind_field_of(
 
 
 class BiasConfig(Config):
-    """A bias on x_dot of a state.
+    """A bias on the derivative of a state.
 
     It rises from 0 to `value` along half a cosine. If `rise` is 0, it rises in a step.
     """
@@ -185,7 +185,7 @@ class BiasConfig(Config):
 
 
 class SineConfig(Config):
-    """A sine on x_dot of a state: amplitude sin(frequency t + phase)."""
+    """A sine on the derivative of a state: amplitude sin(frequency t + phase)."""
 
     amplitude: Number = Field(description="amplitude, SI unit of the state per s")
     frequency: Positive = Field(description="frequency, rad/s")
@@ -193,7 +193,7 @@ class SineConfig(Config):
 
 
 class DrawConfig(Config):
-    """A draw of aircraft: entries of A and B are multiplied by 1 + d, with d drawn from a seed."""
+    """A random draw of A and B: entries are multiplied by 1 + d, with d drawn from a seed."""
 
     A: float = Field(default=0.0, ge=0, lt=1, description="largest relative d of an entry of A")
     B: float = Field(default=0.0, ge=0, lt=1, description="largest relative d of an entry of B")
@@ -202,9 +202,9 @@ class DrawConfig(Config):
 
 
 class UncertaintyConfig(DrawConfig):
-    """An aircraft that is sampled around the airframe.
+    """An uncertain aircraft, which is sampled around the airframe.
 
-    Every entry of A and B is multiplied by 1 + d, with an independent d for each. The rows of
+    Every entry of A and B is multiplied by 1 + d, with an independent d for each entry. The rows of
     angles stay as they are.
     """
 
@@ -234,14 +234,14 @@ class UncertaintyConfig(DrawConfig):
         require_length("parts", self.parts, self.entries)
 
     def spread(self) -> Spread:
-        """Return how the entries are drawn."""
+        """Return the distribution from which the entries are drawn."""
         return Spread(dict(zip(self.entries, self.parts, strict=True)), self.distribution)
 
 
 class DriftConfig(DrawConfig):
-    """A change of A and B in flight, as by ice or by damage.
+    """A change of A and B in flight, such as by ice or damage.
 
-    Every entry is multiplied by 1 + d, with an independent and uniform d for each.
+    Every entry is multiplied by 1 + d, with an independent and uniform d for each entry.
     """
 
     start: Annotated[float, Field(ge=0, allow_inf_nan=True)] = Field(
@@ -255,8 +255,8 @@ class DriftConfig(DrawConfig):
         require(self.A > 0.0 or self.B > 0.0, "A", "0, and B 0", "how far A or B change")
 
 
-# These lists have one value for each channel. An empty list means that all channels are ideal. An
-# infinite limit (.inf in YAML) means that its channel has no limit.
+# These lists have a value for each channel. An empty list means that all channels are ideal. An
+# infinite limit (.inf in YAML) means that a channel has no limit.
 NonNegativesOrNone = tuple[NonNegative, ...]
 
 
@@ -272,7 +272,7 @@ Rates = tuple[Annotated[float, Field(gt=0, allow_inf_nan=True)], ...]
 NumbersOrNone = tuple[Number, ...]
 
 
-Times = Upper  # from 0 on, .inf for never
+Times = Upper  # times from 0 on, .inf for never
 
 
 class ActuatorConfig(Config):
@@ -304,7 +304,7 @@ class ActuatorConfig(Config):
         self.read_faults()
 
     def read_faults(self) -> tuple[effector_faults.Fault, ...]:
-        """Read the faults. Raises ParameterError."""
+        """Return the faults that `faults` describes. Raises ParameterError."""
         return tuple(
             effector_faults.read_fault(sentence, f"faults[{number}]")
             for number, sentence in enumerate(self.faults)
@@ -312,7 +312,7 @@ class ActuatorConfig(Config):
 
 
 class SensorConfig(Config):
-    """The sensors. The defaults are ideal sensors."""
+    """The errors and delays of the sensors. The defaults are those of ideal sensors."""
 
     bias: NumbersOrNone = Field(default=(), description="constant errors, SI")
     drift: NonNegativesOrNone = Field(
@@ -338,9 +338,9 @@ PerPose = dict[str, Number]
 
 
 class PoseConfig(Config):
-    """How `pose` is measured.
+    """The measurement of `pose`.
 
-    By default the estimator is ideal: it gives the true pose at once, at up to 50 Hz.
+    By default the estimator is ideal. It gives the true pose without delay, at up to 50 Hz.
     """
 
     rate: Positive | None = Field(
@@ -364,7 +364,7 @@ class PoseConfig(Config):
 
 
 class StartConfig(Config):
-    """Where the aircraft is at t = 0."""
+    """The position and the heading of the aircraft at t = 0."""
 
     north: Number = Field(default=0.0, description="distance to the north of the origin, m")
     east: Number = Field(default=0.0, description="distance to the east of the origin, m")
@@ -374,6 +374,6 @@ class StartConfig(Config):
 def by_state(
     configs: Mapping[str, Config], keys: Sequence[str], states: Iterable[str]
 ) -> list[FloatArray]:
-    """Return one array over the states for each key, with 0 for a state that is not named."""
+    """Return an array over the states for each key, with 0 for each state that is not named."""
     sections = [configs.get(state) for state in states]
     return [np.array([float(getattr(section, key, 0.0)) for section in sections]) for key in keys]

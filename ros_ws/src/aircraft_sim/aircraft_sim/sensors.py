@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sensors between the aircraft and y.
+"""Model the sensors between the aircraft and y.
 
-They add bias, drift, noise and quantisation, then lose and delay samples.
+They add bias, drift, noise and quantisation, and then lose and delay samples.
 """
 
 from typing import NamedTuple
@@ -21,26 +21,26 @@ class Sensors(NamedTuple):
 
     noise: FloatArray  # (m,) standard deviation per sample, SI
     delay_ns: int  # transport delay, from the instant of a sample to its arrival
-    dropout: float  # probability that a sample is dropped, all channels together
+    dropout: float  # probability that a sample, with all of its channels, is dropped
     seed: int
-    bias: FloatArray | None = None  # (m,) SI
+    bias: FloatArray | None = None  # (m,) constant bias, SI
     # (m,) standard deviation of the random walk's step from sample to sample, SI
     drift: FloatArray | None = None
-    quantum: FloatArray | None = None  # (m,) steps of the quantisation, SI, 0 = none
+    quantum: FloatArray | None = None  # (m,) step of the quantisation, SI, 0 = none
 
 
 class RandomWalk(NamedTuple):
-    """State of the sensors: the random walk at a sample."""
+    """State of the sensors: the random walk of the drift at a sample."""
 
     number: int  # number of the sample
-    value: FloatArray  # (m,) SI
+    value: FloatArray  # (m,) value of the walk, SI
 
 
 class Measured(NamedTuple):
-    """A measurement."""
+    """A measurement, with its error."""
 
     y: FloatArray  # (m,)
-    error: FloatArray  # (m,) y measured - C x
+    error: FloatArray  # (m,) measured y minus C x
     drift: RandomWalk
 
 
@@ -59,7 +59,7 @@ def measure(number: int, y: FloatArray, drift: RandomWalk, params: Sensors) -> M
         measured = quantised(y + error(number))
 
     The sample must not be earlier than the sample of `drift`. The error of a quantised sample is
-    the measured value minus y. Ideal sensors return y to the last bit.
+    the measured value minus y. Ideal sensors return y exactly.
     """
     added, drift = error(number, drift, params)
     y_measured = y + added
@@ -82,9 +82,9 @@ def error(number: int, drift: RandomWalk, params: Sensors) -> tuple[FloatArray, 
 
 
 def quantised(measured: Array, quantum: Array) -> Array:
-    """Round to quantum round(measured / quantum), half to even; unchanged if the quantum is 0.
+    """Round to multiples of the quantum, half to even; a quantum of 0 changes nothing.
 
-    Works on any array type.
+    The result is quantum round(measured / quantum). The function takes any array type.
     """
     xp = array_namespace(measured)
     coarse = quantum > 0.0
@@ -98,9 +98,9 @@ def quantised(measured: Array, quantum: Array) -> Array:
 def noise(number: int, params: Sensors) -> FloatArray:
     """Draw the noise of sample `number` >= 0, shape (m,): noise_i n_i.
 
-    n_i is standard normal, white over channels and samples.
+    The numbers n_i are standard normal, and independent over channels and samples.
     """
-    # For a few channels this takes a seventh of the time of .any().
+    # For a few channels, this form takes a seventh of the time of .any().
     if not any(params.noise.tolist()):
         return params.noise
     return params.noise * random_streams.generator(
@@ -111,8 +111,8 @@ def noise(number: int, params: Sensors) -> FloatArray:
 def walk(number: int, drift: RandomWalk, params: Sensors) -> RandomWalk:
     """Advance the random walk to sample `number`: w(0) = 0, w(k) = w(k-1) + drift_i n_i(k).
 
-    n is standard normal and independent. If samples are skipped, their steps are added, too, so
-    that the walk does not depend on which samples are measured.
+    The numbers n are standard normal and independent. The steps of skipped samples are added too,
+    so the walk does not depend on which samples are measured.
     """
     if params.drift is None:
         return drift
@@ -124,9 +124,9 @@ def walk(number: int, drift: RandomWalk, params: Sensors) -> RandomWalk:
 
 
 def arrives(number: int, params: Sensors) -> bool:
-    """Return whether sample `number` >= 0 is not dropped: v >= dropout.
+    """Return whether sample `number` >= 0 arrives, which it does if v >= dropout.
 
-    v is uniform in [0, 1), independent of the noise.
+    v is uniform in [0, 1), and independent of the noise.
     """
     return (
         params.dropout == 0.0
@@ -138,11 +138,11 @@ def arrives(number: int, params: Sensors) -> bool:
 def transmit(
     delay_line: DelayLine, now_ns: int, y: FloatArray | None, params: Sensors
 ) -> tuple[DelayLine, DelayLine]:
-    """Delay samples at a sample instant: (delay line, now, y) -> (delay line, arrived samples).
+    """Delay samples: put y into the delay line, and take out the samples that arrive now.
 
-    y enters the delay line with the stamp `now_ns`. If y is None, the sample is dropped. When a
-    sample is as old as the delay, it arrives. The oldest samples come first, and each keeps the
-    instant of its measurement as its stamp.
+    y gets the stamp `now_ns`. If y is None, the sample is dropped. A sample arrives when it is as
+    old as the delay. The oldest samples come first, and each keeps the instant of its measurement
+    as its stamp. Returns the new delay line, and the samples that arrive.
     """
     line = delay_line if y is None else (*delay_line, StampedVector(now_ns, y))
     arrived = sum(sample.stamp_ns + params.delay_ns <= now_ns for sample in line)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated aircraft at the sample instants: a flight dynamics model and sensors.
+"""Simulate an aircraft at the sample instants, by a flight dynamics model and sensors.
 
-The node and the loop in one process use it, for every kind of aircraft.
+The node and the loop in one process use this module, for every kind of aircraft.
 """
 
 import math
@@ -33,7 +33,7 @@ class FlightDynamicsModel(Protocol):
 
     @property
     def truth_names(self) -> tuple[str, ...]:
-        """Channels of `truth`: "group.name"."""
+        """Names of the channels of `truth`, each as "group.name"."""
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
         """Fly from t to t + duration with the command u held, deviations from trim, SI."""
@@ -50,18 +50,18 @@ class FlightDynamicsModel(Protocol):
     def pose(self) -> FloatArray:
         """Return the pose relative to the air mass, absolute values, SI.
 
-        It is in the order of `channels.POSE`.
+        The values are in the order of `channels.POSE`.
         """
 
     def diverged(self) -> bool:
-        """Return whether the state is not finite or too large for a flight."""
+        """Return whether the state is not finite, or too large for a flight."""
 
     def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
         """Take the actuator faults and the gusts of these parameters from t on."""
 
 
 class Simulator:
-    """A flight dynamics model and sensors, sample by sample."""
+    """A flight dynamics model with its sensors, advanced from sample to sample."""
 
     def __init__(self, parameters: AircraftConfig) -> None:
         channels = parameters.channels()
@@ -110,13 +110,14 @@ class Simulator:
         self._error = np.zeros(len(self.outputs))
         self._number = 0
         late = nanoseconds(parameters.actuators.delay) // self.period_ns
-        self._commands = deque([np.zeros(len(self.inputs))] * late)  # on the way to the actuators
+        # values of u on the way to the actuators
+        self._commands = deque([np.zeros(len(self.inputs))] * late)
         self._require_above_ground(0)
 
     def retune(self, parameters: AircraftConfig) -> None:
-        """Take faults and gusts of these parameters from now on.
+        """Take the faults and gusts of these parameters from now on.
 
-        Raises ParameterError if one of them would change the past.
+        Raises ParameterError if a fault or a gust would change the past.
         """
         now_ns = self._number * self.period_ns
         t = seconds(now_ns)
@@ -158,15 +159,15 @@ class Simulator:
     def sample(self, number: int, u: FloatArray) -> DelayLine:
         """Advance to sample `number` with u held since the last sample, and measure.
 
-        The sample is at `number` periods of flight time. Returns the y that arrive, the oldest
-        first, with stamps in flight time. Raises FlightEnded if the aircraft touches the ground,
-        and if its state has diverged or an output is beyond `flight_core.plausible`.
+        The flight time of the sample is `number` periods. Returns the samples of y that arrive, the
+        oldest first, with stamps in flight time. Raises FlightEnded if the aircraft touches the
+        ground, if its state has diverged, or if an output is beyond `flight_core.plausible`.
         """
         t_ns = number * self.period_ns
         self._advance(number, u)
         self._number = number
         true = self._model.y()
-        # The comparison is false for NaN too.
+        # The comparison is also false for NaN.
         if self._model.diverged() or not (np.abs(true) <= self._largest[: len(true)]).all():
             raise FlightEnded(f"diverged at t = {seconds(t_ns):.2f} s")
         if self._vanes is not None and self._vane_state is not None:
@@ -187,7 +188,7 @@ class Simulator:
         return arrived
 
     def _advance(self, number: int, u: FloatArray) -> None:
-        """Advance the model to a sample, period by period if u is late."""
+        """Advance the model to a sample, period by period if u has a delay."""
         step = 1 if self._commands else max(number - self._number, 1)
         for k in range(self._number, number, step):
             self._commands.append(u)
@@ -212,7 +213,7 @@ class Simulator:
             raise self._with_place(end)
 
     def _with_place(self, end: FlightEnded) -> FlightEnded:
-        """Add the speed across the heading and the place to the end, if it is a landing."""
+        """Return the end of the flight; for a landing, add the lateral speed and the place."""
         if end.end is not End.LANDED:
             return end
         at = dict(zip(POSE, self.pose().tolist(), strict=True))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The linear model of an airframe as a flight dynamics model: equation (1), wind and pose."""
+"""The flight dynamics model of an airframe: equation (1) with wind and pose."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ from flight_core.kinematics import heading_rate
 from flight_core.rates import divide, seconds
 from flight_core.vectors import FloatArray
 
-BLOCK = 100  # number of steps for which the forcing is computed together
+BLOCK = 100  # number of steps for which the forcing is computed at once
 POSE_STATES = ("V", "alpha", "beta", "phi", "theta", "q", "r")
 """States of an airframe from which its pose follows."""
 
@@ -24,9 +24,9 @@ POSE_STATES = ("V", "alpha", "beta", "phi", "theta", "q", "r")
 class StateSpaceModel:
     """Equation (1) with the matrices of an airframe, behind actuators.
 
-    The forcing is computed for BLOCK steps together, which takes a tenth of the time. Heading,
-    position and altitude are no states of an airframe; they are integrated by the trapezoidal rule
-    over `advance`, from 0. States that the airframe lacks are 0, as in trim.
+    The forcing is computed for BLOCK steps at once, which takes a tenth of the time. Heading,
+    position and altitude are no states of an airframe. They begin at 0, and each call of `advance`
+    integrates them by the trapezoidal rule. States that the airframe lacks are 0, as in trim.
     """
 
     def __init__(self, parameters: AircraftConfig) -> None:
@@ -50,7 +50,7 @@ class StateSpaceModel:
         self._over_place = parameters.relative_wind()
         self._wind_here = self._wind_at(0)
         self._wind_dot = np.zeros(3)
-        # effect of a change of the wind forward, right, down
+        # effect on x_dot of a change of the wind: forward, right, down
         self._into = np.zeros((len(states), 3))
         for k, name in enumerate(("V", "beta", "alpha")):
             if name in states:
@@ -61,7 +61,7 @@ class StateSpaceModel:
         )
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
-        """See FlightDynamicsModel."""
+        """Fly from t to t + duration with u held, deviations from trim, SI."""
         steps = divide(duration_ns, self._plant.step_ns, "step", "the duration")
         begin = (t_ns - self._block_ns) // self._plant.step_ns
         if not 0 <= begin <= begin + steps <= BLOCK or self._drifts(t_ns):
@@ -96,11 +96,11 @@ class StateSpaceModel:
             self._wind_dot = (self._wind_here - before) / (2.0 * half)
 
     def _tilted(self, forced: Forcing) -> Forcing:
-        """Return the forcing of a step with the loss of lift in a tilt, which a subclass adds."""
+        """Return the forcing of a step; a subclass adds the loss of lift in a tilt."""
         return forced
 
     def _fly_on(self, dt: float) -> None:
-        """Integrate over a step what is neither a state of the airframe nor heading or position."""
+        """Integrate over a step the motion that a subclass adds to the states of the airframe."""
 
     def _wind_at(self, t_ns: int) -> FloatArray:
         """Return the wind minus the wind at the start: north, east and down, m/s."""
@@ -112,14 +112,14 @@ class StateSpaceModel:
         """Compute x_dot caused by the change of the wind along the flight, shape (n,).
 
         The states V, beta and alpha are relative to the air: V_dot -= W_dot forward, beta_dot -=
-        W_dot right / V0, alpha_dot -= W_dot down / V0. W_dot is taken over the period before.
+        W_dot right / V0, alpha_dot -= W_dot down / V0. W_dot is that over the previous period.
         Source: B. Etkin, Dynamics of Atmospheric Flight (1972), 5.5.
         """
         _, _, _, phi, theta, *_ = self._states()
         return self._into @ (wind_field.body_axes(phi, theta, self._psi) @ self._wind_dot)
 
     def _drifts(self, t_ns: int) -> bool:
-        """Return whether the aircraft at t differs from that of the block."""
+        """Return whether the aircraft at t differs from the one that the block assumes."""
         drift = self._plant.drift
         if drift is None:
             return False
@@ -129,7 +129,7 @@ class StateSpaceModel:
         return bool(now != before)
 
     def pose(self) -> FloatArray:
-        """See FlightDynamicsModel."""
+        """Return the pose relative to the air mass, absolute, in the order of `channels.POSE`."""
         _, _, beta, phi, theta, *_ = self._states()
         attitude = (pose.wrapped(phi), theta, pose.wrapped(self._psi))
         velocity = np.array(self._velocity)
@@ -143,7 +143,7 @@ class StateSpaceModel:
         return [0.0 if place is None else x[place] for place in self._places]
 
     def _heading_rate(self, states: Sequence[float]) -> float:
-        """Compute psi_dot in rad/s from the POSE_STATES; it is r with the linear kinematics."""
+        """Compute psi_dot, rad/s, from the POSE_STATES; with linear kinematics it is r."""
         *_, phi, theta, q, r = states
         return heading_rate(phi, theta, q, r) if self._euler else r
 
@@ -153,14 +153,14 @@ class StateSpaceModel:
         return pose.velocity(self._speed + V, alpha, beta, phi, theta, self._psi)
 
     def y(self) -> FloatArray:
-        """See FlightDynamicsModel."""
+        """Return the outputs before the sensors, deviations from trim, shape (m,), SI."""
         y: FloatArray = plant.output(self._state, self._plant)
         return y
 
     def air_angles(self, t_ns: int) -> FloatArray:
-        """See FlightDynamicsModel.
+        """Return alpha and beta relative to the air, deviations from trim, rad, shape (2,).
 
-        Each is the state of x minus w / V0, where w is the wind along the axis that
+        Each of them is a state minus w / V0, where w is the wind along the axis that
         `disturbance.AIR_STATE` pairs with the angle.
         """
         x = self._states()
@@ -175,7 +175,7 @@ class StateSpaceModel:
         )
 
     def truth(self, t_ns: int) -> FloatArray:
-        """See FlightDynamicsModel."""
+        """Return the values of `truth` in the order of `truth_names`."""
         index = 2 * ((t_ns - self._block_ns) // self._plant.step_ns)
         plant_now = self._plant._replace(
             aircraft=plant.aircraft_at(t_ns, self._plant, self._state.x)
@@ -191,11 +191,11 @@ class StateSpaceModel:
         return truth.values(self._state, wind, rate, plant_now)
 
     def diverged(self) -> bool:
-        """See FlightDynamicsModel."""
+        """Return whether the state is not finite, or too large for a flight."""
         return plant.diverged(self._state)
 
     def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
-        """See FlightDynamicsModel."""
+        """Take the actuator faults and the gusts of these parameters from t on."""
         aircraft = self._plant.aircraft._replace(gusts=parameters.gust_arrays(self._axes))
         self._plant = self._plant._replace(
             aircraft=aircraft,

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ground truth for the log: the full state, f(x, t), the wind and the actuator positions.
+"""Collect the ground truth for the log: state, f(x, t), wind and actuator positions.
 
-No controller receives it.
+No controller receives the ground truth.
 """
 
 import numpy as np
@@ -15,11 +15,11 @@ from flight_core.vectors import FloatArray
 
 
 def names(airframe: Airframe) -> tuple[str, ...]:
-    """Name the channels of `truth`, group by group.
+    """Return the names of the channels of `truth`, group by group.
 
     They are "x.state", "f.state" (f of equation (1), with the disturbances), "gust.axis" (the wind
     along the axes of the airframe's gusts, 1-cosine gust plus turbulence, m/s) and "actuator.input"
-    (the position now).
+    (the present position).
     """
     groups = (
         ("x", airframe.states),
@@ -36,7 +36,7 @@ def names(airframe: Airframe) -> tuple[str, ...]:
 def values(
     state: AircraftState, wind: FloatArray, rate: FloatArray, plant: PlantParams
 ) -> FloatArray:
-    """Return the values of `truth` in the order of `names`; f and the wind act from now on.
+    """Return the values of `truth` in the order of `names`; f and wind are those from now on.
 
     `wind` (G,) and `rate` (n,) are the `dynamics.Forcing` of this instant.
     """

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Uncertain aircraft for Monte Carlo campaigns, repeatable by seed.
+"""Sample uncertain aircraft for Monte Carlo campaigns, repeatable by seed.
 
-A and B are sampled around a published airframe.
+A and B are sampled around those of a published airframe.
 """
 
 from collections.abc import Mapping
@@ -35,19 +35,19 @@ standard deviations; or the two limits, with equal probability."""
 
 
 class Spread(NamedTuple):
-    """How the entries of A and B are drawn."""
+    """The distribution from which the entries of A and B are drawn."""
 
-    # largest relative deviation of an entry, by its name as in `drawn_entries`
+    # largest relative deviation of an entry, by its name in `drawn_entries`
     entries: Mapping[str, float] = MappingProxyType({})
     distribution: Distribution = "uniform"
-    # largest deviation of an entry that is 0 as published, as a part of its row; see `row_sizes`
+    # largest deviation of an entry that is published as 0, as a part of its row; see `row_sizes`
     zeros: float = 0.0
 
 
 UNIFORM = Spread()
 
-# size of a thrust in newtons, as a part of the thrust in trim: a tenth of the throttle if trim
-# needs half of it
+# size of a thrust in newtons, as a part of the thrust in trim. It is a tenth of the throttle if
+# trim needs half of the throttle.
 THRUST_SIZE = 0.2
 
 
@@ -56,8 +56,8 @@ def nominal_and_sampled(
 ) -> tuple[FloatArray, FloatArray]:
     """Return A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI.
 
-    The first ones are as published, followed by numbers 0, 1, ... of the seed. Raises as
-    `sampled_matrices` does.
+    The first matrices are the published ones. The aircraft with the numbers 0, 1, ... of the seed
+    follow. Raises as `sampled_matrices` does.
     """
     A, B = sampled_matrices(airframe, uncertainty, uncertainty, seed, 0, samples, spread)
     return np.concatenate([airframe.matrix_a()[None], A]), np.concatenate(
@@ -74,10 +74,11 @@ def sample_airframe(
     wind: WindEffect = AIR_RELATIVE,
     spread: Spread = UNIFORM,
 ) -> Airframe:
-    """Sample uncertain airframe `number` of a seed, with uncertainties of A and of B.
+    """Sample the uncertain airframe `number` of a seed, with uncertainties `part_A` and `part_B`.
 
-    If both are 0 and no entry is given, this is the published airframe. The effect of wind comes
-    from `wind_factors`; the rest of f stays as published. Raises as `sampled_matrices` does.
+    If both uncertainties are 0 and `spread` names no entry, the result is the published airframe.
+    The effect of wind follows from `wind_factors`, and the rest of f stays as published. Raises as
+    `sampled_matrices` does.
     """
     A, B = sampled_matrices(airframe, part_A, part_B, seed, number, 1, spread)
     if part_A == part_B == 0.0 and not spread.entries:
@@ -88,15 +89,15 @@ def sample_airframe(
 def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:
     """Compute the factors on the published effect of wind, shape (N, n, G), of N aircraft.
 
-    A holds their matrices, shape (N, n, n), SI. Wind w along an axis changes the state j of
-    AIR_STATE relative to the air, so the wind acts as minus column j of A:
+    A has the matrices of the N aircraft, shape (N, n, n), SI. Wind w along an axis changes the
+    state j of AIR_STATE relative to the air, so its effect is minus column j of A:
 
         air_relative    factor_i = A_ij / published A_ij
             1 where the published A_ij is 0 or the airframe has no state j
         published       factor_i = 1
 
-    If the published effect equals minus the published column, per w / V0 or w, it then equals minus
-    the aircraft's own column.
+    If the published effect is minus the published column, per w / V0 or w, the resulting effect is
+    minus the column of each aircraft.
     """
     nominal = airframe.matrix_a()
     factors = np.ones((len(A), len(airframe.states), len(airframe.gusts)))
@@ -108,9 +109,9 @@ def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatAr
 
 
 def gust_directions(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:
-    """Compute how x_dot changes for 1 m/s of wind along the axes, shape (N, n, G), of N aircraft.
+    """Compute the change of x_dot by 1 m/s of wind along each axis, shape (N, n, G).
 
-    A holds their matrices; see `wind_factors`.
+    A has the matrices of N aircraft, see `wind_factors`.
     """
     return wind_factors(airframe, A, wind) * airframe.matrix_gusts()
 
@@ -126,11 +127,11 @@ def sampled_matrices(
 ) -> tuple[FloatArray, FloatArray]:
     """Draw A and B of the aircraft first, first + 1, ... of a seed, SI.
 
-    The shapes are (count, n, n) and (count, n, m). Every entry is multiplied by 1 + d, with d
-    independent and within +-uncertainty, distributed as `spread` says. The rows of angles stay. An
-    entry that is 0 becomes d times its row, with d within +-zeros. An aircraft depends only on seed
-    and number, not on `count`. Raises ParameterError for an uncertainty outside [0, 1), and for an
-    unknown entry.
+    The shapes are (count, n, n) and (count, n, m). Every entry is multiplied by 1 + d, with an
+    independent d within +-uncertainty and the distribution of `spread`. The rows of angles stay. An
+    entry that is 0 becomes d times its row (`row_sizes`), with d within +-zeros. An aircraft
+    depends only on seed and number, and not on `count`. Raises ParameterError for an uncertainty
+    outside [0, 1), and for an unknown entry.
     """
     sizes = row_sizes(airframe)
     parts = {
@@ -166,7 +167,7 @@ def sampled_matrices(
 
 
 def deviations(uniform: FloatArray, distribution: Distribution) -> FloatArray:
-    """Turn numbers in [0, 1) into deviations in [-1, 1]."""
+    """Convert uniform numbers in [0, 1) to deviations in [-1, 1] with a distribution."""
     if distribution == "uniform":
         return 2.0 * uniform - 1.0
     if distribution == "corners":
@@ -177,10 +178,10 @@ def deviations(uniform: FloatArray, distribution: Distribution) -> FloatArray:
 
 
 def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str, FloatArray]:
-    """Return the entries that `sampled_matrices` draws, by name as A[q,alpha] and B[V,thrust].
+    """Return the entries that `sampled_matrices` draws, by names such as A[q,alpha].
 
-    They have shape (N,), SI. A, of shape (N, n, n), and B, of shape (N, n, m), are those of N
-    aircraft. Entries that are 0 as published, and the rows of angles, are not drawn.
+    Each of them has shape (N,), SI. A, (N, n, n), and B, (N, n, m), are the matrices of N aircraft.
+    Entries that are 0 as published, and the rows of angles, are not drawn.
     """
     matrices = {"A": A, "B": B}
     return {
@@ -189,9 +190,9 @@ def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str,
 
 
 def drawn_places(airframe: Airframe, *, zeros: bool = False) -> dict[str, tuple[str, int, int]]:
-    """Locate the entries that `sampled_matrices` draws: matrix, row and column by name.
+    """Return the matrix, row and column of each entry that `sampled_matrices` draws, by name.
 
-    With `zeros`, those that are 0 follow, if `row_sizes` has a size for them.
+    With `zeros`, the entries that are 0 follow, if `row_sizes` has a size for them.
     """
     rows = [*airframe.states]
     columns = {"A": rows, "B": [*airframe.inputs]}
@@ -208,17 +209,17 @@ def drawn_places(airframe: Airframe, *, zeros: bool = False) -> dict[str, tuple[
 
 
 def row_sizes(airframe: Airframe) -> dict[str, FloatArray]:
-    """Compute what a whole row is for each entry of A and B that is 0 as published, SI.
+    """Compute the value that stands for the whole row of each entry published as 0, SI.
 
         row_i / size_j,   row_i = max over A and B of abs(A_ik) size_k, abs(B_ik) size_k
 
-    so that the entry moves x_dot_i as the largest one of its row does, if both states or inputs are
-    at their sizes. These are 1 m/s, 0.1 rad (/s), a tenth of a throttle, and THRUST_SIZE of the
-    thrust in trim.
+    With this value, the entry would change x_dot_i as much as the largest entry in its row does, if
+    the states or inputs of both entries have their sizes. The sizes are 1 m/s, 0.1 rad (/s), a
+    tenth of a throttle, and THRUST_SIZE of the thrust in trim.
 
-    The size is 0 for entries that are not 0, and for those that stay 0 in every aircraft: in rows
-    of angles, in columns of angles, because no force but gravity depends on an angle, and for
-    inputs without a known size.
+    The result is 0 for entries that are not 0, and for entries that stay 0 in every aircraft. These
+    are the entries in rows of angles, and in columns of angles, because gravity is the only force
+    that depends on an angle. Entries of inputs without a known size stay 0 too.
     """
     is_free = np.array([state not in KINEMATIC for state in airframe.states])
     matrices = {"A": airframe.matrix_a(), "B": airframe.matrix_b()}
@@ -235,7 +236,7 @@ def row_sizes(airframe: Airframe) -> dict[str, FloatArray]:
 
 
 def input_sizes(airframe: Airframe) -> FloatArray:
-    """Return the sizes of the inputs, (p,), SI; 0 for one without a known size."""
+    """Return the sizes of the inputs, (p,), SI; 0 for an input without a known size."""
     trim = np.abs(np.nan_to_num(airframe.no_thrust()))
     dimensions = [quantity(channel.unit).dimension for channel in airframe.inputs.values()]
     has_range = [dimension in {ANGLE, DIMENSIONLESS} for dimension in dimensions]
@@ -245,9 +246,10 @@ def input_sizes(airframe: Airframe) -> FloatArray:
 def with_entries(
     airframe: Airframe, deviations: Mapping[str, float], wind: WindEffect = AIR_RELATIVE
 ) -> Airframe:
-    """Multiply entries of an airframe by 1 + deviation, named as in `drawn_entries`.
+    """Multiply entries of an airframe by 1 + deviation; `deviations` has their names.
 
-    An entry that is 0 becomes the deviation times its row. The wind acts as `wind_factors` says.
+    The names are those of `drawn_entries`. An entry that is 0 becomes the deviation times its row
+    (`row_sizes`). The effect of the wind follows from `wind_factors`.
     """
     matrices = {"A": airframe.matrix_a().copy(), "B": airframe.matrix_b().copy()}
     places = drawn_places(airframe, zeros=True)
@@ -264,6 +266,6 @@ def with_entries(
 def as_yaml(airframe: Airframe) -> str:
     """Write an airframe as the text of an airframe file.
 
-    The numbers read back to the last bit.
+    Reading the text gives the same numbers, to the last bit.
     """
     return dump_yaml(airframe.model_dump(mode="json", exclude_defaults=True))

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Vanes: angle of attack and sideslip relative to the air.
+"""Model vanes, which measure angle of attack and sideslip relative to the air.
 
-Icing acts before the sensor, and readings are lost after it.
+Icing acts before the errors of the sensor, and readings are lost after them.
 """
 
 from collections.abc import Sequence
@@ -25,14 +25,14 @@ class Vanes(NamedTuple):
     """Parameters of k vanes."""
 
     places: Sequence[int]  # (k,) indices in ANGLES
-    # (k,) flight time from which a vane keeps its angle, s, infinite for never
+    # (k,) flight time from which on a vane keeps its angle, s, infinite for never
     frozen_at: FloatArray
     dropout: float  # probability that a reading of a vane is lost, independently for each vane
     seed: int
 
 
 class VaneSensorsConfig(Config):
-    """The vanes, which add the channels alpha and beta relative to the air to y.
+    """The vanes, which add alpha and beta relative to the air to y as channels.
 
     The errors of `sensors` apply to these channels, too.
     """
@@ -56,7 +56,7 @@ class VaneSensorsConfig(Config):
             require_length("frozen_at", self.frozen_at, self.channels)
 
     def require_fit(self, airframe: Airframe) -> None:
-        """Refuse a vane that an airframe cannot have."""
+        """Refuse a vane that does not fit an airframe."""
         key = "vanes.channels"
         has_none = f"none: the airframe {airframe.name} has no"
         for name in self.channels:
@@ -66,7 +66,7 @@ class VaneSensorsConfig(Config):
             require(airframe.speed > 0.0, key, name, f"{has_none} speed")
 
     def arrays(self, seed: int) -> Vanes | None:
-        """Return the vanes as arrays, with losses of this seed; None if there are none."""
+        """Return the vanes as arrays, with random losses from a seed; None without vanes."""
         if not self.channels:
             return None
         frozen_at = np.array(self.frozen_at or (np.inf,) * len(self.channels))
@@ -77,8 +77,8 @@ class VaneSensorsConfig(Config):
 class VaneState(NamedTuple):
     """State of the vanes between two samples."""
 
-    angle: FloatArray  # (k,) of the vanes
-    reading: FloatArray  # (k,) last readings received
+    angle: FloatArray  # (k,) angles of the vanes
+    reading: FloatArray  # (k,) last readings that were received
 
 
 def initial_state(params: Vanes) -> VaneState:
@@ -88,16 +88,17 @@ def initial_state(params: Vanes) -> VaneState:
 
 
 def turned(t: float, angles: FloatArray, state: VaneState, params: Vanes) -> VaneState:
-    """Turn the vanes at t to (alpha, beta) of the air, (2,); a frozen vane stays as it is."""
+    """Turn the vanes to the alpha and beta of the air, (2,); an iced vane keeps its angle."""
     return state._replace(
         angle=np.where(t >= params.frozen_at, state.angle, angles[list(params.places)])
     )
 
 
 def read_vanes(number: int, measured: FloatArray, state: VaneState, params: Vanes) -> VaneState:
-    """Read sample `number`, (k,), from measured angles with errors.
+    """Return the state of the vanes with the readings of sample `number`, (k,).
 
-    If a reading is lost, the last one is repeated.
+    `measured` are the angles with the errors of the sensor. If a reading is lost, the last reading
+    is repeated.
     """
     if params.dropout == 0.0:
         return state._replace(reading=measured)

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Airframes: files with units and signs, models of other tools, and what physics fixes in them."""
+"""Airframes: their files, models of other tools, and the laws of physics that they must obey."""

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Airframe files: published matrices with their units and signs.
+"""Load airframe files, which hold published matrices with their units and signs.
 
-They are converted to SI here and nowhere else.
+The matrices are converted to SI here and nowhere else.
 """
 
 import math
@@ -40,7 +40,7 @@ EXPECTED = "an airframe file"
 
 LIBRARY = Path(str(files("aircraft_sim.airframes")))
 
-Unit = str  # of `flight_core.units.quantity`
+Unit = str  # a unit of `flight_core.units.quantity`
 Matrix = Annotated[tuple[Numbers, ...], Field(min_length=1)]
 
 
@@ -58,9 +58,9 @@ AIRPLANE_STATES = {
 
 
 class Input(Config):
-    """An input: the unit of its column of B, and the effect of a positive value.
+    """An input of an airframe: the unit of its column of B, and the effect of a positive value.
 
-    For an engine or a rotor, `no_thrust` can say at which value it gives no thrust.
+    For an engine or a rotor, `no_thrust` can state the value at which it gives no thrust.
     """
 
     unit: Unit = Field(description="unit of this column of B")
@@ -89,7 +89,7 @@ class Product(Config):
 
 
 class Airframe(Config):
-    """An airframe in the units of the file. `matrix_a` to `products` give SI arrays.
+    """An airframe in the units of its file; `matrix_a` to `products` convert it to SI arrays.
 
     Args:
         values: Values by key, as in an airframe file.
@@ -150,7 +150,7 @@ class Airframe(Config):
             require(
                 shape == [columns] * n, key, f"rows of {shape} values", f"{n} rows of {columns}"
             )
-        # Outputs: as many as inputs, with units that are known.
+        # There must be as many outputs as inputs, and their units must be known.
         fewer = f"{m} or fewer, as many as inputs or fewer"
         require(0 < len(self.outputs) <= m, "outputs", f"{len(self.outputs)} of them", fewer)
         for key, unit in (
@@ -159,7 +159,7 @@ class Airframe(Config):
         ):
             quantity(unit, key)
         self._check_outputs(n, len(self.outputs))
-        # Every name of a state in the file must be that of a state.
+        # Every name in the file that stands for a state must be that of a state.
         states_by_key = (
             {} if self.C else {f"outputs[{i}]": name for i, name in enumerate(self.outputs)}
         )
@@ -199,14 +199,14 @@ class Airframe(Config):
             require(name in self.states, key, f"{name!r}", f"a state: {', '.join(self.states)}")
 
     def _units(self) -> list[tuple[str, Unit]]:
-        """Return the units of states and inputs with their keys."""
+        """Return the keys and units of all states and inputs."""
         states = [(f"states.{name}", unit) for name, unit in self.states.items()]
         return states + [
             (f"inputs.{name}.unit", channel.unit) for name, channel in self.inputs.items()
         ]
 
     def _check_outputs(self, n: int, m: int) -> None:
-        """Check C, D and output_units: shapes, a unit for each output, no feedthrough."""
+        """Check C, D and output_units: their shapes, a unit for each output, and no feedthrough."""
         shape = [len(row) for row in self.C]
         require(
             shape in ([], [n] * m),
@@ -231,7 +231,7 @@ class Airframe(Config):
                 f"{name!r}",
                 expected,
             )
-        # A row of C is either a state, or has a name and a unit of its own.
+        # A row of C either selects a state, or has a separate name and unit.
         for name, row in zip(self.outputs, self.C, strict=bool(self.C)):
             require(
                 name in self.states or name in self.output_units,
@@ -280,9 +280,9 @@ class Airframe(Config):
         return matrix * row[:, None] / column[None, :]
 
     def no_thrust(self) -> FloatArray:
-        """Return the value of each input at which it gives no thrust, from trim, shape (p,), SI.
+        """Return the value of each input at which it gives no thrust, shape (p,), SI.
 
-        It is 0 for a surface, and nan if the file does not say it.
+        It is a deviation from trim. It is 0 for a surface, and nan if the file does not state it.
         """
         units = [quantity(channel.unit) for channel in self.inputs.values()]
         unsaid = [0.0 if unit.dimension == ANGLE else math.nan for unit in units]
@@ -313,7 +313,7 @@ class Airframe(Config):
         return matrix
 
     def products(self) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
-        """Return the inertial coupling, P terms: f = gain @ (x[first] * x[second]).
+        """Return the P terms of the inertial coupling: f = gain @ (x[first] * x[second]).
 
         The shapes of gain, first and second are (n, P), (P,) and (P,).
         """
@@ -328,9 +328,9 @@ class Airframe(Config):
     def with_matrices(self, A: FloatArray, B: FloatArray, wind_factor: FloatArray) -> Self:
         """Copy the airframe with new A, shape (n, n), and B, shape (n, m).
 
-        They are given in SI and stored in the units of the file. `wind_factor`, shape (n, G),
-        multiplies the effect of wind along the axes of `gusts`. Sampled and identified entries need
-        not meet the identities of physics, so the copy is not checked for them.
+        The new matrices are in SI, and are stored in the units of the file. `wind_factor`
+        multiplies the effect of wind along the axes of `gusts`. The copy is not checked against the
+        identities of physics, because sampled and identified entries need not meet them.
 
         Args:
             A: Shape (n, n), SI.
@@ -359,7 +359,7 @@ class Airframe(Config):
     def through(self, T: FloatArray, inputs: Sequence[str]) -> Self:
         """Copy the airframe with the m inputs v of u = T v, SI, in place of its p inputs u.
 
-        u is in the order of the airframe, and the copy is not checked against physics.
+        u is in the order of the airframe. The copy is not checked against physics.
 
         Args:
             T: Matrix of u = T v, shape (p, m).
@@ -374,15 +374,15 @@ class Airframe(Config):
         return self.validate_mapping(self.model_dump() | values, f"airframe {self.name}")
 
     def with_rotary_gusts(self, axes: Sequence[str] = ROTARY) -> Self:
-        """Copy the airframe so that air that turns with p_g, q_g, r_g, rad/s, moves it.
+        """Copy the airframe and add axes on which air that turns with p_g, q_g, r_g, rad/s, acts.
 
             x_dot_i -= A_ij w_j,  i and j in p, q, r
 
-        Forces caused by these rates are left out, because A[alpha, q] and A[beta, r] also hold
-        kinematics. Effects that the file states stay.
+        Forces caused by these rates are left out, because A[alpha, q] and A[beta, r] also contain
+        kinematics. Effects of rotary gusts that the file already states stay as they are.
 
         Args:
-            axes: Axes of ROTARY; those of states that the airframe lacks are left out.
+            axes: Axes of ROTARY. Axes whose state the airframe lacks are left out.
 
         Returns:
             The copy with more axes in `gusts`.
@@ -397,7 +397,7 @@ class Airframe(Config):
         return self.model_copy(update={"gusts": self.gusts | gusts})
 
     def matrix_gusts(self) -> FloatArray:
-        """Compute how x_dot changes for 1 m/s of wind along the axes of `gusts`, shape (n, G)."""
+        """Compute the change of x_dot by 1 m/s of wind along each axis of `gusts`, shape (n, G)."""
         return (
             np.array([self.gust_direction(axis) for axis in self.gusts])
             .reshape(-1, len(self.states))
@@ -405,7 +405,7 @@ class Airframe(Config):
         )
 
     def gust_direction(self, gust: str) -> FloatArray:
-        """Compute how x_dot changes for 1 m/s of wind along an axis, shape (n,).
+        """Compute the change of x_dot by 1 m/s of wind along an axis, shape (n,).
 
         Args:
             gust: Name of the axis.
@@ -426,14 +426,14 @@ class Airframe(Config):
 
 
 def _si(units: Iterable[Unit]) -> FloatArray:
-    """Return the SI values of 1 of each unit."""
+    """Return the factor that converts each unit to SI."""
     return np.array([si_per_unit(unit) for unit in units])
 
 
 def check_identities(airframe: Airframe) -> None:
-    """Refuse an airframe that contradicts what physics fixes.
+    """Refuse an airframe that contradicts the identities of physics.
 
-    It passes unchecked if the file says `identities: false`.
+    An airframe whose file says `identities: false` passes unchecked.
     """
     if airframe.identities:
         effects = {name: channel.positive for name, channel in airframe.inputs.items()}
@@ -475,7 +475,7 @@ def load_airframe(name: FilePath | Airframe) -> Airframe:
         name: Name in the library, path of an airframe file (.yaml), or an Airframe.
 
     Returns:
-        The airframe, validated. An Airframe is returned as it is.
+        The validated airframe. An Airframe is returned as it is.
 
     Raises:
         ParameterError: No airframe has the name, or the file is invalid.
@@ -494,7 +494,7 @@ def load_airframe(name: FilePath | Airframe) -> Airframe:
 def _parsed(name: str, path: Path, content: bytes) -> Airframe:
     """Read an airframe from the content of a file; cached.
 
-    The cache saves 15 ms for a node that checks a change in flight.
+    The cache saves 15 ms in a node that checks a change in flight.
     """
     parsed = parse_yaml(content, f"airframe {path}", EXPECTED)
     require(isinstance(parsed, dict), f"airframe {path}", type(parsed).__name__, "a mapping")
@@ -510,7 +510,7 @@ EULER_STATES = ("phi", "theta", "p", "q", "r")
 
 
 def euler_kinematics(airframe: Airframe) -> EulerKinematics:
-    """Return the arrays of Euler's equations. Raises ParameterError without a trim speed."""
+    """Return the arrays for Euler's equations. Raises ParameterError if there is no trim speed."""
     require(
         airframe.speed > 0.0,
         "kinematics",

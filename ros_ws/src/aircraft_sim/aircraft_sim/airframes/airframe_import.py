@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Airframes from the models of other tools.
+"""Make airframes from the models of other tools.
 
 The tools are python-control, SciPy, MATLAB, AVL, XFLR5, and anything with named matrices.
 """
@@ -38,7 +38,7 @@ def import_airframe(
     text: str = "",
     **body: str | float,
 ) -> tuple[Airframe, str]:
-    """Make an airframe from the model of another tool, with a sentence about what it is made of.
+    """Make an airframe from a model of another tool, and a sentence that says how it was read.
 
     The airframe is checked against physics.
 
@@ -46,20 +46,20 @@ def import_airframe(
         source: A state space of python-control or SciPy, or the path of a MATLAB file (.mat), of an
             airframe file (.yaml), or of a text of AVL (system matrix, or stability derivatives) or
             XFLR5 (state matrices).
-        name: Name of the airframe; empty: that of the file.
+        name: Name of the airframe; if empty, that of the file.
         speed: Trim speed, a number in m/s or with a unit: "176 ft/s".
         states: Names of the states in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s,
             theta: rad".
         inputs: Names of the inputs in the order of B, with units and effects: "elevator: rad nose
             down, thrust: 1 more thrust".
-        outputs: As many as inputs, or fewer: names of states or of rows of C with units ("V:
-            ft/s"), or sums: "q, V = 0.987 u + 0.163 w". If empty: q, V, p, r by elevator, thrust,
-            aileron, rudder.
-        thrust: Whether to add an input thrust in units of the weight along the flight path, for a
+        outputs: At most as many outputs as inputs. They are names of states, names of rows of C
+            with units ("V: ft/s"), or sums: "q, V = 0.987 u + 0.163 w". If empty, they are those of
+            q, V, p, r that elevator, thrust, aileron and rudder move.
+        thrust: Whether to add an input thrust, in units of the weight along the flight path, to a
             model without a thrust.
         text: Where the figures come from.
-        body: mass, Ixx, Iyy, Izz, Ixz, density of the aircraft of AVL's derivatives, and its unit
-            of length, `length`.
+        body: mass, Ixx, Iyy, Izz, Ixz and density for the derivatives of AVL, and `length`, AVL's
+            unit of length.
 
     Raises ParameterError with one sentence.
     """
@@ -86,9 +86,9 @@ def import_airframe(
 
 
 def _of_file(source: str | Path, name: str, options: Mapping[str, Any]) -> Airframe:
-    """Load an airframe file, under another name unless it is empty.
+    """Load an airframe file, and rename the airframe if `name` is not empty.
 
-    No other option may stand beside the file.
+    Raises ParameterError if another option is given.
     """
     for key, value in options.items():
         require(not value, key, f"{value!r} beside an airframe file", "none: the file has it")
@@ -97,7 +97,7 @@ def _of_file(source: str | Path, name: str, options: Mapping[str, Any]) -> Airfr
 
 
 def _named(names: Named, key: str) -> dict[str, Any]:
-    """Split names from what is said about each; {} if there are none."""
+    """Split names from their units and effects, by name; {} if there are no names."""
     if isinstance(names, str):
         parts = [part.strip() for part in names.split(",")] if names.strip() else []
         split = [(part.partition(":")[0].strip(), part.partition(":")[2].strip()) for part in parts]
@@ -109,7 +109,7 @@ def _named(names: Named, key: str) -> dict[str, Any]:
 
 
 def _check_identities(model: ToolModel, name: str, speed: float) -> None:
-    """Refuse a model that breaks an identity of physics; the trim speed is in m/s."""
+    """Refuse a model that contradicts an identity of physics; the trim speed is in m/s."""
     effects = {key: channel.get("positive", "") for key, channel in model.inputs.items()}
     units = tuple(channel["unit"] for channel in model.inputs.values())
     none = np.zeros_like(model.A)
@@ -130,7 +130,7 @@ def _check_identities(model: ToolModel, name: str, speed: float) -> None:
 def _with_thrust(model: ToolModel) -> ToolModel:
     """Add an input thrust in units of the weight along the flight path.
 
-    V_dot, or u_dot, is g times this input.
+    The input adds g times its value to V_dot or u_dot.
     """
     require(
         "thrust" not in model.inputs, "thrust", "an input thrust in the model", "none to add one"
@@ -202,7 +202,7 @@ def _rows_of_outputs(
 ) -> tuple[dict[str, FloatArray], dict[str, str]]:
     """Return rows of C by output, and units of the outputs that are not states.
 
-    `labels` name the rows of the model's own C.
+    `labels` name the rows of C in the model.
     """
     names = list(model.states)
     identity = np.eye(len(names))
@@ -254,7 +254,7 @@ def _output(text: str, names: Sequence[str]) -> tuple[str, str, FloatArray | Non
 
 
 def _default_outputs(model: ToolModel) -> list[str]:
-    """Choose q, V, p, r by elevator, thrust, aileron, rudder.
+    """Return the outputs of q, V, p, r that elevator, thrust, aileron and rudder move.
 
     In body axes V = u cos(alpha_0) + w sin(alpha_0), where u_dot = -W0 q gives alpha_0.
     """
@@ -279,7 +279,7 @@ def _default_outputs(model: ToolModel) -> list[str]:
 
 
 def _effect(model: ToolModel, name: str) -> str:
-    """Say what a positive value of an input does, from the sign of B."""
+    """Say how a positive value of an input moves the aircraft, from the sign of B."""
     state, up, down = MOVES.get(name, ("", "", ""))
     state = "u" if state == "V" and "V" not in model.states else state
     if state not in model.states:
@@ -291,10 +291,10 @@ def _effect(model: ToolModel, name: str) -> str:
 
 
 def _gusts(frame: Airframe) -> dict[str, dict[str, float]]:
-    """Return what wind adds to x_dot, per w / V0.
+    """Return the effect of wind on x_dot by axis, per w / V0.
 
-    This is minus the column of the state that moves relative to the air. Wind adds nothing to
-    angles and h.
+    The effect is minus the column of the state that moves relative to the air. Wind has no effect
+    on angles and h.
     """
     A = frame.matrix_a()
     names = list(frame.states)

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An airframe away from the trim speed.
+"""Compute an airframe at other airspeeds than the trim speed.
 
-A, B and trim are those of level flight at the same altitude; they follow powers of the airspeed.
+Its A, B and trim are those of level flight at the same altitude. They follow powers of the
+airspeed.
 """
 
 from collections.abc import Mapping
@@ -52,15 +53,15 @@ WIND_STATE = {
 }
 """Kind of the state in which wind along an axis acts relative to the air."""
 
-TRIM_STEPS = 20  # steps of the airspeed: the trim from 1 to 1.4 V0 is exact to 1e-4 of it
-# V / V0 of the trims of a simulated aircraft, which are linear in between
+TRIM_STEPS = 20  # steps of the airspeed: the trim at 1.4 V0 is then exact to 1e-4 of its value
+# V / V0 at which a simulated aircraft has trims; between them the trim is interpolated linearly
 SLOWEST = 0.5
 FASTEST = 2.0
 SPACING = 0.05
 
 
 class Exponents(NamedTuple):
-    """Exponents of the ratio of airspeeds in the entries of an airframe's matrices, SI."""
+    """Exponents by which the entries of an airframe's SI matrices follow the ratio of airspeeds."""
 
     A: FloatArray  # (n, n)
     B: FloatArray  # (n, p)
@@ -69,7 +70,7 @@ class Exponents(NamedTuple):
 
 
 def exponents(airframe: Airframe, thrust: str) -> Exponents:
-    """Return the exponents for the input `thrust`.
+    """Return the exponents for an airframe whose input `thrust` is the thrust.
 
     Raises ParameterError for a state whose exponents are not known.
     """
@@ -97,18 +98,18 @@ def exponents(airframe: Airframe, thrust: str) -> Exponents:
 
 
 def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
-    """Trim an airframe at `ratio` times its speed V0, with shape and units as before.
+    """Return an airframe at `ratio` times its trim speed V0, with the same shape and units.
 
-    Moments caused by an angle of incidence or by a surface grow with V^2, dampings with V, and what
-    a force does to an angle of incidence grows with the force over V. Thrust, gravity and
-    kinematics stay the same, and so does lift, which is the weight. Every entry is scaled by a
-    power of the ratio: EXPONENTS, OF_SURFACE, and OF_THRUST for the input `thrust`. Wind acts by
-    the new A. Derivatives are those of the trim: they depend neither on Mach number nor on C_L.
-    Source: B. L. Stevens, F. L. Lewis, "Aircraft Control and Simulation", 2.6, dimensional
+    Moments caused by an angle of incidence or by a surface grow with V^2, and dampings with V. The
+    effect of a force on an angle of incidence grows with the force over V. Thrust, gravity and
+    kinematics stay the same, and so does lift, which equals the weight. Every entry is scaled by a
+    power of the ratio: EXPONENTS, OF_SURFACE, and OF_THRUST for the input `thrust`. Wind acts
+    through the new A. The derivatives are those of the trim, without an effect of Mach number and
+    C_L. Source: B. L. Stevens, F. L. Lewis, "Aircraft Control and Simulation", 2.6, dimensional
     derivatives. Raises as `exponents` does.
     """
     powers = exponents(airframe, thrust)
-    wind = ratio ** (powers.wind + 1.0)  # the file gives the effect per w / V0
+    wind = ratio ** (powers.wind + 1.0)  # the file gives the effect of wind per w / V0
     airframe_at_speed = airframe.with_matrices(
         airframe.matrix_a() * ratio**powers.A, airframe.matrix_b() * ratio**powers.B, wind
     )
@@ -123,13 +124,13 @@ def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
 
 
 def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatArray, FloatArray]:
-    """Trim at `ratio` times V0: deviations x, (n,), and u, (p,), from the trim at V0, SI.
+    """Return the trim at `ratio` times V0: deviations x, (n,), and u, (p,), from that at V0, SI.
 
         (A + gravity) dx + B du = 0,
             dx = dV, dalpha = dtheta in level flight, along the ratio from 1 on
 
-    A and B are those of the airspeed, and du is the least one if several inputs can serve, in
-    TRIM_STEPS steps. Raises as `exponents` does.
+    The ratio is reached in TRIM_STEPS steps. In each of them A and B are those of the airspeed, and
+    du is the smallest solution if several inputs can serve. Raises as `exponents` does.
     """
     names = list(airframe.states)
     powers = exponents(airframe, thrust)
@@ -154,9 +155,9 @@ def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatAr
 
 
 def over_airspeed(airframe: Airframe, thrust: str) -> OverAirspeed:
-    """Return how matrices and trim of an airframe follow the airspeed.
+    """Return the exponents and trims by which an airframe follows the airspeed.
 
-    Raises as `exponents` does, and if there is no V or no speed.
+    Raises ParameterError as `exponents` does, and for an airframe without V or without a speed.
     """
     require(
         "V" in airframe.states and airframe.speed > 0.0,

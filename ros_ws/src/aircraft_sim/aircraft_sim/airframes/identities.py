@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What physics fixes in the matrices of an aircraft.
+"""Check the matrices of an aircraft against the laws of physics.
 
-That is kinematics, gravity, trim speed, and the sign and the size of a control. The names of the
-states say what they are: V, u, v, w speeds, alpha, beta, theta, phi, psi angles, p, q, r angular
-rates, h a height; FRD axes. A state of any other name is not checked, but VT and other names for
-these quantities are refused. Source of the identities: the linear equations of motion about
-straight flight, B. L. Stevens, F. L. Lewis, Aircraft Control and Simulation, 2nd ed. (2003), sec.
-3.7; B. Etkin, L. D. Reid, Dynamics of Flight, 3rd ed. (1996), eq. (4.9,18).
+They are kinematics, gravity, trim speed, and the sign and the size of a control. The names of the
+states say which quantities they are: V, u, v, w speeds, alpha, beta, theta, phi, psi angles, p, q,
+r angular rates, h a height. The axes are FRD. A state of any other name is not checked, but VT and
+other names for these quantities are refused. Source of the identities: the linear equations of
+motion about straight flight, B. L. Stevens, F. L. Lewis, Aircraft Control and Simulation, 2nd ed.
+(2003), sec. 3.7; B. Etkin, L. D. Reid, Dynamics of Flight, 3rd ed. (1996), eq. (4.9,18).
 """
 
 from collections.abc import Iterator, Mapping
@@ -41,7 +41,7 @@ LIFT = (0.3, 2.8)
 """Accepted fractions of an expected value: cos of a trim angle up to 45 deg; V0 with the force of a
 rate, Z_q or Y_r; the change of lift = weight with speed, which compressibility and thrust alter
 (published aircraft have 0.78 to 1.02)."""
-FOREIGN = 0.02  # SI, largest entry of an unrelated state that is accepted in the row of an angle
+FOREIGN = 0.02  # SI, largest accepted entry for an unrelated state in the row of an angle
 EXPECTED: Mapping[tuple[str, str], tuple[float, str, tuple[float, float]]] = {
     ("theta", "q"): (1.0, "", TURNED),
     ("phi", "p"): (1.0, "", TURNED),
@@ -91,9 +91,9 @@ class LinearModel(NamedTuple):
     """The linear model of an airframe in the units of the file."""
 
     name: str
-    states: Mapping[str, str]  # units
-    effects: Mapping[str, str]  # what a positive value of an input does
-    inputs: tuple[str, ...]  # units
+    states: Mapping[str, str]  # units by state
+    effects: Mapping[str, str]  # effect of a positive value, by input
+    inputs: tuple[str, ...]  # units of the inputs
     speed: float  # V0, m/s
     file_A: FloatArray  # (n, n)
     file_B: FloatArray  # (n, m)
@@ -112,13 +112,13 @@ class LinearModel(NamedTuple):
 
     @property
     def angular(self) -> frozenset[str]:
-        """Inputs that are angles: control surfaces."""
+        """Names of the inputs that are angles, which are control surfaces."""
         units = zip(self.effects, self.inputs, strict=True)
         return frozenset(name for name, unit in units if quantity(unit).dimension == ANGLE)
 
 
 class Finding(NamedTuple):
-    """A contradiction: what the file has, and what physics expects."""
+    """A contradiction to physics: what was found in the file, and what is expected."""
 
     key: str
     actual: str
@@ -126,7 +126,7 @@ class Finding(NamedTuple):
 
 
 def check(model: LinearModel) -> None:
-    """Raise ParameterError for the first contradiction."""
+    """Raise ParameterError for the first contradiction to physics."""
     finding = next(contradictions(model), None)
     if finding is None:
         return
@@ -138,7 +138,7 @@ def check(model: LinearModel) -> None:
 
 
 def contradictions(model: LinearModel) -> Iterator[Finding]:
-    """Yield what contradicts physics: units first, then A, then B."""
+    """Yield the contradictions to physics: first of units, then of A, then of B."""
     yield from _dimensions(model)
     yield from _entries(model)
     yield from _kinematic_rows(model)
@@ -149,7 +149,8 @@ def contradictions(model: LinearModel) -> Iterator[Finding]:
 
 def _dimensions(model: LinearModel) -> Iterator[Finding]:
     for name, unit in model.states.items():
-        book_name = "V" if name.lower() == "vt" else name.lower()  # as textbooks write it
+        # V, as textbooks write it, in place of vt
+        book_name = "V" if name.lower() == "vt" else name.lower()
         if name not in KINDS and book_name in KINDS:
             yield Finding(
                 f"states.{name}", name, f"{book_name}: the name by which a state is checked"
@@ -179,7 +180,7 @@ def _entries(model: LinearModel) -> Iterator[Finding]:
             continue
         entry = float(model.matrix_a()[names.index(row), names.index(column)])
         expected = sign * values[symbol]
-        # A multirotor hovers, so its entry of V0 is 0.
+        # A multirotor hovers, so its entries have no V0.
         left_out = entry == 0.0 and (
             symbol.startswith("2 g") or (symbol == "V0" and not model.angular)
         )
@@ -241,9 +242,10 @@ def _effects(model: LinearModel) -> Iterator[Finding]:
 
 
 def _strengths(model: LinearModel) -> Iterator[Finding]:
-    """Judge the size of a control: angular acceleration per rad over stiffness + damping.
+    """Yield a contradiction for each control of implausible size.
 
-    The latter is |M_alpha| + |M_q| (|M_q| + |Z_alpha|).
+    The size is the angular acceleration per rad divided by stiffness plus damping, which is
+    |M_alpha| + |M_q| (|M_q| + |Z_alpha|).
     """
     names = list(model.states)
     for k, name in enumerate(model.effects):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Readers of the models of other tools: python-control, SciPy, MATLAB, AVL, XFLR5."""
+"""Read the models of other tools: python-control, SciPy, MATLAB, AVL, XFLR5."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -46,21 +46,22 @@ MOVES = {
 
 
 class ToolModel(NamedTuple):
-    """Matrices of a tool, in the units of `states` and `inputs`."""
+    """The matrices of a model from another tool, in the units of `states` and `inputs`."""
 
-    states: dict[str, str]  # units
-    inputs: dict[str, dict[str, str]]  # unit, and positive: the effect, if it is stated
+    states: dict[str, str]  # units by state
+    # by input: its unit, and its effect as `positive` if it is stated
+    inputs: dict[str, dict[str, str]]
     A: FloatArray
     B: FloatArray
     C: FloatArray | None = None
     D: FloatArray | None = None
     outputs: tuple[str, ...] = ()  # names of the rows of C
     speed: float | None = None  # m/s
-    note: str = ""  # what the file was read as
+    note: str = ""  # says as what the file was read
 
 
 def _states(units_by_name: Mapping[str, Any], labels: Sequence[str], n: int) -> dict[str, str]:
-    """Return the units of the n states: as given, or else by the names that the model carries."""
+    """Return the units of the n states: the given ones, or those for the names in the model."""
     names = units_by_name or dict.fromkeys(labels, "")
     names_text = ", ".join(names) or "no names"
     require(
@@ -87,7 +88,7 @@ def _inputs(
 ) -> dict[str, dict[str, str]]:
     """Return units and effects of the m inputs.
 
-    They are as given ("rad nose down"), or else rad, and 1 for thrust.
+    They are the given ones, such as "rad nose down". Otherwise the unit is rad, or 1 for a thrust.
     """
     names = units_by_name or dict.fromkeys(labels, "")
     names_text = ", ".join(names) or "no names"
@@ -116,7 +117,7 @@ def read_model(
     speed: float | None,
     body: Mapping[str, str | float],
 ) -> ToolModel:
-    """Read the model of a source of `import_airframe`. Raises ParameterError."""
+    """Read the model from a `source` of `import_airframe`. Raises ParameterError."""
     no_body = "none: it belongs to AVL's stability derivatives"
     if not isinstance(source, str | Path):
         require(not body, next(iter(body), ""), "it beside a state space", no_body)
@@ -171,7 +172,7 @@ def _square(A: FloatArray, B: FloatArray) -> None:
 
 
 def _state_space(system: Any, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> ToolModel:
-    """Read a StateSpace of python-control or SciPy, by its attributes."""
+    """Read a StateSpace of python-control or SciPy through its attributes."""
     if not all(hasattr(system, key) for key in "ABCD"):
         raise ParameterError(
             f"source: found {type(system).__name__}, expected a state space: control.ss or "
@@ -208,7 +209,7 @@ def _state_space(system: Any, states: Mapping[str, Any], inputs: Mapping[str, An
 def _matlab(path: Path, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> ToolModel:
     """Read A, B, C, D of a .mat file, or of a structure in the file.
 
-    The names are in StateName, InputName, OutputName.
+    StateName, InputName and OutputName have the names.
     """
     from scipy.io import loadmat  # noqa: PLC0415 - for .mat alone
     from scipy.io.matlab import MatReadError  # noqa: PLC0415
@@ -271,9 +272,9 @@ def _rows(lines: Sequence[str], count: int, columns: int, key: str) -> FloatArra
 
 
 def _xflr5(text: str, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> ToolModel:
-    """Read both 4 x 4 matrices of XFLR5's log, SI.
+    """Read the longitudinal and the lateral 4 x 4 matrix from a log of XFLR5, SI.
 
-    The control matrices are per rad, one set of both for each control.
+    The control matrices are per rad, and each control has one for either motion.
     """
     lines = text.splitlines()
 
@@ -313,7 +314,7 @@ def _xflr5(text: str, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> T
 
 
 def _control(name: str) -> str:
-    """Return elevator, aileron or rudder for a name that begins like them, or else the name."""
+    """Return elevator, aileron or rudder for a name that begins like it, otherwise the name."""
     return next(
         (full for full in ("elevator", "aileron", "rudder") if name.lower().startswith(full[:3])),
         name,
@@ -321,7 +322,7 @@ def _control(name: str) -> str:
 
 
 def _avl_header(text: str) -> tuple[int, list[str], list[str]] | None:
-    """Find line, states and controls of the header of AVL's system matrix."""
+    """Find the header of AVL's system matrix: its line number, the states and the controls."""
     for i, line in enumerate(text.splitlines()):
         words = line.replace("|", " | ").split()
         if words[:4] == ["u", "w", "q", "the"]:
@@ -339,7 +340,7 @@ def _avl_matrix(
 ) -> ToolModel:
     """Read AVL's system matrix, SI.
 
-    The axes are those that physics confirms: x forward and z down, or x aft and z up.
+    The axes are x forward and z down, or x aft and z up, whichever fits physics.
     """
     line, names, controls = header
     require(
@@ -390,8 +391,8 @@ def _avl_derivatives(
 ) -> ToolModel:
     """Derive linear equations about level flight in stability axes from AVL's derivatives.
 
-    Derivatives by alpha_dot are left out. Source: R. C. Nelson, Flight Stability and Automatic
-    Control, 2nd ed. (1998), tables 3.5, 3.6, eqs. (4.51), (5.33).
+    Derivatives with respect to alpha_dot are left out. Source: R. C. Nelson, Flight Stability and
+    Automatic Control, 2nd ed. (1998), tables 3.5, 3.6, eqs. (4.51), (5.33).
     """
     if speed is None:
         raise ParameterError("speed: found none, expected the trim speed beside AVL's derivatives")
@@ -403,7 +404,7 @@ def _avl_derivatives(
     weights = qS * CL / (mass * GRAVITY)
     level = "1: speed, mass and density of level flight at this CL"
     require(0.8 < weights < 1.25, "CLtot", f"a lift of {weights:.3g} times the weight", level)
-    CD_CL = 2.0 * CL * S / (np.pi * b**2 * value.get("e", 0.8))  # of the induced drag
+    CD_CL = 2.0 * CL * S / (np.pi * b**2 * value.get("e", 0.8))  # derivative of the induced drag
     CD_alpha = value.get("CDa", CD_CL * value["CLa"])
     # Inertias of the stability axes.
     cosine, sine = np.cos(alpha), np.sin(alpha)
@@ -412,7 +413,8 @@ def _avl_derivatives(
     cross = 0.5 * (Ixx - Izz) * np.sin(2.0 * alpha) + Ixz * np.cos(2.0 * alpha)
     inverse = np.linalg.inv(np.array([[Ix, -cross], [-cross, Iz]]))
     per_V, half_c, half_b = qS / (mass * V0), c / (2.0 * V0), b / (2.0 * V0)
-    scale = np.array([1.0, half_b, half_b])  # of derivatives by beta, p and r
+    # lengths that multiply the derivatives with respect to beta, p and r
+    scale = np.array([1.0, half_b, half_b])
     lateral = np.array([[value[f"C{row}{by}"] for by in "bpr"] for row in "Yln"]) * scale
     # Longitudinal motion V, alpha, q, theta, then lateral motion beta, p, r, phi.
     A = np.zeros((8, 8))
@@ -441,7 +443,7 @@ def _avl_derivatives(
 
 
 def _avl_body(body: Mapping[str, str | float]) -> list[float]:
-    """Return the values of BODY in SI, and the unit of length of AVL's file in m."""
+    """Return the values of BODY in SI, and AVL's unit of length in m."""
     if unknown := [key for key in body if key not in {*BODY, "length"}]:
         raise ParameterError(
             f"{unknown[0]}: unknown, expected {one_of([*BODY, 'length'], unknown[0])}"
@@ -475,7 +477,7 @@ def _avl_values(text: str) -> dict[str, float]:
 
 
 def _avl_controls(text: str, inputs: Mapping[str, Any]) -> dict[str, int]:
-    """Return the controls of AVL by number, those that are named or have a usual name."""
+    """Return the controls of AVL by number: those that are named, or that have a usual name."""
     numbers = {
         _control(name): int(number) for name, number in re.findall(r"(\S+)\s+d0?(\d+)\b", text)
     }

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The air: gusts, turbulence, and wind that depends on the place."""
+"""The air: gusts, turbulence, and wind that varies with the position."""

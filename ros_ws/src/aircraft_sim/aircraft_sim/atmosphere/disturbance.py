@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Disturbances as functions of time: 1-cosine gusts, biases and sines on x_dot.
+"""Compute disturbances as functions of time: 1-cosine gusts, biases and sines on x_dot.
 
-Assumption 2 requires f in C1 with f and f_dot bounded. Gusts, sines and biases with a rise meet it.
-A bias with rise 0 is a step: it does not meet Assumption 2 and lies outside the theorem.
+Assumption 2 requires that f is C1, and that f and f_dot are bounded. Gusts, sines, and biases with
+a rise time meet it. A bias with a rise time of 0 is a step. It does not meet Assumption 2, so it
+lies outside the theorem.
 """
 
 from typing import NamedTuple
@@ -27,31 +28,32 @@ AIR_STATE = {
 """State that wind w along an axis changes relative to the air: V - w, beta - w / V0, alpha - w / V0
 for small angles; p - p_g, q - q_g, r - r_g."""
 
-# s, used for rise 0, a step: t / 1e-30 saturates for every t > 0, in float32 too, without division
-# by 0.
+# s, in place of a rise time of 0, a step. t / 1e-30 saturates for every t > 0, also in float32,
+# without a division by 0.
 MIN_RISE = 1e-30
 
 
 class Gusts(NamedTuple):
-    """G discrete gusts. A speed of 0 is exactly no gust."""
+    """G discrete gusts. A gust with a speed of 0 has exactly no effect."""
 
     start: Array  # (G,) instant of entry, s
     speed: Array  # (G,) peak speed U_ds, m/s
     length: Array  # (G,) distance H from entry to peak, m, > 0
-    # (G,) time after which each comes again, s, > 0, infinite for never; None: none does
+    # (G,) time after which each gust is repeated, s, > 0, infinite for never; None if no gust is
+    # repeated
     every: Array | None = None
 
 
 class Bias(NamedTuple):
-    """A bias per state. A value of 0 is exactly no bias."""
+    """A bias on the derivative of each state. A value of 0 has exactly no effect."""
 
     start: Array  # (n,) start of the rise, s
     value: Array  # (n,) final value, [x]/s
-    rise: Array  # (n,) rise time, s; 0 is a step
+    rise: Array  # (n,) rise time, s; 0 for a step
 
 
 class Sines(NamedTuple):
-    """A sine per state. An amplitude of 0 is exactly no sine."""
+    """A sine on the derivative of each state. An amplitude of 0 has exactly no effect."""
 
     amplitude: Array  # (n,) [x]/s
     frequency: Array  # (n,) rad/s
@@ -61,16 +63,16 @@ class Sines(NamedTuple):
 def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
     """Compute the speeds of the gusts, m/s, (G,): w = U_ds/2 (1 - cos(pi s/H)) up to s = 2H.
 
-    s = V0 ((t - start) mod every). The speed is zero before entry, and after 2H/V0 seconds until
-    the gust comes again. The derivative is continuous and at most U_ds/2 pi V0/H, which meets
-    Assumption 2. Source of the form: FAR/CS 25.341(a).
+    s = V0 ((t - start) mod every). The speed is zero before the entry, and from 2H/V0 seconds after
+    it until the gust is repeated. The derivative is continuous and at most U_ds/2 pi V0/H, which
+    meets Assumption 2. Source of the form: FAR/CS 25.341(a).
     """
     xp = array_namespace(gusts.speed)
     since = t - gusts.start
     if gusts.every is not None:
         since = xp.where(since > 0.0, since % gusts.every, since)
-    # Minimum and maximum are several times faster than clip, which checks the types of its limits
-    # first.
+    # Minimum and maximum are several times faster than clip, which first checks the types of its
+    # limits.
     s = xp.minimum(xp.maximum(airspeed * since / gusts.length, 0.0), 2.0)
     return gusts.speed / 2.0 * (1.0 - xp.cos(xp.pi * s))
 

@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Dryden turbulence of MIL-F-8785C, MIL-HDBK-1797.
+"""Simulate Dryden turbulence of MIL-F-8785C and MIL-HDBK-1797.
 
-It gives intensities, lengths, and shaping filters driven by white noise. Turbulence lies outside
-the theorem: Assumption 2 requires a bounded f with a bounded derivative, but a Gaussian process has
-no bound, and none of the three winds has a derivative, because the filters have one pole more than
-zeros.
+The module has intensities, scale lengths, and shaping filters driven by white noise. Turbulence
+lies outside the theorem, because Assumption 2 requires a bounded f with a bounded derivative. A
+Gaussian process has no bound. None of the three winds has a derivative either, because the filters
+have one pole more than zeros.
 
 The rotary gusts p_g, q_g, r_g act only if a scenario has `turbulence.rotary`, because they depend
-on the span, which not all airframe files state. Their effect is not small: at 100 m, for a span of
-3 m, p_g gives the `osprey` seven times the roll acceleration (rms) of v_g; q_g adds two fifths to
-the pitch acceleration of w_g, and r_g a sixteenth in yaw. Turbulent flights without them roll less
-than real ones.
+on the span, which some airframe files do not state. Their effect is not small. At 100 m and for a
+span of 3 m, p_g gives the `osprey` seven times the roll acceleration (rms) of v_g. q_g adds two
+fifths to the pitch acceleration of w_g, and r_g adds a sixteenth in yaw. So without rotary gusts an
+aircraft rolls less in turbulence than a real one.
 """
 
 from collections.abc import Sequence
@@ -37,31 +37,32 @@ MODERATE_SIGMA = 3.05
 """m/s, of moderate turbulence: W_20 of 30 kt (MIL-F-8785C 3.7.3.4), and the intensity at high
 altitude, 10 ft/s."""
 
-MODERATE = {"altitude": 100.0, "wind": MODERATE_WIND}  # m above the ground, m/s
+MODERATE = {"altitude": 100.0, "wind": MODERATE_WIND}  # altitude in m above the ground, wind in m/s
 
-STATES = 5  # one of the longitudinal filter, two of the lateral, two of the vertical one
-ROTARY_STATES = 3  # p_g over its intensity, and the vertical and the lateral wind behind lags
-BLOCK = 64  # steps that share a generator: creating one takes as long as hundreds of its numbers
+STATES = 5  # one state of the longitudinal filter, two of the lateral, two of the vertical filter
+ROTARY_STATES = 3  # p_g divided by its intensity, and the vertical and the lateral wind behind lags
+# steps that share a generator, because its creation takes as long as hundreds of numbers
+BLOCK = 64
 
 
 class Dryden(NamedTuple):
-    """Parameters of the Dryden spectra, longitudinal, lateral, vertical."""
+    """Parameters of the Dryden spectra in the order longitudinal, lateral, vertical."""
 
     length: FloatArray  # (3,) scale lengths L of MIL-F-8785C, m
     sigma: FloatArray  # (3,) intensities: standard deviations, m/s
 
 
 class Turbulence(NamedTuple):
-    """Turbulence filters discretised for a step, for the winds of G axes.
+    """Turbulence filters for the winds on G axes, discretised for one step.
 
-    The state z is (s,), with s = 5, or 8 with rotary gusts. The first five have unit variance or
-    less.
+    The state z has shape (s,), with s = 5, or 8 with rotary gusts. The first five states have a
+    variance of at most 1.
     """
 
-    transition: Array  # (s, s)
-    spread: Array  # (s, k), lower triangular: of k = 5 or 6 normal numbers
-    stationary: Array  # (s, s), lower triangular
-    output: Array  # (G, s), m/s, of rotary gusts rad/s
+    transition: Array  # (s, s) transition matrix of a step
+    spread: Array  # (s, k), lower triangular, multiplies the k = 5 or 6 normal numbers of a step
+    stationary: Array  # (s, s), lower triangular root of the stationary covariance
+    output: Array  # (G, s) gives the winds from the state, m/s, and rad/s for rotary gusts
     seed: int
 
 
@@ -78,9 +79,9 @@ def dryden(altitude: float, wind: float, sigma: float) -> Dryden:
         h >= 2000 ft    L_u = L_v = L_w = 1750 ft,  sigma_u = sigma_v = sigma_w = sigma
         in between      linear interpolation of L and of sigma
 
-    Source: MIL-F-8785C, 3.7.2 and 3.7.3.4. MIL-HDBK-1797 defines L_v and L_w half as long and
-    writes 2 L in the spectra, with equal result. The axes along and across the wind are taken as
-    along and across the trimmed flight.
+    Source: MIL-F-8785C, 3.7.2 and 3.7.3.4. MIL-HDBK-1797 defines L_v and L_w as half of these
+    lengths, and writes 2 L in the spectra, which gives the same result. The axes along and across
+    the wind are taken to be those along and across the trimmed flight.
     """
     low = min(altitude, LOW)
     c = 0.177 + 0.000823 * low / FOOT
@@ -91,11 +92,11 @@ def dryden(altitude: float, wind: float, sigma: float) -> Dryden:
 
 
 def roll_gust(spectrum: Dryden, airspeed: float, span: float) -> tuple[float, float]:
-    """Return intensity, rad/s, and time constant, s, of p_g for a span b, m; it is of first order.
+    """Return the intensity, rad/s, and the time constant, s, of the first-order gust p_g.
 
         Phi_p = sigma_w^2 / (L_w V0) 0.8 (pi L_w / 4b)^(1/3) / (1 + (T omega)^2),  T = 4b / (pi V0)
 
-    Source: MIL-F-8785C, 3.7.1.2 and 3.7.4, one-sided in omega.
+    `span` is b, m. Source: MIL-F-8785C, 3.7.1.2 and 3.7.4, one-sided in omega.
     """
     L = spectrum.length[2]
     T = 4.0 * span / (np.pi * airspeed)
@@ -125,15 +126,17 @@ def filters(
         Phi_u = sigma^2 2T/pi / (1 + (T omega)^2)
         Phi_v = sigma^2 T/pi (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2,  Phi_w alike
 
-    A step takes z to transition z and adds a covariance, h = a dt (for u the first entries alone):
+    In a step, z becomes transition z plus noise with a covariance. With h = a dt, and only the
+    first entries for u,
 
         transition = exp(-h) [[1, 0], [h, 1]],  spread spread' = [[g_1, g_2/2], [g_2/2, g_3/2]]
 
-    with g_k = gammainc(k, 2h), of the integrals of 2 s^(k-1) exp(-2s) from 0 to h; stationary
-    stationary' belongs to h = inf.
+    where g_k = gammainc(k, 2h), from the integrals of 2 s^(k-1) exp(-2s) from 0 to h. The product
+    stationary stationary' is this covariance for h = inf.
 
-    `airspeed` is V0, m/s; `dt` is in s; `axes` are those required, as indices in AXES, then ROTARY;
-    `span` is b, m, for rotary gusts, which `_with_rotary` adds. Source: MIL-F-8785C, 3.7.1.2.
+    `airspeed` is V0, m/s, and `dt` is in s. `axes` are the required axes as indices in AXES and
+    then ROTARY. `span` is b, m, for the rotary gusts, which `_with_rotary` adds. Source:
+    MIL-F-8785C, 3.7.1.2.
     """
     steps = airspeed / spectrum.length * dt
     p = np.sqrt(1.5)
@@ -162,8 +165,8 @@ def _with_rotary(
         q_g = -s / V0 / (1 + T_q s) w_g,  T_q = 4b / (pi V0)
         r_g =  s / V0 / (1 + T_r s) v_g,  T_r = 3b / (pi V0)
 
-    The air turns nose up if w_g falls along the flight, and nose right if v_g rises. For the lags
-    of q_g and r_g, the wind of a step is held. Source: MIL-F-8785C, 3.7.1.2, for FRD axes.
+    The air turns nose up if w_g falls along the flight, and nose right if v_g rises. The lags of
+    q_g and r_g take the wind as constant over a step. Source: MIL-F-8785C, 3.7.1.2, for FRD axes.
     """
     from scipy.linalg import solve_discrete_lyapunov  # noqa: PLC0415 - slow to load, only for this
 
@@ -210,10 +213,10 @@ def initial_state(params: Turbulence) -> FloatArray:
 
 
 def normals(first: int, count: int, params: Turbulence) -> FloatArray:
-    """Draw the standard normal numbers of `count` steps from `first` on, shape (count, k).
+    """Draw the standard normal numbers of `count` steps, beginning at `first`, shape (count, k).
 
-    Those of step k depend only on seed and k. The numbers of the winds are the same with and
-    without rotary gusts.
+    The numbers of a step depend only on the seed and on the number of the step. Those of the winds
+    are the same with and without rotary gusts.
     """
     offset = first % BLOCK
     streams = [(random_streams.TURBULENCE, STATES)]
@@ -238,14 +241,14 @@ def step(z: Array, normal: Array, params: Turbulence) -> Array:
 
 
 def wind(z: Array, params: Turbulence) -> Array:
-    """Return the winds along the G axes in m/s, rotary gusts in rad/s, shape (G,): output z."""
+    """Return output z, shape (G,): the winds along the G axes, m/s, and rotary gusts, rad/s."""
     return params.output @ z
 
 
 @lru_cache(maxsize=64)
 def _block(block: int, seed: int, stream: int, width: int) -> FloatArray:
     numbers = random_streams.generator(block, stream, seed).standard_normal((BLOCK, width))
-    numbers.flags.writeable = False  # because the cache returns it again
+    numbers.flags.writeable = False  # because the cache returns the same array again
     return numbers
 
 

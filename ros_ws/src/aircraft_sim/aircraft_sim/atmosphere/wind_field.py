@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Wind that depends on the place: a profile over the height (wind shear), and a microburst.
+"""Compute wind that varies with the position: a profile over the height, and a microburst.
 
 An aircraft flies in an air mass that moves with the wind at its start. Where the wind differs from
-this, the difference acts on the aircraft.
+the wind at the start, the difference acts on the aircraft.
 """
 
 import math
@@ -25,9 +25,10 @@ times the spread at the height of the largest outflow."""
 
 
 class Log(NamedTuple):
-    """Factor ln(h / z0) / ln(h_ref / z0) on the wind at the reference height; 0 below z0.
+    """Logarithmic wind profile, as a factor on the wind at the reference height.
 
-    Source: neutral surface layer, MIL-F-8785C, 3.7.3.2.
+    The factor is ln(h / z0) / ln(h_ref / z0), and 0 below z0. Source: neutral surface layer,
+    MIL-F-8785C, 3.7.3.2.
     """
 
     reference: float  # h_ref, m
@@ -40,7 +41,7 @@ class Log(NamedTuple):
 
 
 class Power(NamedTuple):
-    """Factor (h / h_ref)^a on the wind at the reference height; 0 on the ground."""
+    """Power law of the wind: a factor (h / h_ref)^a on the wind at h_ref; 0 on the ground."""
 
     reference: float  # h_ref, m
     exponent: float  # a
@@ -51,7 +52,7 @@ class Power(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Wind over the height: linear between the heights, constant beyond them."""
+    """Wind by height from a table, linear between its heights and constant beyond them."""
 
     height: tuple[float, ...]  # m, rising
     north: tuple[float, ...]  # m/s, positive if the air moves to the north
@@ -64,19 +65,19 @@ class Microburst(NamedTuple):
         u = l R^2 / 2 r (1 - exp(-r^2 / R^2)) (exp(-z / z*) - exp(-z / e))     outward
         w = -l exp(-r^2 / R^2) (e (exp(-z / e) - 1) - z* (exp(-z / z*) - 1))   up
 
-    with l = speed / PEAK R, z* = height / PEAK_HEIGHT, e = z* / LAYER; the air keeps its volume.
-    Source: R. M. Oseguera, R. L. Bowles, A Simple, Analytic 3-Dimensional Downburst Model Based on
-    Boundary Layer Stagnation Flow, NASA TM-100632 (1988).
+    with l = speed / PEAK R, z* = height / PEAK_HEIGHT and e = z* / LAYER. The flow is
+    incompressible. Source: R. M. Oseguera, R. L. Bowles, A Simple, Analytic 3-Dimensional Downburst
+    Model Based on Boundary Layer Stagnation Flow, NASA TM-100632 (1988).
     """
 
-    north: float  # m, of the centre
+    north: float  # m, north of the centre
     east: float
-    radius: float  # R, m
+    radius: float  # R, m, radius of the downdraft
     speed: float  # largest outflow, m/s
-    height: float  # of the largest outflow above the ground, m
+    height: float  # height of the largest outflow above the ground, m
 
     def wind(self, north: float, east: float, height: float) -> tuple[float, float, float]:
-        """Return the wind at a place, to the north, to the east and down, m/s."""
+        """Return the wind at a place, m/s: to the north, to the east and down."""
         x = north - self.north
         y = east - self.east
         r = max(math.hypot(x, y), 1e-6 * self.radius)
@@ -94,16 +95,17 @@ class Microburst(NamedTuple):
 class WindField(NamedTuple):
     """Wind as a function of place.
 
-    `wind` is the steady wind; for `Log` and `Power` it is the one at their reference height.
+    `wind` is the steady wind. With a profile `Log` or `Power`, it is the wind at the reference
+    height.
     """
 
     wind: tuple[float, float]  # m/s to the north, to the east
-    ground: float  # altitude of the ground, m, with the zero of the altitude in `pose`
+    ground: float  # altitude of the ground, m, with the reference of the altitude in `pose`
     shear: Log | Power | Table | None = None
     microburst: Microburst | None = None
 
     def at(self, north: float, east: float, altitude: float) -> tuple[float, float, float]:
-        """Return the wind at a place over ground, to the north, to the east and down, m/s."""
+        """Return the wind at a place over ground, m/s: to the north, to the east and down."""
         height = altitude - self.ground
         shear = self.shear
         to_north, to_east = self.wind
@@ -123,8 +125,8 @@ class WindField(NamedTuple):
 class RelativeWind:
     """Wind minus the wind at the start, in the axes of a flight.
 
-    In these axes the flight begins at the origin and heads north. `carried` is the wind at the
-    start to the north and to the east, m/s, which moves the air mass.
+    In these axes the flight begins at the origin and heads north. The air mass moves with the wind
+    at the start, `carried`, to the north and to the east, m/s.
     """
 
     def __init__(self, field: WindField, start: Start, altitude: float) -> None:
@@ -135,7 +137,7 @@ class RelativeWind:
         self._sin = math.sin(start.heading)
 
     def at(self, t: float, north: float, east: float, altitude: float) -> FloatArray:
-        """Return the wind at t and at a place of the flight, m/s, shape (3,).
+        """Return the wind at a time and at a place of the flight, m/s, shape (3,).
 
         Its components are north, east and down.
         """
@@ -150,7 +152,7 @@ class RelativeWind:
 
 
 def body_axes(phi: float, theta: float, psi: float) -> FloatArray:
-    """Return the matrix from north, east, down to forward, right, down of the body, (3, 3).
+    """Return the rotation matrix from north, east, down to body axes (FRD), shape (3, 3).
 
     Source: Stevens, Lewis, Aircraft Control and Simulation, 2nd ed. (2003), eq. (1.3-20).
     """

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Aircraft of JSBSim: files, trim, commands, flight and linearisation."""
+"""Aircraft of JSBSim: their files, trim, commands, flight and linearisation."""

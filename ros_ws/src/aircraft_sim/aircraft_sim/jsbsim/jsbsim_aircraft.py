@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Aircraft of JSBSim: names, channel tables, flight condition, wind.
+"""Define aircraft of JSBSim: names, tables of channels, flight condition, wind.
 
-JSBSim is imported when it is first used. It has feet, and commands that are normalised from stop to
-stop. u, y and truth are deviations from trim in SI. Only the tables INPUTS and STATES map between
-the two, with units and signs.
+JSBSim is imported when it is first used. It works in feet, with commands that are normalised from
+stop to stop. u, y and truth are deviations from trim in SI. Only the tables INPUTS and STATES
+convert between JSBSim and these signals, with units and signs.
 """
 
 import difflib
@@ -27,7 +27,7 @@ from flight_core.vectors import FloatArray
 
 # Prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p.
 PREFIX = "jsbsim:"
-# Environment: a folder with aircraft, engine and systems in place of the package's.
+# Environment variable: a folder with aircraft, engine and systems that replaces the package's.
 ROOT_VARIABLE = "JSBSIM_ROOT"
 # Suffix of the file of a model.
 SUFFIX = ".xml"
@@ -35,15 +35,16 @@ MODEL_ELEMENT = "fdm_config"
 
 
 class Command(NamedTuple):
-    """An input: a normalised command of JSBSim, unit 1."""
+    """An input, which is a normalised command of JSBSim with the unit 1."""
 
     property: str
-    trim_property: str | None  # the trim's own part of the command; JSBSim limits the sum of both
+    trim_property: str | None  # property of the trim, a part of the command; JSBSim limits the sum
     lower: float  # end stops of the whole command
     upper: float
     each_engine: bool
-    positive: str  # the effect of a positive value, in models that follow JSBSim's convention
-    named: "NamedProperties" = ()  # by the user, in place of `property` and `trim_property`
+    positive: str  # the effect of a positive value in models that follow JSBSim's sign convention
+    # properties named by the user, in place of `property` and `trim_property`
+    named: "NamedProperties" = ()
 
 
 NamedProperties = tuple[tuple[str, float], ...]
@@ -52,19 +53,19 @@ NamedProperties = tuple[tuple[str, float], ...]
 NONE = "none"
 
 
-# A property outside of JSBSim's settings.
+# A property outside of JSBSim's settings, as a pattern.
 PROPERTY = re.compile(r"(?!simulation/)[A-Za-z][\w-]*(\[\d+\])?(/[A-Za-z][\w-]*(\[\d+\])?)+")
 
 
 def named_properties(
     commands: Mapping[str, str], key: str
 ) -> tuple[tuple[str, NamedProperties], ...]:
-    """Read the user's own properties by input.
+    """Read the properties that the user names for inputs.
 
-    They come from texts such as "fcs/cmdAilR_rad=0.5 fcs/cmdAilL_rad=-0.5". The number is the
-    property's value at the command 1, which is the default; "none" for the rudder means a model
-    without one. Raises ParameterError for an unknown input, for anything that is no property of an
-    aircraft, and for the value 0.
+    `commands` has a text for each input, such as "fcs/cmdAilR_rad=0.5 fcs/cmdAilL_rad=-0.5". The
+    number is the value of the property at the command 1, and 1 if it is left out. "none" for the
+    rudder stands for a model without a rudder. Raises ParameterError for an unknown input, for
+    anything that is no property of an aircraft, and for the value 0.
     """
     properties = list[tuple[str, NamedProperties]]()
     for name, text in commands.items():
@@ -101,7 +102,7 @@ class JsbsimQuantity(NamedTuple):
 
     property: str
     si: float
-    unit: Unit | None  # the display unit of an output, None for other states
+    unit: Unit | None  # display unit if the quantity is an output; None for other states
 
 
 INPUTS: Mapping[str, Command] = {
@@ -140,10 +141,10 @@ INPUTS: Mapping[str, Command] = {
 }
 
 STATES: Mapping[str, JsbsimQuantity] = {
-    "q": JsbsimQuantity("velocities/q-rad_sec", 1.0, "rad/s"),  # FRD body axes, nose up +
+    "q": JsbsimQuantity("velocities/q-rad_sec", 1.0, "rad/s"),  # FRD body axes, positive nose up
     "V": JsbsimQuantity("velocities/vt-fps", FOOT, "m/s"),  # true airspeed
-    "p": JsbsimQuantity("velocities/p-rad_sec", 1.0, "rad/s"),  # roll right +
-    "r": JsbsimQuantity("velocities/r-rad_sec", 1.0, "rad/s"),  # nose right +
+    "p": JsbsimQuantity("velocities/p-rad_sec", 1.0, "rad/s"),  # positive roll right
+    "r": JsbsimQuantity("velocities/r-rad_sec", 1.0, "rad/s"),  # positive nose right
     "alpha": JsbsimQuantity("aero/alpha-rad", 1.0, None),
     "theta": JsbsimQuantity("attitude/theta-rad", 1.0, None),
     "beta": JsbsimQuantity("aero/beta-rad", 1.0, None),
@@ -169,24 +170,24 @@ RESIDUALS: Mapping[str, float] = {
 
 
 class FlightCondition(NamedTuple):
-    """An aircraft of JSBSim in a flight condition.
+    """The flight condition in which an aircraft of JSBSim is trimmed.
 
-    Level, straight, gear up, engines running, heading north, no wind.
+    The flight is level and straight, heading north, with gear up, engines running and no wind.
     """
 
-    name: str  # of the aircraft, without PREFIX, or the absolute path of its model
+    name: str  # name of the aircraft without PREFIX, or the absolute path of its model
     speed: float  # true airspeed, m/s
     altitude: float  # above sea level, m
     step_ns: int  # integration step
-    named: tuple[tuple[str, NamedProperties], ...] = ()  # the user's own properties, by input
+    named: tuple[tuple[str, NamedProperties], ...] = ()  # properties that the user names, by input
 
     @property
     def title(self) -> str:
-        """Name of the aircraft in messages, with PREFIX."""
+        """Name of the aircraft in messages, which begins with PREFIX."""
         return f"{PREFIX}{self.name}"
 
     def commands(self) -> dict[str, Command]:
-        """Return INPUTS, with the user's own properties."""
+        """Return INPUTS, changed by the properties that the user names."""
         properties = dict(self.named)
         return {
             name: command._replace(trim_property=None, named=properties[name])
@@ -196,35 +197,35 @@ class FlightCondition(NamedTuple):
         }
 
     def inputs(self) -> tuple[str, ...]:
-        """Name the inputs in the order of INPUTS, without a missing rudder."""
+        """Names of the inputs in the order of INPUTS; a missing rudder is left out."""
         return tuple(INPUTS)[:-1] if ("rudder", ()) in self.named else tuple(INPUTS)
 
     def paired_outputs(self) -> tuple[str, ...]:
-        """Name the outputs paired with `inputs`, in the order of OUTPUTS."""
+        """Names of the outputs that are paired with `inputs`, in the order of OUTPUTS."""
         return tuple(OUTPUTS)[: len(self.inputs())]
 
 
 class Trim(NamedTuple):
-    """A trimmed flight condition."""
+    """The commands and states of a trimmed flight condition."""
 
     commands: FloatArray  # (4,) whole commands in the order of INPUTS
-    lower: FloatArray  # (4,) end stops as deviations from them
-    upper: FloatArray  # (4,)
+    lower: FloatArray  # (4,) lower end stops as deviations from the trim commands
+    upper: FloatArray  # (4,) upper end stops as deviations from the trim commands
     states: FloatArray  # (9,) in the order of STATES, SI
     residuals: FloatArray  # (6,) remaining accelerations in the order of RESIDUALS, SI
 
 
 class WindModel(NamedTuple):
-    """Wind along the AXES of `disturbance`."""
+    """The wind along the AXES of `disturbance`, by its sources."""
 
     gusts: Gusts
-    turbulence: Turbulence | None  # filters for one step, or None without turbulence
+    turbulence: Turbulence | None  # filters for one step; None without turbulence
     over_place: RelativeWind | None = None  # None if the wind is the same everywhere
 
 
 @cache
 def aircraft_names() -> tuple[str, ...]:
-    """Name the aircraft of JSBSim. Raises ParameterError if JSBSim is not installed."""
+    """Return the names of JSBSim's aircraft. Raises ParameterError if JSBSim is not installed."""
     return tuple(
         sorted(
             path.parent.name
@@ -235,10 +236,10 @@ def aircraft_names() -> tuple[str, ...]:
 
 
 def root() -> Path:
-    """Return the folder with JSBSim's folders aircraft, engine and systems.
+    """Return the folder that contains JSBSim's folders aircraft, engine and systems.
 
-    It is $JSBSIM_ROOT, or in the package jsbsim. Raises ParameterError if JSBSim is not installed,
-    or if $JSBSIM_ROOT is no such folder.
+    It is $JSBSIM_ROOT, or the folder in the package jsbsim. Raises ParameterError if JSBSim is not
+    installed, or if $JSBSIM_ROOT is no such folder.
     """
     try:
         import jsbsim  # noqa: PLC0415 - other aircraft fly without it
@@ -263,8 +264,9 @@ def root() -> Path:
 def require_aircraft(airframe: str) -> str:
     """Return the name in "jsbsim:NAME", or the absolute path of the model in "jsbsim:PATH".
 
-    PATH is the XML file of a model, or its folder; it has a "/" or ends with ".xml". Raises
-    ParameterError: for a name with the closest known name, for a path with what is there.
+    PATH is the XML file of a model, or its folder. It contains a "/" or ends with ".xml". Raises
+    ParameterError. For an unknown name, the message has the closest known name. For a path, it says
+    what is there.
     """
     name = airframe.removeprefix(PREFIX)
     if "/" in name or name.endswith(SUFFIX):
@@ -278,9 +280,9 @@ def require_aircraft(airframe: str) -> str:
 
 
 def foreign_model(name: str) -> Path | None:
-    """Return the file of an aircraft's model if it is not one of the package jsbsim.
+    """Return the file of an aircraft's model if it does not come from the package jsbsim.
 
-    It is the user's own, or comes from $JSBSIM_ROOT. Otherwise the result is None.
+    The user names this file, or it comes from $JSBSIM_ROOT. For other models the result is None.
     """
     if Path(name).is_absolute():
         return Path(name)
@@ -290,8 +292,8 @@ def foreign_model(name: str) -> Path | None:
 def root_of(model: Path) -> Path:
     """Return the folder of the engines and systems of a model.
 
-    It is $JSBSIM_ROOT, the ROOT of ROOT/aircraft/NAME/NAME.xml, or the package. JSBSim first looks
-    for the files of a model beside the model.
+    It is $JSBSIM_ROOT, the ROOT in ROOT/aircraft/NAME/NAME.xml, or the folder of the package.
+    JSBSim looks beside the model first for files that the model names.
     """
     folder = model.parents[min(2, len(model.parents) - 1)]
     is_tree = (

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The commands of an aircraft of JSBSim: their properties, and the effect on the accelerations."""
+"""Set the commands of an aircraft of JSBSim, and test their effect on its accelerations."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -26,19 +26,19 @@ FROZEN: Mapping[str, float] = {
 systems run on."""
 
 PART = 0.2  # change of a command by which its effect is tested
-MOVED = 0.5  # frozen flight after this change, in which an engine begins to respond, s
-AFTERWARDS = 10.0  # frozen flight after the test, in which an engine returns, s
-# Multiple of the difference between two equal runs (an engine may still settle) beyond which a
-# change counts as an effect.
+MOVED = 0.5  # s of frozen flight after this change, in which an engine begins to respond
+AFTERWARDS = 10.0  # s of frozen flight after the test, in which an engine returns
+# A change counts as an effect if it exceeds this multiple of the difference between two equal runs.
+# Equal runs differ while an engine still settles.
 NOISE = 2.0
 SYSTEMS = ("flight_control", "autopilot", "system")
-CONVENTION = "-cmd-norm"  # at the end of JSBSim's own commands
+CONVENTION = "-cmd-norm"  # suffix of JSBSim's standard commands
 LEAST = 1e-6  # least change of an acceleration that counts as an effect, m/s^2 or rad/s^2
 
 
 @contextmanager
 def frozen(fdm: jsbsim.FGFDMExec) -> Iterator[None]:
-    """Hold position, velocity, attitude and fuel, while the aircraft runs."""
+    """Hold position, velocity, attitude and fuel while engines and systems run."""
     before = {path: fdm[path] for path in FROZEN}
     for path, value in FROZEN.items():
         fdm[path] = value
@@ -50,21 +50,21 @@ def frozen(fdm: jsbsim.FGFDMExec) -> Iterator[None]:
 
 
 def settle(fdm: jsbsim.FGFDMExec, duration: float) -> None:
-    """Run the frozen aircraft for `duration` s."""
+    """Run the frozen aircraft for a time `duration`, s."""
     with frozen(fdm):
         for _ in range(round(duration / fdm.get_delta_t())):
             fdm.run()
 
 
 def engine_count(fdm: jsbsim.FGFDMExec) -> int:
-    """Return the number of engines."""
+    """Return the number of engines of an aircraft."""
     return int(fdm.get_propulsion().get_num_engines())
 
 
 def command_paths(command: Command, engines: int) -> list[tuple[str, float]]:
-    """List the properties of a command with the value of each at the command 1.
+    """Return the properties of a command, each with its value at the command 1.
 
-    A command for each engine has a property per engine.
+    A command of the engines has one property for each engine.
     """
     if command.named:
         return list(command.named)
@@ -74,22 +74,22 @@ def command_paths(command: Command, engines: int) -> list[tuple[str, float]]:
 
 
 def set_command(fdm: jsbsim.FGFDMExec, command: Command, value: float) -> None:
-    """Set the properties of a command."""
+    """Set the properties of a command to a value of the command."""
     for path, at_one in command_paths(command, engine_count(fdm)):
         fdm[path] = at_one * value
 
 
 def residuals(fdm: jsbsim.FGFDMExec) -> FloatArray:
-    """Return the accelerations in the order of RESIDUALS, SI."""
+    """Return the accelerations in the order of RESIDUALS, SI, which are 0 in trim."""
     return np.array([fdm[f"accelerations/{name}"] * si for name, si in RESIDUALS.items()])
 
 
 def commands_and_limits(
     fdm: jsbsim.FGFDMExec, inputs: Iterable[Command]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return whole commands, including the trim's part, and the distances to their stops, (4,).
+    """Return the whole commands and their distances from the lower and upper stops, (4,) each.
 
-    The stops are the lower and the upper ones.
+    A whole command includes the part of the trim.
     """
     inputs = list(inputs)
     first = [command_paths(command, 1)[0] for command in inputs]
@@ -107,7 +107,7 @@ def commands_and_limits(
 
 
 def without_effect(fdm: jsbsim.FGFDMExec, commands: Mapping[str, Command]) -> list[str]:
-    """Name the inputs that move no acceleration of the frozen aircraft while its engines run."""
+    """Name the inputs that change no acceleration of the frozen aircraft, with engines running."""
     return [
         name
         for name, command in commands.items()
@@ -124,7 +124,7 @@ def _first(command: Command) -> str:
 
 
 def _moves(fdm: jsbsim.FGFDMExec, paths: Iterable[tuple[str, float]], part: float) -> bool:
-    """Return whether properties move an acceleration by more than two equal runs differ."""
+    """Return whether properties change an acceleration by more than two equal runs differ."""
     before = {path: fdm[path] for path, _ in paths}
     runs = []
     for deflection in (0.0, 0.0, part):
@@ -142,9 +142,9 @@ def _moves(fdm: jsbsim.FGFDMExec, paths: Iterable[tuple[str, float]], part: floa
 def sentence_without_effect(
     fdm: jsbsim.FGFDMExec, commands: Mapping[str, Command], names: Iterable[str], model: Path | None
 ) -> str:
-    """Write a sentence about inputs without effect.
+    """Write a sentence about inputs that have no effect.
 
-    It names the properties that move nothing, and those that the model reads.
+    It names the properties that have no effect, and those that the model reads.
     """
     parts = [
         f"{name}: {' and '.join(path for path, _ in command_paths(commands[name], 1))}"
@@ -163,9 +163,10 @@ def sentence_without_effect(
 
 
 def hysteresis_of(model: Path | None) -> str:
-    """End the sentence about a trim that fails, if servos of the model have hysteresis.
+    """Return the end of a sentence about a failed trim if servos of the model have hysteresis.
 
-    They hold their output while a command moves little. Returns "" if there are none.
+    Such servos hold their output while a command changes little. Returns "" if there is no
+    hysteresis.
     """
     members = {} if model is None else model_files(model).members
     if not any(b"<hysteresis_width>" in content for content in members.values()):
@@ -176,7 +177,7 @@ def hysteresis_of(model: Path | None) -> str:
 def _read_by_model(model: Path) -> list[str]:
     """List the properties that the control systems of a model read or declare.
 
-    They are those that no component writes.
+    Properties that a component writes are left out.
     """
     inputs_of_components: set[str] = set()
     written: set[str] = set()

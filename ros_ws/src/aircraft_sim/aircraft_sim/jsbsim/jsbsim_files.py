@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The files of a foreign model of JSBSim, and what the model may not do.
+"""Collect the files of a foreign model of JSBSim, and refuse what such a model may not do.
 
-They are found as JSBSim finds files, and JSBSim loads a copy of these files only. Sources: JSBSim
-1.3, FGModelLoader.cpp (a name without ".xml" gets it), FindFullPathName of FGModel, FGFCS and
-FGPropulsion (the folders), FGFDMExec::LoadModel (input and output), FGPropagate.cpp and
-FGLinearization.cpp (properties that write a file), sg_path.cxx (a backslash is a slash).
+A foreign model is one that the package jsbsim does not contain. Its files are found as JSBSim finds
+files, and JSBSim loads only a copy of them. Sources: JSBSim 1.3, FGModelLoader.cpp (a name without
+".xml" gets it), FindFullPathName of FGModel, FGFCS and FGPropulsion (the folders),
+FGFDMExec::LoadModel (input and output), FGPropagate.cpp and FGLinearization.cpp (properties that
+write a file), sg_path.cxx (a backslash is a slash).
 """
 
 import io
@@ -23,10 +24,11 @@ from aircraft_sim.jsbsim.jsbsim_aircraft import SUFFIX, root_of
 from flight_core.files import open_nonblocking
 from flight_core.parameters import ParameterError, require
 
-# Sections of a model that open a socket or write a file; within a section they name properties.
+# Sections of a model that open a socket or write a file. Inside of other sections these elements
+# name properties.
 LEFT_OUT = ("input", "output")
-CHILD = "child"  # a section that names another model, which JSBSim does not support yet
-# Properties of simulation/: JSBSim writes a file if one of them is set.
+CHILD = "child"  # section that names another model, which JSBSim does not support yet
+# Properties of simulation/ to which JSBSim responds by writing a file.
 WRITERS = ("do_linearization", "write-state-file")
 
 ENGINE_FOLDERS = ("Engines", "engines", "Engine", "engine")
@@ -55,19 +57,21 @@ SECTIONS = frozenset(
 these needs no file."""
 
 
-MOST_BYTES = 16 << 20  # of a file: the largest of JSBSim's own has a third of a megabyte
+# largest size of a file; the largest of JSBSim's files has a third of a megabyte
+MOST_BYTES = 16 << 20
 
 
 class ModelFiles(NamedTuple):
-    """A model and the files that it names, as a root of JSBSim."""
+    """A model and the files that it names, arranged as a root folder of JSBSim."""
 
-    model: str  # its path in the root
-    # Content by path: aircraft/NAME/ holds what is beside the model, engine/ and systems/ the rest.
+    model: str  # path of the model in the root
+    # Content by path. aircraft/NAME/ has the files beside the model, engine/ and systems/ have the
+    # others.
     members: Mapping[str, bytes]
-    left_out: tuple[str, ...]  # the sections that are not loaded, as <output name="x.csv">
+    left_out: tuple[str, ...]  # sections that are not loaded, such as <output name="x.csv">
 
     def write(self, root: Path) -> Path:
-        """Write the files below a folder, the new root, and return the path of the model there."""
+        """Write the files below `root`, and return the path of the model in this folder."""
         for name, content in self.members.items():
             path = root / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -75,9 +79,9 @@ class ModelFiles(NamedTuple):
         return root / self.model
 
     def archive(self) -> bytes:
-        """Pack a zip file of the root; the same files always give the same bytes.
+        """Return a zip file of the root; the same files always give the same bytes.
 
-        Unpacked, jsbsim:FOLDER/aircraft/NAME flies the same.
+        Unpacked to FOLDER, the airframe jsbsim:FOLDER/aircraft/NAME flies in the same way.
         """
         content = io.BytesIO()
         with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -87,17 +91,18 @@ class ModelFiles(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """A file for JSBSim: its path in the new root, and where it comes from."""
+    """A file for JSBSim: its path in the new root, and its original path."""
 
     member: str
     path: Path
 
 
 def model_files(model: Path) -> ModelFiles:
-    """Collect the files of a model that is not the package's.
+    """Collect the files of a model that does not come from the package jsbsim.
 
-    Raises ParameterError if a file is missing, cut short, or outside of the folders of the model
-    and its root, also through a link, and for a child model or a property that writes a file.
+    Raises ParameterError if a file is missing or cut short, or if it lies outside of the folders of
+    the model and its root, also through a link. It is also raised for a child model, and for a
+    property that writes a file.
     """
     first = _Place(f"aircraft/{model.stem}/{model.name}", model)
     members: dict[str, bytes] = {}
@@ -154,7 +159,7 @@ def _places(model: Path, element: str, name: str) -> Iterator[_Place]:
 
 
 def _relative(name: str, path: Path) -> str:
-    """Return the path of a named file with its suffix.
+    """Return the relative path of a named file, with its suffix.
 
     Raises ParameterError if the path leaves the folder.
     """
@@ -167,9 +172,9 @@ def _relative(name: str, path: Path) -> str:
 
 
 def _sentence(model: Path, missing: Mapping[str, str]) -> str:
-    """Write a sentence about missing files, by name with the element.
+    """Write a sentence about missing files; `missing` has the element by the file's name.
 
-    It is about the files of elements like the first.
+    It names the files of elements of the same kind as the first.
     """
     element = next(iter(missing.values()))
     names = sorted(
@@ -200,7 +205,7 @@ def _content(path: Path) -> bytes:
 
 
 def _parsed(content: bytes, path: Path) -> ElementTree.Element:
-    """Parse the elements as JSBSim reads them: names as they stand, without namespaces.
+    """Parse XML as JSBSim reads it, which means that names have no namespaces.
 
     Raises ParameterError.
     """
@@ -218,7 +223,7 @@ def _parsed(content: bytes, path: Path) -> ElementTree.Element:
 
 
 def _leave_out(tree: ElementTree.Element, model: Path) -> tuple[str, ...]:
-    """Remove the sections LEFT_OUT of a model, and return their texts.
+    """Remove the sections LEFT_OUT from a model, and return their start tags.
 
     Raises ParameterError for a child model.
     """
@@ -240,7 +245,7 @@ def _start_tag(element: ElementTree.Element) -> str:
 
 
 def _require_no_writer(tree: ElementTree.Element, path: Path) -> None:
-    """Refuse a property to whose value JSBSim responds with a file."""
+    """Refuse a property to which JSBSim responds by writing a file."""
     attributes = chain.from_iterable(element.attrib.values() for element in tree.iter())
     text = "".join([*tree.itertext(), *attributes])
     for name in WRITERS:

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Linearisation of an aircraft of JSBSim about its trim: an airframe, and the lags of its inputs.
+"""Linearise an aircraft of JSBSim about its trim: an airframe, and the lags of its inputs.
 
-The derivatives are central differences of JSBSim's own accelerations in frozen flight, where
-engines and flight control systems run and the motion stands still.
+The derivatives are central differences of the accelerations that JSBSim computes in frozen flight.
+There, engines and flight control systems run, but the motion stands still.
 """
 
 import math
@@ -31,32 +31,34 @@ from flight_core.units import FOOT, GRAVITY
 from flight_core.vectors import FloatArray
 
 RATES = ("p", "q", "r")
-# change of a rate, rad/s, and of wind / V0, which is small compared with the tables of a model
+# change of a rate, rad/s, and of wind / V0, in the differences; small compared with the steps in a
+# model's tables
 MOTION = 0.01
 SIZES = (0.05, 0.1, 0.2)
 """Steps of a command: the small ones stay linear, the large ones exceed a hysteresis or reach a
 rate limit."""
 MAX_STEP_FRACTION = 0.9  # upper bound of a step, as a fraction of the distance to the end stop
 SURFACE_TIME = 0.5  # s of frozen flight: long enough for flight control systems
-ENGINE_TIME = 20.0  # s: a turbine at altitude spools up in less
-STILL = 1e-6  # a step that changes accelerations by less moves nothing, m/s^2 or rad/s^2
-LEAST = 1e-6  # an entry below this is rounding, SI
+ENGINE_TIME = 20.0  # s of frozen flight: a turbine at altitude spools up in less time
+STILL = 1e-6  # m/s^2 or rad/s^2; a step that changes accelerations by less has no effect
+LEAST = 1e-6  # an entry below this value is a rounding error, SI
 
 
 class Linearization(NamedTuple):
-    """An aircraft of JSBSim about its trim: an airframe, and what steps of its inputs show."""
+    """An aircraft of JSBSim about its trim: an airframe, and the results of steps of its inputs."""
 
-    condition: FlightCondition  # a rudder that moves nothing is left out
+    condition: FlightCondition  # without the rudder if the rudder has no effect
     trim: Trim
     airframe: Airframe
-    lag: FloatArray  # (m,) s, of each input's own output, the longest of all sizes
-    size: FloatArray  # (m,) of the step with the largest effect, which counts
-    spread: FloatArray  # (m,) smallest effect of all sizes over the largest; 1 if it is linear
-    still: tuple[str, ...]  # steps without an effect, in sentences
+    # (m,) s, lag from each input to its paired output, the longest of all sizes of steps
+    lag: FloatArray
+    size: FloatArray  # (m,) size of the step with the largest effect, from which B follows
+    spread: FloatArray  # (m,) smallest effect per size divided by the largest; 1 for a linear input
+    still: tuple[str, ...]  # sentences on steps without an effect
 
     @property
     def Omega(self) -> FloatArray:  # noqa: N802 - the paper's name
-        """C B, (m, m), 1/s of the outputs per unit of a command."""
+        """C B, (m, m): 1/s of the outputs per unit of a command."""
         return np.asarray(self.airframe.matrix_c() @ self.airframe.matrix_b())
 
     def travel(self) -> FloatArray:
@@ -64,7 +66,7 @@ class Linearization(NamedTuple):
         return np.minimum(-self.trim.lower, self.trim.upper)[: len(self.lag)]
 
     def authority(self) -> FloatArray:
-        """Compute the y_dot that each input gives its output at the nearer end stop, (m,), SI."""
+        """Compute the y_dot that each input gives its output at its nearer stop, (m,), SI."""
         return np.abs(np.diag(self.Omega)) * self.travel()
 
 
@@ -79,10 +81,10 @@ def linearize(condition: FlightCondition) -> Linearization:
             beta_dot += g cos(theta) / V sin(phi),  for the small bank of a trim
         B_j = x_dot(t_end) / size,  lag_j = step + integral of 1 - x_dot(t) / x_dot(t_end)
 
-    u is in normalised commands from trim, w along AXES in m/s, and each lag is that of the output
-    that the input drives. The step is JSBSim's: a command acts a step later. Attitude acts only by
-    gravity, and altitude not at all. Raises FlightEnded if there is no trim, or if an input does
-    not move its output.
+    u has the normalised commands as deviations from trim, and w is the wind along AXES in m/s. Each
+    lag is that of the output that the input drives. The integration step of JSBSim is part of the
+    lag, because a command acts one step later. Attitude acts only through gravity, and altitude has
+    no effect. Raises FlightEnded if there is no trim, or if an input does not move its output.
     """
     solution = trim_solution(condition)
     _, trim = trimmed_fdm(condition, solution)
@@ -110,7 +112,7 @@ def linearize(condition: FlightCondition) -> Linearization:
 
 
 def driven(name: str) -> str:
-    """Name the output that an input drives."""
+    """Return the name of the output that an input drives."""
     return list(OUTPUTS)[list(INPUTS).index(name)]
 
 
@@ -119,7 +121,7 @@ def _duration(name: str) -> float:
 
 
 class _InputSteps(NamedTuple):
-    """The steps of an input."""
+    """The response of the aircraft to steps of an input."""
 
     effect: FloatArray  # (n,) column of B
     lag: float
@@ -129,7 +131,7 @@ class _InputSteps(NamedTuple):
 
 
 def _steps(condition: FlightCondition, trim: Trim, name: str) -> _InputSteps | None:
-    """Record the response to steps of an input both ways, or return None if no output moves."""
+    """Return the response to steps of an input in both directions; None if no output moves."""
     output = driven(name)
     place = list(INPUTS).index(name)
     travel = MAX_STEP_FRACTION * float(min(-trim.lower[place], trim.upper[place]))
@@ -162,7 +164,7 @@ def _steps(condition: FlightCondition, trim: Trim, name: str) -> _InputSteps | N
 
 
 def _response(condition: FlightCondition, trim: Trim, name: str, size: float) -> FloatArray:
-    """Record x_dot at each step of frozen flight after a step of an input, (N, n)."""
+    """Return x_dot at each integration step of frozen flight after a step input, (N, n)."""
     fdm, _ = trimmed_fdm(condition, trim_solution(condition))
     for path, at_one in command_paths(condition.commands()[name], engine_count(fdm)):
         fdm[path] += at_one * size
@@ -176,7 +178,7 @@ def _response(condition: FlightCondition, trim: Trim, name: str, size: float) ->
 
 
 def _x_dot(fdm: jsbsim.FGFDMExec, condition: FlightCondition, trim: Trim) -> FloatArray:
-    """Compute the derivatives from the accelerations, (n,); those of the attitude are 0."""
+    """Compute x_dot from the accelerations, (n,); the derivatives of the attitude are 0."""
     u_dot, v_dot, w_dot, p_dot, q_dot, r_dot = residuals(fdm)
     alpha = _trim_state(trim, "alpha")
     along = math.cos(alpha) * u_dot + math.sin(alpha) * w_dot
@@ -190,7 +192,7 @@ def _trim_state(trim: Trim, name: str) -> float:
 
 
 def _derivative(condition: FlightCondition, trim: Trim, name: str) -> FloatArray:
-    """Compute how x_dot changes by 1 rad/s of a rate, or 1 m/s of wind along an axis, (n,)."""
+    """Compute the change of x_dot by 1 rad/s of a rate, or by 1 m/s of wind, shape (n,)."""
     ends = []
     for sign in (1.0, -1.0):
         fdm, _ = trimmed_fdm(condition, trim_solution(condition))
@@ -208,7 +210,7 @@ def _derivative(condition: FlightCondition, trim: Trim, name: str) -> FloatArray
 
 
 def _set_rate(fdm: jsbsim.FGFDMExec, trim: Trim, name: str, value: float) -> None:
-    """Give an aircraft in trim a body rate, rad/s; engines and systems keep their state."""
+    """Set a body rate of an aircraft in trim, rad/s; engines and systems keep their state."""
     for key in ("alpha", "phi"):
         fdm[f"ic/{key}-rad"] = _trim_state(trim, key)
     fdm["ic/gamma-deg"] = fdm["ic/beta-rad"] = 0.0
@@ -217,7 +219,7 @@ def _set_rate(fdm: jsbsim.FGFDMExec, trim: Trim, name: str, value: float) -> Non
 
 
 def _airframe(condition: FlightCondition, trim: Trim, B: FloatArray) -> Airframe:
-    """Build the airframe of a trim with the columns of its inputs."""
+    """Build the airframe of a trim; B has the columns of its inputs."""
     places = {name: i for i, name in enumerate(AIRPLANE_STATES)}
     V = condition.speed
     wind = np.column_stack([_derivative(condition, trim, axis) for axis in AXES])

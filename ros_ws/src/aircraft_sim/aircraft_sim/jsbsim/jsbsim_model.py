@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flight dynamics model of JSBSim: a six-degree-of-freedom aircraft.
+"""The flight dynamics model of an aircraft of JSBSim, in six degrees of freedom.
 
 It flies around a trim point like the linear aircraft.
 """
@@ -50,21 +50,23 @@ LEAST_FUEL = 1.0
 class JsbsimModel:
     """An aircraft of JSBSim behind its actuators, in trim at t = 0.
 
-    A `simulator.FlightDynamicsModel`. A step of the integration, from t_k to t_k + dt:
+    The class is a `simulator.FlightDynamicsModel`. A step of the integration, from t_k to t_k + dt,
+    is
 
         position+ = actuators.apply_faults(t_k, position, actuators.step(position, u, dt))
         wind+     = gusts(t_k + dt) + turbulence.wind(z+), along the heading, to the right and down
         commands  = trim + actuators.effect(t_k, position+), then JSBSim runs
 
-    If the throttle of an engine is lost, it is at 0, and the engine has no fuel or no ignition.
+    If the throttle of an engine is lost, the throttle is 0, and the engine has no fuel or no
+    ignition.
 
-    JSBSim integrates the forces of the step before, then computes the forces of the new commands
-    and the new wind, so commands and wind act a step later. Since it computes forces at an instant,
-    t_k + dt, the position at this instant is the right one: the mean over the past step would be
-    half a step older.
+    JSBSim integrates the forces of the previous step, and then computes the forces for the new
+    commands and the new wind. So commands and wind act one step later. Because the forces are those
+    at the instant t_k + dt, JSBSim gets the actuator positions at this instant. The mean positions
+    over the step would be half a step older.
 
-    Raises FlightEnded if the aircraft does not trim, crashes or hangs. An isolated process tries
-    the aircraft first.
+    An isolated process tries the aircraft first. Raises FlightEnded if the aircraft has no trim, or
+    if it crashes or hangs the process.
     """
 
     def __init__(
@@ -75,7 +77,8 @@ class JsbsimModel:
             condition, jsbsim_trim.trim_solution(condition)
         )
         engines = engine_count(self._fdm)
-        # For each input: the nodes, and their values in trim and at the command 1.
+        # For each input: the nodes of its properties, with their values in trim and at the command
+        # 1.
         self._commands = [
             [
                 (node := self._node(path), node.get_double_value(), at_one)
@@ -91,7 +94,8 @@ class JsbsimModel:
             self._node(path)
             for path in (jsbsim_trim.HEADING, jsbsim_trim.HEIGHT, jsbsim_trim.CONTACT)
         )
-        # The number and the flag of each engine that can stop; an electric engine has no flag.
+        # The number and the running flag of each engine that can stop. An electric engine has no
+        # flag.
         running = {i + 1: self._node(jsbsim_trim.running_property(i)) for i in range(engines)}
         self._engines = {
             number: node for number, node in running.items() if node.get_double_value()
@@ -111,9 +115,9 @@ class JsbsimModel:
             self._z = turbulence.initial_state(wind_model.turbulence)
         self._position = np.zeros(len(inputs))
         self._altitude = self._node("position/h-sl-ft")
-        self._position_ground = np.zeros(2)  # to the north and the east of the start
+        self._position_ground = np.zeros(2)  # m to the north and to the east of the start
         self._apply_wind(self._wind(0))
-        # Make a step here, so that the wind of t = 0 acts from t = 0 on.
+        # Make one step here, so that the wind at t = 0 acts from t = 0 on.
         settle(self._fdm, seconds(condition.step_ns))
         self._x = self._deviations()
         self._pose_nodes = [(self._node(path), si) for path, si in POSE]
@@ -125,7 +129,7 @@ class JsbsimModel:
         )
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
-        """Fly from t to t + duration with the command u held, shape (m,), deviations from trim.
+        """Fly from t to t + duration with u held, shape (m,), deviations from trim.
 
         Raises FlightEnded if JSBSim fails, an engine stops or the aircraft touches the ground.
         """
@@ -171,7 +175,7 @@ class JsbsimModel:
         self._require_flight(t_ns + duration_ns, sink)
 
     def _require_flight(self, t_ns: int, sink: float) -> None:
-        """Raise FlightEnded on the ground, given the sink in m/s, and if an engine has stopped."""
+        """Raise FlightEnded on the ground, or if an engine stops; `sink` is the sink rate, m/s."""
         if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:
             is_on_wheels = not any(node.get_double_value() for node in self._structure)
             raise touch(self.condition.title, t_ns, sink, is_on_wheels=is_on_wheels)
@@ -189,9 +193,9 @@ class JsbsimModel:
         return self._x[: len(OUTPUTS)]
 
     def air_angles(self, t_ns: int) -> FloatArray:
-        """See `simulator.FlightDynamicsModel`.
+        """Return alpha and beta relative to the air, as deviations from trim, rad, shape (2,).
 
-        alpha and beta of JSBSim are relative to the air.
+        The alpha and beta of JSBSim are relative to the air.
         """
         return self._x[[list(STATES).index(name) for name in ANGLES]]
 
@@ -200,9 +204,9 @@ class JsbsimModel:
         return np.concatenate([self._x, self._wind(t_ns), self._position])
 
     def pose(self) -> FloatArray:
-        """See `simulator.FlightDynamicsModel`.
+        """Return the pose relative to the air mass, absolute values in SI, by `channels.POSE`.
 
-        Position is integrated from the velocity by the trapezoidal rule.
+        The position is integrated from the velocity by the trapezoidal rule.
         """
         phi, theta, psi, altitude, *velocity, beta = (
             node.get_double_value() * si for node, si in self._pose_nodes
@@ -215,16 +219,16 @@ class JsbsimModel:
         return np.array([node.get_double_value() * si for node, si in self._pose_nodes[4:6]])
 
     def diverged(self) -> bool:
-        """Return whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
+        """Return whether a state is not finite, or has a component above DIVERGENCE_LIMIT."""
         return not bool(np.all(np.abs(self._x) < DIVERGENCE_LIMIT))
 
     def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
-        """See `simulator.FlightDynamicsModel`."""
+        """Take the actuator faults and the gusts of these parameters from t on."""
         self._actuator_model = parameters.actuator_model()._replace(no_thrust=self._no_thrust)
         self._wind_model = self._wind_model._replace(gusts=parameters.gust_arrays(AXES))
 
     def _cut_engines(self, cut: bool) -> None:
-        """Stop the engines while they are lost, and start them again afterwards.
+        """Stop the engines if `cut` is true, because they are lost; otherwise start them again.
 
         An engine that stops here does not end the flight.
         """
@@ -232,7 +236,7 @@ class JsbsimModel:
             return
         jsbsim_trim.cut_engines(self._fdm, cut)
         self._are_engines_cut = cut
-        self._engines = {}  # an engine that was cut off may need longer than a step to run again
+        self._engines = {}  # an engine that was cut off may need more than one step to run again
 
     def _deviations(self) -> FloatArray:
         return (
@@ -242,13 +246,13 @@ class JsbsimModel:
 
     def _node(self, path: str) -> jsbsim.FGPropertyNode:
         node = self._fdm.get_property_manager().get_node(path)
-        # The trim has checked that it exists.
+        # the trim has checked that the property exists
         if node is None:
             raise FlightEnded(f"{self.condition.title} cannot be flown: it has no property {path}")
         return node
 
     def _wind(self, t_ns: int) -> FloatArray:
-        """Return the wind along AXES, (3,), m/s, at the instant of the turbulence's state."""
+        """Return the wind along AXES, (3,), m/s, at the instant of the state of the turbulence."""
         gusts = one_minus_cosine(
             np.array(seconds(t_ns)), self._wind_model.gusts, np.array(self.condition.speed)
         )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Trim of an aircraft of JSBSim, found in an isolated process, and quantities of the trim."""
+"""Trim an aircraft of JSBSim, in an isolated process."""
 
 import os
 import re
@@ -51,10 +51,10 @@ FUEL = "propulsion/total-fuel-lbs"
 
 WIND = ("atmosphere/wind-north-fps", "atmosphere/wind-east-fps", "atmosphere/wind-down-fps")
 
-MIXTURE = 0.9  # of piston engines: rich
-BOTH_MAGNETOS = 3.0  # ignition of piston engines: 0 off, 1 left, 2 right
+MIXTURE = 0.9  # mixture of piston engines: rich
+BOTH_MAGNETOS = 3.0  # ignition of piston engines; 0 is off, 1 left, 2 right
 SETTLE = 10.0  # s of frozen flight in which running engines settle
-SPIN_UP = 30.0  # the same for engines that have just been started
+SPIN_UP = 30.0  # s of frozen flight in which engines settle that have just been started
 SLOW_SETTLE = 80.0
 SLOW_SPIN_UP = 300.0
 """The same for a propeller that is slow to reach its speed, such as one of an electric engine with
@@ -69,10 +69,11 @@ ATTEMPTS = (
 """Settling times, s, and the fraction of the pitch trim that the elevator gives: all of it for a
 model without a trim of its own."""
 
-# Multiple of TOLERANCE that an engine leaves until it has settled; more has another cause.
+# Largest multiple of TOLERANCE that an engine which has not settled leaves. A larger one has
+# another cause.
 NEAR = 100.0
-FAR = 1e6  # of TOLERANCE, in place of accelerations that are not finite
-IDLE = 0.01  # throttle below which an engine may give no thrust
+FAR = 1e6  # multiple of TOLERANCE in place of accelerations that are not finite
+IDLE = 0.01  # throttle below which a running engine may give no thrust
 
 # alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad).
 START = np.array([0.05, 0.7, 0.0, 0.0, 0.0, 0.0])
@@ -80,18 +81,18 @@ SCALE = np.array([0.1, 0.5, 0.5, 0.5, 0.5, 0.1])  # scales of these unknowns for
 # Bounds of these unknowns.
 LOWEST = (-0.5, 0.0, -1.0, -1.0, -1.0, -0.5)
 HIGHEST = (0.5, 1.0, 1.0, 1.0, 1.0, 0.5)
-# m/s^2, rad/s^2: a tenth of a degree of attitude.
+# m/s^2, rad/s^2, largest accelerations in trim: those of a tenth of a degree of attitude.
 TOLERANCE = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])
 
 AXES_OF_RESIDUALS = ("forward", "sideways", "up or down", "in roll", "in pitch", "in yaw")
 NEIGHBOURS = ((0.9, 1.0), (1.1, 1.0), (0.75, 1.0), (1.35, 1.0), (1.0, 0.5), (0.75, 0.5))
 """Factors on speed and altitude to try if a condition has no trim, by distance."""
 
-PROBE_TIME = 2.0  # s of the test flight in the isolated process
-PROBE_SIZE = 0.02  # how far the test flight moves each command
-# s of processor time for trim and test flight; every aircraft that trims needs less than one.
+PROBE_TIME = 2.0  # s, length of the test flight in the isolated process
+PROBE_SIZE = 0.02  # change of each command in the test flight
+# s of processor time for trim and test flight; every aircraft that trims needs less than 1 s.
 TIMEOUT = 30.0
-NEAR_TIMEOUT = 3.0  # the same for a condition beside one without a trim
+NEAR_TIMEOUT = 3.0  # s of processor time for a condition near one that has no trim
 
 TrimSolution = tuple[float, ...] | None
 """The solver's unknowns of frozen flight, scaled, then spin-up and elevator part of ATTEMPTS; None
@@ -99,9 +100,9 @@ where JSBSim's own trim succeeds. It gives the same bits everywhere."""
 
 
 class _Log(jsbsim.FGLogger):
-    """Keeps JSBSim's output off the console.
+    """A logger that keeps JSBSim's output off the console.
 
-    `last` has the last two errors: the second often says only where.
+    `last` has the last two errors, because the second one often says only where the error was.
     """
 
     def __init__(self) -> None:
@@ -129,20 +130,20 @@ class _Log(jsbsim.FGLogger):
 
 
 class Unbalanced(NamedTuple):
-    """A trim that the solver does not reach, with the sentence about what is left."""
+    """A trim that the solver did not reach, with a sentence about the remaining accelerations."""
 
     sentence: str
 
 
 class NotBalanced(FlightEnded):
-    """Raised if the solver does not reach a trim; a condition near this one may have one."""
+    """Raised if the solver does not reach a trim; a condition nearby may have a trim."""
 
 
 @cache
 def trim_solution(condition: FlightCondition, timeout: float = TIMEOUT) -> TrimSolution:
     """Find the trim and make a short test flight in an isolated process.
 
-    JSBSim may crash or hang there. Raises FlightEnded.
+    JSBSim may crash or hang in this process, which raises FlightEnded.
     """
     try:
         foreign = foreign_model(condition.name) is not None
@@ -161,9 +162,9 @@ def solve_and_probe(
     step_ns: int,
     named: tuple[tuple[str, NamedProperties], ...] = (),
 ) -> TrimSolution | Unbalanced:
-    """Find and apply the trim, and fly with one command after the next moved by PROBE_SIZE.
+    """Find and apply the trim, and make a test flight with each command changed by PROBE_SIZE.
 
-    Raises FlightEnded, except for a trim that the solver does not reach.
+    If the solver does not reach a trim, returns Unbalanced. Raises FlightEnded for other failures.
     """
     condition = FlightCondition(
         name=name, speed=speed, altitude=altitude, step_ns=step_ns, named=named
@@ -191,7 +192,7 @@ def trimmed_fdm(
 ) -> tuple[jsbsim.FGFDMExec, Trim]:
     """Load the aircraft in the trim of a solution.
 
-    Raises FlightEnded where the aircraft cannot be loaded.
+    Raises FlightEnded if the aircraft cannot be loaded.
     """
     fdm = _load(condition)
     if solution is None:
@@ -208,39 +209,40 @@ def trimmed_fdm(
 
 
 def structure_contacts(fdm: jsbsim.FGFDMExec) -> list[str]:
-    """List the properties that are 1 while the structure, not a wheel, touches the ground."""
+    """Return the properties that are 1 while the structure, and not a wheel, touches the ground."""
     catalog = fdm.query_property_catalog("contact/unit")
     lines = catalog.splitlines() if isinstance(catalog, str) else catalog
     return [line.split()[0] for line in lines if "/WOW" in line]
 
 
 def running_property(engine: int) -> str:
-    """Name the property with the value 1 while an engine runs.
+    """Return the name of the property that is 1 while an engine runs.
 
-    An electric engine of JSBSim never has this value.
+    For an electric engine of JSBSim it is never 1.
     """
     return f"propulsion/engine[{engine}]/set-running"
 
 
 def thrust_property(engine: int) -> str:
-    """Name the property of the thrust of an engine, lbf."""
+    """Return the name of the property that has the thrust of an engine, lbf."""
     return f"propulsion/engine[{engine}]/thrust-lbs"
 
 
 def cut_engines(fdm: jsbsim.FGFDMExec, cut: bool) -> None:
-    """Cut off the fuel of all turbines and turboprops and the ignition of all pistons.
+    """Cut off the fuel of all turbines and turboprops, and the ignition of all pistons.
 
-    If `cut` is false, switch both on again. An electric engine and a rocket have no such switch:
-    they stop at throttle 0, where a turbine idles and gives thrust.
+    If `cut` is false, fuel and ignition are switched on again. An electric engine and a rocket need
+    no such switch, because they stop at throttle 0. A turbine idles and gives thrust there.
     """
     fdm["propulsion/cutoff_cmd"] = float(cut)
     fdm["propulsion/magneto_cmd"] = 0.0 if cut else BOTH_MAGNETOS
 
 
 def error_text(error: jsbsim.BaseError) -> str:
-    """Write JSBSim's message on a single line.
+    """Return the message of JSBSim on a single line.
 
-    Most often it says that a property of a flight simulator around JSBSim is missing.
+    Most often the message says that a property is missing which a flight simulator around JSBSim
+    would provide.
     """
     text = " ".join(str(error).split())
     missing = re.search(r"The property (\S+) does not exist", text)
@@ -250,14 +252,13 @@ def error_text(error: jsbsim.BaseError) -> str:
 
 
 def _solve_trim(condition: FlightCondition) -> TrimSolution | Unbalanced:
-    """Find the trim: level, straight, sideslip 0, with the bank angle that this needs.
+    """Find the trim in level, straight flight without sideslip, with the bank that this needs.
 
-    JSBSim's own trim comes first. It assumes settled engines and flight control systems, so these
-    get time in frozen flight, where everything runs except position, velocity and attitude. If
-    JSBSim's trim fails, or does not last, a solver finds the six unknowns (alpha, throttle, pitch
+    The trim function of JSBSim comes first. It assumes settled engines and flight control systems,
+    so they get time in frozen flight, where everything runs except position, velocity and attitude.
+    If this trim fails, or does not last, a solver finds the six unknowns (alpha, throttle, pitch
     trim, aileron, rudder, bank) in frozen flight, where everything has settled. Raises FlightEnded
-    with one sentence if there is no trim. If the solver merely does not reach one, the function
-    returns Unbalanced.
+    with one sentence if there is no trim. Returns Unbalanced if the solver does not reach a trim.
     """
     fdm = _load(condition)
     try:
@@ -282,7 +283,7 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution | Unbalanced:
             if residual < nearest or problem is None:
                 nearest = residual
                 problem = _trim_failure(attempt, condition)
-            # A solver that ends far from a trim may have left numbers that are not finite.
+            # If the solver ends far from a trim, it may leave numbers that are not finite.
             fdm = _load(condition)
     except jsbsim.BaseError as error:
         problem = error_text(error)
@@ -296,7 +297,7 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution | Unbalanced:
 
 
 def _require_effect(condition: FlightCondition) -> None:
-    """Refuse an elevator or a throttle that moves nothing, because no trim can be found then."""
+    """Refuse an elevator or a throttle without effect, because then no trim can be found."""
     fdm = _load(condition)
     commands = condition.commands()
     _start_engines(fdm, condition)
@@ -322,7 +323,7 @@ def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
             f"{condition.title} has no engine to control V with: no "
             f"{INPUTS['throttle'].property}[0]"
         )
-    # JSBSim creates a property that it does not have.
+    # JSBSim would create a property that does not exist.
     for path in _properties(condition, engines):
         if not manager.hasNode(path):
             raise FlightEnded(f"{condition.title} cannot be flown: it has no property {path}")
@@ -338,12 +339,12 @@ def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
 
 
 def _loaded(foreign: Path | None, name: str, folder: Path) -> jsbsim.FGFDMExec:
-    """Load a model of the package by its name, or a foreign one as a copy in a folder.
+    """Load a model of the package by its name, or a foreign model as a copy in `folder`.
 
     Raises ParameterError, OSError and BaseError.
     """
     log = _Log()
-    # The logger is that of this thread.
+    # Each thread has its own logger.
     jsbsim.set_logger(log)
     fdm = jsbsim.FGFDMExec(str(root() if foreign is None else folder))
     fdm.set_debug_level(0)
@@ -390,7 +391,7 @@ def _properties(condition: FlightCondition, engines: int) -> list[str]:
 
 
 def _jsbsim_trim(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
-    """Apply JSBSim's own trim, and return whether it succeeds and lasts."""
+    """Apply the trim function of JSBSim, and return whether it succeeds and lasts."""
     fdm.run_ic()
     fdm["propulsion/set-running"] = -1  # all engines
     try:
@@ -404,7 +405,7 @@ def _jsbsim_trim(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
 def _solve_accelerations(
     fdm: jsbsim.FGFDMExec, condition: FlightCondition, settling: float, by_elevator: float
 ) -> tuple[float, ...]:
-    """Solve for zero accelerations after `settling` s of frozen flight.
+    """Find the trim at which accelerations vanish after `settling` s of frozen flight.
 
     The unknowns are x = START + (scaled - 1) SCALE.
     """
@@ -416,8 +417,8 @@ def _solve_accelerations(
         return residuals(fdm)
 
     _start_engines(fdm, condition)
-    # The unknowns stay inside the stops, even if an input has no effect: a flying wing has no
-    # rudder.
+    # The unknowns stay inside the stops even if an input has no effect, as in a flying wing without
+    # a rudder.
     if by_elevator:
 
         def weighted(scaled: FloatArray) -> FloatArray:
@@ -431,7 +432,8 @@ def _solve_accelerations(
             weighted, np.ones(len(START)), bounds=(low, high), diff_step=steps, max_nfev=40
         )
         return tuple(fit.x.tolist())
-    # Differences over a thousandth of the scales: engines settle more accurately than that.
+    # The differences are a thousandth of the scales, because engines settle more accurately than
+    # that.
     scaled, *_ = fsolve(
         accelerations, np.ones(len(START)), epsfcn=1e-6, xtol=1e-6, maxfev=100, full_output=True
     )
@@ -451,7 +453,7 @@ def _set_unknowns(
     fdm["ic/alpha-rad"] = alpha
     fdm["ic/gamma-deg"] = 0.0
     fdm["ic/phi-rad"] = bank
-    fdm["ic/beta-rad"] = 0.0  # a change of alpha in a bank leaves some
+    fdm["ic/beta-rad"] = 0.0  # a change of alpha in a bank leaves some sideslip
     fdm.run_ic()
     commands = condition.commands()
     set_command(fdm, commands["throttle"], throttle)
@@ -472,11 +474,11 @@ def _is_trimmed(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
 
 
 def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str | Unbalanced:
-    """Say why the solver's result is no trim: an engine does not start, or what is left."""
+    """Say why a result is no trim: an engine does not start, or accelerations remain."""
     engines = range(engine_count(fdm))
     paths = command_paths(condition.commands()["throttle"], len(engines))
     idle = [fdm[path] < IDLE * at_one for path, at_one in paths]
-    idle += idle[-1:] * (len(engines) - len(idle))  # a property of several engines
+    idle += idle[-1:] * (len(engines) - len(idle))  # one property can stand for several engines
     stopped = [
         str(i + 1)
         for i in engines
@@ -509,7 +511,7 @@ def _engines_start(condition: FlightCondition) -> bool:
 
 
 def nearest_trim(condition: FlightCondition) -> str | None:
-    """Name the nearest speed and altitude of NEIGHBOURS at which an aircraft trims, in words."""
+    """Say in words at which nearby speed and altitude of NEIGHBOURS an aircraft trims."""
     for speed, altitude in NEIGHBOURS:
         near = condition._replace(
             speed=speed * condition.speed, altitude=altitude * condition.altitude

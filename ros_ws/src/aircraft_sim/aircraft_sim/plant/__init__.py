@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The plant of equation (1) behind its actuators, and the faults of effectors."""
+"""The plant of equation (1) with its actuators, and the faults of effectors."""

@@ -1,49 +1,50 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Actuators between the command u and the aircraft.
+"""Model the actuators between the command u and the aircraft.
 
-They have dead zone, lag, rate and position saturation, and faults of effectors.
+They have a dead zone, a lag, a rate limit, end stops, and the faults of effectors.
 """
 
 from typing import Any, NamedTuple
 
 from flight_core.vectors import Array, array_namespace
 
-# Lag that replaces a lag of 0, s. There is no division by 0, and exp(-dt / 1e-30) is exactly 0, in
-# float32, too.
+# s, in place of a lag of 0. It avoids a division by 0, and exp(-dt / 1e-30) is exactly 0, also in
+# float32.
 MIN_LAG = 1e-30
 
 
 class Actuators(NamedTuple):
     """Parameters of m actuators, SI.
 
-    An ideal actuator has lag 0 and infinite limits. If a property is None, no actuator has it.
+    An ideal actuator has a lag of 0 and infinite limits. A field that is None means that no
+    actuator has this property.
     """
 
     lag: Array | None = None  # (m,) time constant of the first-order response, s, 0 = none
     lower: Array | None = None  # (m,) lower end stop, deviation from trim, -inf = none
     upper: Array | None = None  # (m,) upper end stop, deviation from trim, inf = none
     rate: Array | None = None  # (m,) largest rate, units of u / s, inf = none
-    dead_zone: Array | None = None  # (m,) half-width, 0 = none
+    dead_zone: Array | None = None  # (m,) half-width of the dead zone, 0 = none
     # The times of faults are flight times, s, and inf means never.
-    stuck_at: Array | None = None  # (m,) when the actuator gets stuck
-    # (m,) when the actuator goes to `no_thrust` for good
+    stuck_at: Array | None = None  # (m,) time at which the actuator gets stuck
+    # (m,) time from which on the actuator stays at `no_thrust`
     lost_at: Array | None = None
-    # (m,) when the effect of the actuator is multiplied by `weak_effect`
+    # (m,) time from which on the effect of the actuator is multiplied by `weak_effect`
     weak_at: Array | None = None
-    weak_effect: Array | None = None  # (m,) factor
-    # (m,) when the lag of the actuator becomes at least `slow_lag`
+    weak_effect: Array | None = None  # (m,) factor on the effect
+    # (m,) time from which on the lag of the actuator is at least `slow_lag`
     slow_at: Array | None = None
-    slow_lag: Array | None = None  # (m,) s
-    # (m,) when the actuator gets the backlash `loose_play`
+    slow_lag: Array | None = None  # (m,) lag of a slow actuator, s
+    # (m,) time from which on the actuator has the backlash `loose_play`
     loose_at: Array | None = None
     loose_play: Array | None = None  # (m,) half-width of the backlash
-    # (m,) when the actuator runs away to `hard_over_to`
+    # (m,) time from which on the actuator runs away to `hard_over_to`
     hard_over_at: Array | None = None
-    hard_over_to: Array | None = None  # (m,) end stop, deviation from trim
+    hard_over_to: Array | None = None  # (m,) end stop of a runaway, deviation from trim
     backlash: Array | None = None  # (m,) half-width of the backlash in force, see `in_force`
-    runs_to: Array | None = None  # (m,) end stop of a runaway in force, nan if there is none
-    # (m,) position in which the effector gives no thrust, deviation from trim, 0 for a surface
+    runs_to: Array | None = None  # (m,) end stop of a runaway in force, nan without a runaway
+    # (m,) position at which the effector gives no thrust, deviation from trim, 0 for a surface
     no_thrust: Array | None = None
 
 
@@ -58,13 +59,13 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
         limited = position + clip(lagged - position, -rate dt, rate dt)        rate limit
         p+      = clip(limited, lower, upper)                                  end stops
 
-    Each line is a property of the actuator and takes the result of the line before. An ideal
-    actuator passes the command on to the last bit, because the difference is zero and the limits
-    only choose between values.
+    Each line models a property of the actuator and takes the result of the previous line. An ideal
+    actuator passes the command on exactly, to the last bit, because the difference is zero and the
+    limits only choose between values.
 
-    Shapes: position, command (m,), dt (). Units: SI, deviations from trim; dt > 0 in s.
-    Source: the lag is the zero-order-hold equivalent of 1 / (lag s + 1); Franklin, Powell, Workman,
-    Digital Control, 4.3.
+    Position and command have shape (m,) and are deviations from trim in SI. dt > 0 is a scalar in
+    s. Source: the lag is the zero-order-hold equivalent of 1 / (lag s + 1); Franklin, Powell,
+    Workman, Digital Control, 4.3.
     """
     xp = array_namespace(position)
     target = _input(position, command, params)
@@ -81,7 +82,7 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
 def mean_position(position: Array, command: Array, new: Array, dt: Any, params: Actuators) -> Array:
     """Compute the mean actuator positions over a step from `position` to `new`, shape (m,).
 
-    This is the input of the aircraft in this step:
+    The mean is the input of the aircraft in this step:
 
         input                                                                     as in `step`
         lagged  = input - (input - position) lag / dt (1 - exp(-dt / lag))
@@ -92,9 +93,9 @@ def mean_position(position: Array, command: Array, new: Array, dt: Any, params: 
             the motion is monotonic and has end stops
 
     In a step in which a limit begins or ceases to act, the mean is approximate and lies between the
-    two ends. An ideal actuator has mean = new, to the last bit.
+    two ends. For an ideal actuator the mean is exactly `new`.
 
-    Shapes and units as in `step`; `new` is the result of `step`.
+    Shapes and units are as in `step`, and `new` is the result of `step`.
     """
     if params.lag is None and params.rate is None:
         return new
@@ -113,7 +114,7 @@ def mean_position(position: Array, command: Array, new: Array, dt: Any, params: 
 def move(
     t: Any, position: Array, command: Array, dt: Any, params: Actuators
 ) -> tuple[Array, Array]:
-    """Return the positions at the end of a step from t, and the mean input over the step.
+    """Return the positions at the end of a step that begins at t, and the mean input over it.
 
     The mean is the input of the aircraft. Both results include faults and have the shape (m,).
     """
@@ -126,10 +127,10 @@ def move(
 
 
 def in_force(t: Any, position: Array, params: Actuators) -> Actuators:
-    """Return the parameters of a step from t on.
+    """Return the parameters in force for a step that begins at t.
 
-    A slow actuator has at least the lag `slow_lag`, a loose one has the backlash `loose_play`, and
-    a runaway goes to `hard_over_to` at the rate limit, without a lag.
+    A slow actuator has at least the lag `slow_lag`, and a loose actuator has the backlash
+    `loose_play`. A runaway goes to `hard_over_to` at the rate limit, without a lag.
     """
     xp = array_namespace(position)
     if params.slow_at is not None:
@@ -152,13 +153,13 @@ def in_force(t: Any, position: Array, params: Actuators) -> Actuators:
 
 
 def effect(t: Any, position: Array, params: Actuators) -> Array:
-    """Compute the input of the aircraft at these positions, shape (m,).
+    """Compute the input of the aircraft at the given actuator positions, shape (m,).
 
-        t >= weak_at    no_thrust + weak_effect (position - no_thrust)
-            a part of the thrust, also of that in trim
+        t >= weak_at no_thrust + weak_effect (position - no_thrust) a part of the thrust, also of
+            the thrust in trim
         else            position
 
-    `position` is the one at t, after `apply_faults`.
+    `position` is the position at t, after `apply_faults`.
     """
     if params.weak_at is None:
         return position
@@ -180,7 +181,7 @@ def _input(position: Array, command: Array, params: Actuators) -> Array:
 
 
 def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Array:
-    """Apply faults to the actuator positions at the end of a step from t on, shape (m,).
+    """Apply faults to the actuator positions at the end of a step that begins at t, shape (m,).
 
     The positions can also be means over the step.
 

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Equation (1), the aircraft: x_dot = A x + f(x, t) + B u, y = C x, in deviations from trim.
+"""Evaluate the aircraft, equation (1): x_dot = A x + f(x, t) + B u, y = C x, deviations from trim.
 
-f(x, t) = f_state(x) + f_time(t). `x_dot` computes the sum at one instant, while `plant.advance`
-computes f_time once for all instants of the steps.
+f(x, t) is the sum of f_state(x) and f_time(t). `x_dot` computes the sum at one instant, while
+`plant.advance` computes f_time once for all instants of the steps.
 """
 
 from typing import Any, NamedTuple
@@ -15,21 +15,22 @@ from flight_core.vectors import Array, array_namespace
 class Coupling(NamedTuple):
     """P products of two states: f += gain @ (x[first] x[second])."""
 
-    gain: Array  # (n, P)
+    gain: Array  # (n, P) effect of each product on x_dot
     first: Array  # (P,) indices in x
-    second: Array  # (P,)
+    second: Array  # (P,) indices in x
 
 
 class EulerKinematics(NamedTuple):
-    """Nonlinear kinematics in place of the linear kinematics of A.
+    """Nonlinear kinematics that replace the linear kinematics of A.
 
-    Angles belong to the stability axes, so they are 0 in trim.
+    The angles are relative to the stability axes, so they are 0 in trim.
     """
 
     select: Array  # (5, n), picks phi, theta, p, q, r
-    into: Array  # (n, 3), adds to alpha_dot, phi_dot, theta_dot
+    into: Array  # (n, 3), adds the terms to alpha_dot, phi_dot, theta_dot
     linear: (
-        Array  # (3, n), rows of A that they replace: none of alpha_dot, those of phi_dot, theta_dot
+        # (3, n), rows of A that are replaced: none for alpha_dot, those of phi_dot and theta_dot
+        Array
     )
     turn_rate: Array  # () g/V0, 1/s
 
@@ -43,7 +44,7 @@ class Aircraft(NamedTuple):
     A: Array  # (n, n)
     B: Array  # (n, m)
     C: Array  # (m, n)
-    gravity: Array  # (n, n), gravity @ sin(x)
+    gravity: Array  # (n, n), the sine terms are gravity @ sin(x)
     gust_direction: Array  # (n, G), change of x_dot for 1 m/s of wind along each axis
     gusts: Gusts
     speed: Array  # () trim speed V0, m/s
@@ -51,7 +52,7 @@ class Aircraft(NamedTuple):
     bias: Bias | None = None
     sines: Sines | None = None
     kinematics: EulerKinematics | None = None
-    # (n,) term of x_dot if the matrices belong to an airspeed other than the trim speed
+    # (n,) constant term of x_dot, for matrices at another airspeed than the trim speed
     trim: Array | None = None
 
 
@@ -61,8 +62,8 @@ def f(t: Any, x: Array, params: Aircraft, turbulence: Array | None = None) -> Ar
         f = gravity @ sin(x) + gain @ (x[first] x[second]) + gust_direction @ (w(t) + turbulence)
             + bias(t) + sines(t) + kinematics(x)
 
-    `turbulence` is its wind along the G axes, shape (G,), m/s, or None for no turbulence. x can
-    hold N states in columns, (n, N).
+    `turbulence` is the wind of the turbulence along the G axes, shape (G,), m/s; None means no
+    turbulence. x can hold N states in columns, (n, N).
     """
     return f_state(x, params) + f_time(t, wind(t, params, turbulence), params)
 
@@ -74,14 +75,14 @@ def x_dot(t: Any, x: Array, u: Array, params: Aircraft, turbulence: Array | None
 
 def x_dot_forced(x: Array, forced: Array, params: Aircraft) -> Array:
     """Compute A x + f_state(x) + forced, shape (n,): equation (1) with forced = f_time + B u."""
-    # For a few states `dot` takes a third of the time of @, and gives the same bits.
+    # For a few states, `dot` takes a third of the time of @, with the same result to the last bit.
     return params.A.dot(x) + f_state(x, params) + forced
 
 
 def f_state(x: Array, params: Aircraft) -> Array:
     """Compute the state-dependent part of f, shape (n,).
 
-    gravity @ sin(x) + gain @ (x[first] x[second]) + kinematics(x).
+    It is gravity @ sin(x) + gain @ (x[first] x[second]) + kinematics(x).
     """
     total = params.gravity.dot(array_namespace(x).sin(x))
     if params.coupling is not None:
@@ -91,14 +92,14 @@ def f_state(x: Array, params: Aircraft) -> Array:
 
 
 def kinematics(x: Array, params: EulerKinematics) -> Array:
-    """Compute the difference between the nonlinear and the linear kinematics, shape (n,).
+    """Compute the nonlinear minus the linear kinematics, shape (n,).
 
         alpha_dot += g/V0 (cos phi cos theta - 1)
         phi_dot    = p + tan theta (q sin phi + r cos phi)
         theta_dot  = q cos phi - r sin phi
 
-    The first term is the loss of lift along the vertical in a bank. Source: B. L. Stevens, F. L.
-    Lewis, Aircraft Control and Simulation, 2nd ed. (2003), eqs. (1.3-22), (2.4-5).
+    The first term is the loss of vertical lift in a bank. Source: B. L. Stevens, F. L. Lewis,
+    Aircraft Control and Simulation, 2nd ed. (2003), eqs. (1.3-22), (2.4-5).
     """
     xp = array_namespace(x)
     phi, theta, p, q, r = params.select @ x
@@ -115,7 +116,7 @@ def kinematics(x: Array, params: EulerKinematics) -> Array:
 def f_time(t: Any, wind: Array, params: Aircraft) -> Array:
     """Compute the time-dependent part of f, shape (n,).
 
-    gust_direction @ wind + bias(t) + sines(t),  wind of shape (G,), m/s
+    It is gust_direction @ wind + bias(t) + sines(t), with the wind in m/s, shape (G,).
     """
     total = params.gust_direction @ wind
     if params.bias is not None:
@@ -126,13 +127,13 @@ def f_time(t: Any, wind: Array, params: Aircraft) -> Array:
 
 
 def wind(t: Any, params: Aircraft, turbulence: Array | None = None) -> Array:
-    """Compute the wind along the G axes, shape (G,), m/s: gusts + turbulence."""
+    """Compute the wind along the G axes, gusts plus turbulence, shape (G,), m/s."""
     gusts = one_minus_cosine(t, params.gusts, params.speed)
     return gusts if turbulence is None else gusts + turbulence
 
 
 class Forcing(NamedTuple):
-    """Wind and f_time at T instants."""
+    """Wind and f_time at T instants, computed in advance."""
 
     wind: Array  # (T, G) speed of the gusts along the G axes, m/s
     rate: Array  # (T, n) f_time in this wind

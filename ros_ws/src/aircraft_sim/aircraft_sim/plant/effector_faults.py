@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of effectors: a list of sentences in a scenario, and the arrays of `actuators`.
+"""Read faults of effectors from a list of sentences in a scenario, as arrays of `actuators`.
 
     faults: [aileron lost 60, elevator weak 60 0.3, rudder hard_over 20 upper]
 
-A fault is INPUT KIND AT, with AT in s of flight time, and for some kinds how strong the fault is.
+A fault is INPUT KIND AT, with AT in s of flight time. Some kinds also state how strong the fault
+is.
 """
 
 import math
@@ -18,11 +19,11 @@ from flight_core.vectors import FloatArray
 
 
 class FaultKind(NamedTuple):
-    """A kind of fault: its keys in `actuators.Actuators`, and how strong a fault is."""
+    """A kind of fault: its fields in `actuators.Actuators`, and the number for its strength."""
 
     begin: str
-    strength: str = ""  # "": the kind has none
-    default: float = math.nan  # of the strength; nan: the fault says the strength
+    strength: str = ""  # field of the strength; "" if the kind has no strength
+    default: float = math.nan  # default of the strength; nan if the fault must state its strength
     least: float = 0.0
     most: float = LARGEST
 
@@ -50,13 +51,13 @@ FORM = "INPUT KIND AT, as aileron lost 60"
 
 
 class Fault(NamedTuple):
-    """A fault of an effector."""
+    """A fault of an effector, as read from a sentence."""
 
     input: str
     kind: str
     at: float  # s of flight time
-    strength: float | None = None  # SI; None without a strength
-    end: str = ""  # of a runaway: one of ENDS
+    strength: float | None = None  # SI; None for a kind without a strength
+    end: str = ""  # end of a runaway: one of ENDS
 
     @property
     def subject(self) -> str:
@@ -65,12 +66,12 @@ class Fault(NamedTuple):
 
     @property
     def extent(self) -> str:
-        """How strong the fault is; "" for a kind without a strength."""
+        """Strength of the fault as text; "" for a kind without a strength."""
         return self.end or ("" if self.strength is None else f"{self.strength:g}")
 
 
 def read_fault(sentence: str, key: str) -> Fault:
-    """Read the fault in a sentence. Raises ParameterError."""
+    """Read a fault from a sentence. Raises ParameterError."""
     words = sentence.split()
     require(len(words) in {3, 4}, key, repr(sentence), FORM)
     name, kind_name, at, *how = words
@@ -107,10 +108,10 @@ def require_possible(
     no_thrust: FloatArray,
     owner: str,
 ) -> None:
-    """Refuse a fault that these inputs of `owner` cannot have.
+    """Refuse faults that the inputs of `owner` cannot have.
 
-    `stops` are the end stops by ENDS. `no_thrust` has the positions without thrust, nan if unknown,
-    0 for a surface.
+    `stops` has the end stops by ENDS. `no_thrust` has the position of each input at which it gives
+    no thrust, nan if unknown, and 0 for a surface.
     """
     effects = [(fault.input, KINDS[fault.kind].begin) for fault in faults]
     for number, fault in enumerate(faults):
@@ -140,7 +141,7 @@ def arrays(
 ) -> dict[str, Any]:
     """Return the faults as fields of `actuators.Actuators`, each of shape (m,).
 
-    The begin of a fault is infinite for an input that never has it.
+    For an input that never has a fault, the beginning of this fault is infinite.
     """
     columns: dict[str, Any] = {}
     for fault in faults:

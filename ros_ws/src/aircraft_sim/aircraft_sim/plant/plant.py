@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated plant: equation (1) behind actuators, with zero-order hold of u.
+"""Simulate the plant: equation (1) behind actuators, with zero-order hold of u.
 
-It is integrated in fixed steps.
+The plant is integrated in fixed steps.
 """
 
 from typing import Any, NamedTuple
@@ -19,37 +19,37 @@ from flight_core.rates import divide, seconds
 from flight_core.vectors import Array, array_namespace
 
 # A state whose magnitude exceeds this limit, SI, counts as diverged. No state of an aircraft in
-# flight comes near it.
+# flight comes near this limit.
 DIVERGENCE_LIMIT = 1e6
 
-SHORTEST_DRIFT = 1e-9  # duration that replaces 0, s, so that nothing is divided by 0
+SHORTEST_DRIFT = 1e-9  # s, in place of a duration of 0, so that nothing is divided by 0
 
 
 class Drift(NamedTuple):
     """A change of A, B and the effect of wind in flight.
 
-    A, B and `wind` are the factors on the entries after `duration`. Until then the factors change
-    linearly from 1.
+    A, B and `wind` are factors on the entries, which apply after `duration`. Until then the factors
+    change linearly from 1.
     """
 
     start: float  # s of flight time
-    duration: float  # s, 0 for a change at once
+    duration: float  # s, 0 for a sudden change
     A: Array  # (n, n)
     B: Array  # (n, m)
     wind: Array  # (n, G)
 
 
 def share(t: Array, start: Any, duration: Any) -> Array:
-    """Compute how far a drift acts at t: 0 before the start, 1 after the duration."""
+    """Compute the share of a drift that acts at t: 0 before the start, 1 after the duration."""
     xp = array_namespace(t)
     part = xp.minimum((t - start) / xp.maximum(duration, SHORTEST_DRIFT), 1.0)
     return xp.where(t >= start, xp.where(duration > 0.0, part, 1.0), 0.0)
 
 
 class OverAirspeed(NamedTuple):
-    """How A, B and the trim follow the airspeed V0 + V.
+    """The powers by which A, B and the trim follow the airspeed V0 + V.
 
-    Entries follow powers of the ratio of the airspeed to V0, with the exponents in `A`, `B`,
+    Entries are multiplied by powers of the airspeed divided by V0. The exponents are in `A`, `B`,
     `gravity` and `wind`. The trim is given at K ratios.
     """
 
@@ -59,7 +59,7 @@ class OverAirspeed(NamedTuple):
     B: Array  # (n, m)
     gravity: Array  # (n, n)
     wind: Array  # (n, G)
-    ratio: Array  # (K,) rising
+    ratio: Array  # (K,) rising ratios of airspeed to V0
     x: Array  # (K, n) states of the trims, deviations from the trim at V0
     u: Array  # (K, m) inputs of the trims, deviations from the trim at V0
 
@@ -67,24 +67,24 @@ class OverAirspeed(NamedTuple):
 class PlantParams(NamedTuple):
     """Parameters of the plant.
 
-    They are aircraft, actuators, integration step, turbulence, drift, and what follows the
-    airspeed.
+    They are those of aircraft, actuators, integration step, turbulence and drift, and of the change
+    with airspeed.
     """
 
     aircraft: Aircraft
     actuators: Actuators
     step_ns: int  # integration step
-    turbulence: Turbulence | None = None  # filters for one step, or None without turbulence
+    turbulence: Turbulence | None = None  # filters for one step; None without turbulence
     drift: Drift | None = None
     over_airspeed: OverAirspeed | None = None  # if None, A and B stay those of the trim speed
 
 
 def aircraft_at(t_ns: int, plant: PlantParams, x: Array | None = None) -> Aircraft:
-    """Return the aircraft at t in the state x, (n,), or in trim without x.
+    """Return the aircraft at t in the state x, (n,), or in trim if x is None.
 
-    A, B and the effect of wind are multiplied by 1 + share (factor - 1). Over the airspeed, entries
-    are multiplied by powers of r = 1 + V / V0, and deviations are taken about the trim of r, (x_r,
-    u_r):
+    The drift multiplies A, B and the effect of wind by 1 + share (factor - 1). If they follow the
+    airspeed, entries are multiplied by powers of r = 1 + V / V0, and deviations are taken from the
+    trim at r, (x_r, u_r):
 
         x_dot = A x + gravity sin(x) + B u + trim,  trim = -(A x_r + gravity sin(x_r) + B u_r)
     """
@@ -130,7 +130,7 @@ class AircraftState(NamedTuple):
 
 
 def initial_state(plant: PlantParams) -> AircraftState:
-    """Return the state in trim: x = 0, actuators at 0.
+    """Return the state in trim, with x = 0 and all actuators at 0.
 
     The turbulence filters start from a sample of their stationary distribution.
     """
@@ -142,9 +142,9 @@ def initial_state(plant: PlantParams) -> AircraftState:
 
 
 def forcing(t_ns: int, steps: int, plant: PlantParams, x: Array | None = None) -> Forcing:
-    """Compute the forcing at the beginnings, middles and ends of steps from t and x on.
+    """Compute the forcing at the beginnings, middles and ends of steps that begin at t.
 
-    These are 2 steps + 1 instants. For all of them the aircraft is taken as it is at t.
+    For n steps there are 2 n + 1 instants. The aircraft at all of them is that at t in the state x.
     """
     halves = array_namespace(plant.aircraft.A).arange(2 * steps + 1, dtype=plant.aircraft.A.dtype)
     return dynamics.at_times(
@@ -162,15 +162,15 @@ def advance(
 ) -> AircraftState:
     """Integrate from the state at t to t + duration, with the command u held (zero-order hold).
 
-    A step dt from t_k is
+    A step of length dt that begins at t_k is
 
         position+, mean = actuators.move(t_k, position, u, dt)
         x+  = Runge-Kutta step of equation (1) with the input `mean` and the turbulence at t_k
         z+              = turbulence.step(z, n_k)
 
-    The mean position over the step acts during the whole step. The error against the continuous
-    actuator is then of second order in dt, and an ideal actuator passes u on without delay, to the
-    last bit. The turbulence at the beginning of the step acts during the whole step, so the
+    The mean position over the step acts during the whole step. So the error relative to a
+    continuous actuator is of second order in dt, and an ideal actuator passes u on exactly and
+    without delay. The turbulence at the beginning of the step acts during the whole step. So its
     spectrum is exact at the steps, with a hold in between. Time is counted in ns, so that steps add
     up exactly.
 
@@ -204,11 +204,11 @@ def advance(
 
 
 def diverged(state: AircraftState) -> bool:
-    """Return whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
-    # The comparison is false for NaN too.
+    """Return whether a state is not finite, or has a component above DIVERGENCE_LIMIT."""
+    # The comparison is also false for NaN.
     return not all(abs(x) < DIVERGENCE_LIMIT for x in state.x.tolist())
 
 
 def output(state: AircraftState, plant: PlantParams) -> Array:
-    """Compute the outputs y = C x, before any sensor, shape (m,)."""
+    """Compute the outputs y = C x without the errors of sensors, shape (m,)."""
     return dynamics.y(state.x, plant.aircraft)
