@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The age of u at the aircraft, from the diagnostics.
+"""Read the age of u at the aircraft from the diagnostics.
 
-It is the delay of the whole loop, from the instant of y to the action of u.
+This age is the delay of the whole loop, from the instant of y to the action of u.
 """
 
 from collections.abc import Iterable
@@ -19,15 +19,15 @@ from flight_log.named_vectors import typestore
 DIAGNOSTICS = "/diagnostics"
 MEAN = "age of u mean (s)"
 MAX = "age of u max (s)"
-IN_MESSAGE = MEAN.encode()  # occurs in a message with an age of u
+IN_MESSAGE = MEAN.encode()  # bytes that occur in a message with an age of u
 CHANNELS = ("mean", "max")
 
 
 def age_of_u(messages: Iterable[bytes], namespace: str) -> Signal | None:
     """Return the mean and the largest age of u, s, in each report of an aircraft.
 
-    Each covers the time since the report before. `namespace` is the namespace of the aircraft.
-    Returns None if the aircraft has no report.
+    Each report covers the time since the previous report. `namespace` is the namespace of the
+    aircraft. Returns None if the aircraft has no report.
     """
     rows: dict[int, tuple[float, float]] = {}
     for data in messages:

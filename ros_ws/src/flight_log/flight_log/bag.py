@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a bag in the layout of rosbag2: an MCAP file of CDR messages, and metadata.yaml.
+"""Write a bag in the layout of rosbag2: an MCAP file of CDR messages, and metadata.yaml.
 
-It needs no ROS.
+The module needs no ROS.
 """
 
 import struct
@@ -31,18 +31,19 @@ FILE_MEDIA_TYPE = "text/yaml"  # media type of other attached files
 BEFORE_REMAP = "rise_di_topic"
 OUTCOME = "rise_di_outcome"  # name of the metadata record with the outcome of the flight
 SILENCES = "rise_di_silent"  # name of the metadata record with the silences of topics, s
-OUTCOME_FILE = "outcome"  # file in the folder of a run by which the recorder learns the outcome
-# Name of the metadata record of a log that the stack did not fly: "log", "kind", "map", COMPARED.
+OUTCOME_FILE = "outcome"  # file in the folder of a run from which the recorder learns the outcome
+# Name of the metadata record of a log that the stack did not fly. Its keys are "log", "kind", "map"
+# and COMPARED.
 IMPORTED = "rise_di_imported"
-# Key in IMPORTED: a sentence on what the vehicle's parameters do not tell. It is empty if all of
-# them agree with the map.
+# Key in IMPORTED of a sentence on what the vehicle's parameters do not tell. The sentence is empty
+# if all of them agree with the map.
 COMPARED = "parameters"
 # Name of the metadata record with the SI units of channels, for a log without a scenario.
 CHANNEL_UNITS = "rise_di_units"
-# Name of the metadata record of a flight by /clock. It has the topic, and the speed of the flight
-# as a multiple of real time.
+# Name of the metadata record of a flight whose time was given by /clock. The record has the topic,
+# and the speed of the flight as a multiple of real time.
 SIMULATED_TIME = "rise_di_simulated_time"
-# Name of the metadata record that counts the messages the recorder lost, by topic.
+# Name of the metadata record that counts the messages that the recorder lost, by topic.
 LOST_MESSAGES = "rise_di_lost"
 CHUNK_BYTES = 256 * 1024
 
@@ -53,27 +54,27 @@ END_BYTES = 2 * CHUNK_BYTES
 INDEX_BYTES = 77
 INDEX_BYTES_BY_TOPIC = 10
 
-# Private attributes of mcap's Writer, as in mcap 1.6. Another version would use its own.
+# Private attributes of the Writer of mcap 1.6. Another version would have other private attributes.
 CHUNK_BUILDER = "_Writer__chunk_builder"
 CHUNK_INDEXES = "_Writer__chunk_indices"
 MESSAGE = int(Opcode.MESSAGE)
-# RECORD, followed by channel, sequence, log time and publish time (MCAP specification)
+# RECORD, then channel, sequence, log time and publish time (MCAP specification)
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
-INDEX_HEAD = struct.Struct("<BQHI")  # RECORD, followed by channel and size
+INDEX_HEAD = struct.Struct("<BQHI")  # RECORD, then channel and size
 
 
 class LogAttachments(NamedTuple):
-    """Files and metadata that a log stores in addition to the messages."""
+    """Files and metadata that a log stores beside the messages."""
 
     scenario: Path | None = None
     files: tuple[Path, ...] = ()
-    # A YAML file of named sets of strings, each of which becomes a metadata record.
+    # A YAML file of named sets of strings. Each set becomes a metadata record.
     metadata: Path | None = None
 
 
 @dataclass
 class BagChannel:
-    """A topic of an unfinished bag."""
+    """A topic of a bag that is being written."""
 
     topic: str
     type: MessageDefinition
@@ -94,9 +95,9 @@ class _MessageIndex(MessageIndex):
 
 
 class _ChunkBuilder(ChunkBuilder):
-    """Writes the bytes of mcap's builder in half the time.
+    """A chunk builder that writes the same bytes as mcap's builder in half the time.
 
-    mcap's own builder writes a message field by field, and then goes back to write its length.
+    The builder of mcap writes a message field by field, and then goes back to write its length.
     """
 
     def add_message(self, message: Message) -> None:
@@ -120,10 +121,10 @@ class _ChunkBuilder(ChunkBuilder):
 
 
 class _ChunkIndexes:
-    """Chunk indexes as records on disk, instead of mcap's list in memory.
+    """Chunk indexes as records on disk, in place of mcap's list in memory.
 
-    mcap's list grows by 1 kB a chunk, 36 MB an hour. The reserve for the end of the file grows with
-    the number of chunks.
+    The list grows by 1 kB a chunk, which is 36 MB an hour. The reserve for the end of the file
+    grows with the number of chunks.
     """
 
     def __init__(self, file: ReservedFile, channels: Sequence[BagChannel]) -> None:
@@ -148,17 +149,17 @@ class _ChunkIndexes:
 
 
 def full_names(remaps: Mapping[str, str]) -> dict[str, str]:
-    """Return the full name in the stack by topic of a log.
+    """Return the full names in the stack, by topic of a log.
 
-    `remaps` has the topic of the log by name in the stack.
+    `remaps` has the topic of the log for each name in the stack.
     """
     return {topic: f"/{name.lstrip('/')}" for name, topic in remaps.items()}
 
 
 def stack_topic(channel: Channel, remaps: Mapping[str, str] = {}) -> str:
-    """Return the full name in the stack of a topic of a log.
+    """Return the full name that a topic of a log has in the stack.
 
-    `remaps` has names by topic of the log. They replace the names that the log itself has.
+    `remaps` has names by topic of the log. They replace the names that the log contains.
     """
     return remaps.get(channel.topic) or channel.metadata.get(BEFORE_REMAP) or channel.topic
 
@@ -166,10 +167,10 @@ def stack_topic(channel: Channel, remaps: Mapping[str, str] = {}) -> str:
 class BagWriter:
     """Writes a bag into a folder.
 
-    `flush` closes the chunk in progress. If the process is killed, closed chunks stay readable.
-    Disk space for the end of the file is reserved. After a write has used the reserve, `full` is
-    true and the bag must be closed. Raises OSError if a write fails for any other reason, or if the
-    reserve is not enough.
+    `flush` closes the chunk in progress. If the process is killed, the closed chunks stay readable.
+    Disk space for the end of the file is reserved. After a write has used this reserve, `full` is
+    true and the bag must be closed. Raises OSError if a write fails for another reason, or if the
+    reserve does not suffice.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -256,7 +257,7 @@ class BagWriter:
         self._writer.flush()
 
     def contents(self) -> FileContents:
-        """Return what the file holds so far."""
+        """Return the content of the file so far."""
         counts = (
             TopicCount(
                 topic=channel.topic,

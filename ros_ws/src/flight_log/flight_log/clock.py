@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Check of a topic's stamps in the order of the recording.
+"""Check the stamps of a topic in the order of the recording.
 
-It finds steps of the clock that made the stamps, damaged stamps and equal stamps.
+The check finds steps of the clock that made the stamps, damaged stamps and equal stamps.
 """
 
 from collections.abc import Iterator, Mapping
@@ -15,35 +15,35 @@ from numpy.typing import NDArray
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import LostPart, Recording, Signal
 
-STEP_NS = NANOSECONDS // 10  # least step back of a clock, ns; no sample is as late as this
-# least step forth of a clock, compared with the time of the recording, ns
+STEP_NS = NANOSECONDS // 10  # ns, least backward step of a clock; no sample is late by this much
+# ns, least forward step of a clock, relative to the time of the recording
 LEAP_NS = NANOSECONDS // 4
-# If fewer than CONFIRMED messages are older than the one before by more than this time, ns, their
+# ns. If fewer than CONFIRMED messages are older than the previous message by more than this, their
 # stamps are damaged.
 STRAY_NS = NANOSECONDS
-LATE_NS = 4 * NANOSECONDS  # largest delay of the first sample of a recorder on a busy host, ns
-# Number of successive messages that confirm a step. Fewer come from another publisher, or have a
-# damaged stamp.
+LATE_NS = 4 * NANOSECONDS  # ns, largest delay of a recorder's first sample on a busy host
+# Number of successive messages that confirm a step. Fewer messages come from another publisher, or
+# have a damaged stamp.
 CONFIRMED = 10
 CONFIRMED_AT_END = 3  # the same number at the end of a topic
 SINCE_EPOCH_NS = 10**15  # larger stamps count from 1970, not from the start of the flight
 
 
 class StampClock:
-    """Finds the usable samples of a topic, which end at a step of the clock of their stamps.
+    """Finds the usable samples of a topic, up to a step of the clock that made their stamps.
 
-    A sample with a damaged stamp is left out. The samples after a step forth stay here, because
-    only `without_leaps`, which knows all topics, can decide about them.
+    A sample with a damaged stamp is left out. The samples after a forward step are kept here,
+    because only `without_leaps`, which sees all topics, can decide about them.
     """
 
     def __init__(self) -> None:
         self._count = self._unset = self._repeated = self._left_out = 0
         self._step_ns = self._step_at_ns = 0
         self._last_ns: int | None = None  # last usable stamp
-        self._last_offset_ns = 0  # this stamp minus the time of its recording
-        self._offset_ns = -(2**62)  # the largest lead of a stamp over the time of the recording
+        self._last_offset_ns = 0  # the last usable stamp minus the time of its recording
+        self._offset_ns = -(2**62)  # largest lead of a stamp over the time of its recording
         self._is_history = False  # whether the last samples were recorded in a burst
-        # the last stamp before each pause in which nothing was received either
+        # last stamps before pauses in which no topic was received
         self._pauses_ns: set[int] = set()
 
     def usable(
@@ -57,11 +57,11 @@ class StampClock:
     ) -> tuple[NDArray[np.bool_], int]:
         """Return a mask of the usable messages among the first K messages, shape (K,), and K.
 
-        K is less than the number of messages if `more` messages follow at once and the last ones
-        neither confirm nor exclude a step. `end` says that these are the last messages of the
-        topic. `steps` has the increase of the publisher's number before each message. If the number
-        falls together with both times, this span of the log is out of order. If messages are lost
-        at a jump forth, the jump is a gap.
+        K is less than the number of messages if `more` messages follow immediately and the last
+        messages neither confirm nor exclude a step. `end` is true for the last messages of the
+        topic. `steps` has the increase of the publisher's message number at each message. If this
+        number falls together with both times, this span of the log is out of order. If messages are
+        lost at a forward jump, the jump is a gap.
         """
         latest = np.maximum.accumulate(np.append(self._last_ns or 0, stamp_ns))[:-1]
         if self._step_ns:
@@ -80,7 +80,7 @@ class StampClock:
         # If nothing is received meanwhile, the publisher or the host has paused, not the clock.
         with_reception = (jumps > LEAP_NS) & (leads <= LEAP_NS) & has_time
         self._pauses_ns.update((stamps - jumps)[with_reception].tolist())
-        # These are the indices at which the messages of a new clock can begin.
+        # These are the indices at which the messages of a new clock may begin.
         starts = np.flatnonzero(back | forth)
         edges = [0, *starts[starts > 0].tolist(), len(stamps)]
         for first, after in pairwise(edges if len(stamps) else []):
@@ -88,7 +88,7 @@ class StampClock:
             jump_ns, is_ahead = self._jump_to(
                 int(stamps[first]), int(offsets[first]), has_time=bool(has_time[first])
             )
-            # If the clock goes on, nothing needs to be confirmed.
+            # If the clock continues, nothing needs a confirmation.
             goes_on = self._last_ns is not None and jump_ns >= 0 and not is_ahead
             is_short = after - first < (CONFIRMED_AT_END if is_last and end else CONFIRMED)
             if is_short and not (goes_on and first not in starts):
@@ -100,7 +100,7 @@ class StampClock:
             is_back = jump_ns < -STEP_NS and bool(back[first])
             if is_back and has_time[first]:
                 is_late = self._catches_up(stamps[first:], offsets[first:])
-                if is_late is None and more:  # the next messages will tell
+                if is_late is None and more:  # the next messages will decide
                     return self._taken(stamp_ns, keep[: places[first]], int(places[first]))
                 is_back = not is_late
             if is_back or is_ahead:
@@ -109,14 +109,14 @@ class StampClock:
                 after_step = int(places[first])
                 keep[after_step:] = self._after_step(stamp_ns[after_step:])
                 return self._taken(stamp_ns, keep, len(stamp_ns), after_step)
-            # The messages before are too few to be the beginning of the clock.
+            # The previous messages are too few to be the beginning of the clock.
             if self._last_ns is None:
                 keep[places[:first]] &= _begins(stamps[: first + 1], offsets[: first + 1])
             self._follow(stamps[first:after], offsets[first:after])
         return self._taken(stamp_ns, keep, len(stamp_ns))
 
     def _follow(self, stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> None:
-        """Note the stamps of successive messages of the clock."""
+        """Note the stamps of successive messages of the same clock."""
         self._last_ns = int(stamp_ns[-1])
         self._last_offset_ns = int(offset_ns[-1])
         self._offset_ns = max(self._offset_ns, int(offset_ns.max()))
@@ -124,11 +124,11 @@ class StampClock:
             self._is_history = _in_burst(stamp_ns, offset_ns)
 
     def _catches_up(self, stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool | None:
-        """Return whether the samples after a step back are merely late.
+        """Return whether the samples after a backward step are only late.
 
-        A late sample is at most STRAY_NS older than the one before, and after at most STRAY_NS of
-        reception the samples are no later than before. If the clock was set, they stay behind.
-        Returns None if there are too few messages to tell.
+        A late sample is at most STRAY_NS older than the previous one. After at most STRAY_NS of
+        reception, such samples have caught up. If the clock was set back, the samples stay behind.
+        Returns None if there are too few messages to decide.
         """
         if self._last_ns is None or stamp_ns[0] < self._last_ns - STRAY_NS:
             return False
@@ -141,10 +141,10 @@ class StampClock:
     def _jump_to(self, stamp_ns: int, offset_ns: int, *, has_time: bool) -> tuple[int, bool]:
         """Return the time from the last usable stamp to a stamp, ns, and whether the stamp leads.
 
-        A stamp leads if it is too far ahead of the time of the recording. The time is 0 if there is
-        no usable stamp.
+        A stamp leads if it is too far ahead of the time of the recording. The returned time is 0 if
+        there is no usable stamp yet.
         """
-        # There is no usable stamp yet, or only one that was not set.
+        # There is no usable stamp yet, or only a stamp that was not set.
         if not self._last_ns:
             return 0, False
         jump_ns = stamp_ns - self._last_ns
@@ -152,9 +152,10 @@ class StampClock:
         return jump_ns, is_ahead and has_time and not self._is_history
 
     def _after_step(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return a mask of the samples that stay after the step.
+        """Return a mask of the samples that stay after a step of the clock.
 
-        After a step forth, the samples later than the step stay. After a step back, none stay.
+        After a forward step, the samples later than the step stay. After a backward step, no sample
+        stays.
         """
         return (stamp_ns > self._step_at_ns) & (self._step_ns > 0)
 
@@ -173,7 +174,7 @@ class StampClock:
         return keep, count
 
     def recording(self, unset: int = 0) -> Recording:
-        """Return what was found, with `unset` further messages without a usable stamp."""
+        """Return the findings, and add `unset` messages that had no usable stamp."""
         return Recording(
             found=self._count,
             unset=self._unset + unset,
@@ -186,7 +187,7 @@ class StampClock:
 
 
 def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return a mask of the first N - 1 of N samples that can have the clock of the last one."""
+    """Return which of the first N - 1 of N samples may have the clock of the last sample."""
     away_ns = stamp_ns[-1] - stamp_ns[:-1]
     lead_ns = offset_ns[-1] - offset_ns[:-1]
     is_near = (away_ns <= STRAY_NS) | (lead_ns <= LATE_NS)
@@ -194,11 +195,11 @@ def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArra
 
 
 def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool:
-    """Return whether the last samples were recorded in a burst, like the history of a publisher.
+    """Return whether the last samples were recorded in a burst, as a publisher's history is.
 
-    The last samples span LEAP_NS of stamps. In a burst they were recorded in less than half of that
-    time, because a recorder that starts late receives the history of the publisher at once. A pause
-    in such a history is no step of the clock.
+    The last samples are those of the last LEAP_NS by their stamps. In a burst they were recorded in
+    less than half of this time, because a recorder that starts late receives the history of the
+    publisher at once. A pause in such a history is no step of the clock.
     """
     recent = stamp_ns >= stamp_ns[-1] - LEAP_NS
     span_ns = stamp_ns[-1] - stamp_ns[recent][0]
@@ -207,7 +208,7 @@ def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool
 
 
 def recording_note(name: str, recording: Recording, start_ns: int) -> str | None:
-    """Write a sentence about the stamps of a topic, or return None if all are usable."""
+    """Write a sentence about the stamps of a topic; None if all of them are usable."""
     parts = []
     if recording.unset:
         parts.append(
@@ -225,13 +226,13 @@ def recording_note(name: str, recording: Recording, start_ns: int) -> str | None
 
 
 class Leap(NamedTuple):
-    """A leap of the clock of all topics at one instant."""
+    """A forward step that the clock of all topics makes at one instant."""
 
     at_ns: int  # the last stamp before the leap
     by_ns: int  # the size of the leap
 
     def undone(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Convert stamps to the clock before the leap."""
+        """Convert stamps to the clock as it was before the leap."""
         return stamp_ns - np.where(stamp_ns > self.at_ns + STEP_NS, self.by_ns, 0)
 
 
@@ -241,9 +242,9 @@ LOOP = ("y", "y_m", "u", "internals", "truth")  # topics that must all show a le
 def without_leaps(
     signals: Mapping[str, Signal], recording: Mapping[str, Recording]
 ) -> tuple[dict[str, Signal], dict[str, Recording], list[Leap]]:
-    """Convert the signals to the clock before each leap, and return them and the leaps.
+    """Convert the signals to the clock before each leap, and return them with the leaps.
 
-    If a single topic steps forth, this is no leap, and the samples after the step are left out.
+    A forward step of a single topic is no leap, and the samples after this step are left out.
     """
     mended = dict(signals)
     clocks = dict(recording)
@@ -256,7 +257,7 @@ def without_leaps(
             for name in LOOP
             if name in mended and mended[name].stamp_ns[-1] > earlier.at_ns + STEP_NS
         ]
-        # A single topic has a clock of its own.
+        # A single topic has its own clock.
         if len(loop) < 2 or not {*loop} <= {*leaping}:
             continue
         leaps.append(earlier)
@@ -276,11 +277,11 @@ def without_leaps(
 def _candidates(
     signals: Mapping[str, Signal], recording: Mapping[str, Recording]
 ) -> Iterator[Leap]:
-    """Yield the leaps of the stamps against a second measure of time.
+    """Yield the leaps of the stamps relative to a second measure of time.
 
-    The measure is the flight time in `truth`. If there is none, it is a constant period of the
-    messages, provided no message is lost. A gap during which nothing was received either is no
-    leap: the host was busy or suspended, but its clock went on.
+    The second measure is the flight time in `truth`. Without `truth` it is a constant period of the
+    messages, provided that no message is lost. A gap in which nothing was received is no leap,
+    because the host was busy or suspended, but its clock continued.
     """
     name = next((name for name in ("truth", "y_m", "y") if name in signals), "")
     if not name:
@@ -313,7 +314,7 @@ def _has_gap(signal: Signal, leap: Leap) -> bool:
 
 
 def lost_in_leap(leap: Leap, start_ns: int) -> LostPart:
-    """Return the span of the flight that a leap of the clock hides."""
+    """Return the span of the flight that is lost in a leap of the clock."""
     times = f"{seconds(leap.by_ns):.3f} s at t = {seconds(leap.at_ns - start_ns):.3f} s"
     return LostPart(sentence=f"the clock of all stamps leaps forth by {times}")
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of a topic as columns: a short topic in memory, a long one in a temporary file.
+"""Store the samples of a topic as columns, a short topic in memory, a long one in a temporary file.
 
 Metrics and figures use whole channels, one after another. An hour of `truth` takes 400 MB, but each
 of its channels only 14 MB.
@@ -24,11 +24,11 @@ after 5 min."""
 
 
 class Columns:
-    """Samples in order of arrival: stamps, and rows of equal length.
+    """Samples in the order of arrival, with stamps and rows of equal length.
 
-    The rows are read as columns, which are contiguous in memory. There is space for `expected`
-    samples at first, and for more when they come. Raises ParameterError if no temporary file can
-    hold a long topic.
+    The rows are read as columns, which are contiguous in memory. At first there is space for
+    `expected` samples, and it grows with further samples. Raises ParameterError if no temporary
+    file can hold a long topic.
     """
 
     def __init__(self, width: int, expected: int) -> None:
@@ -89,14 +89,15 @@ class _MemoryColumns:
 class _FileColumns:
     """Columns in a temporary file without a name.
 
-    They go to the file at once, and are mapped into memory only while an array of them is used.
+    The columns are written to the file immediately, and mapped into memory only while an array of
+    them is in use.
     """
 
     def __init__(self, width: int, capacity: int) -> None:
         self._capacity = capacity
         self._shape = (width, capacity)
         with _on_disk():
-            self._file = TemporaryFile()  # noqa: SIM115 - open as long as a signal has it
+            self._file = TemporaryFile()  # noqa: SIM115 - open as long as a signal uses it
             finalize(self, self._file.close)
             self._file.truncate(8 * width * capacity)
 
@@ -106,7 +107,7 @@ class _FileColumns:
             self._file.write(np.ascontiguousarray(values).data)
 
     def read(self, first: int, end: int, count: int) -> FloatArray:
-        """Read columns, (count, end - first)."""
+        """Read columns `first` to `end`, shape (count, end - first)."""
         with _on_disk():
             self._file.flush()
         if not self._capacity or first == end:
@@ -130,8 +131,8 @@ def _on_disk() -> Iterator[None]:
 class _StoredSignal(Signal):
     """A signal whose values are in a file.
 
-    Its channels are the columns of the file from `first` on. `values` maps the file each time, so
-    that the memory is free when you drop the array. In a loop, keep the array.
+    The channels are the columns of the file from `first` on. Each access to `values` maps the file,
+    so the memory is freed when you drop the array. In a loop, keep the array.
     """
 
     def __init__(

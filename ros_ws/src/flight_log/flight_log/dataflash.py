@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the messages of a DataFlash log from a card that lost bytes.
+"""Find the messages of a DataFlash log on a card that lost bytes.
 
 Source: ArduPilot, AP_Logger/LogStructure.h (log_Format). A packet has no checksum.
 """
@@ -21,17 +21,17 @@ TAIL = 528
 
 
 class Packets(DFReader.DFReader_binary):
-    """The packets of a log that are followed by another packet or by the end.
+    """The packets of a log that are followed by another packet or by the end of the log.
 
-    pymavlink's own index ends at the first unknown packet, which lost bytes leave behind.
+    The index of pymavlink ends at the first unknown packet, which lost bytes leave behind.
     """
 
     def init_arrays(self, progress_callback: Callable[[int], None] | None = None) -> None:
-        """Index the packets, and list the bytes without a packet."""
+        """Index the packets, and list the spans of bytes that hold no packet."""
         self.name_to_id: dict[str, int] = {}
         self.id_to_name: dict[int, str] = {}
         self.offsets: list[list[int]] = [[] for _ in range(256)]
-        # first byte and end of each span without a packet, and the place of the packet before it
+        # first byte and end of each span without a packet, and the place of the previous packet
         self.lost: list[tuple[int, int, int]] = []
         here = before = 0
         while here < self.data_len:
@@ -52,7 +52,7 @@ class Packets(DFReader.DFReader_binary):
     init_arrays_fast = init_arrays
 
     def _length(self, here: int) -> int:
-        """Return the length of the packet at a place, bytes, or 0 if no whole packet is there."""
+        """Return the length of the packet at a place, bytes; 0 if there is no whole packet."""
         form = self.formats.get(int.from_bytes(self.data_map[here + 2 : here + 3], "little"))
         if self.data_map[here : here + 2] != HEAD or form is None:
             return 0
@@ -64,14 +64,14 @@ class Packets(DFReader.DFReader_binary):
         return int(form.len)
 
     def _declare(self, content: bytes) -> bool:
-        """Take the format that a packet declares, and return False if it is damaged."""
+        """Take the format that a packet declares. Returns False if the format is damaged."""
         identity, length, *texts = struct.unpack(self.formats[FORMAT].msg_struct, content)
         name, types, columns = map(DFReader.null_term, texts)
         try:
             form = DFReader.DFFormat(
                 identity, name, length, types, columns, oldfmt=self.formats.get(identity)
             )
-        # pymavlink raises Exception itself for a format with unknown types.
+        # pymavlink raises Exception for a format with unknown types
         except Exception:
             return False
         size = len(HEAD) + 1 + struct.calcsize(form.msg_struct)
@@ -83,12 +83,12 @@ class Packets(DFReader.DFReader_binary):
         return True
 
     def _stamp_ns(self, place: int) -> int:
-        """Return the stamp of the packet at a place, ns, or 0 if it has none."""
+        """Return the stamp of the packet at a place, ns; 0 if the packet has no stamp."""
         self.offset = place
         return round(1e3 * stamp_us(self._parse_next(), 0.0))
 
     def loss(self) -> Loss | None:
-        """Return the loss of bytes that hold no packet, or None for a whole log."""
+        """Return the loss, which is the bytes that hold no packet; None for a whole log."""
         lost = self.lost
         if lost and lost[-1][1] == self.data_len and lost[-1][1] - lost[-1][0] < TAIL:
             lost = lost[:-1]
@@ -109,10 +109,10 @@ class Lines(DFReader.DFReader_text):
     offset: int
 
     def init_arrays(self, progress_callback: Callable[[int], None] | None = None) -> None:
-        """Index the lines, and count those without a message."""
+        """Index the lines, and count the lines without a message."""
         self.offsets: dict[str, list[int]] = {}
         self._places: list[int] = []
-        self.lost_us: list[float] = []  # the last stamp before each line without a message, us
+        self.lost_us: list[float] = []  # last stamp before each line without a message, us
         newest_us = 0.0
         here: int = self.offset
         self._count = 0
@@ -132,7 +132,7 @@ class Lines(DFReader.DFReader_text):
         self.offset = 0
 
     def _parse_next(self) -> Any:
-        """Return the message of the next line that has one."""
+        """Return the message of the next line that holds a message."""
         place = bisect_left(self._places, self.offset)
         if place == len(self._places):
             self.offset = self.data_len
@@ -141,25 +141,25 @@ class Lines(DFReader.DFReader_text):
         return super()._parse_next()
 
     def _message(self, here: int, line: bytes) -> Any:
-        """Return the message of a line, or None if the line is damaged."""
+        """Return the message of a line; None if the line is damaged."""
         try:
             name, *values = line.decode().split(self.delimiter)
             form = self.formats.get(name)
             if form is None or len(values) < len(form.format):
                 return None
             message = DFReader.DFMessage(form, values, False, self)
-            # This converts each value, so that a damaged one raises an exception here.
+            # This converts each value, so that a damaged value raises an exception here.
             message.to_dict()
             if name == "FMT":
                 self.offset = here
                 super()._parse_next()
-        # pymavlink raises Exception itself for a format with unknown types.
+        # pymavlink raises Exception for a format with unknown types
         except Exception:
             return None
         return message
 
     def loss(self) -> Loss | None:
-        """Return the loss of lines that hold no message, or None for a whole log."""
+        """Return the loss, which is the lines that hold no message; None for a whole log."""
         if not self.lost_us:
             return None
         what = f"{len(self.lost_us)} of {self._count} lines hold no message"
@@ -167,8 +167,8 @@ class Lines(DFReader.DFReader_text):
 
 
 def stamp_us(message: Any, before_us: float) -> float:
-    """Return the stamp of a message, us, or `before_us` if it has none.
+    """Return the stamp of a message, us; `before_us` if the message has no stamp.
 
-    In logs of 2014 and before, MODE has no stamp, and the other messages have a stamp in ms.
+    In logs of 2014 and earlier, MODE has no stamp, and the other messages have a stamp in ms.
     """
     return float(getattr(message, "TimeUS", 1e3 * getattr(message, "TimeMS", 1e-3 * before_us)))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files on a full disk: free space, and a file with reserved space."""
+"""Find the free space of a disk, and write files with reserved space."""
 
 import errno
 import fcntl
@@ -22,8 +22,8 @@ def free_bytes(folder: Path) -> int:
 def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:
     """Lock a file until the stream is closed.
 
-    Returns False if a second process, such as a recorder, holds the lock. On a file system without
-    locks, it always returns True.
+    Returns False if another process, such as a recorder, holds the lock. On a file system without
+    locks, the result is always True.
     """
     try:
         fcntl.flock(stream, kind | fcntl.LOCK_NB)
@@ -35,7 +35,7 @@ def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:
 
 
 def is_locked(path: Path) -> bool:
-    """Return whether a second process, such as a recorder, holds the lock of a file.
+    """Return whether another process, such as a recorder, holds the lock of a file.
 
     Raises OSError if the file cannot be opened.
     """
@@ -46,9 +46,9 @@ def is_locked(path: Path) -> bool:
 class ReservedFile:
     """A new unbuffered file that reserves disk space, so that it can be finished on a full disk.
 
-    A second, unnamed file takes up the reserve. When a write finds no space, it closes the second
-    file and then succeeds. The reserve also ends with the process. While the reserve exists, it
-    holds the data of `keep`, which belong to the end of the file.
+    A second, unnamed file occupies the reserved space. If a write finds no space, it closes the
+    second file and then succeeds. The reserve also ends with the process. While the reserve exists,
+    it stores the data of `keep`, which belong to the end of the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -62,15 +62,15 @@ class ReservedFile:
             raise
         try_lock(self._descriptor)
         self._reserved_bytes = 0
-        # Number of bytes of kept data in the reserve. `release` moves them to `_end_data`.
+        # Number of bytes of kept data in the reserve; `release` moves these data to `_end_data`.
         self._kept_bytes = 0
         self._end_data = bytearray()
         self._position = 0
         self._closed = False
-        self.full = False  # whether the reserve was needed
+        self.full = False  # whether a write has needed the reserve
 
     def reserve(self, size: int) -> None:
-        """Reserve this many bytes in total.
+        """Reserve `size` bytes in total.
 
         If there is not enough space, `full` is set and the earlier reserve stays. A call after
         `release` has no effect, because the last chunk is being written then.
@@ -85,14 +85,14 @@ class ReservedFile:
             self.full = error.errno in NO_SPACE
 
     def keep(self, data: bytes) -> None:
-        """Keep data for the end of the file, in the reserve if there is one, else in memory."""
+        """Keep data for the end of the file, in the reserve or, without a reserve, in memory."""
         if not self._reserve.closed:
             try:
                 if os.pwrite(self._reserve.fileno(), data, self._kept_bytes) == len(data):
                     self._kept_bytes += len(data)
                     return
             except OSError as error:
-                # On a file system without fallocate the reserve has no space of its own.
+                # On a file system without fallocate the reserve occupies no space.
                 if error.errno not in NO_SPACE:
                     raise
             self.full = True
@@ -112,7 +112,7 @@ class ReservedFile:
     def write(self, data: bytes | memoryview) -> int:
         """Write the data.
 
-        Raises OSError if the reserve is not enough, or for any other reason.
+        Raises OSError if the reserve does not suffice, or if the write fails for another reason.
         """
         unwritten = memoryview(data)
         size = unwritten.nbytes
@@ -134,7 +134,7 @@ class ReservedFile:
         return self._position
 
     def flush(self) -> None:
-        """Do nothing: the file is unbuffered."""
+        """Do nothing, because the file is unbuffered."""
 
     def close(self) -> None:
         """Close the file and free the reserve."""

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The engagements of a bridge in a log, from its reports on `bridge/engagement`."""
+"""Find the engagements of a bridge in a log, from its reports on `bridge/engagement`."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -15,17 +15,18 @@ ENGAGED = "ENGAGED"  # the key of a report
 
 
 class Engagement(NamedTuple):
-    """A span in which a bridge was engaged. Its times, ns, are by the clock of the stamps."""
+    """A span of time in which a bridge was engaged, in ns by the clock of the stamps."""
 
     start_ns: int
-    stop_ns: int | None  # None if the log ends before the engagement
+    stop_ns: int | None  # None if the log ends before the engagement does
     reason: str  # why the engagement ended
 
 
 def engagements_of(reports: Iterable[tuple[int, bytes]]) -> list[Engagement] | None:
     """Return the engagements, in order, from the reports of a bridge.
 
-    A report is the time of sending, ns, and the message. Returns None if there is no report.
+    A report is a pair of the time of sending, ns, and the message. Returns None if there is no
+    report.
     """
     spans: list[Engagement] | None = None
     for sent_ns, data in reports:

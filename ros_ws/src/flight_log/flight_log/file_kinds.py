@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Names the kind of a file by its first bytes.
+"""Name the kind of a file by its first bytes.
 
 A file is a log, a packed log, or a file of another program.
 """
@@ -78,7 +78,7 @@ HEAD_BYTES = 4096
 
 
 def file_kind(path: Path) -> str:
-    """Name the kind of a file with an article, as in "a ULog of PX4". Never raises."""
+    """Return the kind of a file with an article, as in "a ULog of PX4". Never raises."""
     try:
         with open_nonblocking(path) as stream:
             head = stream.read(HEAD_BYTES)
@@ -88,11 +88,11 @@ def file_kind(path: Path) -> str:
 
 
 def kind_of_head(head: bytes) -> str:
-    """Name the kind of a file by its first HEAD_BYTES bytes.
+    """Return the kind of a file by its first HEAD_BYTES bytes.
 
-    If the bytes are of no kind in the table, they are a text or unknown bytes.
+    Bytes that are in no row of the table are a text or unknown bytes.
     """
-    # A recorder that is killed at its start leaves a file with only the first bytes of an MCAP.
+    # A recorder that is killed at its start leaves a file that has only the first bytes of an MCAP.
     if MCAP0_MAGIC.startswith(head):
         return BEGUN if head else EMPTY
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip(b" \t\r\n")
@@ -116,9 +116,9 @@ def kind_of_head(head: bytes) -> str:
 
 
 def tlog_start(head: bytes) -> int | None:
-    """Find the place of the first packet with a time before it, or return None.
+    """Return the place of the first packet that has a time before it; None without a packet.
 
-    The text that a radio sends at its start can come before this packet. If so, a second packet
+    A text that a radio sends at its start may come before this packet. In this case a second packet
     must follow.
     """
     for start in range(len(head) - TLOG_TIME.size):
@@ -129,13 +129,13 @@ def tlog_start(head: bytes) -> int | None:
 
 
 def _packet_end(head: bytes, start: int) -> int:
-    """Return the end of a packet of MAVLink that follows its time, or 0 if there is no packet."""
+    """Return the end of a MAVLink packet that follows its time; 0 if there is no packet."""
     place = start + TLOG_TIME.size
     magic = head[place : place + 1]
     if magic not in MAVLINK or not _is_time(*TLOG_TIME.unpack_from(head, start)):
         return 0
-    # `frame` is the size without the payload (MAVLink guide, Packet Serialization). A signature has
-    # 13 bytes.
+    # `frame` is the size of a packet without the payload (MAVLink guide, Packet Serialization). A
+    # signature has 13 bytes.
     size, flags = (*head[place + 1 : place + 3], 0, 0)[:2]
     frame = 8 if magic == MAVLINK[1] else 12 + 13 * (flags & 1)
     return place + frame + size
@@ -151,7 +151,7 @@ def _text_kind(head: bytes) -> str:
     try:
         text = head.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        # The last character can be cut at the end of the head.
+        # The last character may be cut at the end of the head.
         if error.start < len(head) - 4:
             return "a file of unknown content"
         text = head[: error.start].decode("utf-8-sig")

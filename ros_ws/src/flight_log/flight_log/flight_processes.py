@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The processes of a flight in a log.
+"""Find the processes of a flight in a log.
 
-A line on /rosout tells when a process was ready, and its samples tell how long it lived.
+A line on /rosout tells when a process was ready, and its samples show how long it lived.
 """
 
 import re
@@ -66,10 +66,11 @@ def flight_processes(
 ) -> dict[str, Process]:
     """Return the processes by name, such as "/controller#4711", from the `spans` of publishers.
 
-    A node that was restarted is several processes. A process was ready at the last time in `ready`
-    at which its node was ready before the first sample of the process. A node without samples, such
-    as the recorder, has no process id in its name, and in lockstep no node has one. If there are
-    nodes of the stack, every other publisher counts, too, even `ros2 topic pub`, which has no name.
+    A node that was restarted has several processes. `ready` has the times at which nodes were
+    ready. A process became ready at the last of the times of its node before the first sample of
+    the process. A node without samples, such as the recorder, has no process id in its name. In
+    lockstep no node has a process id. If there are nodes of the stack, every other publisher counts
+    as a process too, even `ros2 topic pub`, which has no name.
     """
     waiting: dict[str, list[int]] = {}
     for node, time_ns in ready:
@@ -108,15 +109,16 @@ def flight_processes(
     }
 
 
-# silence of a publisher after which the next one is admitted, as `aircraft.max_age`
+# silence of a publisher, after which another publisher is admitted, as `aircraft.max_age`
 SILENT_NS = NANOSECONDS // 5
 SILENT_PERIODS = 3  # the same silence for a slow publisher, in periods of its samples
 
 
 def admitted(signal: Signal) -> Signal:
-    """Keep the samples that the nodes admit.
+    """Return the samples that the nodes admit.
 
-    They are those of the first publisher, and after a silence of it those of the next.
+    They are those of the first publisher. After a silence of this publisher, the nodes admit those
+    of the next.
     """
     if signal.sender is None:
         return signal
@@ -134,15 +136,15 @@ def admitted(signal: Signal) -> Signal:
     return signal if keep.all() else signal.where(keep)
 
 
-RESTART = 10  # if a tick number falls by more than this, another controller has started
+RESTART = 10  # if the number of ticks falls by more than this, another controller has started
 
 
 def controller_starts(number: FloatArray) -> list[int]:
-    """Find the indices at which a new controller begins, from the numbers of ticks, (N,).
+    """Return the indices at which a new controller begins, from the numbers of ticks, (N,).
 
-    The numbers are in the order of time. Two ticks of one instant can be stored in either order. A
-    number that is a little less than the one before, and that this controller has not had yet,
-    therefore does not begin a new controller.
+    The numbers are in the order of time. Two ticks of one instant may be stored in either order. So
+    a number slightly below the previous one does not begin a new controller if this controller has
+    not had the number yet.
     """
     starts = []
     first = 0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Finds which instance of each message in an autopilot's log the autopilot flew with.
+"""Find the instance of each message in an autopilot's log by which the autopilot flew.
 
 Sources: ArduPilot, AP_Logger/LogStructure.h (ARSP: H healthy, U used, Pri primary; IMU: GH),
 AP_InertialSensor.cpp (INS_USE), AP_Airspeed.cpp (ARSPD_USE); ArduPlane/Log.cpp (CTUN.As: the
@@ -17,15 +17,17 @@ from flight_core.parameters import ParameterError, require
 from flight_log.log_samples import Instances
 from flight_log.vehicle_tables import PLANE, Choice, MessageTable, Parameters
 
-STILL = 0.1  # an instance does not fly if it moves less than this fraction of the largest motion
-# Two sensors agree if they differ by at most this fraction of the quantity's standard deviation.
+# an instance was not flown if it moves by less than this fraction of the largest motion
+STILL = 0.1
+# Two sensors agree if they differ by at most this fraction of the standard deviation of the
+# quantity.
 UNLIKE = 0.4
-# A flag counts as set if it is set in this fraction of the samples. An airspeed counts as that of a
-# flight if it is this fraction of the largest one.
+# A flag counts as set if it is set in at least this fraction of the samples. An airspeed counts as
+# that of a flight if it is at least this fraction of the largest one.
 MOST = 0.5
 AIRSPEEDS = frozenset({"Airspeed", "true_airspeed_m_s"})
 TYPICAL = 90.0  # percentile that counts as the typical value of an airspeed
-# messages whose instance 1 is that of the surfaces of a VTOL of PX4
+# messages of PX4 whose instance 1 is that of the surfaces of a VTOL
 SURFACES = ("vehicle_torque_setpoint", "actuator_controls_0")
 CORES = ("XKF1", "NKF1", "EKF1")
 
@@ -33,10 +35,10 @@ CORES = ("XKF1", "NKF1", "EKF1")
 def instances_of_flight(
     instances: Instances, fields: Mapping[str, Set[str]], parameters: Parameters, choice: Choice
 ) -> tuple[dict[str, MessageTable], list[tuple[str, str]]]:
-    """Return one table for each message, and each choice among several instances with its reason.
+    """Return a table for each message, and each choice among several instances with its reason.
 
-    `fields` has the fields that are read by message. For any other message the first instance is
-    taken. Raises ParameterError if two unlike instances remain.
+    `fields` has the fields that are read, by message. For a message that is not in `fields`, the
+    first instance is taken. Raises ParameterError if two different instances remain.
     """
     for name in choice.instances:
         require(
@@ -83,7 +85,7 @@ def instances_of_flight(
 
 
 def _of_motion(name: str, tables: Mapping[int, MessageTable], fields: Set[str]) -> tuple[int, str]:
-    """Return the moving instance, or the first of several equal ones."""
+    """Return the moving instance, or the first of several instances that agree."""
     motions = {number: _motion(table, fields) for number, table in tables.items()}
     moving = {
         number: tables[number]
@@ -106,7 +108,7 @@ def moving_numbers(motions: Mapping[int, float], least: float = STILL) -> list[i
 def _motion(table: MessageTable, fields: Set[str]) -> float:
     """Return a measure of the motion that an instance shows.
 
-    It is the typical value of an airspeed, which is 0 for a dead sensor. For other messages, it is
+    For an airspeed it is the typical value, which is 0 for a dead sensor. For other messages it is
     the sum of the standard deviations of the fields.
     """
     for field in fields & AIRSPEEDS & table.fields.keys():
@@ -121,7 +123,7 @@ def _deviation(values: np.ndarray) -> float:
 
 
 def _agree(first: MessageTable, second: MessageTable, fields: Set[str]) -> bool:
-    """Return whether the fields of two sensors differ by less than UNLIKE of their deviations."""
+    """Return whether two sensors' fields differ by less than UNLIKE times their deviations."""
     for field in fields & first.fields.keys() & second.fields.keys():
         values = first.fields[field]
         difference = values - second.at(field, first.stamp_ns)
@@ -134,7 +136,7 @@ def _agree(first: MessageTable, second: MessageTable, fields: Set[str]) -> bool:
 
 
 def _usable_sensors(tables: Mapping[int, MessageTable], parameters: Parameters) -> set[int]:
-    """Return the healthy gyroscopes in use, by INS_USE, INS_USE2 and INS_USE3."""
+    """Return the numbers of the healthy gyroscopes in use, by INS_USE, INS_USE2 and INS_USE3."""
     names = {number: f"INS_USE{number + 1 if number else ''}" for number in tables}
     numbers = {
         number
@@ -155,15 +157,15 @@ def _usable_sensors(tables: Mapping[int, MessageTable], parameters: Parameters) 
 
 
 def _share(table: MessageTable, field: str) -> float:
-    """Return the fraction of the samples in which a flag is set, or 1 if there is no such flag."""
+    """Return the fraction of the samples in which a flag is set; 1 if there is no such flag."""
     return float(np.mean(table.fields[field] != 0.0)) if field in table.fields else 1.0
 
 
 def _airspeed(sensors: Mapping[int, MessageTable]) -> tuple[MessageTable, str]:
-    """Return the airspeed of the primary sensor, or else of one that is healthy and in use.
+    """Return the airspeed of the primary sensor, or of another sensor in use and healthy.
 
-    The primary sensor can change in flight. A value is NaN where the sensor is not healthy. The
-    second result says which sensor was taken.
+    The primary sensor may change in flight. The airspeed is NaN while the sensor is not healthy.
+    The second result says which sensor was taken.
     """
     tables = {number: _healthy(table) for number, table in sensors.items()}
     live = {
@@ -194,8 +196,8 @@ def _reason_against_airspeed(
 ) -> Refusal | None:
     """Return why the autopilot flew by none of its airspeed sensors.
 
-    The reason comes from the flags U and H. If a log lacks U, ARSPD_USE is taken. Returns None if
-    the autopilot flew by a sensor, or if the log does not tell.
+    The reason follows from the flags U and H. For a log without U, ARSPD_USE counts. Returns None
+    if the autopilot flew by a sensor, or if the log does not say.
     """
     reasons = []
     for number, table in sorted(sensors.items()):
@@ -213,7 +215,7 @@ def _reason_against_airspeed(
 
 
 def _has_estimate(instances: Instances) -> bool:
-    """Return whether CTUN has an airspeed, the estimate by which ArduPlane flies."""
+    """Return whether CTUN has an airspeed, which is the estimate by which ArduPlane flies."""
     return any({"As", "Aspd"} & table.fields.keys() for table in instances.get("CTUN", {}).values())
 
 

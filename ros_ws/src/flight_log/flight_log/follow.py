@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a growing log by `Scan`. Each call continues where the last call ended.
+"""Read a growing log by `Scan`; each call continues where the last call ended.
 
 A finished log is read in the same way. A packed log is always finished, so `open_log` reads it. A
-record is read when it is whole, so a chunk in progress is not read yet.
+record is read once it is whole, so a chunk in progress is not read yet.
 """
 
 import math
@@ -30,20 +30,20 @@ class Messages(NamedTuple):
     topic: str  # full name
     type_name: str
     sent_ns: list[int]
-    data: list[bytes]  # CDR
+    data: list[bytes]  # messages in CDR
 
 
 @dataclass
 class _Channel:
     topic: str
     type_name: str
-    # highest rate that is wanted, Hz: 0 for no messages, infinite for all messages
+    # highest rate of messages to read, Hz; 0 for no messages, infinite for all messages
     rate: float
-    step: int = 0  # every step-th message is read; 0 until two messages have shown their period
-    skip: int = 0  # number of messages before the next one that is read
+    step: int = 0  # every step-th message is read; 0 until two messages show their period
+    skip: int = 0  # number of messages that are skipped before the next one is read
 
     def chosen(self, batch: MessageBatch) -> slice:
-        """Choose which messages of a batch are read."""
+        """Return the slice of a batch's messages that are read."""
         if self.rate == math.inf:
             return slice(None)
         if self.step == 0 and len(batch.data) > 1 and batch.data.shape[1] >= STAMP.stop:
@@ -58,11 +58,12 @@ class _Channel:
 
 
 class Follower:
-    """Follows the log of a run, which is the folder of a bag or an MCAP file.
+    """Reads the log of a run while it grows.
 
-    The folder need not have a file yet. `rate_of(topic, type_name)` returns the highest wanted rate
-    of the messages of a topic, Hz. It is infinite for no limit, and 0 for no messages. `remaps` has
-    names of the stack by topic of the log.
+    The run is the folder of a bag, or an MCAP file. The folder need not have a file yet.
+    `rate_of(topic, type_name)` returns the highest rate of messages to read from a topic, Hz. It is
+    infinite for all messages, and 0 for no messages. `remaps` has names of the stack by topic of
+    the log.
     """
 
     def __init__(
@@ -73,29 +74,29 @@ class Follower:
     ) -> None:
         self.run = run
         self.complete = False  # whether the end of the data has been read
-        self.fault = ""  # why no more of the log can be read
+        self.fault = ""  # why the rest of the log cannot be read
         # Definitions (ros2msg) of the message types that have occurred, by name.
         self.definitions: dict[str, str] = {}
         self._rate_of = rate_of
         self._remaps = remaps
         self._read_files: list[Path] = []
-        self._damaged = 0  # number of records of these files that could not be read
+        self._damaged = 0  # number of damaged records in the files that were read before
         self._pending: deque[Messages | Attachment | Metadata] = deque()
         self._begin_file()
 
     def _begin_file(self) -> None:
         self._path: Path | None = None
         self._scan: Scan | None = None
-        self._size = 0  # size of the file at the last look, bytes
+        self._size = 0  # size of the file at the last check, bytes
         self._identity = (0, 0)  # device and inode of the file, after something has been read
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, _Channel] = {}
-        # records of a packed file that are still to be read
+        # records of a packed file that have still to be read
         self._finished: Iterator[object] | None = None
 
     @property
     def path(self) -> Path | None:
-        """The file that is being read, or None if there is no file yet.
+        """The file that is being read; None if there is no file yet.
 
         Raises ParameterError for a folder with several bags.
         """
@@ -113,12 +114,12 @@ class Follower:
 
     @property
     def backlog(self) -> int:
-        """Number of unread bytes of the file. Raises as `path` does, and OSError."""
+        """Number of unread bytes of the file. Raises OSError, and ParameterError as `path` does."""
         position = self._scan.position if isinstance(self._scan, Scan) else 0
         return 0 if self.path is None else self.path.stat().st_size - position
 
     def skip(self, topics: Container[str]) -> None:
-        """Stop reading messages of these topics, by their full names, in this file."""
+        """Read no more messages of these topics, given by full names, from this file."""
         for channel in self._channels.values():
             if channel.topic in topics:
                 channel.rate = 0.0
@@ -126,8 +127,8 @@ class Follower:
     def read(self) -> Iterator[Messages | Attachment | Metadata]:
         """Yield the records since the last call.
 
-        You can stop the iteration, and the next call continues there. Raises OSError if the file
-        cannot be read, and ParameterError for a folder with several bags.
+        If you stop the iteration, the next call continues at this record. Raises OSError if the
+        file cannot be read, and ParameterError for a folder with several bags.
         """
         yield from self._pending_records()
         while not self.fault and (path := self.path) is not None:
@@ -179,7 +180,7 @@ class Follower:
         self._damaged += not self._scan.complete
 
     def _pending_records(self) -> Iterator[Messages | Attachment | Metadata]:
-        """Yield the decoded records. If the caller stops, the next call yields the rest."""
+        """Yield the pending records. If the caller stops, the next call yields the rest."""
         while self._pending:
             yield self._pending.popleft()
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Latency of the loop from y to u, from the recorded times of sending."""
+"""Compute the latency of the loop from y to u, from the recorded times of sending."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -16,7 +16,7 @@ TOPICS = ("y", "u")
 
 
 class Times(NamedTuple):
-    """Stamps of some messages of a topic and the times of their sending, ns, shape (N,)."""
+    """Stamps of messages of a topic and the times at which they were sent, ns, (N,) each."""
 
     stamp_ns: NDArray[np.int64]
     sent_ns: NDArray[np.int64]
@@ -25,9 +25,9 @@ class Times(NamedTuple):
 def latency(times: Mapping[str, Sequence[Times]]) -> Signal | None:
     """Compute the time from the sending of y to the sending of the u with the same stamp, s.
 
-    The signal has one channel and the stamps of u. `times` has the times by the full names of the
-    topics y and u. Returns None for a log without y or u or with several aircraft. It also returns
-    None if u has the times of y, as in a flight in one process.
+    The signal has one channel, and its stamps are those of u. `times` has the times by the full
+    names of the topics y and u. Returns None for a log without y or u, for a log with several
+    aircraft, and if u was sent at the times of y, as in a flight in one process.
     """
     topics = {topic.rpartition("/")[2]: topic for topic in times}
     if len(times) != len(TOPICS) or len(topics) != len(TOPICS) or not all(times.values()):
@@ -41,7 +41,7 @@ def latency(times: Mapping[str, Sequence[Times]]) -> Signal | None:
 
 
 def _last_of_each(times: Sequence[Times]) -> Times:
-    """Return the times in the order of the stamps, with only the last time of equal stamps."""
+    """Return the times in the order of the stamps; of equal stamps only the last time stays."""
     stamp_ns, sent_ns = (np.concatenate(arrays)[::-1] for arrays in zip(*times, strict=True))
     unique_ns, place = np.unique(stamp_ns, return_index=True)
     return Times(unique_ns, sent_ns[place])

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of the topic `learning`, which say what became of the proposals of a learner.
+"""Write and read the messages of the topic `learning`, without ROS.
 
-They are written and read without ROS.
+These messages say what became of the proposals of a learner.
 """
 
 import json
@@ -19,7 +19,7 @@ WARN = 1
 
 
 def learning_message(stamp_ns: int, kind: str, sentence: str, *, warns: bool) -> bytes:
-    """Make a message of LEARNING as the controller publishes it, with the `kind` of an event."""
+    """Return a message of LEARNING on an event of this `kind`, as the controller publishes it."""
     store = typestore()
     types = {
         name: store.types[f"diagnostic_msgs/msg/{name}"]
@@ -33,7 +33,7 @@ def learning_message(stamp_ns: int, kind: str, sentence: str, *, warns: bool) ->
 
 
 def stamped_sentence(message: Any) -> tuple[int, str]:
-    """Return the stamp, ns, and the sentence of a message of LEARNING, or "" if it has none."""
+    """Return the stamp, ns, and the sentence of a message of LEARNING; "" for no sentence."""
     stamp = message.header.stamp
     return stamp.sec * NANOSECONDS + stamp.nanosec, " ".join(
         status.message for status in message.status

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The content of the files of a bag: samples by topic, scenario, attachments, metadata, notes."""
+"""Read the content of a bag's files: samples by topic, scenario, attachments, metadata, notes."""
 
 import re
 import shlex
@@ -63,12 +63,12 @@ ROUTE = "route"
 BATCH = 512
 
 
-# Least difference between a stamp and its time of sending that shows a step of the system clock. In
-# other cases the difference is only the age of the sample.
+# Least difference between a stamp and its time of sending that shows a step of the system clock. A
+# smaller difference is only the age of the sample.
 LEAST_CLOCK_STEP_NS = NANOSECONDS
 
 
-RESTING = ("u", "internals")  # topics whose stamps can repeat during a failsafe
+RESTING = ("u", "internals")  # topics whose stamps may repeat during a failsafe
 
 
 UNSTAMPED = ("route",)  # topics that are often published without a stamp
@@ -83,28 +83,29 @@ MOST_PUBLISHERS = 64  # largest number of publishers of a topic that are counted
 
 
 class StoredFile(NamedTuple):
-    """A file inside the log."""
+    """A file that is attached to a log."""
 
     name: str
     content: bytes
 
 
 class _Publisher:
-    """The messages of one sender on a topic: those not decoded yet, and counts of all."""
+    """The messages of a publisher on a topic: those not decoded yet, and the counts of all."""
 
     def __init__(self) -> None:
-        # Tables of messages of one length, with their log times and the steps of their numbers.
+        # Tables of messages of equal length, with their log times and the steps of their numbers.
         self.batch: list[tuple[Table, NDArray[np.int64], NDArray[np.int64]]] = []
         self.batched = 0  # number of messages in `batch`
         self.clock = StampClock()
-        self.name: str | None = None  # name of the sender, or None before its first sample
+        self.name: str | None = None  # name of the publisher; None before its first sample
         self.zeros = 0  # number of samples with a zero stamp that `signal` leaves out
         self.refused = 0  # number of samples that are damaged or not finite
-        self.kept: Counter[tuple[str, ...]] = Counter()  # number of samples by their channels
+        # number of samples with each set of channels
+        self.kept: Counter[tuple[str, ...]] = Counter()
         self.messages = 0
-        # least and largest lead of a stamp over its reception, or None if no reception has a time
+        # least and largest lead of a stamp over its reception; None if no reception has a time
         self.leads_ns: tuple[int, int] | None = None
-        self._number: int | None = None  # number of the last message
+        self._number: int | None = None  # number of the last message by the publisher
         self._numbered = self._restarted = False
         self._lost = 0
 
@@ -121,30 +122,30 @@ class _Publisher:
         self.batched += len(table)
 
     def lead(self, table: Table, log_ns: NDArray[np.int64]) -> None:
-        """Note how far the stamps of messages are ahead of their reception."""
+        """Note by how much the stamps of messages are ahead of their reception."""
         leads_ns = stamps_of(table)[log_ns != 0] - log_ns[log_ns != 0]
         if len(leads_ns):
             least, largest = self.leads_ns or (2**62, -(2**62))
             self.leads_ns = min(least, int(leads_ns.min())), max(largest, int(leads_ns.max()))
 
     def has_clock_of(self, other: "_Publisher") -> bool:
-        """Return whether the log leaves it open that another publisher's clock made every stamp."""
+        """Return whether every stamp may come from the clock of another publisher."""
         if self is other or self.leads_ns is None or other.leads_ns is None:
             return True
         (least, largest), (least_of_other, largest_of_other) = self.leads_ns, other.leads_ns
         return least_of_other - LATE_NS <= least and largest <= largest_of_other + LATE_NS
 
     def recording(self) -> Recording:
-        """Return what the stamps show in the order of the recording."""
+        """Return the findings on the stamps in the order of the recording."""
         is_counted = self._numbered and not self._restarted
         return self.clock.recording(self.zeros)._replace(lost=self._lost if is_counted else None)
 
 
 class TopicSamples:
-    """The samples of a topic, which are decoded in batches. Those with equal names are the signal.
+    """The samples of a topic, decoded in batches; samples with equal names form the signal.
 
-    Steps of the clock, lost numbers and damage are counted for each sender, so that those of a
-    foreign publisher are not blamed on another one.
+    Steps of the clock, lost numbers and damage are counted for each publisher, so that the faults
+    of a foreign publisher are not attributed to another one.
     """
 
     def __init__(self, decode: Decoder, expected: int) -> None:
@@ -155,9 +156,9 @@ class TopicSamples:
         self.spans: dict[str, SampleSpan] = {}  # by the name of the publisher
 
     def add(self, table: Table, log_ns: NDArray[np.int64], sequence: NDArray[np.int64]) -> None:
-        """Add messages of one length, one in each row, with log times and publisher's numbers."""
+        """Add messages of equal length, one per row, with log times and publisher's numbers."""
         for sender, rows in rows_by_sender(table):
-            # A log with very many publishers is hostile.
+            # A log with very many publishers may be an attack.
             known = sender in self._publishers or len(self._publishers) < MOST_PUBLISHERS
             publisher = self._publishers.setdefault(sender if known else b"", _Publisher())
             part = table if rows is None else table[rows]
@@ -213,7 +214,7 @@ class TopicSamples:
                 publisher.name = sender
                 publisher.kept[names] += len(stamp_ns)
                 if names not in self._samples:
-                    # Samples with other names are few, unless the log is hostile.
+                    # Samples with other names are few, except in a hostile log.
                     expected = 0 if self._samples else self._expected
                     self._samples[names] = Columns(len(names), max(expected, len(values)))
                 self._samples[names].append(stamp_ns, values, sender)
@@ -223,7 +224,7 @@ class TopicSamples:
     def _ordered(
         self, names: tuple[str, ...], values: NDArray[np.float64]
     ) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-        """Bring names and values into the order of the first sample with these names.
+        """Return names and values in the order of the first sample with the same set of names.
 
         Values are matched by name.
         """
@@ -235,8 +236,8 @@ class TopicSamples:
     def signal(self, name: str) -> Signal | None:
         """Return the samples of a topic in the order of the stamps, or None if none has a stamp.
 
-        In RESTING topics, equal stamps can follow one another, so several stamps of 0 can be flight
-        time. A plan needs no stamp.
+        In RESTING topics, stamps may repeat, so several stamps of 0 may be flight time. A plan
+        needs no stamp.
         """
         for publisher in self._publishers.values():
             while publisher.batch:
@@ -247,7 +248,7 @@ class TopicSamples:
         columns = self._samples[names]
         signal = columns.signal(tuple(map(printable, names)))
         keep = ~self._unset_zeros(name, signal, columns)
-        # The nodes refuse a stamp far from their clock, so they refuse its publisher.
+        # The nodes refuse a publisher whose stamps are far from their clock.
         most = self._most()
         for publisher in self._publishers.values():
             if publisher.name in columns.senders and not publisher.has_clock_of(most):
@@ -260,7 +261,7 @@ class TopicSamples:
             order = np.argsort(signal.stamp_ns, kind="stable")
             stamps = signal.stamp_ns[order]
             values = signal.values[order]
-            # A span of the log can be there twice.
+            # A span of the log may be present twice.
             again = (np.diff(stamps) == 0) & (np.diff(values, axis=0) == 0.0).all(axis=1)
             keep = np.append(True, ~again)
             sender = None if signal.sender is None else signal.sender[order][keep]
@@ -270,7 +271,7 @@ class TopicSamples:
     def _unset_zeros(self, name: str, signal: Signal, columns: Columns) -> NDArray[np.bool_]:
         """Return a mask of the samples whose stamp was left at zero, shape (N,).
 
-        Their number is also stored for each publisher.
+        The number of these samples is also stored for each publisher.
         """
         unset = np.zeros(len(signal.stamp_ns), dtype=np.bool_)
         if name in UNSTAMPED or not np.any(signal.stamp_ns == 0):
@@ -281,7 +282,7 @@ class TopicSamples:
             zero = stamps == 0
             zeros = int(np.count_nonzero(zero))
             usual = len(stamps) - 1 if name in RESTING else 1
-            # A recorder can store each message twice.
+            # A recorder may store each message twice.
             if zeros > usual:
                 usual = int(np.unique(stamps[~zero], return_counts=True)[1].max(initial=usual))
             if zeros and (zeros > max(usual, 1) or stamps.max() > SINCE_EPOCH_NS):
@@ -298,7 +299,8 @@ class TopicSamples:
     def _names(self) -> tuple[str, ...]:
         """Return the names of the channels of the publisher with the most samples.
 
-        If its samples have different names, they are the most frequent ones that include the first.
+        If its samples have different names, the result is the most frequent set that includes the
+        names of the first sample.
         """
         most = self._most()
         first = next(iter(most.kept))
@@ -307,7 +309,7 @@ class TopicSamples:
         )
 
     def of_flight(self, signal: Signal | None) -> list[_Publisher]:
-        """Return the publishers whose samples the nodes admit, or all if there is no signal."""
+        """Return the publishers whose samples the nodes admit; all of them without a signal."""
         publishers = [*self._publishers.values()]
         if signal is None or not self._samples:
             return publishers
@@ -317,7 +319,7 @@ class TopicSamples:
         return [publisher for publisher in publishers if publisher.name in names]
 
     def further_publishers(self, signal: Signal | None) -> list[str]:
-        """Return the names of the publishers that are not admitted. A name can be ""."""
+        """Return the names of the publishers that are not admitted. A name may be ""."""
         of_flight = self.of_flight(signal)
         return [
             sender[:-1].decode(errors="replace") if publisher.name is None else publisher.name
@@ -331,7 +333,7 @@ class TopicSamples:
         return any(before.last_ns >= after.first_ns for before, after in pairwise(spans))
 
     def recording(self, signal: Signal | None = None) -> Recording:
-        """Return what the stamps of the flight's publishers show. Call `signal` first."""
+        """Return the findings on the stamps of the flight's publishers. Call `signal` first."""
         recordings = [publisher.recording() for publisher in self.of_flight(signal)]
         if len(recordings) == 1:
             return recordings[0]
@@ -367,9 +369,9 @@ class LogContent:
         self.metadata: dict[str, Mapping[str, str]] = {}
         self.attachments: list[StoredFile] = []
         self.truncated: list[str] = []  # names of the truncated files
-        self.missing: LostPart | None = None  # files that the folder lacks
+        self.missing: LostPart | None = None  # number and names of files that the folder lacks
         self.last_ns = 0  # log time of the last message
-        self.known_end_ns = 0  # the latest log time in any index or metadata
+        self.known_end_ns = 0  # latest log time in any index or in the metadata
         # stamps and times of sending of y and u, by full topic name
         self.sent = defaultdict[str, list[Times]](list)
         self.texts: list[StoredText] = []  # messages that hold text
@@ -380,7 +382,7 @@ class LogContent:
     def reader_of(
         self, topic: str, type_name: str, expected: int
     ) -> Callable[[MessageBatch], None] | None:
-        """Return a function that takes the messages of a topic, or None if the topic is unused.
+        """Return a function that takes the messages of a topic; None if the topic is not used.
 
         `expected` is the number of messages in the index.
         """
@@ -426,7 +428,7 @@ class LogContent:
         return int(sent_ns)
 
     def samples_of(self, topic: str, type_name: str, expected: int = 0) -> TopicSamples | None:
-        """Return the samples of a topic, or None if its type has no named vectors or waypoints."""
+        """Return the samples of a topic; None if its type is no named vector and no waypoints."""
         is_route = topic.rpartition("/")[2] == ROUTE and type_name == PATH
         if (
             topic not in self.topics
@@ -449,9 +451,9 @@ class LogContent:
                 self.attachments.append(StoredFile(name, record.data))
 
     def truncated_at(self, end: float | None) -> list[LostPart]:
-        """Return the lost ends of files.
+        """Return the spans that are lost at the ends of truncated files.
 
-        `end` is the flight time of the last sample, s, or None if there is no sample.
+        `end` is the flight time of the last sample, s; None if there is no sample.
         """
         where = "" if end is None else f", t = {end:.3f} s"
         text = f"is truncated: read up to its last complete chunk{where}"
@@ -460,7 +462,7 @@ class LogContent:
     def notes_at(self, end: float | None) -> list[str]:
         """Return the notes about the log.
 
-        `end` is the flight time of the last sample, s, or None if there is no sample.
+        `end` is the flight time of the last sample, s; None if there is no sample.
         """
         missing = seconds(self.known_end_ns - self.last_ns)
         more = f"; {missing:.3f} s are missing after it" if missing > 0 and self.last_ns else ""
@@ -496,7 +498,7 @@ def read_content(run: Path, remaps: Mapping[str, str]) -> LogContent:
 
 
 def _add_metadata(folder: Path, log: LogContent) -> None:
-    """Add what metadata.yaml tells about a bag.
+    """Add the information in metadata.yaml about a bag.
 
     If the file cannot be read, a note names the repair command.
     """
@@ -551,7 +553,7 @@ def _read_file(file: Path, log: LogContent) -> None:
         raise ParameterError(
             f"{file}: cannot be read ({error.strerror}), expected {A_RUN}"
         ) from None
-    # Note what this file tells about the whole log.
+    # Note the information of this file about the whole log.
     if first_ns < before_ns - NANOSECONDS and file.parent.name != ROSBAG2:
         log.notes.append(
             f"{file.name} begins before the end of the part before: the parts are out of order, "

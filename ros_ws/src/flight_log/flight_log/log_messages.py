@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a log says in words: warnings, errors, parameter changes, learning and a bridge."""
+"""Collect the messages of a log in words: warnings, errors, parameters, learning and bridge."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -19,11 +19,12 @@ from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parame
 WARN = 30  # level of rcl_interfaces/msg/Log
 CONTROL = "control"  # name of the node that carries out the requests of a page
 PARAMETER = "parameter"
-MAX_TEXT = 400  # characters of a text from the log
+MAX_TEXT = 400  # largest number of characters of a text from the log
 CUT = " ..."  # mark at the end of a longer text
-# length of the end of a log in which last words count: a node that waits says so every 2 s
+# length of the end of a log in which the last messages count; a node that waits says so every 2 s
 LAST_NS = 3 * NANOSECONDS
-# largest number of values of a parameter that are shown: one for each channel, but not a matrix
+# largest number of values of a parameter that are shown: enough for one per channel, but not for a
+# matrix
 MAX_VALUES = 16
 
 
@@ -31,9 +32,9 @@ MAX_VALUES = 16
 class LogMessage:
     """A message of a flight, for the user.
 
-    `stamp_ns` is by the clock of the samples, or by that of the host. `kind` is "warning", "error",
-    "control", "parameter", "learning" or "bridge", and on the live page also "mode" or "route". If
-    the message is about a parameter, `namespace` is the namespace of its node.
+    `stamp_ns` is by the clock of the samples, or by the clock of the host. `kind` is "warning",
+    "error", "control", "parameter", "learning" or "bridge", and on the live page also "mode" or
+    "route". If the message is about a parameter, `namespace` is the namespace of its node.
     """
 
     stamp_ns: int
@@ -64,10 +65,10 @@ def holds_texts(topic: str, type_name: str) -> bool:
 def log_message(
     message: Any, type_name: str, sent_ns: int, *, has_begun: bool = True
 ) -> LogMessage | None:
-    """Return a decoded message as a LogMessage, or None for mere information or an empty message.
+    """Return a decoded message as a LogMessage; None for information only or an empty message.
 
-    Set `has_begun` to False before the first sample. New parameters are then no changes, because
-    starting nodes still declare them.
+    Set `has_begun` to False before the first sample. New parameters then do not count as changes,
+    because the nodes still declare them at their start.
     """
     if type_name == LOG:
         if message.level >= WARN:
@@ -119,14 +120,14 @@ def log_messages(texts: Iterable[StoredText], namespace: str, first_ns: int) -> 
 
 
 def last_words(messages: Iterable[LogMessage]) -> list[str]:
-    """Return the warnings and errors at the end of a log, each once, in order."""
+    """Return the warnings and errors at the end of a log in their order, without repetitions."""
     said = [each for each in messages if each.kind in {"warning", "error"}]
     end_ns = max((each.stamp_ns for each in said), default=0) - LAST_NS
     return list(dict.fromkeys(each.text for each in said if each.stamp_ns > end_ns))
 
 
 def shown(value: Any) -> str:
-    """Show the value of a parameter with four digits, or the size of a matrix."""
+    """Write the value of a parameter with four digits; for a matrix, write its size."""
     if isinstance(value, list) and len(value) > MAX_VALUES:
         return f"{len(value)} values"
     if isinstance(value, list):
@@ -135,6 +136,6 @@ def shown(value: Any) -> str:
 
 
 def bounded(text: str) -> str:
-    """Make a text from the log printable and of bounded length, with a mark where it is cut."""
+    """Return a text from the log in printable form, cut with a mark if it is too long."""
     whole = printable(text)
     return whole if len(whole) <= MAX_TEXT else f"{whole[: MAX_TEXT - len(CUT)]}{CUT}"

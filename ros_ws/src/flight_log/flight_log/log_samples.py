@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of messages from the samples of an autopilot's log."""
+"""Make tables of messages from the samples of an autopilot's log."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -13,8 +13,8 @@ from flight_core.vectors import FloatArray
 from flight_log.vehicle_tables import PARAMETER, MessageTable, ParameterRecord, Parameters
 
 LARGEST = 2**62  # largest stamp that is not damaged, ns
-STEP_NS = NANOSECONDS  # if the clock goes back by more, ns, the autopilot has started again
-LOST_NS = 60 * NANOSECONDS  # longest gap between samples that agree, as a link can be lost, ns
+STEP_NS = NANOSECONDS  # ns; if the clock goes back by more, the autopilot has started again
+LOST_NS = 60 * NANOSECONDS  # ns, longest gap between samples that agree, because a link may be lost
 AGREEING = 5  # number of samples that must agree on another time before it counts as true
 
 Sample = tuple[tuple[str, int], int, Any]
@@ -30,17 +30,18 @@ SETTING = (PARAMETER, 0)
 def tables_of(
     samples: Iterable[Sample], fields: Mapping[str, set[str]]
 ) -> tuple[Instances, Parameters, str]:
-    """Return the messages as tables, the parameters, and a sentence on what was left out.
+    """Return the tables of the messages, the parameters, and a sentence on what was left out.
 
-    If the first message of a table lacks a field, the table lacks it, too. If the clock goes back
-    by more than STEP_NS, as when an autopilot starts again, a new part begins, and only the longest
-    part counts. If fewer than AGREEING samples in a row agree with a stamp, the stamp is damaged,
-    and its sample is left out. A parameter belongs to the part of the next sample, because an
-    autopilot writes its parameters first when it starts.
+    If the first message of a table lacks a field, the table lacks this field, too. If the clock
+    goes back by more than STEP_NS, as when an autopilot starts again, a new part begins, and only
+    the longest part counts. If fewer than AGREEING samples in a row agree with a stamp, the stamp
+    is damaged, and its sample is left out. A parameter belongs to the part of the next sample,
+    because an autopilot writes its parameters first when it starts.
     """
     parts = [list[Sample]()]
     newest_ns = 0
-    strays: list[Sample] = []  # last samples, which agree with each other but not with the part
+    # last samples, which agree with each other but not with the current part
+    strays: list[Sample] = []
     settings = [list[Sample]()]  # the parameters of each part
     next_settings: list[Sample] = []
     for sample in samples:
@@ -114,9 +115,9 @@ def is_number(value: object) -> bool:
 
 
 def near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return a mask of the stamps near the median of the five around them.
+    """Return a mask of the stamps that are near the median of five neighbouring stamps.
 
-    A damaged stamp is not near.
+    A damaged stamp is far from this median.
     """
     if len(stamp_ns) <= 2:
         return np.ones(len(stamp_ns), dtype=bool)
@@ -126,6 +127,6 @@ def near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def table_of(stamp_ns: NDArray[np.int64], fields: Mapping[str, FloatArray]) -> MessageTable:
-    """Make a table in the order of its stamps, with the first sample of each repeated stamp."""
+    """Return a table in the order of its stamps; of equal stamps only the first sample stays."""
     stamps, places = np.unique(stamp_ns, return_index=True)
     return MessageTable(stamps, {name: values[places] for name, values in fields.items()})

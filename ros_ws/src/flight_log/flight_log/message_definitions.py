@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Message definitions for MCAP and rosbag2, from the installed packages or else from rosbags.
+"""Find message definitions for MCAP and rosbag2, in the installed packages or in rosbags.
 
-No ROS is needed at run time.
+The module needs no ROS at run time.
 """
 
 import json
@@ -19,19 +19,19 @@ class MessageDefinition(NamedTuple):
     """A message type as stored in a log."""
 
     name: str  # "sensor_msgs/msg/JointState"
-    text: str  # its definition and those of all referenced types
+    text: str  # its definition, and the definitions of all referenced types
     type_hash: str  # "RIHS01_..."
 
 
 @cache
 def definition(name: str) -> MessageDefinition:
-    """Return the definition of "pkg/msg/Type".
+    """Return the definition of a message type, by its name "pkg/msg/Type".
 
-    The text is the main definition. For each referenced type, a line of 80 "=", a line "MSG:
-    pkg/Type" and its definition follow (MCAP registry, schema encoding ros2msg). The hash by REP
-    2016 comes from the JSON of the package. rosbags has the common types of ROS 2 Jazzy with the
-    same fields and the same hash, but without comments. Raises ParameterError if neither an
-    installed package nor rosbags has the type.
+    The text begins with the main definition. For each referenced type, a line of 80 "=", a line
+    "MSG: pkg/Type" and the definition of this type follow (MCAP registry, schema encoding ros2msg).
+    The hash by REP 2016 comes from the JSON of the package. rosbags has the common types of ROS 2
+    Jazzy with the same fields and the same hash, but without comments. Raises ParameterError if
+    neither an installed package nor rosbags has the type.
     """
     try:
         description = json.loads(read_definition(name, "json"))
@@ -55,9 +55,9 @@ def definition(name: str) -> MessageDefinition:
 
 
 def read_definition(name: str, suffix: str) -> str:
-    """Read the file of "pkg/msg/Type" or "pkg/srv/Type" with a suffix.
+    """Read the definition file of "pkg/msg/Type" or "pkg/srv/Type" that has the given suffix.
 
-    Raises ParameterError if no installed package has it.
+    Raises ParameterError if no installed package has the file.
     """
     package, section, kind = name.split("/")
     # The wheels install into the prefix of the interpreter and do not set AMENT_PREFIX_PATH.

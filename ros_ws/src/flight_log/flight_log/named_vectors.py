@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Decodes the messages of a topic as named vectors, without ROS.
+"""Decode the messages of a topic as named vectors, without ROS.
 
-The messages of a topic usually have the same sender and channels, and differ only in stamp and
-values. The decoder learns the byte layout from one message and decodes all messages of the same
-layout together.
+The messages of a topic usually have the same sender and the same channels, and differ only in stamp
+and values. The decoder learns the byte layout from one message, and then decodes all messages with
+this layout together.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -51,13 +51,13 @@ class Samples:
     names: tuple[str, ...]
     stamp_ns: NDArray[np.int64]  # (N,), the instant of each sample
     values: FloatArray  # (N, k)
-    sender: str = ""  # name of the publisher with its process, as "/controller#4711"
+    sender: str = ""  # name of the publisher with its process, such as "/controller#4711"
 
 
 class Decoded(NamedTuple):
-    """The content of some messages.
+    """The decoded content of some messages.
 
-    A vector without channels stands for a missing sample and is left out.
+    A vector without channels means a missing sample, and is left out.
     """
 
     samples: list[Samples]
@@ -72,14 +72,14 @@ Decoder = Callable[[Table], Decoded]
 
 @cache
 def typestore() -> Typestore:
-    """Return the message types of ROS 2 Jazzy. They are loaded once, because this takes 70 ms."""
+    """Return the message types of ROS 2 Jazzy; they are loaded once, which takes 70 ms."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 @cache
 def joint_state_types() -> Typestore:
-    """Return JOINT_STATE_TYPES, which are enough for most logs."""
-    # The empty store has Time.
+    """Return the types JOINT_STATE_TYPES, which suffice for most logs."""
+    # The empty store already has Time.
     store = get_typestore(Stores.EMPTY)
     for name, definition in JOINT_STATE_TYPES.items():
         store.register(get_types_from_msg(definition, name))
@@ -87,12 +87,12 @@ def joint_state_types() -> Typestore:
 
 
 def full_name(type_name: str) -> str:
-    """Return the full name "pkg/msg/Type" of a message type, given this or the short "pkg/Type"."""
+    """Return the full name "pkg/msg/Type" of a message type from its full or short name."""
     return type_name.replace("/", "/msg/") if type_name.count("/") == 1 else type_name
 
 
 def decoder(type_name: str) -> Decoder | None:
-    """Return a decoder of a message type, or None if its messages are no named vectors.
+    """Return a decoder for a message type; None if its messages are no named vectors.
 
     Use one decoder for each topic. A call takes several messages in their order.
     """
@@ -100,7 +100,7 @@ def decoder(type_name: str) -> Decoder | None:
 
 
 def tables(messages: Iterable[bytes]) -> Iterator[Table]:
-    """Group messages in their order into tables of successive messages of equal length."""
+    """Group successive messages of equal length into tables, and keep their order."""
     for size, group in groupby(messages, len):
         messages_of_size = list(group)
         yield np.frombuffer(b"".join(messages_of_size), dtype=np.uint8).reshape(
@@ -153,9 +153,9 @@ def _sender(row: NDArray[np.uint8]) -> bytes:
 
 
 def flight_start_ns(stamp_ns: int, t: float) -> int | None:
-    """Return the stamp of flight time 0, ns, which is the stamp minus t of a sample of `truth`.
+    """Return the stamp of flight time 0, ns, from the stamp of a `truth` sample at time t.
 
-    t is in s. Returns None if t is not a flight time.
+    t is in s. The result is the stamp minus t, or None if t is not a flight time.
     """
     return stamp_ns - nanoseconds(t) if abs(t) <= MAX_FLIGHT_TIME else None
 
@@ -163,8 +163,8 @@ def flight_start_ns(stamp_ns: int, t: float) -> int | None:
 def encoded(samples: Samples) -> NDArray[np.uint8]:
     """Serialise samples as sensor_msgs/JointState, one message in each row.
 
-    Velocity and effort are empty. The first message is serialised by its definition; the others
-    differ only in stamp and values.
+    Velocity and effort are empty. The first message is serialised by its definition. The other
+    messages differ from it only in stamp and values.
     """
     store = joint_state_types()
     types: dict[str, Any] = store.types
@@ -186,12 +186,12 @@ def encoded(samples: Samples) -> NDArray[np.uint8]:
 
 
 def _marks(k: int) -> FloatArray:
-    """Return values that occur in no string."""
+    """Return k values whose bytes occur in no string."""
     return np.asarray(-np.arange(1.0, k + 1.0) * np.pi)
 
 
 def _position(message: bytes, marks: FloatArray) -> slice:
-    """Return the place of the values in a message with marks."""
+    """Return the place of the marks, and thus of the values, in a message."""
     start = message.index(marks.tobytes())
     return slice(start, start + marks.nbytes)
 
@@ -219,14 +219,14 @@ def decode_routes(table: Table) -> Decoded:
 
 
 class _JointStateDecoder:
-    """A decoder of sensor_msgs/JointState with names and positions."""
+    """A decoder of sensor_msgs/JointState that reads names and positions."""
 
     def __init__(self) -> None:
         self._store = joint_state_types()
         self._names: tuple[str, ...] = ()
         self._sender = ""
         self._template = np.zeros(0, dtype="<u4")  # the message from which the layout was learnt
-        # 255 for the bytes that are equal in all messages of the layout, else 0
+        # 255 for each byte that is equal in all messages with this layout, else 0
         self._constant = np.zeros(0, dtype="<u4")
         self._values = slice(0, 0)
 
@@ -278,8 +278,8 @@ class _JointStateDecoder:
     def _learn(self, message: bytes) -> None:
         """Learn the byte layout of a message.
 
-        Marks in place of the values are serialised with the same strings. Where the marks are in
-        the result, the values are in the message.
+        Marks are serialised in place of the values, with the same strings. The values of the
+        message are at the places that the marks have in the result.
         """
         try:
             vector: Any = self._store.deserialize_cdr(message, JOINT_STATE)
@@ -307,7 +307,7 @@ class _JointStateDecoder:
         self._names = tuple(vector.name)
         self._values = values
         self._sender = vector.header.frame_id
-        # A message without velocity and effort ends with their lengths.
+        # A message without velocity and effort ends with the lengths of these two arrays.
         self._template = np.frombuffer(message, dtype="<u4")
         constant = np.full(len(message), 255, dtype=np.uint8)
         constant[STAMP] = constant[self._values] = 0

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Opens the files of a log for every reader.
+"""Open the files of a log for every reader.
 
-It unpacks packed files and compressed messages, and orders the files of a bag. A path that is no
-log is refused in one sentence that says what is there.
+This module unpacks packed files and compressed messages, and orders the files of a bag. It refuses
+a path that is no log in a sentence that says what the path contains.
 """
 
 import re
@@ -53,9 +53,9 @@ UNPACK = {".zst": "zstd -d", ".zstd": "zstd -d", ".lz4": "lz4 -d"}
 
 
 def log_files(run: Path) -> list[Path]:
-    """List the files of a log in the order of recording, with those in ROSBAG2 last.
+    """Return the files of a log in the order of recording; files in ROSBAG2 come last.
 
-    If the path has no log, raises ParameterError with a sentence on what is there.
+    If the path has no log, raises ParameterError with a sentence on what it contains.
     """
     files = [*bag_files(run), *(bag_files(run / ROSBAG2) if is_folder(run / ROSBAG2) else ())]
     kinds = [file_kind(file) for file in files]
@@ -70,7 +70,7 @@ def log_files(run: Path) -> list[Path]:
 
 
 def _what_is_there(run: Path, files: Sequence[Path], kinds: Sequence[str]) -> str:
-    """Say what a path without a log holds, for a sentence."""
+    """Return the part of a sentence that says what a path without a log contains."""
     if files:
         if is_file(run):
             return kinds[0]
@@ -103,15 +103,15 @@ def _is_bag(folder: Path) -> bool:
 
 
 def _some(names: Sequence[str]) -> str:
-    """List the first names, and count the rest."""
+    """Return a text with the first names and the number of the rest."""
     surplus = len(names) - NAMED
     return "; ".join(names[:NAMED]) + (f"; and {surplus} more" if surplus > 0 else "")
 
 
 def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list[str]:
-    """Name the files of a bag that metadata.yaml lists but the folder lacks.
+    """Return the names of a bag's files that metadata.yaml lists but the folder lacks.
 
-    If there is no metadata.yaml, the bag should have every number from 0, where rosbag2 begins, to
+    Without metadata.yaml, the bag should have every number from 0, the first number of rosbag2, to
     the last number in the folder. Renamed files are compared by number.
     """
     paths = information.get("relative_file_paths")
@@ -131,7 +131,7 @@ def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list
 
 @contextmanager
 def open_scan(file: Path) -> Iterator[Scan]:
-    """Open the reader of a file of a log, by its first bytes.
+    """Open the reader of a log's file, which depends on the first bytes of the file.
 
     A packed file is unpacked into a temporary folder. Raises ParameterError if the file cannot be
     read.
@@ -148,7 +148,7 @@ def open_scan(file: Path) -> Iterator[Scan]:
 
 
 def _unpack(file: Path, plain: Path, kind: str) -> None:
-    """Write the content of a packed file.
+    """Unpack the content of a packed file into the file `plain`.
 
     If the file is truncated, only the beginning is written. Raises ParameterError.
     """
@@ -157,7 +157,7 @@ def _unpack(file: Path, plain: Path, kind: str) -> None:
     size = 0
     try:
         with open_packed(file, "rb") as source, plain.open("wb") as target:
-            # `read1` gives what a truncated file holds before its end.
+            # `read1` returns the content of a truncated file up to its end.
             while block := source.read1(COPY_BYTES):
                 size += len(block)
                 unpack = UNPACK.get(file.suffix, "unpack")
@@ -177,7 +177,7 @@ def _unpack(file: Path, plain: Path, kind: str) -> None:
 
 
 def log_topics(run: Path, remaps: Mapping[str, str] = {}) -> dict[str, str]:
-    """Return the types of the topics of a log by full name.
+    """Return the types of the topics in a log, by the full name of the topic.
 
     The type of messages that are not CDR ends with "in ENCODING". If the file has an index, only
     the index is read. Raises ParameterError for a path without a log.
@@ -197,16 +197,16 @@ def log_topics(run: Path, remaps: Mapping[str, str] = {}) -> dict[str, str]:
                         name if encoding == "cdr" else f"{name} in {encoding}",
                     )
                 elif topics and scan.message_counts:
-                    # The index names all channels.
+                    # The index has all channels.
                     break
     return topics
 
 
 def plain_message(data: bytes) -> bytes:
-    """Return a message without the compression of `ros2 bag record`, if it has any.
+    """Return a message; if `ros2 bag record` compressed it, decompress it.
 
-    No message in CDR begins like a compressed one. A damaged message stays as it is, because no
-    decoder accepts it.
+    No message in CDR begins like a compressed message. A damaged message is returned as it is,
+    because no decoder accepts it.
     """
     if data[:4] != ZSTD_MAGIC:
         return data
@@ -221,7 +221,7 @@ def plain_message(data: bytes) -> bytes:
 def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
     """Decompress the messages of a batch as `plain_message` does.
 
-    Afterwards their lengths can differ, so they come in batches of equal length.
+    Decompressed messages may differ in length, so they come in batches of equal length.
     """
     if not len(batch.data) or batch.data[0, :4].tobytes() != ZSTD_MAGIC:
         yield batch

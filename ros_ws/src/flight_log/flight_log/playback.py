@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Playback schedule of a log: the messages and the times to send them.
+"""Schedule the playback of a log: the messages, and the times at which to send them.
 
-It needs no ROS. `flight_bringup.player` sends the messages.
+The module needs no ROS. `flight_bringup.player` sends the messages.
 """
 
 import re
@@ -21,27 +21,28 @@ from flight_log.named_vectors import JOINT_STATE, decoder, flight_start_ns, stam
 from flight_log.stored_messages import StoredMessage, stored_messages
 from flight_log.tape_reader import A_FLIGHT, chosen_namespace, names_within, topics_text
 
-CLOCK = "/clock"  # never played: the player publishes its own clock
+CLOCK = "/clock"  # never played, because the player publishes a clock
 
 SHARED = ("/diagnostics", "/parameter_events", "/rosout")
 """Topics on which every node of a domain can publish. They are played only if they are named."""
 
-# largest depth of a latched topic; a lockstep flight keeps 20,000 messages, which is no latch
+# largest depth of a latched topic. The 20,000 messages that a lockstep flight keeps are no latch.
 MAX_LATCHED = 100
-# A stamp further than a day from the host's clock is flight time, as in lockstep.
+# A stamp that differs by more than a day from the host's clock is flight time, as in lockstep.
 MAX_CLOCK_OFFSET_NS = 86_400 * NANOSECONDS
-NO_FIELD = re.compile(r"\s*(#|$|\S+\s+\w+\s*=)")  # a comment, an empty line, a constant
+# a line that declares no field: a comment, an empty line or a constant
+NO_FIELD = re.compile(r"\s*(#|$|\S+\s+\w+\s*=)")
 STAMPED = re.compile(r"\s*((std_msgs(/|::)(msg::)?)?Header|builtin_interfaces(/|::)(msg::)?Time)\s")
 IDL_STRUCT = re.compile(r"\bstruct\s+\w+\s*\{")  # the first match is the type itself
 
 
 class ScheduledMessage(NamedTuple):
-    """A message to send."""
+    """A message to send, with the time at which it is due."""
 
-    due_ns: int  # on the time scale of the log's stamps
+    due_ns: int  # on the time scale of the stamps in the log
     topic: str
     data: bytes  # CDR, as recorded
-    stamped: bool  # whether the data begin with a stamp on that time scale
+    stamped: bool  # whether the data begin with a stamp on this time scale
 
 
 class Playback(NamedTuple):
@@ -50,7 +51,7 @@ class Playback(NamedTuple):
     types: Mapping[str, str]  # type names by full topic name
     messages: Sequence[ScheduledMessage]
     start_ns: int  # the instant of flight time 0
-    # kind of the messages that no ROS topic can have, by full topic name
+    # kind of the messages that no ROS topic can carry, by full topic name
     skipped: Mapping[str, str]
 
     def t(self, due_ns: int) -> float:
@@ -63,14 +64,14 @@ def read_playback(
 ) -> Playback:
     """Read the messages of a log from the flight time `start`, s.
 
-    `topics` are full names or their last parts. If there are none, every topic except SHARED is
-    played. `namespace` selects an aircraft. If it is None, every aircraft is played. Topics in an
-    encoding other than CDR, such as JSON, are skipped.
+    `topics` are full names, or the last parts of names. If it is empty, every topic except SHARED
+    is played. `namespace` selects an aircraft; None selects every aircraft. Topics in an encoding
+    other than CDR, such as JSON, are skipped.
 
     A message is due at its time of sending. In the log of a lockstep flight the host's clock has no
-    meaning, so a message is due at its stamp, but not before messages that were sent before. Raises
-    ParameterError if the log cannot be read, lacks a topic or the namespace, or ends before the
-    start.
+    meaning. A message is then due at its stamp, but not earlier than messages that were sent before
+    it. Raises ParameterError if the log cannot be read, lacks a topic or the namespace, or ends
+    before the start.
     """
     stored = sorted(
         (message for message in stored_messages(run) if message.topic != CLOCK), key=_sent_ns
@@ -115,7 +116,7 @@ def _within(messages: Sequence[StoredMessage], namespace: str, where: str) -> li
 
 
 def _is_lockstep(messages: Iterable[StoredMessage]) -> bool:
-    """Return whether most stamps of named vectors are flight time, as in lockstep."""
+    """Return whether most stamps of named vectors are flight times, as in lockstep."""
     votes = [
         _is_flight_time(message)
         for message in messages
@@ -137,8 +138,8 @@ def _scheduled(
     }
     now_ns = 0
     for message in messages:
-        # A stamp on the second time scale, or an unset stamp, gives no due time. The message is
-        # sent unchanged.
+        # A stamp on the other time scale, or a stamp that was not set, gives no due time. Such a
+        # message is sent unchanged.
         has_stamp = message.topic in stamped_topics and _is_flight_time(message) is lockstep
         if not lockstep:
             now_ns = _sent_ns(message)
@@ -151,7 +152,7 @@ def _scheduled(
 def _latched(
     messages: Sequence[ScheduledMessage], last_messages: Mapping[str, StoredMessage], begin_ns: int
 ) -> Iterator[ScheduledMessage]:
-    """Yield the last messages of latched topics before the beginning, for late subscribers.
+    """Yield the messages of latched topics from before the beginning, for late subscribers.
 
     /robot_description is such a topic.
     """
@@ -166,9 +167,9 @@ def _latched(
 
 
 def latched_depth(qos: str) -> int:
-    """Return how many messages a topic keeps for a late subscriber, which is 0 if it is volatile.
+    """Return the number of messages that a topic keeps for a late subscriber; 0 if volatile.
 
-    `qos` is the YAML list of the offered profiles of rosbag2.
+    `qos` is rosbag2's YAML list of the offered profiles.
     """
     try:
         profiles = yaml.safe_load(qos)
@@ -184,14 +185,14 @@ def latched_depth(qos: str) -> int:
 
 
 def _unsendable_kind(message: StoredMessage) -> str | None:
-    """If no ROS topic can carry a message, return what kind it is; otherwise return None."""
+    """Return the kind of a message that no ROS topic can carry; None for any other message."""
     if message.encoding != "cdr":
         return f"{message.type_name} in {message.encoding}".strip()
     return None if message.type_name else "no type"
 
 
 def _definition(message: StoredMessage) -> str:
-    """Return the definition of a message's type, from the installed package or else the log."""
+    """Return the definition of a message's type, from the installed package or from the log."""
     try:
         return definition(message.type_name).text
     except ParameterError:
@@ -201,7 +202,7 @@ def _definition(message: StoredMessage) -> str:
 def begins_with_stamp(text: str) -> bool:
     """Return whether the first field of a message type is a header or a time.
 
-    `text` is the definition, ros2msg or ros2idl.
+    `text` is the definition of the type, in ros2msg or ros2idl.
     """
     if struct := IDL_STRUCT.search(text):
         text = text[struct.end() :]
@@ -226,9 +227,9 @@ def _is_flight_time(message: StoredMessage) -> bool:
 
 
 def _start_ns(messages: Iterable[StoredMessage], otherwise: int) -> int:
-    """Return the stamp of flight time 0, by the first `truth` or else the first `y_m`.
+    """Return the stamp of flight time 0, from the first `truth` or from the first `y_m`.
 
-    Returns `otherwise` if there is neither.
+    Returns `otherwise` if the messages contain neither of them.
     """
     first: dict[str, StoredMessage] = {}
     for message in messages:

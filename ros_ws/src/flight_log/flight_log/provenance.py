@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Provenance of a flight for the metadata of a log, as named sets of strings.
+"""Collect the provenance of a flight for the metadata of a log, as named sets of strings.
 
-It consists of versions, revision, host and command.
+The provenance consists of versions, revision, host and command.
 """
 
 import os
@@ -41,8 +41,8 @@ STACK = (
     "rise_di",
     "rise_di_controller",
 )
-# The dependencies that affect the numbers and the bytes of a flight. The middleware has the names
-# of its wheels.
+# The dependencies that affect the numbers and the bytes of a flight. The middleware is listed by
+# the names of its wheels.
 DEPENDENCIES = (
     "jsbsim",
     "mcap",
@@ -61,7 +61,7 @@ GIT_TIMEOUT = 5.0  # s
 
 
 def provenance() -> dict[str, dict[str, str]]:
-    """Return the provenance of this process now, without what cannot be determined."""
+    """Return the provenance of this process now; values that cannot be determined are missing."""
     return {
         FLIGHT: {
             "start": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -74,7 +74,7 @@ def provenance() -> dict[str, dict[str, str]]:
 
 
 def recorded_arithmetic(metadata: Mapping[str, Mapping[str, str]]) -> str:
-    """Return the version of the arithmetic in a log, or the present one if the log has none."""
+    """Return the version of the arithmetic in a log; the present one if the log has none."""
     return metadata.get(VERSIONS, {}).get("arithmetic", ARITHMETIC)
 
 
@@ -95,7 +95,7 @@ def versions() -> dict[str, str]:
 
 
 def revision(source: Path) -> dict[str, str]:
-    """Return the git commit of a source file, and `dirty`, "true" if a tracked file was changed.
+    """Return the git commit of a source file, and `dirty`: "true" if a tracked file has changed.
 
     The result is empty if the file is in no commit.
     """
@@ -110,7 +110,7 @@ def revision(source: Path) -> dict[str, str]:
         ).stdout.strip()
 
     try:
-        # An installed copy may be inside another project's checkout.
+        # An installed copy may lie inside the checkout of another project.
         output("ls-files", "--error-unmatch", source.name)
         commit = output("rev-parse", "HEAD")
         changes = output("status", "--porcelain", "--untracked-files=no")

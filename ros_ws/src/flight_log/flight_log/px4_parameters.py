@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rate of PX4's body-rate loop, and delay of the gyro's filters, from the parameters of PX4.
+"""Derive the rate of PX4's body-rate loop and the delay of its gyro filters from PX4's parameters.
 
 Sources: PX4 guide, "MC Filter Tuning and Control Latency", and parameter reference; the parameter
 file of QGroundControl: vehicle, component, name, value, type.
@@ -30,8 +30,9 @@ DEFAULTS: Mapping[str, float] = MappingProxyType(
 """Values of PX4 1.16 for parameters that a file leaves out."""
 
 EXPECTED = "a parameter file of QGroundControl, or a ULog"
-COLUMNS = 5  # columns of a row of a parameter file
-# if the gyro is faster than the law by more than this factor, it is interpolated (rise_di_rates.c)
+COLUMNS = 5  # number of columns in a row of a parameter file
+# if the gyro is faster than the law by more than this factor, its samples are interpolated
+# (rise_di_rates.c)
 LIKE_PART = 1.05
 
 
@@ -40,21 +41,21 @@ class RateLoop(NamedTuple):
 
     rate: float  # rate of the law, Hz
     delay: float  # delay from the rates to the torque, s
-    filters: float  # part of this delay that the gyro's filters cause, s
-    origin: str  # the file and the settings that these numbers come from
+    filters: float  # part of the delay that the filters of the gyro cause, s
+    origin: str  # the file and the settings from which the numbers come
 
 
 def rate_loop(path: Path, rate: float | None = None, logged: float = 0.0) -> RateLoop:
-    """Return the loop for a law at a rate, which is by default the rate of the gyro.
+    """Return the timing of a law at `rate`, by default the rate of the gyro.
 
-    The rate of the gyro is IMU_GYRO_RATEMAX. If its samples were `logged` at a lower rate, Hz, that
-    is still enough for the law, this lower rate counts.
+    The rate of the gyro is IMU_GYRO_RATEMAX. Its samples may be `logged` at a lower rate, Hz. If
+    this rate still suffices for the law, it counts.
 
         delay = 1 / (sqrt(2) pi f) + sum_k b_k / (2 pi f_k^2) + 1 / rate + wait
 
-    with the cut-off f of a second-order Butterworth filter, the notches of frequency f_k and width
-    b_k, and a period of the law. If the gyro is faster, a tick waits for the next sample, at most a
-    period of the gyro. Raises ParameterError.
+    with the cut-off f of a second-order Butterworth filter, notches of frequency f_k and width b_k,
+    and one period of the law. If the gyro is faster than the law, a tick waits for the next sample,
+    for at most a period of the gyro. Raises ParameterError.
     """
     values = {**DEFAULTS, **_read(path)}
     fastest = values["IMU_GYRO_RATEMAX"]
@@ -87,13 +88,13 @@ def rate_loop(path: Path, rate: float | None = None, logged: float = 0.0) -> Rat
 def low_pass_delay(cutoff: float) -> float:
     """Compute the delay of a second-order Butterworth low-pass, 1 / (sqrt(2) pi f), s.
 
-    It is 0 for 0 Hz, which means no filter.
+    The delay is 0 for a cut-off of 0 Hz, which means that there is no filter.
     """
     return 1.0 / (math.sqrt(2.0) * math.pi * cutoff) if cutoff > 0.0 else 0.0
 
 
 def _read(path: Path) -> dict[str, float]:
-    """Read those parameters of DEFAULTS that a file has. Raises ParameterError."""
+    """Read the parameters of DEFAULTS that are in a file. Raises ParameterError."""
     require(path.is_file(), "px4", f"no file {path}", EXPECTED)
     if "ULog" in file_kind(path):
         parameters = read_foreign_log(path).parameters

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Repairs a truncated or damaged bag, which a killed recorder leaves behind.
+"""Repair a truncated or damaged bag, which a killed recorder leaves behind.
 
-Every rosbag2 reader accepts the result. It needs no ROS.
+Every rosbag2 reader accepts the repaired bag. The module needs no ROS.
 """
 
 import os
@@ -36,9 +36,9 @@ class FileRepair(NamedTuple):
     """The result of a repair for one file."""
 
     path: Path
-    messages: int  # messages in the file now
+    messages: int  # number of messages in the file after the repair
     last_ns: int  # log time of the last message
-    known_end_ns: int  # the latest log time in any index or metadata, else 0
+    known_end_ns: int  # the latest log time in any index or metadata; 0 if there is none
     faults: str | None  # None for an intact file
     damaged: Path | None  # copy of the damaged file; None for an intact file
 
@@ -48,7 +48,7 @@ class Repair(NamedTuple):
 
     files: tuple[FileRepair, ...]
     wrote_metadata: bool
-    # Names of the files that metadata.yaml lists but the folder lacks.
+    # Names of files that metadata.yaml lists but the folder lacks.
     missing: tuple[str, ...] = ()
 
 
@@ -57,12 +57,12 @@ def repair(run: Path) -> Repair:
 
     A damaged file is truncated or has damaged parts. A rebuilt file holds every readable record and
     has an index. It replaces the damaged file atomically, and the damaged file stays as *.damaged.
-    An intact bag does not change. metadata.yaml keeps the names of missing files. If you name a
-    single file of a bag, only this file is repaired, but not metadata.yaml. Raises ParameterError
-    if there is no bag, if a recorder still writes it, if no message can be read, if metadata.yaml
-    is of another program, or if the folder cannot be written.
+    An intact bag does not change. metadata.yaml keeps the names of missing files. If `run` is a
+    single file of a bag, only this file is repaired, and metadata.yaml stays. Raises ParameterError
+    if there is no bag, if a recorder still writes the bag, if no message can be read, if
+    metadata.yaml comes from another program, or if the folder cannot be written.
     """
-    # `log_files` says what is there.
+    # `log_files` raises, and says what the path contains.
     files = bag_files(run) or log_files(run)
     for file in files:
         require_mcap(file)
@@ -100,8 +100,8 @@ def repair(run: Path) -> Repair:
 def _previous_metadata(path: Path) -> tuple[Mapping[str, Any], int]:
     """Return the content of metadata.yaml and the log time of the last message, ns.
 
-    If the file is missing or damaged, they are an empty mapping and 0. Raises ParameterError for a
-    file of another program, which must not be replaced.
+    If the file is missing or damaged, the results are an empty mapping and 0. Raises ParameterError
+    for a file of another program, because it must not be replaced.
     """
     try:
         return read_bag_metadata(path.parent)
@@ -123,7 +123,7 @@ def _previous_metadata(path: Path) -> tuple[Mapping[str, Any], int]:
 
 
 class _FileScan:
-    """The content of a file, except the data of the messages."""
+    """The content of a file of a bag, except the data of the messages."""
 
     def __init__(self, path: Path) -> None:
         with path.open("rb") as stream:
@@ -190,7 +190,7 @@ class _FileScan:
         with replacing(self.path) as stream:
             self._copy(Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD))
             stream.flush()
-            # A full disk shows here at the latest, before the damaged file gets a second name.
+            # A full disk is noticed here at the latest, before the damaged file gets a second name.
             os.fsync(stream.fileno())
             damaged = _keep_damaged(self.path)
         return FileRepair(
@@ -205,7 +205,7 @@ class _FileScan:
     def _copy(self, writer: Writer) -> None:
         """Copy the readable records, with the schemas and channels first.
 
-        All channels are copied, because the index has those of a damaged chunk, too.
+        All channels are copied, because the index also has the channels of a damaged chunk.
         """
         writer.start(profile="ros2", library="rise-di repair")
         schemas = {
@@ -241,12 +241,12 @@ class _FileScan:
 
 
 def _keep_damaged(path: Path) -> Path:
-    """Give the damaged file a second name, which stays after the replacement.
+    """Give the damaged file a second name, which it keeps after the replacement.
 
     On a file system without hard links, a copy gets this name.
     """
     number = 1
-    # `lexists` is also true for a link to nothing, whose name is taken as well.
+    # `lexists` is also true for a broken link, whose name is taken as well.
     while os.path.lexists(
         damaged := path.with_name(f"{path.name}.damaged{f'-{number}' if number > 1 else ''}")
     ):

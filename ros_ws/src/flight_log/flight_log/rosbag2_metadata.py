@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""metadata.yaml of a bag, version 9 of rosbag2, and the files of a bag.
+"""Read and make metadata.yaml of a bag, version 9 of rosbag2, and find the files of a bag.
 
-This module reads the file, makes its text, and finds the MCAP files of a bag. It needs no ROS.
+The module needs no ROS.
 """
 
 import re
@@ -20,7 +20,7 @@ INFORMATION = "rosbag2_bagfile_information"  # the only key at the top of metada
 
 
 class TopicCount(NamedTuple):
-    """A topic in a file and the number of messages."""
+    """A topic in a file, and the number of its messages."""
 
     topic: str
     type_name: str
@@ -58,17 +58,17 @@ def plain_name(name: str) -> str:
 
 
 def part_number(name: str) -> int | None:
-    """Return the number of a file in a bag, or None if its name has no number."""
+    """Return the number of a file in a bag; None if its name has no number."""
     number = re.search(r"_(\d{1,9})$", Path(plain_name(name)).stem)
     return None if number is None else int(number[1])
 
 
 def bag_files(run: Path) -> list[Path]:
-    """List the files of a bag in the order of their numbers.
+    """Return the files of a bag in the order of their numbers.
 
-    If the path is a file, the list has only this file. If a file is there both packed and unpacked,
-    the list has the unpacked one. Raises ParameterError if the files in the folder are not parts of
-    a single bag.
+    If the path is a file, the list has only this file. If a file exists both packed and unpacked,
+    the list has the unpacked file. Raises ParameterError if the files in the folder are not parts
+    of a single bag.
     """
     if is_file(run):
         return [run]
@@ -91,7 +91,7 @@ def bag_files(run: Path) -> list[Path]:
 
 
 def _several(files: Sequence[Path]) -> str:
-    """Describe files of several bags, for a sentence."""
+    """Return the part of a sentence that describes files of several bags."""
     present = {*chain.from_iterable(file.suffixes for file in files)}
     suffixes = " and ".join(suffix for suffix in SUFFIXES if suffix in present)
     return f"{len(files)} {suffixes} files that are not parts of one bag"
@@ -100,7 +100,7 @@ def _several(files: Sequence[Path]) -> str:
 def read_bag_metadata(run: Path) -> tuple[dict[str, Any], int]:
     """Read metadata.yaml, and the log time of the last message in ns.
 
-    Raises ParameterError if the file is missing or is not rosbag2's.
+    Raises ParameterError if the file is missing, or if it was not made by rosbag2.
     """
     tree = read_yaml(run / METADATA, METADATA, "that of rosbag2")
     try:
@@ -124,7 +124,7 @@ def bag_metadata_yaml(
     """Write the text of metadata.yaml.
 
     Compression, custom data and distribution come from the `previous` content. Files of the
-    previous content that are `missing` stay in the lists of files.
+    previous content that are `missing` from the folder stay in the lists of files.
     """
     counts: dict[str, TopicCount] = {}
     for count in chain.from_iterable(file.counts for file in files):
@@ -180,7 +180,7 @@ def _entries(information: Mapping[str, Any], names: Sequence[str]) -> list[dict[
 
 
 def _profiles(qos: str) -> list[Any]:
-    """Return the offered profiles in a channel's metadata, or [] if they are no YAML list."""
+    """Return the offered profiles in a channel's metadata; [] if they are no YAML list."""
     try:
         profiles = parse_yaml(qos, "qos", "a list")
     except ParameterError:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads the records of an MCAP file that may be truncated, damaged or growing.
+"""Read the records of an MCAP file that may be truncated, damaged or growing.
 
-It reads to the end of the file and leaves out the damaged parts.
+The file is read to its end, and damaged parts are left out.
 """
 
 import os
@@ -41,7 +41,7 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
-# What reading raises if bytes were changed: between records, inside a record, or inside a
+# Exceptions that reading raises if bytes were changed between records, inside a record, or inside a
 # compressed chunk.
 DECODE_ERRORS = (
     McapError,
@@ -53,7 +53,7 @@ DECODE_ERRORS = (
 )
 
 RECORD = struct.Struct("<BQ")  # opcode and length, before each record (MCAP specification, Records)
-# Channel, sequence, log time and publish time, before each message.
+# Channel, sequence, log time and publish time, which come before each message.
 MESSAGE = struct.Struct("<HIQQ")
 # Fields of RECORD and MESSAGE.
 HEAD = np.dtype(
@@ -66,12 +66,14 @@ HEAD = np.dtype(
         ("publish_ns", "<i8"),
     ]
 )
-# Channel and size, before the entries of a message index (MCAP specification, Message Index).
+# Channel and size, which come before the entries of a message index (MCAP specification, Message
+# Index).
 MESSAGE_INDEX = struct.Struct("<HI")
 INDEX_ENTRY = np.dtype([("log_ns", "<i8"), ("place", "<i8")])
 NO_PLACES = np.zeros(0, dtype=np.int64)
 TIMES = struct.Struct("<QQ")  # log times of the first and the last message, before each chunk
-# TIMES, size and checksum of the records, length of the compression's name before this name.
+# TIMES, size and checksum of the records, and the length of the compression's name, which come
+# before this name.
 CHUNK = struct.Struct("<QQQII")
 LENGTH = struct.Struct("<Q")  # before the records of a chunk
 # Opcode, length, offsets of the summary and of its offsets, checksum.
@@ -79,7 +81,7 @@ FOOTER = struct.Struct("<BQQQI")
 CRC = struct.Struct("<I")
 
 ENDS = (int(Opcode.DATA_END), int(Opcode.FOOTER))
-DAMAGED = 0  # stands for an opcode, all of which are larger
+DAMAGED = 0  # in place of an opcode; all opcodes are larger
 
 JOINED_BYTES = 1 << 20
 """Bytes of the records in chunks that are decoded together: about a second of a flight."""
@@ -106,7 +108,7 @@ RECORD_READERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
 
 
 class _Decompressor(threading.local):
-    """A decompressor per thread; a new one per chunk would take as long as the chunk itself."""
+    """A decompressor for each thread, because making one for each chunk would double the time."""
 
     def __init__(self) -> None:
         self.zstd = zstandard.ZstdDecompressor()
@@ -120,24 +122,24 @@ class FilePart(NamedTuple):
 
     opcode: int
     content: bytes
-    message_indexes: list[bytes]  # the contents of those behind a chunk
-    end: int  # place behind the record and its message indexes
+    message_indexes: list[bytes]  # contents of the message indexes that follow a chunk
+    end: int  # place after the record and its message indexes
 
 
 @dataclass(frozen=True, kw_only=True)
 class MessageBatch:
-    """N successive messages of equal channel and length in a chunk or in successive chunks."""
+    """N successive messages with the same channel and length, from one or several chunks."""
 
     channel_id: int
-    data: NDArray[np.uint8]  # (N, length)
+    data: NDArray[np.uint8]  # (N, length) bytes of the messages
     log_ns: NDArray[np.int64]  # (N,)
-    publish_ns: NDArray[np.int64]  # (N,), 0 if the log has no time of sending
-    # (N,), number of the message by the publisher, 0 if the log has none
+    publish_ns: NDArray[np.int64]  # (N,), 0 if the log has no times of sending
+    # (N,), number that the publisher gave to the message, 0 if the log has no numbers
     sequence: NDArray[np.int64]
 
     @property
     def sent_ns(self) -> NDArray[np.int64]:
-        """Times of sending, (N,), or of receipt if the log has none."""
+        """Times of sending, (N,); times of receipt if the log has no times of sending."""
         return np.where(self.publish_ns == 0, self.log_ns, self.publish_ns)
 
 
@@ -146,9 +148,9 @@ T = TypeVar("T")
 
 
 class Scan:
-    """A file that is read from where the last reading ended, as a growing file needs.
+    """Reads a file, and continues where the last reading ended, because the file may grow.
 
-    `records`, `batches` and `groups` read it. The attributes are valid afterwards.
+    `records`, `batches` and `groups` read the file. The attributes are valid after a reading.
     """
 
     def __init__(self, path: Path) -> None:
@@ -157,12 +159,12 @@ class Scan:
         self.ended = False  # whether the end of the data has been read
         self.complete = False  # whether the file has its footer
         self.damaged = 0  # number of chunks and other parts that could not be read
-        self.endless = 0  # claimed size of a record at `position` that no file can hold, bytes
+        self.endless = 0  # size that a record at `position` claims and no file can have, bytes
         # The latest log time in the index and the chunk headers, including lost messages.
         self.known_end_ns = 0
-        # Counts by channel, as the index has them; known from the first record on.
+        # Number of messages by channel, from the index; known from the first record on.
         self.message_counts: dict[int, int] = {}
-        self._messages = 0  # that have been read
+        self._messages = 0  # number of messages that have been read
 
     @property
     def faults(self) -> str | None:
@@ -180,11 +182,11 @@ class Scan:
         return chain.from_iterable(self._read(decode_parts, 0, map))
 
     def batches(self) -> Iterator[McapRecord | MessageBatch]:
-        """Yield as `records` does, many times faster: messages of a channel come together."""
+        """Yield the content of `records` faster, with the messages of a channel together."""
         return chain.from_iterable(self._read(decode_batches, JOINED_BYTES, map_ahead))
 
     def groups(self) -> Iterator[Sequence[McapRecord | MessageBatch]]:
-        """Yield as `batches` does, a chunk at a time, so that a caller may stop in between."""
+        """Yield the same as `batches`, chunk by chunk, so that a caller may stop between them."""
         return self._read(decode_batches, 0, map)
 
     def _read(
@@ -211,7 +213,7 @@ class Scan:
     def _index(self, stream: IO[bytes], size: int) -> list[McapRecord]:
         """Read the records of the index, the MCAP summary.
 
-        They are empty if the file is truncated or the index damaged.
+        The list is empty if the file is truncated or the index is damaged.
         """
         position = size - FOOTER.size - len(MCAP0_MAGIC)
         if position < len(MCAP0_MAGIC):
@@ -238,7 +240,7 @@ class Scan:
             if isinstance(record, Statistics | ChunkIndex)
         ]
         self.known_end_ns = max(ends, default=0)
-        most = size // INDEX_ENTRY.itemsize  # the message indexes alone take that many bytes
+        most = size // INDEX_ENTRY.itemsize  # the message indexes alone would take this many bytes
         self.message_counts = {
             channel: min(count, most)
             for record in index
@@ -250,7 +252,7 @@ class Scan:
     def _parts(
         self, stream: IO[bytes], size: int, index: Sequence[McapRecord]
     ) -> Iterator[FilePart]:
-        """Yield the parts from the position to the end of the data, or of the file so far."""
+        """Yield the parts from `position` to the end of the data, or of the file so far."""
         stream.seek(0)
         if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             self.complete = False
@@ -261,7 +263,7 @@ class Scan:
             yield part
             if part.opcode in ENDS:
                 return
-        # A record that is not whole begins here.
+        # A record begins here that is not whole yet.
         stream.seek(position)
         head = stream.read(RECORD.size + TIMES.size)
         if len(head) == RECORD.size + TIMES.size:
@@ -273,7 +275,7 @@ class Scan:
 
 
 def _known_places(index: Sequence[McapRecord], size: int) -> list[int]:
-    """List the places of the records in the index, in order, and the size of the file."""
+    """Return the places of the records in the index, in order, and then the size of the file."""
     starts = (
         record.chunk_start_offset if isinstance(record, ChunkIndex) else record.offset
         for record in index
@@ -285,8 +287,8 @@ def _known_places(index: Sequence[McapRecord], size: int) -> list[int]:
 def whole_parts(stream: IO[bytes], position: int, places: Sequence[int]) -> Iterator[FilePart]:
     """Yield every whole record from a place to the end of the data, with its message indexes.
 
-    After a damaged record, which gets the opcode DAMAGED, the next record of the index follows.
-    Either the last record is in ENDS, or the file is truncated or still growing.
+    A damaged record gets the opcode DAMAGED, and the reading continues at the next record of the
+    index. If the last record is not one of ENDS, the file is truncated or still growing.
     """
     stream.seek(position)
     size = places[-1]
@@ -317,9 +319,9 @@ def whole_parts(stream: IO[bytes], position: int, places: Sequence[int]) -> Iter
 
 
 def _joined(parts: Iterator[FilePart], most: int) -> Iterator[Sequence[FilePart]]:
-    """Join successive chunks with up to `most` bytes of records; any other record stays alone.
+    """Join successive chunks up to `most` bytes of records; other records stay alone.
 
-    A chunk of more bytes stays alone too.
+    A chunk with more than `most` bytes stays alone too.
     """
     chunks: list[FilePart] = []
     size = 0
@@ -343,7 +345,7 @@ def _joined(parts: Iterator[FilePart], most: int) -> Iterator[Sequence[FilePart]
 def _decoded(
     decode_record: Callable[[Sequence[FilePart]], Iterator[R]], parts: Sequence[FilePart]
 ) -> tuple[FilePart, list[R], int]:
-    """Decode parts: the last of them, their records, and how many damaged parts were left out."""
+    """Return the last of the parts, their records, and the number of damaged parts."""
     try:
         return parts[-1], list(decode_record(parts)), 0
     except DECODE_ERRORS:
@@ -359,9 +361,9 @@ def _decoded(
 
 
 def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Map as `map` does, with the next results from a thread.
+    """Map as `map` does, while a thread computes the next results.
 
-    Decompression and NumPy leave the interpreter to the caller meanwhile.
+    Meanwhile the caller can run, because decompression and NumPy release the interpreter.
     """
     with ThreadPoolExecutor(1) as pool:
         queue: deque[Future[R]] = deque()
@@ -381,7 +383,7 @@ def split(data: bytes) -> Iterator[McapRecord]:
         end = position + length
         if end > len(data):
             raise McapError("a record longer than its container")
-        # Nearly all records are messages.
+        # Nearly all records are messages, so they come first.
         if opcode == Opcode.MESSAGE and length >= MESSAGE.size:
             channel, sequence, log_time, publish_time = MESSAGE.unpack_from(data, position)
             yield Message(
@@ -399,21 +401,21 @@ def _messages_in(record: object) -> int:
 def decode_batches(parts: Sequence[FilePart]) -> Iterator[McapRecord | MessageBatch]:
     """Decode as `decode_record` does, with the messages of a channel together.
 
-    The parts are chunks or a single record. The message indexes of a chunk save most of the time; a
-    wrong index changes nothing. Raises DECODE_ERRORS.
+    The parts are chunks or a single record. The message indexes of a chunk save most of the time.
+    The result does not depend on them, so they may be wrong. Raises DECODE_ERRORS.
     """
     yield from _split_batches([(_plain(part), _places(part.message_indexes)) for part in parts])
 
 
 def _plain(part: FilePart) -> bytes:
-    """Return the records of a part, those of a chunk decompressed. Raises DECODE_ERRORS."""
+    """Return the records of a part; a chunk is decompressed. Raises DECODE_ERRORS."""
     if part.opcode == Opcode.CHUNK:
         return decompress(part.content)
     return RECORD.pack(part.opcode, len(part.content)) + part.content
 
 
 def _places(message_indexes: Sequence[bytes]) -> NDArray[np.int64]:
-    """Read the places of messages in a chunk in their order from its indexes, damaged or not."""
+    """Read the sorted places of messages in a chunk from its indexes, which may be damaged."""
     ends = (
         len(content) - (len(content) - MESSAGE_INDEX.size) % INDEX_ENTRY.itemsize
         for content in message_indexes
@@ -430,7 +432,7 @@ def _split_batches(
 ) -> Iterator[McapRecord | MessageBatch]:
     """Yield the records in chunks, and then the messages by channel. Raises DECODE_ERRORS.
 
-    Each chunk comes with the places of its messages in their order, by the message indexes.
+    Each chunk comes with the sorted places of its messages from the message indexes.
     """
     joined_places: list[NDArray[np.int64]] = []
     size = 0
@@ -438,7 +440,7 @@ def _split_batches(
         try:
             others, places = _walk(data, indexed)
         except DECODE_ERRORS:
-            # An index may be wrong, or belong to another chunk.
+            # An index may be wrong, or may belong to another chunk.
             others, places = _walk(data, NO_PLACES)
         yield from others
         joined_places.append(places + size)
@@ -463,14 +465,14 @@ def _split_batches(
 
 
 def _heads(data: bytes) -> NDArray[np.void]:
-    """Return the head of a message at every place of a chunk."""
+    """Return for every place of a chunk the head that a message at this place would have."""
     return np.ndarray((max(len(data) - HEAD.itemsize + 1, 0),), HEAD, data, strides=(1,))
 
 
 def _walk(data: bytes, places: NDArray[np.int64]) -> tuple[list[McapRecord], NDArray[np.int64]]:
-    """Find the records of a chunk except messages, and the places of the messages, sorted.
+    """Find the records of a chunk that are no messages, and the sorted places of the messages.
 
-    The search steps over the messages at `places`, and from record to record in between. Raises
+    The search skips the messages at `places`, and goes from record to record between them. Raises
     DECODE_ERRORS.
     """
     heads = _heads(data)
@@ -509,7 +511,7 @@ def decode_parts(parts: Iterable[FilePart]) -> Iterator[McapRecord]:
 
 def decode_record(opcode: int, content: bytes) -> Iterator[McapRecord]:
     """Decode a record that is no message. Raises DECODE_ERRORS."""
-    # A chunk does not contain another one.
+    # A chunk does not contain another chunk.
     if opcode in {DAMAGED, Opcode.CHUNK, Opcode.MESSAGE}:
         raise McapError("a record that is damaged")
     if opcode in RECORD_READERS:
@@ -521,7 +523,7 @@ def decode_record(opcode: int, content: bytes) -> Iterator[McapRecord]:
 
 
 def decompress(chunk: bytes) -> bytes:
-    """Decompress the records in a chunk, limited to the stated size.
+    """Decompress the records in a chunk, up to the size that the chunk states.
 
     Raises DECODE_ERRORS.
     """
@@ -537,7 +539,7 @@ def decompress(chunk: bytes) -> bytes:
     if size > max(MAX_CHUNK_BYTES, len(compressed)):
         raise McapError(f"a chunk with a size of {size} bytes")
     if compression == b"zstd":
-        # The decompressor would allocate that much.
+        # The decompressor would allocate the stated size.
         if zstandard.frame_content_size(compressed) > size:
             raise McapError("a chunk that holds more than its size")
         data = _OF_THREAD.zstd.decompress(compressed, max_output_size=size)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of a log as stored bytes, of any type; and the parameter changes among them."""
+"""Read the messages of a log as stored bytes, of any type, and the parameter changes among them."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
@@ -22,26 +22,26 @@ PARAMETER_EVENT = "rcl_interfaces/msg/ParameterEvent"
 
 
 class StoredMessage(NamedTuple):
-    """A message as stored. Its times are in ns, by the recorder's clock."""
+    """A message as it is stored; its times are in ns by the clock of the recorder."""
 
     topic: str  # full name
     type_name: str
-    definition: str  # of the type, as text
+    definition: str  # definition of the type, as text
     received_ns: int
     sent_ns: int
     data: bytes
     encoding: str = "cdr"
-    qos: str = ""  # the offered profiles, YAML of rosbag2
+    qos: str = ""  # the offered profiles, as rosbag2's YAML list
 
 
 NO_SCHEMA = Schema(id=0, data=b"", encoding="", name="")
 
 
 def stored_messages(run: Path) -> Iterator[StoredMessage]:
-    """Yield the messages of a log in the order of writing.
+    """Yield the messages of a log in the order in which they were written.
 
-    In a truncated or damaged file they are the readable ones. Raises ParameterError for a missing
-    or unreadable log.
+    For a truncated or damaged file, the readable messages are yielded. Raises ParameterError for a
+    missing or unreadable log.
     """
     for file in log_files(run):
         schemas: dict[int, Schema] = {}
@@ -77,8 +77,9 @@ def parameter_changes(
 ) -> list[dict[str, Any]]:
     """Return the changes of a node's parameters on `/parameter_events`, in order of the stamps.
 
-    `node` is the full name of a node, as in "/one/controller". A change maps dotted names to values
-    in SI units, for `parameters` or groups of parameters. None stands for a deleted parameter.
+    `node` is the full name of a node, as in "/one/controller". A change is a mapping from dotted
+    names to values in SI units. It has only names that are in `parameters`, or in groups of
+    parameters. None means that a parameter was deleted.
     """
     store = typestore()
     events: list[tuple[int, dict[str, Any]]] = []
@@ -105,7 +106,7 @@ def parameter_changes(
 
 
 def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> bytes:
-    """Make a message of PARAMETER_EVENTS with changes by dotted name; None deletes a parameter.
+    """Return a message of PARAMETER_EVENTS with changes by dotted name; None deletes one.
 
     This is the inverse of `parameter_changes`.
     """
@@ -122,7 +123,7 @@ def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> byt
             0 if value is None else 1 + texts.index(type(value[0] if array else value)) + 5 * array
         )
         empty = [np.zeros(0, dtype=dtype) for dtype in (np.uint8, bool, np.int64, float)]
-        fields: list[Any] = [False, 0, 0.0, "", *empty, []]  # of the kinds from 1 on
+        fields: list[Any] = [False, 0, 0.0, "", *empty, []]  # fields of the types from 1 on
         if kind:
             default = fields[kind - 1]
             is_table = isinstance(default, np.ndarray)
@@ -138,8 +139,8 @@ def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> byt
 
 def parameter_value(message: Any) -> Any:
     """Return the value in a rcl_interfaces/msg/ParameterValue; None for an unset value."""
-    # After the field "type" of rcl_interfaces/msg/ParameterValue there is one field for each type,
-    # in their order from 1 on.
+    # In rcl_interfaces/msg/ParameterValue, the field "type" is followed by one field for each type,
+    # in the order of the types from 1 on.
     kind = message.type
     names = [field.name for field in fields(message)]
     value: Any = getattr(message, names[kind]) if 0 < kind < len(names) else None

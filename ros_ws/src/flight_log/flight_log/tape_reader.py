@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a bag as a Tape, without ROS.
+"""Read a bag as a Tape, without ROS.
 
-It reads bags of this stack and of `ros2 bag record`, even if they are truncated.
+The bags are those of this stack and of `ros2 bag record`, even if they are truncated.
 """
 
 from collections import defaultdict
@@ -61,19 +61,19 @@ from flight_log.open_log import (
 
 PARAMETERS = "parameters.yaml"  # attachment with every parameter of the flight
 A_FLIGHT = f"a recorded flight: y, y_m and u as {JOINT_STATE}"
-# A namespace with one of these topics is that of an aircraft.
+# A namespace that has one of these topics is that of an aircraft.
 AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")
 
 
 class RecordedRun(NamedTuple):
-    """The content of a log for the aircraft in `namespace`, "" for the root.
+    """The content of a log for the aircraft in `namespace`, which is "" for the root.
 
     `metadata` holds the named sets of strings, and `attachments` the files except the scenario.
-    `latency` is that of the loop from y to u, `age_of_u` is the age of u at the aircraft, and
-    `engagements` are those of a bridge; each is None for a log without such samples, or without
-    times of sending. `messages` are its warnings, errors, parameter changes, and those about
-    learning and a bridge. `path` is where the log was read, and `topics` has the types of all
-    topics of the log by full name.
+    `latency` is the latency of the loop from y to u, `age_of_u` is the age of u at the aircraft,
+    and `engagements` are those of a bridge. Each of these is None if the log has no such samples or
+    no times of sending. `messages` are the warnings, errors and parameter changes in the log, and
+    the messages about learning and a bridge. `path` is the path of the log, and `topics` has the
+    types of all its topics by full name.
     """
 
     tape: Tape
@@ -90,19 +90,20 @@ class RecordedRun(NamedTuple):
 
     @property
     def account(self) -> Any:
-        """Share of each topic, and what the log lacks.
+        """The account of the log: the share of each topic in it, and what the log lacks.
 
-        `rise_di.read_run` finds them; without it they are None.
+        `rise_di.read_run` computes the account; otherwise it is None.
         """
         return self.tape.account
 
     def require(self, *names: str) -> None:
         """Raise ParameterError if the log has no sample of a topic.
 
-        The sentence has the topics of the log, and what its nodes said at the end.
+        The error message has the topics of the log, and the last warnings and errors of its nodes.
 
         Args:
-            names: Topics that need a sample; none means at least one topic of a flight.
+            names: Topics that must have a sample. Without names, at least one topic of a flight
+                must have one.
 
         Raises:
             ParameterError: A topic has no sample.
@@ -132,7 +133,7 @@ class RecordedRun(NamedTuple):
 
 
 def topics_text(topics: Mapping[str, str]) -> str:
-    """List topics with their types for a sentence, or return "" if there are none."""
+    """Return topics with their types as part of a sentence; "" if there are no topics."""
     names = [f"{topic} ({type_name or 'no type'})" for topic, type_name in sorted(topics.items())]
     surplus = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {surplus} more topics" if surplus > 0 else "")
@@ -144,7 +145,7 @@ def read_run(
     scenario: FilePath | None = None,
     remaps: Mapping[str, str] = {},
 ) -> RecordedRun:
-    """Read the folder or a file of a run, as `rise_di.read_run` does, without its account."""
+    """Read the folder or a file of a run as `rise_di.read_run` does, but without the account."""
     run = as_path(run, "run", A_RUN)
     replacement = (
         None if scenario is None else stored_scenario(as_path(scenario, "scenario", A_SCENARIO))
@@ -192,7 +193,7 @@ def read_run(
 
 
 def _require_samples(log: LogContent, signals: Mapping[str, Signal], run: Path) -> None:
-    """Refuse a log without a sample of a flight, and give the reasons."""
+    """Raise ParameterError with the reasons for a log without a sample of a flight."""
     has = topics_text(log.kinds)
     lacks = [f"no sample of a flight among {has}" if has else "no sample on any topic"]
     for topic, samples in log.topics.items():
@@ -208,7 +209,7 @@ def _tape(
 ) -> Tape:
     """Make the tape of an aircraft, without the duration.
 
-    `names` are the names within the namespace by topic, `filled` the signals by name.
+    `names` has the name of each topic within the namespace, and `filled` has the signals by name.
     """
     samples_by_name = {
         name: log.topics[topic] for topic, name in names_within(aircraft, log.topics).items()
@@ -222,7 +223,8 @@ def _tape(
     }
     recording = {name: clock for name, clock in recordings.items() if clock.found}
     leaps: list[Leap] = []
-    # The import numbers the samples that it found, so a gap is one of the log, not of its clock.
+    # The import numbers the samples that it found, so a gap is one of the log, and not a step of
+    # its clock.
     if IMPORTED not in log.metadata:
         signals, recording, leaps = without_leaps(signals, recording)
     start_ns = _start_ns(signals)
@@ -265,7 +267,7 @@ def _tape(
 def _publisher_notes(
     topics: Mapping[str, TopicSamples], of_flight: Mapping[str, Signal | None]
 ) -> list[str]:
-    """Write the notes on other publishers of topics: samples at the same time, other messages.
+    """Write notes on other publishers of topics, with samples at the same time or foreign messages.
 
     A note covers all topics with the same publishers.
     """
@@ -292,7 +294,7 @@ def _publisher_notes(
 
 
 def _publishers(senders: Sequence[str]) -> str:
-    """Name publishers for a sentence."""
+    """Return the names of publishers as part of a sentence."""
     surplus = len(senders) - NAMED
     more = f" and {surplus} more publishers" if surplus > 0 else ""
     return ", ".join(bounded(sender) or UNNAMED for sender in senders[:NAMED]) + more
@@ -301,16 +303,17 @@ def _publishers(senders: Sequence[str]) -> str:
 def _is_before_epoch(start_ns: int, spans: Mapping[str, SampleSpan]) -> bool:
     """Return whether the processes took their stamps from /clock.
 
-    Stamps by the host's clock would count from the epoch, and in lockstep the names would lack the
-    process id.
+    The stamps then lie long before the present, and the names have a process id. Stamps by the
+    host's clock count from 1970, and in lockstep the names have no process id.
     """
     return start_ns <= SINCE_EPOCH_NS and any(INSTANCE.fullmatch(sender) for sender in spans)
 
 
 def _spans(topics: Iterable[tuple[str, Mapping[str, SampleSpan]]]) -> dict[str, SampleSpan]:
-    """Return the span of each publisher over its topics, which are names with spans.
+    """Return the span of each publisher over all of its topics.
 
-    For other programs only the topics of aircraft count.
+    `topics` are names of topics with the spans of their publishers. For programs outside of the
+    stack, only the topics of aircraft count.
     """
     spans: dict[str, SampleSpan] = {}
     for name, senders in topics:
@@ -321,7 +324,7 @@ def _spans(topics: Iterable[tuple[str, Mapping[str, SampleSpan]]]) -> dict[str, 
 
 
 def stored_scenario(path: Path) -> StoredFile:
-    """Read a scenario file into the form in which a log has an attached file.
+    """Read a scenario file as a StoredFile, the form in which a log holds an attached file.
 
     Raises ParameterError if it cannot be read.
     """
@@ -329,9 +332,9 @@ def stored_scenario(path: Path) -> StoredFile:
 
 
 def files_beside(run: Path) -> list[StoredFile]:
-    """Find the scenario and the parameters beside a log without attachments.
+    """Return the scenario and the parameters in files beside a log that has no attachments.
 
-    A scenario is recognised by its content. Several scenarios count as none.
+    A scenario is recognised by its content. If there are several scenarios, none is taken.
     """
     folder = run if is_folder(run) else run.parent
     files = []
@@ -347,7 +350,7 @@ def files_beside(run: Path) -> list[StoredFile]:
 
 
 def aircraft_namespaces(topics: Collection[str]) -> list[str]:
-    """List the namespaces of aircraft."""
+    """Return the namespaces of aircraft among the topics."""
     return sorted(
         {
             topic.rpartition("/")[0]
@@ -358,7 +361,7 @@ def aircraft_namespaces(topics: Collection[str]) -> list[str]:
 
 
 def chosen_namespace(topics: Collection[str], namespace: str | None, where: str) -> str:
-    """Choose the namespace of an aircraft; "" for the root and if there is no aircraft.
+    """Return the namespace of an aircraft; "" for the root and if there is no aircraft.
 
     `namespace` is the choice of the caller.
     """
@@ -395,7 +398,7 @@ def names_within(namespace: str, topics: Collection[str]) -> dict[str, str]:
 
 
 def _duration(attachments: Sequence[StoredFile]) -> float | None:
-    """Return the duration of the whole flight by the attached parameters, s; None without them."""
+    """Return the duration of the whole flight in the attached parameters, s; None without them."""
     for file in attachments:
         if file.name == PARAMETERS:
             with suppress(ParameterError, LookupError, OverflowError, TypeError, ValueError):
@@ -407,8 +410,8 @@ def _duration(attachments: Sequence[StoredFile]) -> float | None:
 def _start_ns(signals: Mapping[str, Signal]) -> int:
     """Return the stamp of flight time 0.
 
-    `truth` tells it; without `truth` it is the first y_m, where commands begin, or else the
-    earliest stamp.
+    It follows from `truth`. Without `truth` it is the stamp of the first y_m, with which the
+    commands begin, and without y_m it is the earliest stamp.
     """
     truth = signals.get("truth")
     if truth is not None and "t" in truth.names:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a Tape as an MCAP bag, without ROS.
+"""Write a Tape as an MCAP bag, without ROS.
 
-A flight in one process and a flight over topics leave the same kind of log.
+A flight in one process and a flight over topics thus leave the same kind of log.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ of their stamps."""
 
 
 def write_run(tape: Tape, directory: Path, attachments: LogAttachments) -> Path:
-    """Write the tape and the attachments as a bag into a folder; return the path of the MCAP file.
+    """Write the tape and the attachments as a bag into a folder, and return its MCAP file's path.
 
     Raises ParameterError if the bag cannot be written.
     """
@@ -41,10 +41,11 @@ def write_run(tape: Tape, directory: Path, attachments: LogAttachments) -> Path:
 
 
 class TapeWriter:
-    """Writes a flight part by part as a bag; each sample is a message with its stamp as log time.
+    """Writes a flight as a bag, part by part.
 
-    Messages are in the order of time: the samples of the last DELAY_NS wait for the next part.
-    Raises OSError if the bag cannot be written.
+    Each sample becomes a message whose log time is its stamp. The messages are in the order of
+    time, so the samples of the last DELAY_NS wait for the next part. Raises OSError if the bag
+    cannot be written.
     """
 
     def __init__(self, directory: Path, attachments: LogAttachments, start_ns: int = 0) -> None:
@@ -79,13 +80,13 @@ class TapeWriter:
         self._write({topic: signal.where(due[topic]) for topic, signal in parts.items()})
 
     def write_changes(self, stamp_ns: int, node: str, changes: Mapping[str, Any]) -> None:
-        """Write a change of parameters of a node in flight, as the node itself publishes it."""
+        """Write a change of a node's parameters in flight, as the node would publish it."""
         self._write_message(
             PARAMETER_EVENTS, PARAMETER_EVENT, stamp_ns, parameter_event(stamp_ns, node, changes)
         )
 
     def write_learning(self, stamp_ns: int, kind: str, sentence: str, *, warns: bool) -> None:
-        """Write what became of a proposal of a learner, as the controller itself publishes it."""
+        """Write what became of a learner's proposal, as a controller would publish it."""
         message = learning_message(stamp_ns, kind, sentence, warns=warns)
         self._write_message(f"/{LEARNING}", DIAGNOSTIC_ARRAY, stamp_ns, message)
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the messages of a ULog from a card that lost bytes.
+"""Find the messages of a ULog on a card that lost bytes.
 
-Source: PX4 guide, ULog file format: before a message are its size, 16 bits, and its type.
+Source: PX4 guide, ULog file format. A message begins with its size, 16 bits, and its type.
 """
 
 import struct
@@ -11,8 +11,8 @@ from types import MappingProxyType
 
 from flight_log.vehicle_tables import Loss
 
-HEAD = 16  # bytes: magic, version and time
-MESSAGE = struct.Struct("<HB")  # size and type
+HEAD = 16  # bytes of magic, version and time at the beginning of a file
+MESSAGE = struct.Struct("<HB")  # size and type at the beginning of a message
 DATA, SUBSCRIPTION, FLAGS = b"DAB"
 LEAST = MappingProxyType(
     {FLAGS: 40, SUBSCRIPTION: 4, DATA: 10}
@@ -21,30 +21,33 @@ LEAST = MappingProxyType(
 )
 """Least number of bytes of a message, by its type."""
 
-LARGEST = 10_000  # bytes, of a message (pyulog, core.py)
-APPENDED = slice(HEAD + MESSAGE.size + 16, HEAD + MESSAGE.size + 40)  # offsets, of FLAGS
-TAIL = 528  # bytes: with fewer at its end a log counts as whole, cut inside a message
+LARGEST = 10_000  # bytes of the largest message (pyulog, core.py)
+# place of the offsets of appended parts in the message FLAGS
+APPENDED = slice(HEAD + MESSAGE.size + 16, HEAD + MESSAGE.size + 40)
+# bytes; with fewer bytes after its last message, a log counts as whole and cut inside a message
+TAIL = 528
 
 
 @dataclass(frozen=True, kw_only=True)
 class Messages:
-    """The messages of a ULog as a ULog without other bytes, and the loss."""
+    """The whole messages of a ULog as the bytes of a ULog, and the loss."""
 
     content: bytes
     loss: Loss | None
 
 
 def whole_messages(content: bytes) -> Messages:
-    """Keep the messages that are followed by another message or by the end.
+    """Return the messages that are followed by another message or by the end of the log.
 
-    The content is unchanged if no bytes are lost, or if there are appended parts, which offsets
-    name.
+    The content is returned unchanged if no bytes are lost. The same holds if there are appended
+    parts, because offsets point to them.
     """
     if any(content[APPENDED]) and content[HEAD + 2 : HEAD + 3] == b"B":
         return Messages(content=content, loss=None)
     log = _Log(content)
     parts = [content[:HEAD]]
-    lost: list[tuple[int, int, int]] = []  # first byte, end, and the stamp before, us
+    # first byte and end of each loss, and the stamp before it, us
+    lost: list[tuple[int, int, int]] = []
     here = HEAD
     while here < len(content):
         if end := log.end_of(here):
@@ -67,15 +70,15 @@ def whole_messages(content: bytes) -> Messages:
 
 
 class _Log:
-    """What the messages so far tell about the next ones."""
+    """The facts from earlier messages of a log by which the next message is recognised."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content
-        self._sizes: dict[int, int] = {}  # of the data by number; 0 before the first
-        self.stamp_us = 0  # of the newest data
+        self._sizes: dict[int, int] = {}  # size of the data by number; 0 before the first data
+        self.stamp_us = 0  # stamp of the newest data, us
 
     def end_of(self, here: int) -> int:
-        """Return the end of the whole message at a place; 0 if there is none."""
+        """Return the end of the message at a place; 0 if there is no whole message."""
         size = self._size(here)
         end = here + MESSAGE.size + size
         if not size or end > len(self._content):
@@ -86,9 +89,9 @@ class _Log:
         return end if is_last or self._size(end, number) else 0
 
     def _size(self, here: int, subscribed: int | None = None) -> int:
-        """Return the size that the head of a message gives, bytes; 0 if no message has such a head.
+        """Return the size in the head of a message, bytes; 0 if no message can have such a head.
 
-        `subscribed` is the number of the data to which the message before subscribes.
+        `subscribed` is the number of the data to which the previous message subscribes.
         """
         if here + MESSAGE.size + 2 > len(self._content):
             return 0
@@ -107,7 +110,7 @@ class _Log:
         return int.from_bytes(self._content[start : start + 2], "little")
 
     def take(self, here: int, end: int) -> None:
-        """Take a whole message."""
+        """Take a whole message and note its facts."""
         kind = self._content[here + 2]
         if kind == SUBSCRIPTION:
             self._sizes.setdefault(self._number(here, 1), 0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads the logs that autopilots write: DataFlash of ArduPilot, tlogs of MAVLink, ULogs of PX4.
+"""Read the logs that autopilots write: DataFlash of ArduPilot, tlogs of MAVLink, ULogs of PX4.
 
 Sources: ArduPilot, libraries/AP_Logger/LogStructure.h and ArduPlane/Log.cpp; MAVLink, common.xml;
 PX4 guide, ULog file format, and PX4's msg/*.msg. pymavlink and pyulog decode the files.
@@ -25,8 +25,8 @@ EXPECTED = "a DataFlash log (.bin, .log), a tlog or a ULog"
 def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
     """Read the log of an autopilot.
 
-    Raises ParameterError if the file is no such log, if no message can be decoded, or if it is not
-    clear which of two systems or sensors flew.
+    Raises ParameterError if the file is no such log, if no message can be decoded, or if it is
+    unclear which of two systems or sensors flew.
     """
     require(path.is_file(), str(path), "no such file", EXPECTED)
     kind = file_kind(path)
@@ -89,7 +89,7 @@ takes some 35."""
 
 
 def read_foreign_log(path: Path, choice: Choice = ANY) -> VehicleLog:
-    """Read a log by `read_vehicle_log` in an isolated process, which a hostile log cannot harm.
+    """Read a log by `read_vehicle_log` in an isolated process, as a guard against hostile logs.
 
     A log of a few bytes may claim billions of values. Raises ParameterError.
     """

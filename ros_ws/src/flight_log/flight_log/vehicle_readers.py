@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Decodes the formats of autopilots' logs: the system, the sensors and the clock that flew.
+"""Decode the formats of autopilots' logs, and find the system, sensors and clock that flew.
 
-Sources: as of `vehicle_log`; MAVLink, common.xml (time_boot_ms), MAVLink guide, Serialization (the
-sequence of a link).
+Sources: those of `vehicle_log`; MAVLink, common.xml (time_boot_ms), MAVLink guide, Serialization
+(the sequence of a link).
 """
 
 import re
@@ -55,9 +55,10 @@ from flight_log.vehicle_tables import (
 )
 
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1, common.xml
-NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID, of a ground station and of other components
-ULOG_HEAD = 16  # bytes: magic, version and time
-# a step of a byte over damaged ones reads a head and what may be its message, twice
+NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID of a ground station and of other components
+ULOG_HEAD = 16  # bytes of magic, version and time at the beginning of a ULog
+# reads of a search that goes on byte by byte through damaged data: for each byte it reads a head
+# and a possible message, twice
 READS_PER_BYTE = 4
 FIRMWARE = re.compile(r"(?:Ardu|APM:)(Plane|Copter|Rover|Sub)")  # in a MSG of ArduPilot
 FIRMWARES = MappingProxyType(
@@ -72,7 +73,7 @@ MAV_TYPES: Mapping[int, str] = MappingProxyType(
 """Kinds of vehicles by MAV_TYPE, common.xml."""
 
 PX4 = 12  # MAV_AUTOPILOT_PX4
-PX4_MANUAL = 1 << 16  # and its custom_mode with the main mode MANUAL (px4_custom_mode.h)
+PX4_MANUAL = 1 << 16  # flag of the main mode MANUAL in its custom_mode (px4_custom_mode.h)
 ROTORS = 1  # vehicle_type of vehicle_status: as a multicopter; 2 as a plane
 
 OLD_NAMES = MappingProxyType({"IMU2": ("IMU", 1), "IMU3": ("IMU", 2), "ASP2": ("ARSP", 1)})
@@ -109,7 +110,7 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
                     continue
                 newest_us = stamp_us(message, newest_us)
                 stamp_ns = min(round(1e3 * newest_us), LARGEST)
-                # The number is that of the sensor or of the core.
+                # The number of an instance is that of the sensor or of the core.
                 number = int(getattr(message, "I", 0) or getattr(message, "C", 0))
                 if name == PARAMETER:
                     yield SETTING, stamp_ns, (message.Name, float(message.Value))
@@ -142,7 +143,7 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
 
 
 def _true_airspeed(tables: Mapping[str, MessageTable]) -> None:
-    """Turn equivalent into true airspeed by the ratio in CTUN, in place."""
+    """Convert equivalent airspeed to true airspeed in place, by the ratio in CTUN."""
     control = tables.get("CTUN")
     if control is None or "E2T" not in control.fields:
         return
@@ -157,7 +158,7 @@ class Received:
     """A message of an autopilot in a tlog."""
 
     name: str
-    sequence: int  # of its link, 0 to 255
+    sequence: int  # sequence number on its link, 0 to 255
     arrival_ns: int
     content: Any
 
@@ -238,19 +239,21 @@ def _flown_system(
     return moving[0], (("system", reason),) * (len(messages_of) > 1)
 
 
-# Share of different times among the messages with a time: with fewer the clock stands still.
+# Least share of different times among the messages with a time. With a smaller share, the clock
+# stands still.
 LEAST_TIMES = 0.1
-RECENT = 16  # messages with a time among which one tells the time of a message without
+# number of recent messages with a time, from which a message without a time gets its time
+RECENT = 16
 AGAIN_NS = 30 * NANOSECONDS
 
 
 def _dated(messages: list[Received]) -> Iterator[Sample]:
-    """Yield the samples by the clock of the autopilot.
+    """Yield the samples with stamps by the clock of the autopilot.
 
     The times of arrival cannot serve: a radio may bunch messages, and a second link repeats
-    messages later. A message without a time gets the time of the message before it on the same
-    link, the nearest by the sequence. Stamps count from the first arrival. If the messages have no
-    clock, the arrival is the time.
+    messages later. A message without a time gets that of the preceding message on the same link,
+    which is found by the sequence numbers. Stamps count from the first arrival. If the messages
+    have no clock, the arrival is the time.
     """
     with_time = [message for message in messages if hasattr(message.content, "time_boot_ms")]
     times = {message.content.time_boot_ms for message in with_time}
@@ -260,9 +263,9 @@ def _dated(messages: list[Received]) -> Iterator[Sample]:
     else:
         offset_ns = with_time[0].arrival_ns - 1_000_000 * with_time[0].content.time_boot_ms
     newest_ns = with_time[0].arrival_ns if with_time else 0
-    # Sequences and stamps; None of a message that came before.
+    # Sequences and stamps; the stamp is None for a message that has come before.
     recent = deque[tuple[int, int | None]](maxlen=RECENT)
-    arrivals: dict[tuple[str, int], int] = {}  # by name and time
+    arrivals: dict[tuple[str, int], int] = {}  # number of arrivals by name and time
     for message in messages:
         name, content, arrival_ns = message.name, message.content, message.arrival_ns
         stamp_ns: int | None
@@ -320,14 +323,14 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
         table = table_of(stamps[keep], {name: values[keep] for name, values in columns.items()})
         instances.setdefault(data.name, {})[data.multi_id] = table
     vehicle, is_vtol = _vehicle(instances)
-    # Before 1.14.
+    # Logs before PX4 1.14.
     if is_vtol and "actuator_controls_1" in instances:
         instances["actuator_controls_0"] |= {1: instances["actuator_controls_1"][0]}
     initial = [(0, name, value) for name, value in log.initial_parameters.items()]
     records = [
         (SETTING, 1000 * stamp_us, (name, float(value)))
         for stamp_us, name, value in (*initial, *log.changed_parameters)
-        # A value that is not a number is damaged.
+        # A value that is no number is damaged.
         if is_number(value)
     ]
     parameters = parameters_of(records)
@@ -353,11 +356,11 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
 class UlogContent(BytesIO):
     """The content of a ULog, which ends after too many reads.
 
-    pyulog may otherwise go back from a cut message to the same message for ever.
+    Otherwise pyulog may read the same cut message again for ever.
     """
 
     def __init__(self, content: bytes) -> None:
-        """Permit READS_PER_BYTE reads for each byte, which no readable log needs."""
+        """Permit READS_PER_BYTE reads for each byte, more than any readable log needs."""
         super().__init__(content)
         self._left = READS_PER_BYTE * len(content)
 
@@ -370,7 +373,7 @@ class UlogContent(BytesIO):
 
 
 def _with_dropouts(loss: Loss | None, dropouts: Sequence[Any]) -> Loss:
-    """Combine the loss of bytes with what the logger says it did not write: message O of a ULog."""
+    """Combine the loss of bytes with the dropouts that the logger reports, message O of a ULog."""
     seconds = 1e-3 * sum(dropout.duration for dropout in dropouts)
     count = "a dropout" if len(dropouts) == 1 else f"{len(dropouts)} dropouts"
     what = f"{count} of the logger, {seconds:.2g} s in all"
@@ -385,7 +388,7 @@ def _with_dropouts(loss: Loss | None, dropouts: Sequence[Any]) -> Loss:
 
 
 def _angles(attitude: MessageTable) -> dict[str, FloatArray]:
-    """Compute Euler angles z, y, x, as autopilot_bridge.channel_map does."""
+    """Compute Euler angles in the order z, y, x, as autopilot_bridge.channel_map does."""
     w, x, y, z = (attitude.fields[f"q[{k}]"] for k in range(4))
     return {
         "phi": np.arctan2(2 * (w * x + y * z), w * w - x * x - y * y + z * z),
@@ -395,12 +398,12 @@ def _angles(attitude: MessageTable) -> dict[str, FloatArray]:
 
 
 def _vehicle(instances: Instances) -> tuple[str, bool]:
-    """Return the kind of vehicle by `vehicle_status`, "" if unknown, and whether it is a VTOL."""
+    """Return the kind of vehicle in `vehicle_status`, "" if unknown, and whether it is a VTOL."""
     table = instances.get("vehicle_status", {}).get(0)
     if table is None:
         return "", False
     fields = dict(table.fields)
-    # Before 1.10.
+    # Logs before PX4 1.10.
     if "vehicle_type" not in fields and "is_rotary_wing" in fields:
         fields["vehicle_type"] = np.where(fields["is_rotary_wing"] != 0.0, ROTORS, ROTORS + 1)
         instances["vehicle_status"][0] = table._replace(fields=fields)
@@ -413,7 +416,7 @@ def _vehicle(instances: Instances) -> tuple[str, bool]:
 
 
 def _by_message(places: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
-    """Collect the fields of places by message."""
+    """Return the fields of some places, by message."""
     fields: dict[str, set[str]] = {}
     for message, field in places:
         fields.setdefault(message, set()).add(field)
@@ -421,7 +424,7 @@ def _by_message(places: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
 
 
 def _wanted(log_format: Format) -> dict[str, set[str]]:
-    """Collect the fields that are read, by message."""
+    """Return the fields that are read from a format, by message."""
     sources = (*log_format.sources.values(), *log_format.torques.values(), log_format.mode)
     places = [(source.message, source.field) for source in chain(*sources)]
     for source, count in ((log_format.sticks, STICKS), (log_format.servos, SERVOS)):
@@ -436,7 +439,7 @@ ULOG_VALUES = 65535
 def _require_short(formats: Mapping[str, Any]) -> None:
     """Refuse a format with more values than a message can hold, by ValueError.
 
-    pyulog would make a field of each value.
+    pyulog would make a field for each value.
     """
     counts: dict[str, int] = {}
 

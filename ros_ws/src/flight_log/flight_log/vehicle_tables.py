@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of the logs that autopilots write, and where each has a quantity.
+"""Define tables of the messages in autopilots' logs, and where each format has a quantity.
 
 Sources: ArduPilot, libraries/AP_Logger/LogStructure.h and ArduPlane/Log.cpp; MAVLink, common.xml;
 PX4 guide, ULog file format, and PX4's msg/*.msg.
@@ -27,14 +27,15 @@ SERVOS = 16  # number of servos that are read
 class MessageTable(NamedTuple):
     """The samples of a message.
 
-    The stamps, ns, have the shape (N,) and ascend. Each field, by name, has the shape (N,).
+    The stamps, ns, have shape (N,) and ascend. Each field has shape (N,); the fields are stored by
+    name.
     """
 
     stamp_ns: NDArray[np.int64]
     fields: Mapping[str, FloatArray]
 
     def at(self, field: str, stamp_ns: NDArray[np.int64]) -> FloatArray:
-        """Return the newest value of a field at some instants, (n,), or NaN before the first."""
+        """Return the newest value of a field at some instants, (n,); NaN before the first."""
         places = np.searchsorted(self.stamp_ns, stamp_ns, side="right") - 1
         return np.where(places < 0, np.nan, self.fields[field][places])
 
@@ -49,12 +50,12 @@ class ParameterRecord(NamedTuple):
 Parameters = Mapping[str, tuple[ParameterRecord, ...]]
 """The records of the parameters by name, in the order of the log."""
 
-# A message of DataFlash; the samples of each format have their parameters by this name.
+# A message name of DataFlash. The samples of every format have their parameters under this name.
 PARAMETER = "PARM"
 
 
 class LogField(NamedTuple):
-    """Where a log has a quantity: value = scale field."""
+    """The place of a quantity in a log: its value is scale times the field."""
 
     message: str
     field: str
@@ -66,7 +67,7 @@ Sources = Mapping[str, tuple[LogField, ...]]
 
 
 class Format(NamedTuple):
-    """A format of logs: where it has each quantity.
+    """A format of logs, with the place of each quantity.
 
     The quantities are y and pose in SI (body FRD; north, east, up), the channels of the
     transmitter, and the servos.
@@ -76,7 +77,7 @@ class Format(NamedTuple):
     sticks: LogField  # its field has {} in place of the number of the channel
     servos: LogField
     mode: tuple[LogField, ...]
-    # Outputs of a multicopter's rate controllers, normalised, by what responds to them.
+    # Normalised outputs of a multicopter's rate controllers, by the output that responds.
     torques: Sources = MappingProxyType({})
 
 
@@ -122,10 +123,11 @@ COPTER = "multicopter"
 
 
 class Choice(NamedTuple):
-    """What a user takes from a log, and the kind of vehicle of the map."""
+    """The user's choice of a system and of sensors in a log, and the kind of vehicle in the map."""
 
-    system: int | None = None  # number in a tlog; None for the system that flew
-    # Number of the sensor by message; without it, the sensor or the part that flew.
+    system: int | None = None  # number of the system in a tlog; None for the system that flew
+    # Number of the sensor by message. For a message without an entry, the sensor or the part that
+    # flew counts.
     instances: Mapping[str, int] = MappingProxyType({})
     vehicle: str = PLANE
 
@@ -134,7 +136,7 @@ ANY = Choice()
 
 
 class Loss(NamedTuple):
-    """What a log has lost, and the stamps before the first and the last loss, ns."""
+    """The loss of a log, and the stamps before the first and the last loss, ns."""
 
     what: str
     first_ns: int
@@ -159,28 +161,27 @@ class VehicleLog(NamedTuple):
     tables: Mapping[str, MessageTable]
     parameters: Parameters
     format: Format | None
-    vehicle: str = PLANE  # "" if the log does not say
-    # The number of the mode in which the sticks of a plane are the commands: 0 of ArduPlane
-    # (mode.h).
+    vehicle: str = PLANE  # "" if the log does not say what flew
+    # Number of the mode in which the sticks of a plane are the commands; ArduPlane's is 0 (mode.h).
     manual: int = 0
-    # What is taken of several systems, sensors or instances, and why.
+    # The choices among several systems, sensors or instances, with their reasons.
     taken: tuple[tuple[str, str], ...] = ()
     loss: Loss | None = None
 
     def source(self, quantity: str) -> LogField | None:
-        """Return where this log has a quantity of y or of the pose; None if it has none."""
+        """Return the place of a quantity of y or of the pose; None if the log lacks it."""
         sources = ULOG_SOURCES if self.format is None else self.format.sources
         return next((source for source in sources.get(quantity, ()) if self.has(source)), None)
 
     def start_ns(self, quantity: str) -> int:
-        """Return the first stamp of a quantity that the log has."""
+        """Return the first stamp of a quantity, which the log must have."""
         source = self.source(quantity)
         return 0 if source is None else int(self.tables[source.message].stamp_ns[0])
 
     def parameters_at(self, stamp_ns: int) -> dict[str, float]:
         """Return the values of the parameters at an instant.
 
-        A parameter whose first record comes later is missing.
+        A parameter whose first record comes later is left out.
         """
         values: dict[str, float] = {}
         for name, records in self.parameters.items():
@@ -194,5 +195,5 @@ class VehicleLog(NamedTuple):
         return source.message in self.tables and source.field in self.tables[source.message].fields
 
     def at(self, source: LogField, stamp_ns: NDArray[np.int64]) -> FloatArray:
-        """Return the newest value of a place at some instants, (n,); NaN before the first."""
+        """Return the newest value of a field at some instants, (n,); NaN before the first."""
         return source.scale * self.tables[source.message].at(source.field, stamp_ns)
