@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A Monte Carlo campaign: thousands of uncertain aircraft fly one scenario, in chunks.
+"""Run a Monte Carlo campaign: thousands of uncertain aircraft fly one scenario, in chunks.
 
-An interrupted campaign can be resumed. The folder of a campaign holds its definition, a table for
-each chunk that is complete, and at the end its figures and its report.
+An interrupted campaign can be resumed. The folder of a campaign has its definition and a table for
+each completed chunk. At the end it also has the figures and the report.
 """
 
 import logging
@@ -46,12 +46,13 @@ DEFINITION = "campaign.json"
 CHUNKS = "chunks"
 OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # word in an error of JAX
 LOGGER = logging.getLogger(__name__)
-_FITTING: dict[str, int] = {}  # by definition: aircraft at once that fit, if a chunk did not fit
-MARGIN_AIRCRAFT = 200  # number of first aircraft of a case whose stability is counted
+# number of aircraft at once that fit into memory, by definition, if a chunk did not fit
+_FITTING: dict[str, int] = {}
+MARGIN_AIRCRAFT = 200  # number of first aircraft of a case whose loop is checked for stability
 
 
 def _permitted_units(scenario: Scenario, units: Mapping[str, float]) -> dict[str, float]:
-    """Return the units of the score by output. Raises ParameterError if a unit does not fit."""
+    """Return the score's unit for each output. Raises ParameterError if a unit does not fit."""
     outputs = scenario.controller.outputs
     stated_units = dict(units)
     for name, unit in stated_units.items():
@@ -91,9 +92,9 @@ def define(
 ) -> Definition:
     """Define a campaign over a scenario.
 
-    If `wind` or `spread` is None, it is taken from the scenario's `aircraft.uncertainty`. `units`
-    replaces units of the score by output, SI. If `chunk` is None, it is a size that is fast on the
-    device, or the size for single flights. Raises ParameterError if a campaign cannot fly the
+    If `wind` or `spread` is None, it comes from the scenario's `aircraft.uncertainty`. `units`
+    replaces units of the score by output, SI. If `chunk` is None, its size is one that is fast on
+    the device, or that for single flights. Raises ParameterError if a campaign cannot fly the
     scenario.
     """
     if sweep is not None:
@@ -102,7 +103,7 @@ def define(
         single_flights.require_single_flights(scenario)
     else:
         build_course(scenario)
-    # Each aircraft of the campaign has entries of its own.
+    # Each aircraft of the campaign has different entries.
     nominal = scenario.vary(aircraft={"uncertainty": {}})
     spread = scenario.aircraft.uncertainty.spread() if spread is None else spread
     spread = spread._replace(entries=equipment.expanded(spread.entries, scenario))
@@ -141,7 +142,7 @@ def define(
 
 
 def _default_chunk(scenario: Scenario, aircraft: int) -> int:
-    """Return how many aircraft fly at once by default."""
+    """Return the default number of aircraft that fly at once."""
     if aircraft < 1:
         return 1
     if single_flights.flies_alone(scenario):
@@ -154,8 +155,8 @@ def _default_chunk(scenario: Scenario, aircraft: int) -> int:
 def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
     """Fly a chunk of a campaign, and return its rows as Parquet.
 
-    `text` is the definition as JSON. The rows depend on nothing but `text` and the job. `learner`
-    makes the learner of a scenario. Raises ParameterError if an aircraft does not fit into memory.
+    `text` is the definition as JSON. The rows depend only on `text` and on the job. `learner` makes
+    the learner of a scenario. Raises ParameterError if an aircraft does not fit into memory.
     """
     definition = Definition.model_validate_json(text)
     if single_flights.flies_alone(definition.scenario()):
@@ -174,13 +175,13 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     size = _FITTING.get(text, definition.chunk)
     parts: list[Chunk] = []
     while first < end:
-        # The last part is as large as the others, so that nothing is compiled again. Surplus
-        # aircraft are dropped.
+        # The last part has as many aircraft as the others, so that nothing is compiled again.
+        # Surplus aircraft are dropped.
         count = min(size, end - first)
         try:
             parts.append(_fly_at_once(text, case, first, count, size))
         except (MemoryError, RuntimeError) as error:
-            # JAX raises a RuntimeError.
+            # JAX raises a RuntimeError if the memory does not suffice
             if isinstance(error, RuntimeError) and OUT_OF_MEMORY not in str(error):
                 raise
             if size == 1:
@@ -197,7 +198,7 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
 
 
 def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chunk:
-    """Fly `count` of the `size` aircraft from number `first` on, all at once."""
+    """Fly `size` aircraft from number `first` on at once, and return the first `count` of them."""
     from flight_campaign.batch import batch  # noqa: PLC0415 - JAX, which the command needs only for flights
     from flight_campaign.batch.device import turn  # noqa: PLC0415 - as above
     from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - as above
@@ -205,7 +206,8 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
     definition = Definition.model_validate_json(text)
     shared = _prepare(text, case)
     scenario, course, law = shared.scenario, shared.course, shared.law
-    fleet_of_chunk = drawn_fleet(definition, scenario, first, size)  # while another chunk flies
+    # drawn while another chunk flies
+    fleet_of_chunk = drawn_fleet(definition, scenario, first, size)
     with turn():
         fleet, equipped = fleet_of_chunk.on_device(course, shared.vehicle)
         flight_result = batch.fly(fleet, equipped, course, law.control_law, law.params)
@@ -226,7 +228,7 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
 
 @dataclass(frozen=True, kw_only=True)
 class _Shared:
-    """What all chunks of a case share."""
+    """The objects that all chunks of a case share."""
 
     scenario: Scenario
     course: Course
@@ -236,7 +238,7 @@ class _Shared:
 
 @lru_cache(maxsize=8)
 def _prepare(text: str, case: int) -> _Shared:
-    """Prepare what all chunks of a case share."""
+    """Prepare the objects that all chunks of a case share."""
     from flight_campaign.batch import batch  # noqa: PLC0415 - as above
 
     scenario = Definition.model_validate_json(text).scenario(case)
@@ -251,7 +253,7 @@ def _prepare(text: str, case: int) -> _Shared:
 
 
 class MonteCarlo:
-    """A campaign and its folder."""
+    """A campaign and the folder in which it is stored."""
 
     def __init__(self, folder: Path, definition: Definition) -> None:
         self.folder = folder
@@ -259,7 +261,7 @@ class MonteCarlo:
 
     @classmethod
     def begin(cls, folder: Path, definition: Definition) -> "MonteCarlo":
-        """Begin a new campaign in an existing, empty folder."""
+        """Begin a new campaign in an existing folder that is empty."""
         campaign = cls(folder, definition)
         (folder / CHUNKS).mkdir()
         _write(folder / DEFINITION, definition.model_dump_json(indent=1))
@@ -267,7 +269,7 @@ class MonteCarlo:
 
     @classmethod
     def resume(cls, folder: Path) -> "MonteCarlo":
-        """Load the campaign of a folder. Raises ParameterError if the folder has none."""
+        """Load the campaign in a folder. Raises ParameterError if the folder has no campaign."""
         try:
             definition = Definition.model_validate_json(
                 (folder / DEFINITION).read_text(encoding="utf-8")
@@ -285,7 +287,7 @@ class MonteCarlo:
         return [job for job in self.definition.jobs() if not self._path(job).exists()]
 
     def fly(self, engine: Engine, learner: MakeLearner | None = None) -> Iterator[int]:
-        """Fly the missing chunks, and yield the number of flights of each one that is complete.
+        """Fly the missing chunks, and yield the number of flights of each completed chunk.
 
         `learner` makes the learner of a scenario.
         """
@@ -307,9 +309,9 @@ class MonteCarlo:
         return total
 
     def rows(self, case: int | None = None) -> "pl.LazyFrame":
-        """Return the table of the completed chunks of a case, or of all cases, by case and number.
+        """Return the table of the completed chunks of a case or of all cases, in their order.
 
-        The module `flight_campaign.rows` says which columns it has.
+        The rows are ordered by case and number. `flight_campaign.rows` defines the columns.
         """
         import polars as pl  # noqa: PLC0415 - some tenths of a second
 
@@ -323,7 +325,7 @@ class MonteCarlo:
             self.rows().sink_parquet(stream)
 
     def margins(self, case: int) -> LoopMargins | None:
-        """Return the margins of the nominal aircraft, and the worst ones in the box of a case.
+        """Return the nominal margins of a case, and the worst margins in its box of uncertainty.
 
         Returns None if there is no linear loop.
         """
@@ -341,10 +343,10 @@ class MonteCarlo:
             return None
 
     def guarantee(self, case: int) -> Guarantee | None:
-        """Return the guarantee that was computed for the loop of a case.
+        """Return the stability guarantee that was computed for the loop of a case.
 
-        Returns None if there is no guarantee, or if lags or delays are drawn. A guarantee takes
-        lags and delays as exact.
+        Returns None if there is no guarantee. It also returns None if lags or delays are drawn,
+        because a guarantee assumes that they are exact.
         """
         definition = self.definition
         if any(equipment.is_of_loop(entry) for entry in definition.entries):
@@ -365,7 +367,7 @@ class MonteCarlo:
     def influence(self, case: int, worst: int) -> dict[str, Any]:
         """Return the rank correlations of the drawn entries with the score of a case.
 
-        `worst` is the number of its worst aircraft.
+        `worst` is the number of the worst aircraft in the case.
         """
         import polars as pl  # noqa: PLC0415 - as above
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a campaign: tables, histograms of the errors, and the score over the swept gain."""
+"""Write the report of a campaign: tables, histograms of the errors, and the score over the gain."""
 
 import json
 import shlex
@@ -53,7 +53,8 @@ from flight_core.files import display_path, write_file, writing
 from flight_core.units import ANGULAR_RATE, SPEED
 from flight_core.vectors import FloatArray
 
-COARSE = PER_DECADE // 50  # bins of the statistics in one bin of a figure, which is 5 % wide
+# number of bins of the statistics in one bin of a figure, which is 5 % wide
+COARSE = PER_DECADE // 50
 WIND_EFFECTS: dict[WindEffect, str] = {
     "air_relative": "by each aircraft's own A",
     "published": "that of the airframe",
@@ -98,7 +99,7 @@ LEARNER_LEGEND = (
 def write_results(campaign: MonteCarlo) -> tuple[dict[str, Any], MetricTable]:
     """Write the summary, the report and the scenarios of the worst aircraft.
 
-    Return the summary and the overview. Raises ParameterError.
+    Returns the summary and the table of the overview. Raises ParameterError.
     """
     definition = campaign.definition
     tallies = [campaign.tally(case) for case in range(definition.cases)]
@@ -127,7 +128,7 @@ def write_results(campaign: MonteCarlo) -> tuple[dict[str, Any], MetricTable]:
 
 
 def _write_worst(campaign: MonteCarlo, case: int, tally: Tally) -> list[dict[str, Any]]:
-    """Write the scenarios of the worst aircraft; return them with the commands that fly them."""
+    """Write the scenarios of the worst aircraft, and return them with the commands to fly them."""
     definition = campaign.definition
     again = []
     for aircraft in tally.worst[:RERUN]:
@@ -142,7 +143,7 @@ def _write_worst(campaign: MonteCarlo, case: int, tally: Tally) -> list[dict[str
 def _influence(campaign: MonteCarlo, case: int, tally: Tally) -> dict[str, Any]:
     """Return the rank correlations of a case.
 
-    If there is a worst corner, write its airframe and its scenario.
+    If the case has a worst corner, its airframe and its scenario are written too.
     """
     definition = campaign.definition
     ranked = campaign.influence(case, tally.worst[0].number)
@@ -170,7 +171,7 @@ def _influence(campaign: MonteCarlo, case: int, tally: Tally) -> dict[str, Any]:
         ),
     )
     learn = getattr(scenario.controller, "learn", None)
-    # The learner begins with the airframe and not with the corner.
+    # The learner begins with the airframe, and not with the corner.
     if learn is not None and (learn.prior is None or learn.prior.file is None):
         scenario = scenario.vary(
             controller={"learn": {"prior": {"file": scenario.aircraft.airframe}}}
@@ -202,7 +203,7 @@ def write_page(
 ) -> None:
     """Write the report of a campaign.
 
-    For each case it has a tally, the figures of the summary, and the margins of the loop.
+    For each case, the arguments have its tally, its figures in the summary, and its loop's margins.
     """
     scenario = definition.scenario()
     units = QUANTITY_UNITS | display_units(scenario)
@@ -216,7 +217,7 @@ def write_page(
         f" Score: {score_meaning(scenario, definition.score_units)}; loss of track: a score "
         f"above {LOSS_OF_TRACK_SCORE:g}."
     )
-    # First come the tables of all cases, then those of each case.
+    # The tables of all cases come first, and then those of each case.
     tables = [overview(definition, tallies, margins), _ends(labels, cases)]
     if any(case["guarantee"] for case in cases):
         tables.append(_guarantees(labels, cases))
@@ -258,7 +259,7 @@ def write_page(
 
 
 def _guarantees(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> MetricTable:
-    """Tabulate the guarantees that were computed for the loops of the cases."""
+    """Return a table of the guarantees that were computed for the loops of the cases."""
     rows = []
     for label, case in zip(labels, cases, strict=True):
         promise = case["guarantee"]
@@ -274,7 +275,7 @@ def _guarantees(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Me
 def overview(
     definition: Definition, tallies: Sequence[Tally], margins: Sequence[LoopMargins | None]
 ) -> MetricTable:
-    """Tabulate scores, lost aircraft and margins, with a column for each case."""
+    """Return a table of scores, lost aircraft and margins, with a column for each case."""
     columns = []
     for tally, loop_margins in zip(tallies, margins, strict=True):
         score = tally.figures.get("score", FigureStatistics())
@@ -299,7 +300,7 @@ def overview(
 
 
 def _spread_of_entries(definition: Definition) -> str:
-    """Write the uncertainties by entry, and the distribution unless it is uniform."""
+    """Write the uncertainties by entry, and the distribution if it is not uniform."""
     parts = [f"{name} ±{100 * part:g} %" for name, part in definition.entries.items()]
     if definition.distribution != "uniform":
         parts.append(definition.distribution)
@@ -307,7 +308,7 @@ def _spread_of_entries(definition: Definition) -> str:
 
 
 def score_meaning(scenario: Scenario, score_units: Mapping[str, float] | None = None) -> str:
-    """Say what a campaign's score counts; `score_units` replaces usual units by output, SI."""
+    """Say what a campaign's score measures; `score_units` replaces usual units by output, SI."""
     if scenario.guidance is not None:
         half = CAPTURE_TIME * scenario.guidance.speed
         return (
@@ -375,7 +376,7 @@ def _figures(label: str, tally: Tally, units: Mapping[str, DisplayUnit]) -> Metr
 def figure_rows(tally: Tally, units: Mapping[str, DisplayUnit]) -> list[list[str]]:
     """Return a row for each figure of a tally.
 
-    It has the label with its unit, then the figures that FIGURE_HEADINGS names.
+    A row has the label with its unit, and then the values named by FIGURE_HEADINGS.
     """
     rows = []
     for name, figure in tally.figures.items():
@@ -416,7 +417,7 @@ def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> MetricT
 
 
 def influence_table(label: str, case: Mapping[str, Any]) -> MetricTable:
-    """Tabulate, for a case, the drawn entries whose size correlates most with the score."""
+    """Return a table of a case's drawn entries whose size correlates most with the score."""
     ranked = case["influence"]
     rows = [
         [
@@ -472,7 +473,7 @@ def _spread(
 
 
 def _density(figure: FigureStatistics) -> tuple[FloatArray, FloatArray]:
-    """Return the centres of coarse bins, and the share of the flights in each."""
+    """Return the centres of coarse bins, and the share of the flights in each bin."""
     if not figure.count:
         return np.zeros(0), np.zeros(0)
     places = np.array(list(figure.bins)) // COARSE

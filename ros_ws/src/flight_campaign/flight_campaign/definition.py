@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The definition of a campaign, which has all inputs of its figures."""
+"""Define a campaign by all inputs of its figures."""
 
 from collections.abc import Iterator
 from itertools import product
@@ -25,7 +25,7 @@ from rise_di_controller.params import ControllerConfig
 
 
 def swept_parameters(controller: ControllerConfig) -> list[str]:
-    """Return the parameters that a sweep may multiply: numbers of the law, and input_scale."""
+    """Return the parameters that a sweep may multiply: numbers of the law and input_scale."""
     names = [
         name for name in type(controller).model_fields if name not in ControllerConfig.model_fields
     ]
@@ -36,7 +36,7 @@ def swept_parameters(controller: ControllerConfig) -> list[str]:
 class Sweep(Config):
     """Factors on one parameter of the controller, or on its value in one channel.
 
-    Every aircraft flies with each of them.
+    Every aircraft flies once with each factor.
     """
 
     parameter: str = Field(
@@ -50,10 +50,10 @@ class Sweep(Config):
         return self.parameter.partition("[")[0]
 
     def scaled(self, controller: ControllerConfig, factor: float) -> float | tuple[float, ...]:
-        """Return the parameter times a factor; if a channel is named, only its value changes.
+        """Return the parameter times a factor; if a channel is named, only this channel changes.
 
-        A channel of u stands for the channel of y with which it is paired. Raises ParameterError if
-        the parameter or the channel cannot be swept.
+        A channel of u means the channel of y with which it is paired. Raises ParameterError if the
+        parameter or the channel cannot be swept.
         """
         swept = swept_parameters(controller)
         require(
@@ -68,7 +68,7 @@ class Sweep(Config):
                 return tuple(factor * number for number in value)
             return factor * float(value)
         m = len(controller.outputs)
-        # k_d of (22) has no value for the last channel.
+        # k_d of (22) has no value for the last channel
         by_channel = isinstance(value, tuple) and len(value) in (m - 1, m)
         require(
             by_channel, "sweep", self.parameter, f"{self.name}: it does not have a value a channel"
@@ -90,11 +90,11 @@ class Sweep(Config):
 class Definition(Config):
     """All inputs of a campaign's figures.
 
-    The version of the stack and the arithmetic of the CPU are not in the definition.
+    The version of the stack and the arithmetic of the CPU are no part of the definition.
     """
 
     name: str  # name of the scenario
-    sections: dict[str, dict[str, object]]  # sections of the scenario, with every parameter
+    sections: dict[str, dict[str, object]]  # sections of the scenario with all parameters
     aircraft: int = Field(ge=1, le=2**32, description="how many aircraft fly")
     uncertainty: float = Field(
         ge=0, lt=1, description="the largest relative deviation of an entry of A and of B"
@@ -119,17 +119,17 @@ class Definition(Config):
 
     @property
     def spread(self) -> Spread:
-        """How the entries of A and B are drawn."""
+        """Distribution from which the entries of A and B are drawn."""
         return Spread(equipment.matrix_entries(self.entries), self.distribution)
 
     def drawn_equipment(self, scenario: Scenario, first: int, count: int) -> dict[str, FloatArray]:
-        """Draw lags, noise and delays of aircraft of a case, as `equipment.drawn` does."""
+        """Draw the lags, noise and delays of the aircraft in a case, as `equipment.drawn` does."""
         return equipment.drawn(
             scenario, Spread(self.entries, self.distribution), self.seed, first, count
         )
 
     def scenario(self, case: int = 0) -> Scenario:
-        """Return the scenario of a case of the sweep, with the airframe as published."""
+        """Return the scenario of a case of the sweep, with the published airframe."""
         scenario = scenario_of(self.name, Path(self.name), self.sections)
         if self.sweep is None:
             return scenario
@@ -137,7 +137,7 @@ class Definition(Config):
         return scenario.vary(controller={self.sweep.name: controller})
 
     def aircraft_scenario(self, number: int, case: int = 0) -> Scenario:
-        """Return the scenario of one aircraft of the campaign, as `rise-di fly` flies it."""
+        """Return the scenario of one aircraft of the campaign, which `rise-di fly` can fly."""
         uncertainty: dict[str, Any] = {
             "A": self.uncertainty,
             "B": self.uncertainty,
@@ -166,7 +166,7 @@ class Definition(Config):
 
     @property
     def cases(self) -> int:
-        """Number of flights of each aircraft."""
+        """Number of cases, which is the number of flights of each aircraft."""
         return 1 if self.sweep is None else len(self.sweep.factors)
 
     def factor(self, case: int) -> float:
@@ -184,6 +184,6 @@ class Definition(Config):
         return min(self.chunk, self.aircraft - job[1] * self.chunk)
 
     def jobs(self) -> Iterator[Job]:
-        """Return the chunks, each (case, chunk)."""
+        """Yield the chunks of all cases, each as (case, chunk)."""
         chunks = -(-self.aircraft // self.chunk)
         return product(range(self.cases), range(chunks))

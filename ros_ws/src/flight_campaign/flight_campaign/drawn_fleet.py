@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The drawn aircraft of a campaign, on the host and then as arrays on the device."""
+"""Draw the aircraft of a campaign on the host, and convert them to arrays on the device."""
 
 from typing import NamedTuple
 
@@ -23,8 +23,8 @@ class DrawnFleet(NamedTuple):
     scenario: Scenario
     A: FloatArray  # (N, n, n)
     B: FloatArray  # (N, n, m)
-    gust_directions: FloatArray  # (N, n, G), see `gust_directions`
-    equipment: dict[str, FloatArray]  # by name, (N,) each
+    gust_directions: FloatArray  # (N, n, G) effect of wind on x_dot, see `gust_directions`
+    equipment: dict[str, FloatArray]  # drawn lags, noise and delays by name, (N,) each
 
     def on_device(self, course: Course, vehicle: Vehicle) -> tuple[FleetMatrices, Vehicle]:
         """Return the drawn aircraft for the compiled loop, and the vehicle with their equipment."""
@@ -40,13 +40,13 @@ class DrawnFleet(NamedTuple):
         return fleet, batch.with_equipment(vehicle, self.scenario, self.equipment)
 
     def entries(self) -> dict[str, FloatArray]:
-        """Return what was drawn, by name, (N,) each."""
+        """Return all drawn values by name, (N,) each."""
         airframe = self.scenario.aircraft.nominal_airframe()
         return drawn_entries(airframe, self.A, self.B) | self.equipment
 
 
 def drawn_fleet(definition: Definition, scenario: Scenario, first: int, count: int) -> DrawnFleet:
-    """Draw the `count` aircraft of a campaign from number `first` on."""
+    """Draw `count` aircraft of a campaign, beginning with number `first`."""
     part = definition.uncertainty
     airframe = scenario.aircraft.nominal_airframe()
     A, B = sampled_matrices(airframe, part, part, definition.seed, first, count, definition.spread)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Engines that compute the chunks of a campaign, with equal results.
+"""Provide engines that compute the chunks of a campaign, with equal results.
 
-They are threads of this process, or workers of dask.
+An engine is threads of this process, or workers of dask.
 """
 
 import logging
@@ -25,7 +25,7 @@ LOST_WORKER_TIMEOUT = {"distributed.deploy.lost-worker-timeout": "10 minutes"}
 busy host a start may take longer, and the campaign would wait for ever for a cluster without
 workers."""
 
-AHEAD = 2  # queued chunks per worker: enough to keep it busy, and few enough to save memory
+AHEAD = 2  # number of queued chunks per worker, which keeps it busy without much memory
 
 Job = tuple[int, ...]
 Work = Callable[[Job], Any]
@@ -42,8 +42,8 @@ Devices = Sequence[Mapping[str, str]]
 def require_jax(*, shared: bool = False) -> None:
     """Raise ParameterError if JAX is not installed or finds no device.
 
-    For example, JAX finds no device if JAX_PLATFORMS is that of another host. If `shared`, the
-    process leaves the memory of its device to other processes.
+    For example, JAX finds no device if JAX_PLATFORMS is for another host. If `shared`, the process
+    leaves the memory of its device to other processes as well.
     """
     require_package("jax")
     if shared:
@@ -51,7 +51,7 @@ def require_jax(*, shared: bool = False) -> None:
     from flight_campaign.batch import device  # noqa: PLC0415 - JAX takes a second, which few commands need
 
     try:
-        device.is_cpu()  # JAX looks for its devices
+        device.is_cpu()  # this makes JAX look for its devices
     except (RuntimeError, AssertionError) as error:
         platforms = os.environ.get("JAX_PLATFORMS", "")
         reason = str(error).partition("\n")[0] or "no such device"
@@ -63,8 +63,8 @@ def require_jax(*, shared: bool = False) -> None:
 def threads(workers: int | None = None) -> Engine:
     """Return an engine of threads of this process.
 
-    If `workers` is None, there are as many threads as keep the device busy. The loop is compiled
-    once and releases the interpreter lock, so that threads run in parallel.
+    If `workers` is None, there are just enough threads to keep the device busy. The loop is
+    compiled once and releases the interpreter lock, so that threads run in parallel.
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
@@ -98,8 +98,8 @@ def dask(
     """Return an engine that flies in processes of this machine, or on the workers of a scheduler.
 
     The chunks of a dead worker run again. If a scheduler comes back within RECONNECT, it gets its
-    lost chunks again. On a host with GPUs each process has a GPU of its own, unless `on_devices` is
-    False, because single flights need cores.
+    lost chunks again. On a host with GPUs, each process has a different GPU. With `on_devices`
+    False, no process has a GPU, because single flights need cores.
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
@@ -144,7 +144,7 @@ def _connected(
 ) -> tuple[Any, int]:
     """Connect to the scheduler, or to `count` processes of this machine.
 
-    Return the client, and the number of threads that it has.
+    Returns the client, and the number of threads of its workers.
     """
     from distributed import Client  # noqa: PLC0415 - half a second
 
@@ -156,7 +156,7 @@ def _connected(
         workers = client.scheduler_info()["workers"].values()
         return client, sum(worker["nthreads"] for worker in workers)
     except (OSError, ValueError) as error:
-        # A ValueError means that it is no address at all.
+        # A ValueError means that `scheduler` is no address.
         if scheduler is None:
             raise ParameterError(
                 f"--engine dask: its workers did not start on this host ({error})"
@@ -168,7 +168,7 @@ def _connected(
 def _results(
     client: Any, work: Work, first: Iterable[Job], waiting: Iterator[Job], underway: dict[Any, Job]
 ) -> Iterator[tuple[Job, Any]]:
-    """Yield jobs with their results; `underway` holds the submitted jobs by future."""
+    """Yield jobs with their results; `underway` has the submitted jobs by their futures."""
     from distributed import as_completed  # noqa: PLC0415 - half a second
 
     for job in first:
@@ -204,7 +204,7 @@ def _one_device_each(devices: Devices) -> Any:
 
 @contextmanager
 def _local_cluster(workers: int, devices: Devices) -> Iterator[Any]:
-    """Start processes of this machine; each has the threads that keep a device busy."""
+    """Start processes on this machine, each with enough threads to keep a device busy."""
     import dask  # noqa: PLC0415 - half a second
     from distributed import LocalCluster  # noqa: PLC0415 - as above
 
@@ -214,13 +214,14 @@ def _local_cluster(workers: int, devices: Devices) -> Iterator[Any]:
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=THREADS if devices else 1,
-            dashboard_address=":0",  # any free port, which no other cluster of the host has
-            silence_logs=logging.CRITICAL,  # about workers that end in a chunk, as after Ctrl-C
+            dashboard_address=":0",  # any free port that no other cluster of the host has
+            # no messages about workers that end during a chunk, as after Ctrl-C
+            silence_logs=logging.CRITICAL,
         )
         try:
             yield cluster
         finally:
-            # A worker that is just starting again cannot be joined yet. The campaign does not need
-            # it any more.
+            # A worker that is just starting again cannot be joined yet, but the campaign does not
+            # need it any more.
             with suppress(TimeoutError, AssertionError):
                 cluster.close()

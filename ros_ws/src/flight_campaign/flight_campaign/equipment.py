@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The lags of the actuators, the noise of the sensors and the delay of u of a campaign's aircraft.
+"""Draw the actuator lags, the sensor noise and the delay of u of a campaign's aircraft.
 
 They are drawn like the entries of A and B. The entry lag[INPUT] is a time constant in s, and
-noise[OUTPUT] a standard deviation in SI. lag and noise without a channel mean all channels. The
-entry delay, in s, is the largest delay of u beyond the delay of the scenario. It is drawn in whole
-periods of the controller.
+noise[OUTPUT] is a standard deviation in SI. The entries lag and noise without a channel mean all
+channels. The entry delay, in s, is the largest delay of u beyond the delay of the scenario. The
+delay is drawn in whole periods of the controller.
 """
 
 import math
@@ -25,7 +25,7 @@ KINDS = ("lag", "noise", DELAY)
 
 
 def is_of_equipment(entry: str) -> bool:
-    """Return whether an entry is a lag, a noise or the delay, and not an entry of A or B."""
+    """Return whether an entry is a lag, a noise or the delay, instead of an entry of A or B."""
     return entry.partition("[")[0] in KINDS
 
 
@@ -58,10 +58,10 @@ def published(scenario: Scenario) -> dict[str, float]:
 
 
 def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, float]:
-    """Replace the entries lag and noise by one for each channel.
+    """Replace the entries lag and noise by an entry for each channel.
 
-    A channel's own entry takes precedence, and the delay is in whole periods. Raises ParameterError
-    if an entry is unknown.
+    An entry for a single channel takes precedence. The delay is rounded to whole periods. Raises
+    ParameterError if an entry is unknown.
     """
     entries_of_scenario = published(scenario)
     every = dict[str, float]()
@@ -90,12 +90,12 @@ def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, floa
 def drawn(
     scenario: Scenario, spread: Spread, seed: int, first: int, count: int
 ) -> dict[str, FloatArray]:
-    """Draw lags, noise and delays of aircraft of a seed, by entry, (count,) each.
+    """Draw lags, noise and delays of the aircraft of a seed, by entry, (count,) each.
 
     The numbers of the aircraft are first, first + 1, ... A lag and a noise are multiplied by 1 + d,
-    in the same way as an entry of A. A delay is (1 + d) / 2 of the largest one, in whole periods. A
-    value depends on nothing but the seed and the number of the aircraft. The entries of `spread`
-    are those of `expanded`.
+    in the same way as an entry of A. A delay is (1 + d) / 2 times the largest delay, in whole
+    periods. A value depends only on the seed and on the number of the aircraft. The entries of
+    `spread` are those of `expanded`.
     """
     published_values = published(scenario)
     rate = scenario.controller.rate
@@ -117,8 +117,8 @@ def drawn(
 def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, float]:
     """Return the values to which a deviation is relative.
 
-    They are the `published` values. For the delay it is half of the largest delay, so that it is
-    drawn within +-100 %.
+    These are the `published` values. For the delay it is half of the largest delay, so that the
+    delay is drawn within +-100 %.
     """
     return published(scenario) | ({DELAY: entries[DELAY] / 2.0} if DELAY in entries else {})
 
@@ -126,9 +126,9 @@ def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, fl
 def in_order(
     values: Mapping[str, Any], kind: str, names: tuple[str, ...], otherwise: tuple[float, ...]
 ) -> list[Any]:
-    """Return the values of a kind in the order of the channels.
+    """Return the values of a kind, lag or noise, in the order of the channels.
 
-    A channel without a value has that of `otherwise`.
+    A channel without a value gets that of `otherwise`.
     """
     return [
         values.get(f"{kind}[{name}]", value) for name, value in zip(names, otherwise, strict=True)
@@ -136,7 +136,7 @@ def in_order(
 
 
 def scenario_with_equipment(scenario: Scenario, values: Mapping[str, float]) -> Scenario:
-    """Return the scenario with lags, noise and an additional delay of u, by name."""
+    """Return the scenario with other lags, other noise and an additional delay of u, by name."""
     aircraft = scenario.aircraft
     channels = scenario.aircraft.channels()
     changes = {}

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find which drawn entries of A and B decide the score of a campaign.
 
-Rank correlations show which entries matter, and the corner of the box in which the score is worst.
+Rank correlations show which entries matter. They also show in which corner of the box of
+uncertainty the score is worst.
 """
 
 import math
@@ -17,17 +18,17 @@ if TYPE_CHECKING:
     import polars as pl
 
 RANKED = 10_000  # number of first aircraft of a case that are ranked: the standard error is 0.01
-LEAST_RANKED = 10  # least number of aircraft: fewer show nothing but chance
+LEAST_RANKED = 10  # least number of aircraft; fewer aircraft show only chance
 CHANCE = 0.05  # share of campaigns in which an entry without effect exceeds the level of chance
 
 
 def rank_correlations(table: "pl.DataFrame", published: Mapping[str, float]) -> dict[str, float]:
     """Return the rank correlation (Spearman) of the size of each entry with the score.
 
-    The size is relative to the published value, and the strongest correlation comes first. +1 means
-    that the score grows, and the aircraft flies worse, with the size of the entry. A diverged
-    aircraft has the worst rank. The result is empty if there are fewer than LEAST_RANKED aircraft,
-    or if all are equal.
+    The size is relative to the published value. The strongest correlation comes first. A
+    correlation of +1 means that the aircraft flies worse, with a higher score, the larger the entry
+    is. A diverged aircraft has the worst rank. The result is empty if there are fewer than
+    LEAST_RANKED aircraft, or if all aircraft are equal.
     """
     from scipy.stats import rankdata  # noqa: PLC0415 - half a second, only for this
 
@@ -44,7 +45,7 @@ def rank_correlations(table: "pl.DataFrame", published: Mapping[str, float]) -> 
 
 
 def chance_level(aircraft: int, entries: int) -> float:
-    """Return the rank correlation that no entry without effect exceeds in 95 % of campaigns.
+    """Return the rank correlation that in 95 % of campaigns no entry without effect exceeds.
 
     The correlation of independent values has mean 0 and variance 1 / (N - 1), and is normal for
     large N. Source: Kendall, Rank Correlation Methods, 1948. The level allows for the number of
@@ -63,11 +64,11 @@ def influence(
 ) -> dict[str, Any]:
     """Return the rank correlations of a case as figures for a file.
 
-    `table` gives the correlations, and the row `worst` the entries of the worst aircraft.
-    `uncertainty` is the largest deviation by entry. "worst_aircraft" and "worst_corner" are
-    relative to the published entry. The first is the deviation of the worst aircraft. The second is
-    plus or minus the uncertainty, on the side on which the score rises, and 0 if the correlation is
-    within chance.
+    The correlations come from `table`, and the row `worst` has the entries of the worst aircraft.
+    `uncertainty` is the largest deviation of each entry. The figures "worst_aircraft" and
+    "worst_corner" are relative to the published entry. The first is the deviation of the worst
+    aircraft. The second is plus or minus the uncertainty, with the sign for which the score rises.
+    It is 0 if the correlation may be chance.
     """
     correlations = rank_correlations(table, published)
     level = chance_level(table.height, len(correlations)) if correlations else None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A campaign as a table, whose rows have an aircraft's figures, outcome and drawn entries."""
+"""Store a campaign as a table; a row has an aircraft's figures, outcome and drawn entries."""
 
 import io
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ the drawn entries."""
 
 
 class Chunk(NamedTuple):
-    """Results of the aircraft of a chunk."""
+    """Results of the aircraft in a chunk."""
 
     first: int  # number of the first aircraft
     diverged: FloatArray  # (N,)
-    figures: dict[str, FloatArray]  # (N,) each, by name
-    # (N,) each, by name, see `uncertainty.drawn_entries` and `equipment.drawn`
+    figures: dict[str, FloatArray]  # figures by name, (N,) each
+    # drawn values by name, (N,) each, see `uncertainty.drawn_entries` and `equipment.drawn`
     entries: dict[str, FloatArray]
 
 
@@ -46,7 +46,7 @@ def join_chunks(parts: Sequence[Chunk]) -> Chunk:
 def encode_chunk(chunk: Chunk, seed: int, factor: float) -> bytes:
     """Encode the table of a chunk as Parquet (zstd), SI.
 
-    Figures of a diverged aircraft are null, and so is NaN.
+    The figures of a diverged aircraft are null. NaN becomes null too.
     """
     import polars as pl  # noqa: PLC0415
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flights of a campaign one by one, like those of `rise-di fly --in-process`.
+"""Fly the aircraft of a campaign one by one, as `rise-di fly --in-process` does.
 
-Aircraft that learn, and aircraft on a route, fly this way.
+Aircraft that learn, and aircraft on a route, fly in this way.
 """
 
 import math
@@ -40,11 +40,13 @@ CHUNK = 4
 class LearningOutcome(NamedTuple):
     """The outcome of the identifications of a flight."""
 
-    first_model: float  # s, instant from which the first model flew; NaN if none did
-    models: int  # proposals that flew, not counting the rough model
-    # identifications that the learner refused, and proposals that the controller refused
+    first_model: float  # s, instant from which the first learned model flew; NaN if no model flew
+    models: int  # number of proposals that flew, without the rough model
+    # number of identifications that the learner refused, and of proposals that the controller
+    # refused
     refused: int
-    fallbacks: int  # how often the law of the start took over, in all channels or in some
+    # number of times that the law of the start took over, in all or in some channels
+    fallbacks: int
 
 
 def learned(tape: Tape, events: Sequence[Event]) -> LearningOutcome:
@@ -89,11 +91,11 @@ class SingleFlight(NamedTuple):
     """The result of a flight of a campaign."""
 
     diverged: bool
-    figures: dict[str, float]  # SI, by name
+    figures: dict[str, float]  # figures by name, SI
 
 
 def fly_single(scenario: Scenario, learner: MakeLearner | None = None) -> SingleFlight:
-    """Fly a scenario. The errors are the true ones at the ticks of the controller.
+    """Fly a scenario; its errors are the true errors at the ticks of the controller.
 
     Raises ParameterError.
     """
@@ -112,7 +114,7 @@ def fly_single(scenario: Scenario, learner: MakeLearner | None = None) -> Single
 
 
 def _tracking_figures(tape: Tape, scenario: Scenario) -> dict[str, float]:
-    """Return the true errors by output, and the mean abs(u_dot) by effector."""
+    """Return the true error of each output, and the mean abs(u_dot) of each effector."""
     true = true_error(tape)
     assert true is not None  # noqa: S101 - simulated flights have the truth
     is_tick = true.stamp_ns % period_ns(scenario.controller.rate, "controller.rate") == 0
@@ -128,11 +130,12 @@ def _tracking_figures(tape: Tape, scenario: Scenario) -> dict[str, float]:
 def mission_figures(tape: Tape, guidance: GuidanceConfig) -> dict[str, float]:
     """Return the figures of a mission, SI.
 
-    They are the score, cross-track and altitude error on the route, the largest bank and the legs
-    that were missed. With a fence there are also the distance flown beyond it and the distance from
-    home at the end. The score is the largest cross-track error divided by the distance that the
-    aircraft flies in half a second at V0. Errors on the orbit round the last waypoint and on the
-    way onto a leg do not count. If no leg was flown, the score and these errors are NaN.
+    The figures are the score, the cross-track and altitude errors on the route, the largest bank
+    and the missed legs. With a fence there are also the distance flown outside of it and the
+    distance from home at the end. The score is the largest cross-track error divided by the
+    distance that the aircraft flies in half a second at V0. Errors on the orbit round the last
+    waypoint and on the way onto a leg do not count. If no leg was flown, the score and these errors
+    are NaN.
     """
     log = tape["guidance"]
     last_leg = len(guidance.plan(guidance.waypoints()).legs) - 1
@@ -164,7 +167,7 @@ def _rms(values: FloatArray) -> float:
 
 
 def fly_chunk_singly(definition: Definition, job: Job, learner: MakeLearner | None = None) -> Chunk:
-    """Fly a chunk of a campaign one by one."""
+    """Fly the aircraft in a chunk of a campaign one by one."""
     from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - imports JAX
 
     case, chunk = job

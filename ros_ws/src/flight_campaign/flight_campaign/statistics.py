@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo statistics of constant size.
+"""Collect Monte Carlo statistics, whose size does not grow with the number of flights.
 
 Moments, histograms and the worst flights are summed chunk by chunk.
 """
@@ -29,32 +29,33 @@ SCORE_UNIT = {ANGULAR_RATE: 0.010, SPEED: 0.1}  # rad/s, m/s
 """Unit of an rms error in the score, by dimension of the channel. p counts half, because its
 commands are larger."""
 
-SCORE_UNIT_OF = {"p": 0.020}  # rad/s, by channel, in place of the unit above
+SCORE_UNIT_OF = {"p": 0.020}  # rad/s, by channel, in place of the unit of its kind
 
 FIRST_MODEL = "first_model"
 """A figure of aircraft with a learner; NaN without a model."""
 
-LOSS_OF_TRACK_SCORE = 10.0  # a higher score counts as a loss of track; 1 to 4 is usual
+LOSS_OF_TRACK_SCORE = 10.0  # a higher score counts as a loss of track; scores of 1 to 4 are usual
 QUANTILES = (0.5, 0.95, 0.99)
 WORST_KEPT = 10  # number of worst flights in a tally
 
 
 class FigureStatistics(Config):
-    """A figure over many flights.
+    """The statistics of a figure over many flights.
 
-    The order of the sums is fixed, so that the same chunks give the same bits.
+    The order of the sums is fixed, so the same chunks give the same result to the last bit.
     """
 
     count: int = 0
     mean: float = 0.0
     squares: float = 0.0  # sum of (value - mean)^2
     largest: float = -1.0  # -1 as long as there is no value
-    # Counts by index in EDGES, without empty ones; -1 is below, len(EDGES) - 1 above.
+    # Counts by index in EDGES, without empty bins; index -1 is below all edges, len(EDGES) - 1
+    # above.
     bins: dict[int, int] = Field(default={})
 
     @classmethod
     def from_values(cls, values: FloatArray) -> Self:
-        """Collect values >= 0, (N,), into a figure; NaN does not count."""
+        """Collect values >= 0, (N,), into statistics; NaN does not count."""
         values = values[~np.isnan(values)]
         if not len(values):
             return cls()
@@ -68,7 +69,7 @@ class FigureStatistics(Config):
         return cls(count=len(values), mean=mean, squares=squares, largest=largest, bins=bins)
 
     def __add__(self, added: Self) -> Self:
-        """Join two figures.
+        """Join the statistics of two sets of flights.
 
         Source: Chan, Golub, LeVeque, Updating formulae and a pairwise algorithm, 1979.
         """
@@ -86,11 +87,11 @@ class FigureStatistics(Config):
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of the sample, or 0 if it has fewer than two values."""
+        """Standard deviation of the sample; 0 if it has fewer than two values."""
         return math.sqrt(self.squares / (self.count - 1)) if self.count > 1 else 0.0
 
     def quantile(self, share: float) -> float:
-        """Return the upper bound of a share of the flights, to the width of a bin (2.3 %)."""
+        """Return a quantile of the flights, rounded up to the edge of a bin (2.3 % wide)."""
         rank = share * self.count
         below = 0
         for place, number in self.bins.items():
@@ -105,7 +106,7 @@ class FigureStatistics(Config):
 
 
 class Worst(Config):
-    """One of the worst flights: number of the aircraft, and its score or None if it diverged."""
+    """One of the worst flights: the aircraft's number, and its score or None if it diverged."""
 
     number: int
     score: float | None
@@ -116,18 +117,20 @@ class Tally(Config):
 
     flights: int = 0
     diverged: int = 0
-    lost: int = 0  # flights that did not diverge, but have a score above LOSS_OF_TRACK_SCORE
-    # "score", "rms.q", "max.q", "slew.elevator", ... of the flights that did not diverge
+    # number of flights that did not diverge, but have a score above LOSS_OF_TRACK_SCORE
+    lost: int = 0
+    # statistics of "score", "rms.q", "max.q", "slew.elevator", ... over the flights that did not
+    # diverge
     figures: dict[str, FigureStatistics] = Field(default={})
-    worst: tuple[Worst, ...] = ()  # the worst first
+    worst: tuple[Worst, ...] = ()  # worst flights, the worst first
 
     @classmethod
     def from_flights(
         cls, first: int, diverged: FloatArray, figures: Mapping[str, FloatArray]
     ) -> Self:
-        """Tally the aircraft first, first + 1, ...
+        """Return the statistics of the aircraft first, first + 1, ...
 
-        Every figure has the shape (N,), and so has the "score".
+        `figures` includes the "score". Each figure has shape (N,).
         """
         bounded = ~np.asarray(diverged, dtype=bool)
         score = np.asarray(figures["score"])
@@ -166,7 +169,7 @@ class Tally(Config):
         )
 
     def without_model(self) -> int | None:
-        """Count the flights without a model, except diverged ones; None without learners."""
+        """Count the flights without a learned model that did not diverge; None without learners."""
         if FIRST_MODEL in self.figures:
             return self.flights - self.diverged - self.figures[FIRST_MODEL].count
         return None
@@ -194,7 +197,7 @@ class Tally(Config):
         }
 
     def share(self, count: int) -> tuple[float, float, float]:
-        """Return a number of flights as a share, with its 95 % confidence interval, 0 to 1.
+        """Return a count of flights as a share, with its 95 % confidence interval, 0 to 1.
 
         The interval is that of Clopper and Pearson.
         """
@@ -207,7 +210,7 @@ class Tally(Config):
 def lost_track(diverged: FloatArray, score: FloatArray) -> NDArray[np.bool_]:
     """Return which flights lost track, (N,).
 
-    They did not diverge, but have a score above LOSS_OF_TRACK_SCORE.
+    A flight lost track if it did not diverge, but has a score above LOSS_OF_TRACK_SCORE.
     """
     return np.asarray(~np.asarray(diverged, dtype=bool) & (score > LOSS_OF_TRACK_SCORE))
 
@@ -217,8 +220,8 @@ def score_units(
 ) -> FloatArray:
     """Return the units of the channels' rms errors in the score, SI, (m,).
 
-    `stated` replaces usual units by output. Raises ParameterError if an output has no unit in the
-    score.
+    `stated` replaces the usual units of outputs. Raises ParameterError if an output has no unit in
+    the score.
     """
     units_of_score = SCORE_UNIT_OF | dict(stated or {})
     for name in outputs:
@@ -240,8 +243,9 @@ def score_units(
 
 
 def score(rms: FloatArray, unit: FloatArray) -> FloatArray:
-    """Return the sum over the channels of rms / unit, (N,), from (m, N) and (m,).
+    """Return the score, which is the sum over the channels of rms / unit, (N,).
 
-    A channel adds 1 if its error is 10 mrad/s or 0.1 m/s. The channel p adds 1 at 20 mrad/s.
+    rms has shape (m, N), and unit has shape (m,). A channel adds 1 if its error is 10 mrad/s or 0.1
+    m/s. The channel p adds 1 at 20 mrad/s.
     """
     return np.asarray(np.sum(rms / unit[:, None], axis=0))

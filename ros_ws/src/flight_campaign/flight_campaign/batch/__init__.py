@@ -1,3 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Thousands of aircraft side by side on JAX: the course, the loop, its matrices and device."""
+"""Fly thousands of aircraft side by side on JAX: their course, loop, matrices and device.
+
+The course is what all aircraft have in common: reference, wind, sensor errors and feedforward.
+"""

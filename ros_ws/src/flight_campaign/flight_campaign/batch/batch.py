@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Vectorised Monte Carlo simulation: N uncertain aircraft fly one course under any law.
 
-The loop is that of a single process. The last axis of every array is the aircraft, so that one line
-of a law or of the actuators acts on all of them.
+The course is the reference, the wind, the sensor errors and the feedforward that all aircraft
+share. The closed loop is that of the simulation in a single process. The last axis of every array
+is the aircraft, so one line of a law or of the actuators acts on all aircraft.
 """
 
 from collections.abc import Mapping, Sequence
@@ -72,7 +73,7 @@ def vehicle(scenario: Scenario) -> Vehicle:
 
 
 def shared(params: Any) -> Any:
-    """Turn the parameters of a law for one aircraft, (m,), into those of a fleet, (m, 1).
+    """Convert the parameters of a law for one aircraft, (m,), to those for a fleet, (m, 1).
 
     Matrices stay as they are, because all aircraft share them.
     """
@@ -85,7 +86,7 @@ def shared(params: Any) -> Any:
 def with_equipment(
     vehicle: Vehicle, scenario: Scenario, values: Mapping[str, FloatArray]
 ) -> Vehicle:
-    """Put the lags and noise of N aircraft into the vehicle, by the names of `equipment.drawn`."""
+    """Put the lags and noise of N aircraft into the vehicle; `equipment.drawn` has the names."""
     channels = scenario.aircraft.channels()
     aircraft = scenario.aircraft
     if any(name.startswith("lag[") for name in values):
@@ -105,14 +106,15 @@ def with_equipment(
 
 
 def _rows(values: Sequence[Any]) -> Array:
-    """Return numbers, and arrays of shape (N,), as rows."""
+    """Return an array whose rows are numbers or arrays of shape (N,)."""
     return jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, values)))
 
 
 def _reduced(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
     """Return the indices of the states in the remainder, and the aircraft reduced to them.
 
-    The rows of the reduced aircraft are `remainder_rows`.
+    The remainder is the part of f_state that is not linear in the state. The rows of the reduced
+    aircraft are `remainder_rows`.
     """
     rows = remainder_rows(aircraft)
     coupling = aircraft.coupling
@@ -148,14 +150,15 @@ def fly(
 ) -> FleetResult:
     """Fly N aircraft through the course under one law, from trim at rest.
 
-    Each tick has four parts. The first is the sensors, and the second a step of the law, or its
-    engagement or a missed sample, depending on the phase of the course. Then come the actuators
-    over the K steps to the next tick, and the aircraft. The remainder s at the middle of a tick is
-    extrapolated from this tick and the one before.
+    Each tick has four parts. The first is the sensors. The second is a step of the law, its
+    engagement, or a missed sample, depending on the phase of the course. Then come the actuators
+    over the K steps to the next tick, and the aircraft. The nonlinear remainder s of the aircraft
+    at the middle of a tick is extrapolated from this tick and the previous one.
 
-    `params` of the law are (m, 1) or (m, N). If all aircraft have the same ones, `shared` makes
-    them from those of one aircraft, (m,). `schedule` divides the ticks into compiled loops. None
-    takes the schedule that is fastest on the device. The schedule does not change the figures.
+    `params` of the law have shape (m, 1) or (m, N). If all aircraft have the same parameters,
+    `shared` converts those of one aircraft, (m,). `schedule` divides the ticks into compiled loops.
+    None selects the schedule that is fastest on the device. The schedule does not change the
+    figures.
     """
     timing = _timing(fleet, course)
     constants = batch_loop.Constants(fleet._replace(blocks=()), vehicle, params)
@@ -165,7 +168,8 @@ def fly(
     state = batch_loop.begin(constants, first, **compiled)
     k = 0
     for run in (schedule or schedule_of_device())(course):
-        # The branches of an allocation are not unrolled, since they would then compile for minutes.
+        # The branches of an allocation are not unrolled, because they would then compile for
+        # minutes.
         looped = run if vehicle.allocation is None else run._replace(unroll=1)
         state = batch_loop.fly_run(state, constants, segments, k, run=looped, **compiled)
         k += run.length
@@ -173,7 +177,7 @@ def fly(
 
 
 def on_host(result: FleetResult) -> FleetResult:
-    """Copy the figures to arrays of NumPy, after the flights."""
+    """Copy the figures from the device to NumPy arrays, after the flights."""
     return jax.tree.map(np.asarray, result)
 
 
@@ -183,9 +187,9 @@ def _timing(fleet: FleetMatrices, course: Course) -> Timing:
 
 
 class FleetStepper:
-    """The flights of `fly` tick by tick, with u from outside.
+    """Steps the flights of `fly` tick by tick, with u from outside.
 
-    Call `sense`, then `advance`, for each tick of the course.
+    Call `sense` and then `advance` for each tick of the course.
     """
 
     def __init__(self, fleet: FleetMatrices, vehicle: Vehicle, course: Course) -> None:
@@ -209,7 +213,7 @@ class FleetStepper:
         return np.asarray(self._state.bounded)
 
     def sense(self) -> tuple[FloatArray, FloatArray]:
-        """Sense the y and y_m of the present tick, each (m, N), in the law's order."""
+        """Return y and y_m of the present tick, each (m, N), in the law's order."""
         self._state, sample = _sense_once(self._state, self._segments, self._k, self._vehicle)
         y = np.asarray(sample.y)
         return y, np.broadcast_to(np.asarray(sample.y_m), y.shape)
@@ -231,7 +235,7 @@ class FleetStepper:
         self._k += 1
 
     def restart(self, which: NDArray[np.bool_]) -> None:
-        """Put some aircraft, (N,), into trim at the present tick. Their figures begin again."""
+        """Put the aircraft `which`, (N,), into trim now, and start their figures again."""
         self._state = jax.tree.map(partial(jnp.where, which), self._begin, self._state)
 
     def result(self) -> FleetResult:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise_di_controller.extensions.allocation.allocate` for N aircraft at once, compiled."""
+"""Compute `rise_di_controller.extensions.allocation.allocate` for N aircraft at once, compiled."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -20,7 +20,7 @@ def with_column_limits(params: Allocation) -> Allocation:
 
 
 class _Range(NamedTuple):
-    """The least and the largest u, (p, N)."""
+    """The least and the largest u of each effector, (p, N)."""
 
     low: Array
     high: Array
@@ -29,12 +29,12 @@ class _Range(NamedTuple):
         return jnp.minimum(jnp.maximum(u, self.low), self.high)
 
     def has(self, u: Array) -> Array:
-        """Return which aircraft are inside, (N,)."""
+        """Return which aircraft have a u inside the range, (N,)."""
         return jnp.all((u >= self.low) & (u <= self.high), axis=0)
 
 
 def allocate(v: Array, u_before: Array, dt: Array, params: Allocation) -> tuple[Array, Array]:
-    """Return u (p, N) inside its limits for a demanded v (m, N), and the v that u gives."""
+    """Return u, (p, N), within its limits for a demanded v, (m, N), and the v that u gives."""
     rate_range = _Range(*bounds(u_before, dt, params.limits))
     stops = _Range(*(0.0 * u_before + end for end in (params.limits.lower, params.limits.upper)))
     u = product(params.T, v)
@@ -60,19 +60,19 @@ def allocate(v: Array, u_before: Array, dt: Array, params: Allocation) -> tuple[
 
 
 def _where_not(final: Array, value: Array, otherwise: Callable[[], Array]) -> Array:
-    """Keep the final values. Aircraft whose values are not final get those of `otherwise`."""
+    """Return the values that are final, and those of `otherwise` for all other aircraft."""
     return jax.lax.cond(jnp.all(final), lambda: value, lambda: jnp.where(final, value, otherwise()))
 
 
 def _by_priority(start: Array, v: Array, limits: _Range, params: Allocation) -> Array:
-    """Return u after the effectors of each input of the law moved, in the order of priority."""
+    """Return u after moves of the effectors for each input of the law, in order of priority."""
     order = jnp.array(params.order)
     moves = params.T.T[order][:, :, None] * v[order][:, None]
     return jax.lax.scan(lambda u, move: (_towards(u, move, limits, params), None), start, moves)[0]
 
 
 def _towards(u: Array, move: Array, limits: _Range, params: Allocation) -> Array:
-    """Return u after a move as far as the limits allow. The move begins at a u inside them."""
+    """Return u after a move as far as the limits allow; it begins at a u within the limits."""
     destination = _exchanged(u + move, limits, params)
     arrives = limits.has(destination)
 
@@ -106,7 +106,7 @@ def _towards(u: Array, move: Array, limits: _Range, params: Allocation) -> Array
 
 
 def _exchanged(u: Array, limits: _Range, params: Allocation) -> Array:
-    """Return a u with the same effect, inside its limits if the sweeps find such a u."""
+    """Return a u with the same effect that is within its limits, if the sweeps find such a u."""
     exchange = params.exchange
 
     def sweep(now: tuple[int, Array]) -> tuple[int, Array]:

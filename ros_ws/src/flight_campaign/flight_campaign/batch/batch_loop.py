@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop of N aircraft from tick to tick, compiled: sensors, law, actuators, aircraft.
+"""Step the closed loop of N aircraft, compiled: sensors, law, actuators, aircraft.
 
-Between two ticks of the controller an aircraft is linear up to a small remainder, so that all steps
-of its integration are one matrix product.
+Between two ticks of the controller, an aircraft is linear except for a small remainder. So all
+steps of its integration are a single matrix product.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,22 +40,24 @@ from rise_di_controller.law.saturation import Limits, saturate
 )
 @dataclass(frozen=True)
 class Vehicle:
-    """What all aircraft of a fleet share."""
+    """The properties that all aircraft of a fleet share."""
 
-    # These are constants of the compiled loop, so that a device does not look up places of rows.
+    # These are constants of the compiled loop, so that a device need not look up the places of
+    # rows.
     outputs: tuple[int, ...]  # (m,) indices of the outputs in the state, in the law's order
     inputs: tuple[int, ...]  # (p,) indices of the effectors in the airframe's order
     remainder_states: tuple[int, ...]  # (c,) indices of the states in the nonlinear remainder
-    vanes: tuple[int, ...]  # indices of the states that the vanes read
-    # The aircraft reduced to the remainder: f_state of x[remainder_states] gives the rows
+    vanes: tuple[int, ...]  # indices of the states that the vanes measure
+    # The aircraft reduced to the remainder: its f_state of x[remainder_states] gives the rows
     # `remainder_rows`.
     remainder: Aircraft
-    actuators: Actuators  # (p, 1), airframe's order
-    limits: Limits  # (m, 1), law's order: limits of u, as in the controller
-    quantum: Array | None  # (m, 1), law's order
+    actuators: Actuators  # (p, 1), in the airframe's order
+    limits: Limits  # (m, 1), in the law's order: limits of u in the controller
+    quantum: Array | None  # (m, 1), in the law's order: steps of the quantisation of y
     dt: float  # s, a step of the integration
-    allocation: Allocation | None  # None: the inputs of the law are the effectors
-    # (m, N), law's order: noise relative to that of the course, minus 1; None stands for 0
+    allocation: Allocation | None  # None if the inputs of the law are the effectors
+    # (m, N), in the law's order: noise of each aircraft divided by that of the course, minus 1;
+    # None means 0
     noisier: Array | None = None
 
 
@@ -65,22 +67,22 @@ class FleetResult(NamedTuple):
     Errors are the true ones, C x - y_m.
     """
 
-    rms: Array  # (m, N)
-    max: Array  # (m, N)
+    rms: Array  # (m, N) rms errors
+    max: Array  # (m, N) largest errors
     slew: Array  # (p, N) mean abs(u_dot) by effector, units of u / s
-    # (N,) bool: whether the state exceeded DIVERGENCE_LIMIT; the other figures are then invalid
+    # (N,) bool: whether the state exceeded DIVERGENCE_LIMIT, which makes the other figures invalid
     diverged: Array
 
 
 def rows_of(array: Array, places: Sequence[int] | NDArray[np.int64]) -> Array:
-    """Return the rows at known places as slices, which a GPU compiler fuses with their use."""
+    """Return the rows at constant places as slices, which a GPU compiler can fuse."""
     if not len(places):
         return array[:0]
     return jnp.stack([jax.lax.index_in_dim(array, int(k), keepdims=False) for k in places])
 
 
 def remainder_of(states: Array, aircraft: Aircraft) -> Array:
-    """Return the nonlinear remainder of f_state, (q, N).
+    """Return the remainder, which is the nonlinear part of f_state, (q, N).
 
     It is gravity @ (sin(x) - x) + gain @ (x[first] x[second]) + kinematics(x).
     """
@@ -88,19 +90,19 @@ def remainder_of(states: Array, aircraft: Aircraft) -> Array:
 
 
 class Timing(NamedTuple):
-    """Constants of the compiled loop. They are hashable."""
+    """Constants of the compiled loop, which are hashable."""
 
     blocks: tuple[StateBlock, ...]
-    steps: int  # steps of the integration in a tick
-    y_late: int  # ticks
-    u_late: int  # ticks, the largest of all aircraft
+    steps: int  # steps of the integration in each tick
+    y_late: int  # delay of y, ticks
+    u_late: int  # largest delay of u over all aircraft, ticks
 
 
 class LoopSample(NamedTuple):
     """The sample that a law takes at a tick, (m, N) or (m, 1)."""
 
     y: Array
-    y_m: Array  # reference at the stamp of y
+    y_m: Array  # reference at the stamp of y, in the law's order
     y_m_dot: Array
 
 
@@ -109,12 +111,12 @@ class LoopState(NamedTuple):
 
     x: Array  # (n, N)
     position: Array  # (p, N) airframe's order
-    remainder: Array  # (q, N) remainder at the tick before
+    remainder: Array  # (q, N) remainder at the previous tick
     law: Any
     u: Array  # (m, N) law's order
-    command: Array  # (p, N) command of the effectors; without an allocation it is u
-    y_before: Array  # (y_late, m, N) newest first
-    command_before: Array  # (u_late, p, N)
+    command: Array  # (p, N) command of the effectors; without an allocation it equals u
+    y_before: Array  # (y_late, m, N) previous samples of y, the newest first
+    command_before: Array  # (u_late, p, N) previous commands
     squares: Array  # (m, N) sums of squared errors over the ticks
     max: Array
     travel: Array  # (p, N) sum of abs(command - previous command)
@@ -122,18 +124,18 @@ class LoopState(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """Inputs that stay the same in all ticks. As arguments, they are not folded by the compiler."""
+    """Inputs that stay the same in all ticks; as arguments they are not folded by the compiler."""
 
-    fleet: FleetMatrices  # without its blocks
+    fleet: FleetMatrices  # matrices of the fleet without its blocks
     vehicle: Vehicle
-    params: Any  # those of the law
+    params: Any  # parameters of the law
 
 
 @partial(jax.jit, static_argnames=("control_law", "timing"))
 def begin(
     constants: Constants, first: Segments, *, control_law: ControlLaw, timing: Timing
 ) -> LoopState:
-    """Return the state before the first tick, in trim and with the law not yet engaged."""
+    """Return the state before the first tick, in trim, with the law not yet engaged."""
     fleet, vehicle, params = constants
     start = in_trim(fleet, vehicle, timing)
     none = 0.0 * start.u
@@ -177,7 +179,7 @@ def fly_run(
 def _chosen(
     constant: int | None, value: Array, branches: Sequence[Callable[..., Any]], *arguments: Any
 ) -> Any:
-    """Run the branch `constant`. If it is None, run the branch that the tick's `value` names."""
+    """Run the branch `constant`, or if it is None the branch with the number `value`."""
     if constant is None:
         return jax.lax.switch(value, branches, *arguments)
     return branches[constant](*arguments)
@@ -195,7 +197,7 @@ def tick(
     fleet, vehicle, params = constants
     measure = partial(_measured, fleet=fleet, vehicle=vehicle)
 
-    # Each branch calls `measure`, so that the compiler removes the measurements that its law does
+    # Each branch calls `measure`, so that the compiler can remove measurements which its law does
     # not use.
     def engage(now: LoopState, *measured: Any) -> tuple[Any, Array, Array]:
         started = control_law.engage(measure(now, *measured), params)
@@ -213,7 +215,7 @@ def tick(
         if allocation is None:
             law, _, u = control_law.limited(now.law, measurements, segment.dt, params, limits)
             return law, u, u
-        # As in the guard, the law is limited by the u that the effectors give.
+        # As in the guard, the limits of the law account for the u that the effectors give.
         _, u_free = control_law.step(now.law, measurements, segment.dt, params)
         _, reachable = allocate(
             saturate(u_free, now.u, segment.dt, limits), now.command, segment.dt, allocation
@@ -300,7 +302,7 @@ def advance(
     timing: Timing,
     kind: TickKind = UNKNOWN,
 ) -> LoopState:
-    """Advance to the next tick with the command of this one."""
+    """Advance to the next tick with the command of the present tick."""
     blocks = timing.blocks
     u_late = timing.u_late
     # Find the places of the states in the order of the blocks.
@@ -349,8 +351,8 @@ def _actuated(
     def move(before: Array, t: Array) -> tuple[Array, Array]:
         return actuators.move(t, before, ordered_command, vehicle.dt, vehicle.actuators)
 
-    # This is a loop of its own. Without it, the compiler of a CPU computes all mean positions again
-    # for each state that they act on.
+    # This is a separate loop. Otherwise the compiler for a CPU would compute all mean positions
+    # again for each state on which they act.
     return jax.lax.scan(move, position, times, unroll=unroll)
 
 
@@ -366,7 +368,7 @@ def figures(end: LoopState, ticks: int, period: Array) -> FleetResult:
 
 
 def in_trim(fleet: FleetMatrices, vehicle: Vehicle, timing: Timing) -> LoopState:
-    """Return the state of the closed loop before the first tick, without the law's state."""
+    """Return the state of the closed loop before the first tick, without that of the law."""
     n = len(fleet.forced)
     count = len(fleet.wind)
     m = len(vehicle.outputs)

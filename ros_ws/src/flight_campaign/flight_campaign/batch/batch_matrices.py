@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The matrices of N aircraft over one tick of the controller."""
+"""Assemble the matrices of N aircraft over one tick of the controller."""
 
 from functools import partial
 from itertools import accumulate, repeat
@@ -22,7 +22,7 @@ from flight_core.vectors import Array, FloatArray, array_namespace
 
 
 class StateBlock(NamedTuple):
-    """Coupled states and the signals that act on them. It is hashable.
+    """Coupled states and the signals that act on them. The tuple is hashable.
 
     The states are indices in x, and the signals are indices in [x, p_1, ..., p_K, s].
     """
@@ -32,9 +32,9 @@ class StateBlock(NamedTuple):
 
 
 class DriftMatrices(NamedTuple):
-    """A drift of N aircraft: the changes of the matrices of their fleet.
+    """A drift of N aircraft, as changes of the matrices of their fleet.
 
-    A change begins at `start`, is linear in time, and is complete after `duration`.
+    The changes begin at `start`, are linear in time, and are complete after `duration`.
     """
 
     start: float  # s
@@ -46,22 +46,22 @@ class DriftMatrices(NamedTuple):
 
 
 class FleetMatrices(NamedTuple):
-    """N aircraft over one tick of the controller, which has K steps of the integration.
+    """The matrices of N aircraft over one tick of the controller, with K steps of the integration.
 
-    The remainder has q rows, the forcing r. With the actuators' mean positions p_k over step k, the
-    remainder s and the course's forcing w_k in step k, one tick is
+    p_k are the mean positions of the actuators in step k. s is the remainder, the nonlinear part of
+    f_state, with q rows. w_k is the forcing of the course in step k, with r rows. One tick is
 
         x+ = tick @ [x, p_1, ..., p_K, s] + wind forced @ [w_1, ..., w_K]
     """
 
     blocks: tuple[StateBlock, ...]
-    # (n, n + K p + q, N) in blocks, without the entries that are 0 in all aircraft
+    # (n, n + K p + q, N) matrix `tick` in blocks, without the entries that are 0 in all aircraft
     tick: tuple[Array, ...]
     forced: Array  # (n, K r, N)
-    # (m, n + p, N): C x_dot = rate @ [x, p] + wind forced_rate @ w_1, up to the remainder
+    # (m, n + p, N): C x_dot = rate @ [x, p] + wind forced_rate @ w_1, without the remainder
     rate: Array
     forced_rate: Array  # (m, r, N)
-    wind: Array  # (N,) factor on the course's gusts and turbulence
+    wind: Array  # (N,) factor on the gusts and turbulence of the course
     late: Array  # (N,) delay of u in whole ticks
     change: DriftMatrices | None = None
 
@@ -84,13 +84,13 @@ def assemble(
         forced = [Phi^(K-1) Gamma F, ..., Gamma F],
             F = [gust_directions[course.axes], course.basis]
 
-    The steps, and the actuators' mean positions in them, are those of `plant.advance`. The
+    The steps are those of `plant.advance`, and so are the mean positions of the actuators. The
     remainder is held over a tick, and the forcing over a step.
 
     `wind` and `late` have one value for all aircraft or N values. `late` is added to the delay of
     the course. `gust_directions`, (N, n, G), are the effects of wind on x_dot, as in
-    `uncertainty.gust_directions`. None takes those of the plant for all aircraft. A drift of the
-    plant multiplies the entries of all aircraft by the same factors. The matrices above are then
+    `uncertainty.gust_directions`; None means those of the plant for all aircraft. A drift of the
+    plant multiplies the entries of all aircraft by the same factors, and the matrices are
     interpolated.
     """
     aircraft = plant.aircraft
@@ -136,11 +136,11 @@ def _last(array: Array) -> Array:
 
 
 class _Places(NamedTuple):
-    """Constants of the compiled matrices. They are hashable."""
+    """Constants of the compiled matrices, which are hashable."""
 
-    steps: int  # K, steps of a tick
-    axes: tuple[int, ...]  # axes of the gusts along which there is wind
-    rows: tuple[int, ...]  # rows of the remainder
+    steps: int  # K, steps of the integration in a tick
+    axes: tuple[int, ...]  # indices of the axes of gusts along which there is wind
+    rows: tuple[int, ...]  # indices of the rows of the remainder
 
 
 def _matrices(
@@ -155,7 +155,7 @@ def _matrices(
 ) -> tuple[Array, Array, Array, Array]:
     """Compute tick, forced, rate and forced_rate of `FleetMatrices`, with the aircraft first.
 
-    C is in the law's order.
+    The rows of C are in the law's order.
     """
     xp = array_namespace(A)
     K = places.steps
@@ -181,9 +181,9 @@ def _matrices(
 
 @partial(jax.jit, static_argnames=("places",))
 def _compiled_matrices(*matrices: Any, **constants: Any) -> tuple[Array, Array, Array, Array]:
-    """Do as `_matrices` does, on the device.
+    """Compute `_matrices` on the device.
 
-    NumPy on the host takes 17 s for 1,000,000 aircraft.
+    NumPy on the host would take 17 s for 1,000,000 aircraft.
     """
     # A GPU may round the factors of a product to fewer bits.
     with jax.default_matmul_precision("highest"):
@@ -191,7 +191,7 @@ def _compiled_matrices(*matrices: Any, **constants: Any) -> tuple[Array, Array, 
 
 
 def remainder_rows(aircraft: Aircraft) -> NDArray[np.int64]:
-    """Return the indices of the states that f_state acts on, (q,)."""
+    """Return the indices of the states on whose derivatives f_state acts, (q,)."""
     acts = aircraft.gravity.any(axis=1)
     if aircraft.coupling is not None:
         acts = acts | aircraft.coupling.gain.any(axis=1)
@@ -201,9 +201,10 @@ def remainder_rows(aircraft: Aircraft) -> NDArray[np.int64]:
 
 
 def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
-    """Return the connected components of the states; `moves` has the shape (n, columns).
+    """Return the connected components of the states as blocks.
 
-    They are usually the longitudinal and the lateral motion.
+    `moves`, (n, columns), has the signals that act on each state. The blocks are usually the
+    longitudinal and the lateral motion.
     """
     number, part = connected_components(moves[:, : len(moves)], directed=False)
     rows = [np.flatnonzero(part == k) for k in range(number)]
@@ -214,7 +215,7 @@ def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
 
 
 def at(t: Array, fleet: FleetMatrices) -> FleetMatrices:
-    """Return the matrices at time t."""
+    """Return the matrices of a fleet at time t, s."""
     change = fleet.change
     if change is None:
         return fleet

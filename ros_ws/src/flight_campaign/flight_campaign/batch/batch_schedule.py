@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Schedules of the compiled loop over the ticks of a course: with branches, or in known runs.
+"""Schedule the compiled loop over the ticks of a course, with branches or in known runs.
 
-A GPU waits for the host at each branch. Since phase and forcing are known before the flight, each
-run of ticks gets a loop without a branch. A CPU is faster with one loop.
+A GPU waits for the host at each branch. Phase and forcing are known before the flight, so each run
+of ticks can have a loop without a branch. A CPU is faster with a single loop.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,11 +21,11 @@ UNROLL = 4
 """Ticks in a step of the loop. On one H200, 250,000 flights of 60 s took 3.3 s with 1, and 1.8 s
 with 4 or 8. These compile for 3, 7 and 14 s."""
 
-LONGEST = 20  # ticks of the longest pattern; a pattern is compiled tick by tick
+LONGEST = 20  # number of ticks of the longest pattern; a pattern is compiled tick by tick
 
 
 class TickKind(NamedTuple):
-    """The known properties of a tick when the loop is compiled.
+    """The properties of a tick that are known when the loop is compiled.
 
     If a property is None, a branch at the tick depends on it.
     """
@@ -34,18 +34,18 @@ class TickKind(NamedTuple):
     forced: bool | None  # whether biases, gusts or turbulence act
 
 
-UNKNOWN = TickKind(None, None)  # branches at the tick depend on both
+UNKNOWN = TickKind(None, None)  # branches at the tick depend on both properties
 
 
 class TickRun(NamedTuple):
     """A run of ticks that one compiled loop computes.
 
-    The kinds of its ticks repeat in a pattern. It is hashable.
+    The kinds of its ticks repeat a pattern. The tuple is hashable.
     """
 
-    length: int  # ticks, a multiple of the pattern
+    length: int  # number of ticks, a multiple of the pattern's length
     pattern: tuple[TickKind, ...]
-    unroll: int  # patterns in a step of the loop
+    unroll: int  # number of patterns in a step of the loop
 
 
 Schedule = Callable[[Course], Iterator[TickRun]]
@@ -53,7 +53,7 @@ Schedule = Callable[[Course], Iterator[TickRun]]
 
 
 def with_branches(course: Course) -> Iterator[TickRun]:
-    """Yield one single loop, with branches at each tick."""
+    """Yield a single run for the whole course, with branches at each tick."""
     yield TickRun(len(course.segments.t), (UNKNOWN,), 1)
 
 
@@ -78,7 +78,7 @@ def without_branches(course: Course) -> Iterator[TickRun]:
 
 
 def _pattern(kinds: list[TickKind]) -> tuple[TickKind, ...] | None:
-    """Return the shortest pattern that the kinds repeat; None if it is longer than LONGEST."""
+    """Return the shortest pattern that the kinds repeat; None if it exceeds LONGEST ticks."""
     for length in range(1, min(len(kinds), LONGEST) + 1):
         repeats, rest = divmod(len(kinds), length)
         if not rest and kinds[:length] * repeats == kinds:

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The course of the aircraft of a campaign, tick by tick.
+"""Build the course that all aircraft of a campaign fly, tick by tick.
 
-It has the reference, the wind, the errors of the sensors and the feedforward. It does not depend on
-the aircraft, so that it is computed once, with the functions of the simulation in one process.
+The course has the reference, the wind, the errors of the sensors and the feedforward. It does not
+depend on the aircraft, so it is computed only once, by the functions of the simulation in one
+process.
 """
 
 from typing import NamedTuple
@@ -39,40 +40,38 @@ class Segments(NamedTuple):
 
     t: FloatArray  # (T,) s
     phase: NDArray[np.int32]  # (T,) HOLD, ENGAGE or STEP
-    dt: FloatArray  # (T,) s since the previous sample, inside the controller's range
+    dt: FloatArray  # (T,) s since the previous sample, limited to the controller's range
     y_m: FloatArray  # (T, m) the reference at the tick
-    sampled_y_m: (
-        FloatArray  # (T, m) the reference at the stamp of the y of the tick, and its derivative
-    )
+    sampled_y_m: FloatArray  # (T, m) reference at the stamp of the tick's y, and its derivative
     sampled_y_m_dot: FloatArray  # (T, m)
     u_ff: FloatArray  # (T, m) feedforward
-    error: FloatArray  # (T, m) sensor error of the y of the tick
-    noise: FloatArray  # (T, m) noise in this error
-    # (T, K r) mean forcing over each step to the next tick: wind along `axes`, then basis' @ the
+    error: FloatArray  # (T, m) error of the sensors in the tick's y
+    noise: FloatArray  # (T, m) noise, which is a part of this error
+    # (T, K r) mean forcing over each step until the next tick: wind along `axes`, then basis' @ the
     # other forcing
     forcing: FloatArray
     forcing_now: FloatArray  # (T, r) forcing at the tick
     air: FloatArray  # (T, n) contribution of the wind to alpha and beta, rad
-    vane_m: FloatArray  # (T, k) readings of the vanes in the reference motion, rad
+    vane_m: FloatArray  # (T, k) angles that the vanes would measure in the reference motion, rad
     vane_error: FloatArray  # (T, k) sensor error of the vanes, rad
 
 
 class Course(NamedTuple):
-    """T ticks of the controller, the last one at the end of the flight.
+    """The course of T ticks of the controller; the last tick is at the end of the flight.
 
-    Channels are in the law's order, states in the airframe's.
+    Channels are in the law's order, and states in the airframe's order.
     """
 
     segments: Segments
-    # (g,) indices of the axes of the airframe's gusts along which there is wind
+    # (g,) indices of those axes of the airframe's gusts along which there is wind
     axes: NDArray[np.int64]
-    # (n, r - g) orthonormal directions in x_dot of the part of f_time without wind: biases and
-    # sines
+    # (n, r - g) orthonormal directions in x_dot of biases and sines, which are the part of f_time
+    # without wind
     basis: FloatArray
     order: NDArray[np.int64]  # (m,) indices of the law's outputs in y
     late: int  # delay of y, ticks
     u_late: int  # delay of u, ticks
-    period: float  # s, between two ticks
+    period: float  # s, time between two ticks
     steps: int  # steps of the integration between two ticks
 
 
@@ -97,15 +96,15 @@ their values."""
 
 IDLE = frozenset(
     {
-        # Every aircraft of a campaign has a draw of its own.
+        # Every aircraft of a campaign has a separate draw.
         *(f"uncertainty.{key}" for key in ("A", "B", "seed", "number")),
-        # No law, command or figure depends on the place, since guided aircraft fly one at a time.
+        # No law, command or figure depends on the place, because guided aircraft fly one by one.
         *(f"start.{key}" for key in ("north", "east", "heading")),
         "wind",
         *(f"pose.{key}" for key in ("rate", "delay", "bias", "drift", "noise", "seed")),
-        # Every tick has a u, so that none times out.
+        # Every tick has a u, so no u times out.
         *("max_age", "hold", "ramp"),
-        # These say how the node runs.
+        # These keys say how the node runs.
         *("start_time", "lockstep", "control_rate", "duration", "recorded"),
     }
 )
@@ -133,11 +132,11 @@ FLOWN_RISE_DI = frozenset(
 
 IDLE_CONTROLLER = frozenset(
     {
-        # `build_course` makes sure that y is never older than max_age, and the law stays active.
+        # `build_course` ensures that y is never older than max_age, so the law stays active.
         *("max_age", "hold", "ramp", "on_deactivate"),
-        # These say how the node runs.
+        # These keys say how the node runs.
         *("lockstep", "y_rate"),
-        # Only a learner reads how well the model is known.
+        # Only a learner uses the deviations of the model.
         "feedforward.deviation",
     }
 )
@@ -150,8 +149,8 @@ ONE_AT_A_TIME = "flights of many at once do not have it, those of rise-di fly do
 def require_flyable(scenario: Scenario) -> None:
     """Raise ParameterError if a campaign cannot fly an aircraft or a controller.
 
-    A campaign flies the keys of FLOWN and FLOWN_CONTROLLER. Any other key that has a value and is
-    not idle is refused by its name.
+    A campaign supports the keys of FLOWN and FLOWN_CONTROLLER. Any other key is refused by its name
+    if its value has an effect.
     """
     aircraft = scenario.aircraft
     controller = scenario.controller
@@ -192,9 +191,9 @@ def _references(scenario: Scenario, ticks: int, tick_ns: int) -> tuple[FloatArra
 def build_course(scenario: Scenario) -> Course:
     """Build the course of a scenario, with the feedforward of the controller.
 
-    Raises ParameterError if a campaign cannot fly the scenario. The reasons are an aircraft of
+    Raises ParameterError if a campaign cannot fly the scenario. It cannot fly an aircraft of
     JSBSim, a delay of y or u that is not a whole number of ticks, dropouts of a y whose rate is not
-    that of the ticks, dropouts longer than the age limit, and vanes with faults.
+    that of the ticks, dropouts longer than the age limit, or vanes with faults.
     """
     aircraft = scenario.aircraft
     controller = scenario.controller
@@ -214,7 +213,7 @@ def build_course(scenario: Scenario) -> Course:
     u_late = _whole_ticks(nanoseconds(aircraft.actuators.delay), tick_ns, "actuators.delay")
     vanes = [outputs.index(name) for name in controller.vanes]
     _require_plain_vanes(scenario, late)
-    # Compute, tick by tick, what does not depend on the aircraft.
+    # Compute tick by tick all that does not depend on the aircraft.
     error, noise = _sensor_errors(errors, ticks, tick_ns // sample_ns, len(outputs))
     y_m, y_m_dot = _references(scenario, ticks, tick_ns)
     arrives = [sensors.arrives(k, errors) for k in range(ticks)]
@@ -253,7 +252,7 @@ def build_course(scenario: Scenario) -> Course:
 
 
 def _whole_ticks(delay_ns: int, tick_ns: int, key: str) -> int:
-    """Convert a delay to ticks. Raises ParameterError if they are not whole."""
+    """Convert a delay to ticks. Raises ParameterError if it is not a whole number of ticks."""
     return divide(delay_ns, tick_ns, key, "a tick") if delay_ns else 0
 
 
@@ -291,7 +290,7 @@ def _phases(
 
 
 def _require_plain_vanes(scenario: Scenario, late: int) -> None:
-    """Raise ParameterError if vanes are late, freeze, lose readings or have steps."""
+    """Raise ParameterError if vanes have a delay, icing, lost readings or a quantisation."""
     vanes = scenario.aircraft.vanes
     sensors_of = scenario.aircraft.sensors
     key = "aircraft.vanes"
@@ -324,7 +323,7 @@ def _feedforward(
 ) -> tuple[FloatArray, FloatArray]:
     """Return u_ff at the ticks, (T, m), and the state of the nominal model, (T, n).
 
-    Without a model n is 0.
+    If there is no nominal model, n is 0.
     """
     u_ff = np.zeros_like(y_m)
     if nominal is None:
@@ -346,7 +345,7 @@ def _feedforward(
 def _sensor_errors(
     errors: Sensors, ticks: int, samples: int, channels: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the errors of y at the ticks, `samples` apart, and their noise, (T, channels)."""
+    """Return the errors of y at the ticks, and the noise in them, (T, channels) each."""
     error = np.zeros((ticks, channels))
     noise = np.zeros_like(error)
     drift = sensors.initial_drift(errors)
@@ -358,7 +357,7 @@ def _sensor_errors(
 
 
 class _Forcing(NamedTuple):
-    """A part of the forcing over time."""
+    """A part of the forcing as a function of time."""
 
     over_step: FloatArray  # (T K, ...) mean over each step of the integration
     at_tick: FloatArray  # (T, ...)
@@ -367,7 +366,7 @@ class _Forcing(NamedTuple):
 def _reduced(
     wind: _Forcing, forcing_over_time: _Forcing
 ) -> tuple[NDArray[np.int64], FloatArray, tuple[FloatArray, FloatArray]]:
-    """Return `axes` and `basis` of a course, and the forcing along both over steps and at ticks."""
+    """Return `axes` and `basis` of a course, and the forcing along them over steps and at ticks."""
     axes = np.flatnonzero(wind.over_step.any(axis=0))
     _, sizes, rows = np.linalg.svd(forcing_over_time.over_step, full_matrices=False)
     basis = rows[sizes > 1e-12 * max(sizes[0], 1e-300)].T
@@ -385,7 +384,7 @@ def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _For
         0, ticks * steps, plant._replace(aircraft=plant.aircraft._replace(gust_direction=no_effect))
     )
     wind, timed = (
-        # Simpson's rule, as in Runge-Kutta
+        # Simpson's rule, as in Runge-Kutta.
         _Forcing((part[:-1:2] + 4.0 * part[1::2] + part[2::2]) / 6.0, part[: -1 : 2 * steps])
         for part in forced
     )
@@ -403,7 +402,7 @@ def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _For
 def _air_angles(wind: FloatArray, airframe: Airframe) -> FloatArray:
     """Return the contribution of the wind at the ticks, (T, G), to alpha and beta, rad.
 
-    The result is in the order of the states, (T, n).
+    The result has a column for each state, (T, n).
     """
     angles = np.zeros((len(wind), len(airframe.states)))
     for place, axis in enumerate(airframe.gusts):

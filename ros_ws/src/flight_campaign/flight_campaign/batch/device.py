@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The device on which JAX flies aircraft, and what follows from its kind and its memory."""
+"""Describe the device on which JAX flies aircraft, and choose settings for its kind and memory."""
 
 import logging
 import os
@@ -12,9 +12,10 @@ import jax
 from flight_campaign.batch.batch_schedule import Schedule, with_branches, without_branches
 
 CPU_CHUNK = 1000  # aircraft at once on a CPU; their matrices, 2 MB, stay in the caches of a core
-LARGEST_CHUNK = 250_000  # most aircraft at once on a device; more were not faster on one H200
+# largest number of aircraft at once on a device; more were not faster on one H200
+LARGEST_CHUNK = 250_000
 BYTES = 16_384  # bytes per aircraft; osprey_servo needed 11,300 on one H200 (JAX 0.11.2)
-THREADS = 3  # threads for a device: while one chunk flies, one is drawn and one is written
+THREADS = 3  # threads for a device: while one chunk flies, another is drawn, and a third is written
 
 VISIBLE = {"cuda": "CUDA_VISIBLE_DEVICES", "rocm": "HIP_VISIBLE_DEVICES"}
 """Environment variables that name the devices of a process, by a word in the name of the platform.
@@ -24,9 +25,9 @@ _TURN = Lock()
 
 
 def _as_sentence(record: logging.LogRecord) -> bool:
-    """Report in a sentence that a plugin fails, such as the GPU plugin on a host without a GPU.
+    """Log a failing plugin in one sentence, such as the GPU plugin on a host without a GPU.
 
-    JAX would log a traceback, and fly on the other devices.
+    JAX would log a traceback, and then fly on the other devices.
     """
     if record.exc_info and (error := record.exc_info[1]):
         record.msg = "warning: a plugin of JAX is left out (%s): the other devices fly"
@@ -44,7 +45,7 @@ def is_cpu() -> bool:
 
 
 def device_name() -> str:
-    """Name the device for people: NVIDIA H200, or the cores of the processor."""
+    """Return the name of the device to show: NVIDIA H200, or the cores of the processor."""
     return f"{thread_count()} CPU cores" if is_cpu() else jax.devices()[0].device_kind
 
 
@@ -54,17 +55,17 @@ def schedule_of_device() -> Schedule:
 
 
 def thread_count() -> int:
-    """Return how many threads keep the device busy: one for each core of a CPU."""
+    """Return the number of threads that keep the device busy; on a CPU, one for each core."""
     return os.cpu_count() or 1 if is_cpu() else THREADS
 
 
 def turn() -> AbstractContextManager[object]:
-    """Wait for a chunk's turn on the device. One flies while others are drawn or written."""
+    """Return a context in which one chunk flies while others are drawn or written."""
     return nullcontext() if is_cpu() else _TURN
 
 
 def chunk_of_device(aircraft: int) -> int:
-    """Return how many of these aircraft fly at once: equal chunks that fit into the memory."""
+    """Return how many aircraft fly at once, so that equal chunks fit into the memory."""
     if is_cpu():
         return CPU_CHUNK
     memory = (jax.devices()[0].memory_stats() or {}).get("bytes_limit", BYTES * LARGEST_CHUNK)
@@ -74,7 +75,7 @@ def chunk_of_device(aircraft: int) -> int:
 
 
 def separate_devices() -> list[dict[str, str]]:
-    """Return environments in which each process sees one device of this host; [] for a CPU."""
+    """Return environments that each show a process one device of this host; [] for a CPU."""
     devices = jax.local_devices()
     platform = devices[0].client.platform_version
     variable = next((VISIBLE[word] for word in VISIBLE if word in platform), None)

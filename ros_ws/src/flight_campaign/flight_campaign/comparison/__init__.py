@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Control laws under one tuning procedure, compared on the same aircraft and winds."""
+"""Tune control laws by one procedure, and compare them on the same aircraft and winds."""

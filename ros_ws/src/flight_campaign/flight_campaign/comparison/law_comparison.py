@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of tuned laws on the same aircraft, winds, noise and limits.
+"""Compare tuned laws on the same aircraft, winds, noise and limits.
 
-The aircraft are nominal, uncertain, or have late inputs.
+The aircraft are the nominal one, uncertain ones, and aircraft whose inputs are late.
 """
 
 import os
@@ -33,38 +33,38 @@ from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.law.control_law import ControlLaw
 
 DELAY_TICKS = (1, 2, 3, 4, 6)  # delays of u: 10 to 60 ms at 100 Hz
-TURBULENCE_SEED = 3  # seed of a comparison, which is not that of the tuning
+TURBULENCE_SEED = 3  # seed of a comparison's turbulence, which differs from that of the tuning
 
 
 class Scores(NamedTuple):
-    """Scores of the uncertain aircraft of a level in a wind."""
+    """Scores of the uncertain aircraft of a level of uncertainty in a wind."""
 
     mean: float  # infinite if an aircraft diverged
     worst: float
-    # Share of the aircraft that diverged, or that lost track: their score is above
+    # Share of the aircraft that diverged or lost track, which means a score above
     # LOSS_OF_TRACK_SCORE.
     lost: float
 
 
 class Level(NamedTuple):
-    """Results of a law on the uncertain aircraft of a level, with u in time."""
+    """Results of a law on the uncertain aircraft of a level, without an additional delay of u."""
 
     uncertainty: float
-    scores: dict[str, Scores]  # by wind
+    scores: dict[str, Scores]  # scores by wind
 
 
 class LawResult(NamedTuple):
     """Results of one law in a comparison, SI, with the channels in the order of the law."""
 
     law: str
-    objective: str  # name of the objective of its tuning
-    costs: list[float]  # one for each seed of its tuning; empty for gains of a scenario
-    scores: dict[str, float]  # on the nominal aircraft, by wind
+    objective: str  # name of the objective for which it was tuned
+    costs: list[float]  # cost of each seed of its tuning; empty for gains of a scenario
+    scores: dict[str, float]  # scores of the nominal aircraft by wind
     levels: tuple[Level, ...]
-    # By delay of u in s: share of the aircraft of the first level that lose track in gusts.
+    # By delay of u in s: the share of the first level's aircraft that lose track in gusts.
     lost_late: dict[float, float]
-    rms: FloatArray  # (m,) rms of the true error, nominal aircraft in gusts
-    slew: FloatArray  # (m,) mean abs(u_dot), nominal aircraft in gusts
+    rms: FloatArray  # (m,) rms of the true error of the nominal aircraft in gusts
+    slew: FloatArray  # (m,) mean abs(u_dot) of the nominal aircraft in gusts
     # Margins of the nominal aircraft; None if the law has no linear loop from y to u.
     margins: Margins | None
 
@@ -80,9 +80,9 @@ def compare(
 ) -> Iterator[LawResult]:
     """Simulate the laws with their gain sets on the same flights, one law in each thread.
 
-    In each wind, the nominal aircraft and `aircraft` uncertain aircraft of `seed` fly for each
-    level. In gusts, the aircraft of the first level also fly with u late by `delays`, ticks. Raises
-    ParameterError if an uncertainty is outside [0, 1).
+    In each wind, the nominal aircraft and, for each level of uncertainty, `aircraft` uncertain
+    aircraft of `seed` fly. In gusts, the aircraft of the first level also fly with u late by
+    `delays`, ticks. Raises ParameterError if an uncertainty is outside [0, 1).
     """
     airframe, _ = benchmark.scenario.aircraft.load()
     sampled = [nominal_and_sampled(airframe, level, aircraft, seed) for level in levels]
@@ -104,7 +104,7 @@ def compare(
     )
 
     def results(name: str) -> list[LawResult]:
-        # One control law serves all gain sets, so that it is compiled once.
+        # One control law serves all gain sets, so it is compiled only once.
         control_law = laws[name].control_law(benchmark.model)
         return [
             study.result(name, laws[name], control_law, objective, gains)
@@ -120,9 +120,9 @@ class _LawStudy(NamedTuple):
     """The flights that all laws fly."""
 
     benchmark: Benchmark
-    flights: Mapping[str, FleetMatrices]  # by wind
+    flights: Mapping[str, FleetMatrices]  # aircraft of all flights, by wind
     levels: Sequence[float]
-    parts: Sequence[NDArray[np.int64]]  # places of the aircraft of each level
+    parts: Sequence[NDArray[np.int64]]  # indices of the aircraft of each level
     delays: Sequence[int]
 
     def result(
@@ -164,14 +164,15 @@ class _LawStudy(NamedTuple):
 
 
 def _nominal_once(matrices: Sequence[FloatArray]) -> FloatArray:
-    """Join the matrices of all levels in order, with the nominal aircraft only once."""
+    """Join the matrices of all levels in their order, with the nominal aircraft only once."""
     return np.concatenate([matrices[0], *(level[1:] for level in matrices[1:])])
 
 
 def score_cells(result: LawResult) -> list[str]:
     """Return the scores of a law as cells of a table.
 
-    For each wind they are the score of the nominal aircraft, then mean (worst) by level.
+    For each wind, the first cell is the score of the nominal aircraft. The next cells are the mean
+    (worst) scores of the levels.
     """
     cells = []
     for wind, nominal in result.scores.items():

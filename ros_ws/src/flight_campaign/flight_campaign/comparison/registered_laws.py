@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Registered laws, which are compared with those of the catalogue.
+"""Prepare registered laws for a comparison with the laws of the catalogue.
 
-A registered law is the controller of a scenario. Its gains are those in the scenario.
+A registered law is the controller of a scenario, with the gains in the scenario.
 """
 
 from collections.abc import Iterable, Mapping
@@ -27,7 +27,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 
 def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:
-    """Return the positive numbers that belong to the law itself, by name, without matrices."""
+    """Return the positive parameters of the law itself, by name, without matrices."""
     names = (
         name for name in type(controller).model_fields if name not in ControllerConfig.model_fields
     )
@@ -40,9 +40,9 @@ def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:
 
 
 def registered_law(controller: ControllerConfig, name: str) -> Law:
-    """Return the law of a controller, whose gains are the start of a search.
+    """Return the law of a controller as a start for a search, which begins at its gains.
 
-    The rest of the controller stays as it is.
+    The search leaves the other parameters of the controller as they are.
     """
     start = own_gains(controller)
     scalars = {key for key in start if not isinstance(getattr(controller, key), tuple)}
@@ -83,7 +83,7 @@ def _value(gain: FloatArray, scalar: bool) -> float | list[float]:
 def _last(*leaves: Any) -> FloatArray:
     """Stack a parameter of N candidates, with the candidates in the last axis.
 
-    If all are equal, the result is (m, 1).
+    If all candidates are equal, the result is (m, 1).
     """
     first = np.asarray(leaves[0], dtype=np.float64)
     if all(np.array_equal(first, leaf) for leaf in leaves):
@@ -94,9 +94,9 @@ def _last(*leaves: Any) -> FloatArray:
 def find_laws(
     names: Iterable[str], scenario: Scenario, others: Mapping[str, Scenario]
 ) -> dict[str, ControllerConfig | None]:
-    """Return the controller that flies for each name, or None for a law of the catalogue.
+    """Return the controller that flies for each name; None for a law of the catalogue.
 
-    A name can be a law of the catalogue, the law of the scenario's own controller, or a key of
+    A name may be a law of the catalogue, the law of the scenario's controller, or a key of
     `others`. Each scenario in `others` stands for the law of its controller. Raises ParameterError
     if a name is unknown, or if a controller has an allocation, another rate or another order of the
     channels.
@@ -128,13 +128,13 @@ def find_laws(
                 getattr(controller, key),
                 f"{expected}, as in {scenario.name}",
             )
-        # In a benchmark, topics have no delay.
+        # in a benchmark, topics have no delay
         controllers[name] = controller.model_copy(update={"delay": 0.0})
     return controllers
 
 
 def entries(controllers: Mapping[str, ControllerConfig | None]) -> dict[str, Law]:
-    """Return the laws by name, from the catalogue or from a controller."""
+    """Return the law for each name, from the catalogue or from a controller."""
     return {
         name: LAWS[name] if controller is None else registered_law(controller, name)
         for name, controller in controllers.items()
@@ -144,7 +144,7 @@ def entries(controllers: Mapping[str, ControllerConfig | None]) -> dict[str, Law
 def with_courses(
     benchmark: Benchmark, controllers: Mapping[str, ControllerConfig | None]
 ) -> Benchmark:
-    """Add a course to the benchmark for the feedforward of each of these controllers."""
+    """Add a course to the benchmark for the feedforward of each controller."""
     courses = {wind: dict(by_law) for wind, by_law in benchmark.courses.items()}
     for name, controller in controllers.items():
         if controller is not None and controller.feedforward is not None:

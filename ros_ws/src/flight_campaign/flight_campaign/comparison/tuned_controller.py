@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Turn the tuned gains of a comparison into the controller of a scenario.
+"""Convert the tuned gains of a comparison to the controller of a scenario.
 
-The registered law has the same equations.
+The controller is that of the registered law with the same equations.
 """
 
 from typing import Any
@@ -46,7 +46,7 @@ def require_registered(name: str) -> None:
 def tuned_controller(name: str, result: TuningResult, benchmark: Benchmark) -> ControllerConfig:
     """Return the controller that flies like a law of the catalogue with tuned gains.
 
-    Its inputs are scaled by 1 / abs(Omega_ii), and topics have no delay, both as in the benchmark.
+    As in the benchmark, its inputs are scaled by 1 / abs(Omega_ii), and topics have no delay.
     Raises ParameterError if no scenario can fly the law.
     """
     require_registered(name)
@@ -86,8 +86,8 @@ def tuned_controller(name: str, result: TuningResult, benchmark: Benchmark) -> C
 def _rise_di(gains: dict[str, FloatArray], input_scale: FloatArray) -> dict[str, Any]:
     """Return the parameters of RISE-DI.
 
-    If (22) does not allow a K, a larger K with a smaller input scale replaces it. The loop is the
-    same.
+    If (22) does not allow a K, it is replaced by a larger K with a smaller input scale, which gives
+    the same loop.
     """
     K = gains["K"]
     least = max(MIN_K, float(K[-1]))
@@ -107,7 +107,7 @@ def _rise_di(gains: dict[str, FloatArray], input_scale: FloatArray) -> dict[str,
 
 
 def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
-    """Return the model of a law's feedforward."""
+    """Return the model of a law's feedforward; None for a law without one."""
     controller = benchmark.scenario.controller
     if LAWS[name].feedforward == AIRCRAFT:
         return with_feedforward(controller, benchmark.scenario.aircraft.load()[0]).feedforward
@@ -119,7 +119,7 @@ def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
 def _observer(name: str, result: TuningResult, benchmark: Benchmark) -> ObserverConfig:
     """Return the observer of a law, with its bound on u_o.
 
-    The search has already set the margin, so the observer does not have to meet one.
+    The search has already met the margin, so the controller requires none.
     """
     controller = benchmark.scenario.controller
     airframe = benchmark.scenario.aircraft.load()[0]

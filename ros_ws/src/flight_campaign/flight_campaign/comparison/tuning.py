@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""One tuning procedure for every law: CMA-ES over the logarithms of its gains.
+"""Tune every law by one procedure: CMA-ES over the logarithms of its gains.
 
-Its flights are those of the nominal aircraft and of uncertain ones around it.
+The flights are those of the nominal aircraft and of uncertain aircraft around it.
 """
 
 import os
@@ -42,21 +42,22 @@ GUST = "gust"
 TURBULENCE = "turbulence"
 """The winds of a benchmark: that of its scenario, and turbulence instead of it."""
 
-TUNING_TURBULENCE_SEED = 40  # seed of the turbulence in a cost; a comparison has another seed
+TUNING_TURBULENCE_SEED = 40  # seed of the turbulence in a cost; a comparison has a different seed
 
 
 class Objective(NamedTuple):
-    """The flights of a cost: every aircraft with u in time, and some with u late."""
+    """The flights of a cost: every aircraft without delay of u, and some with a delay."""
 
     title: str
-    weights: dict[str, float]  # by wind
-    delay: int  # delay of the late u, in multiples of `Benchmark.delay`
-    all_late: bool  # whether u is late on all aircraft, and not only on the nominal one
-    # requirement that the nominal loop must meet, if the law has margins
+    weights: dict[str, float]  # weight of each wind
+    delay: int  # delay of u in the late flights, in multiples of `Benchmark.delay`
+    # whether the late flights are those of all aircraft, and not only of the nominal one
+    all_late: bool
+    # requirement that the nominal loop must meet if the law has margins
     requirement: Requirement | None = None
 
 
-# Turbulence has half the weight, because scores in it are about twice those in gusts.
+# Turbulence has half the weight, because scores in turbulence are about twice those in gusts.
 OBJECTIVES = {
     "gust": Objective("gusts", {GUST: 1.0}, 1, all_late=False),
     "gust_turbulence": Objective(
@@ -92,38 +93,39 @@ INITIAL_SIGMA = 0.4
 on. INITIAL_SIGMA is the first standard deviation of log(gain)."""
 
 # Number of parts into which the candidates of a generation are divided. The parts fly side by side.
-# A flight in a smaller part takes more processor time.
+# In a smaller part, a flight takes more processor time.
 PARTS = 2
 
-# Cost of a flight that diverged and of a loop without any margin. It bounds every other cost.
+# Cost of a flight that diverged, and of a loop without any margin. It is the upper bound of every
+# cost.
 MAX_COST = 1000.0
-# s, step of the integration, or one tick if that is shorter. The scores are within 1 % of those of
+# s, step of the integration, but at most one tick. The scores differ by less than 1 % from those of
 # a finer step.
 STEP = 0.005
 
 
 class Benchmark(NamedTuple):
-    """The setting in which laws are tuned and compared: one scenario in two winds.
+    """The setting in which laws are tuned and compared, which is one scenario in two winds.
 
     Channels are in the law's order.
     """
 
     scenario: Scenario
     model: NominalModel
-    unit: FloatArray  # (m,) units of the errors in a score
-    activity_unit: FloatArray  # (m,) units of the mean abs(u_dot) in a cost
+    unit: FloatArray  # (m,) units of the errors in the score
+    activity_unit: FloatArray  # (m,) units of the mean abs(u_dot) in the cost
     plant: PlantParams
     vehicle: Vehicle
-    scenarios: dict[str, Scenario]  # by wind
-    courses: dict[str, dict[str, Course]]  # by wind and by the model of the feedforward
+    scenarios: dict[str, Scenario]  # scenarios by wind
+    courses: dict[str, dict[str, Course]]  # courses by wind and by the model of the feedforward
     delay: int  # ticks, delay of u in the late flights of a cost
 
 
 def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE_SEED) -> Benchmark:
     """Build the benchmark of a scenario: its manoeuvre, actuators and noise.
 
-    y, y_m and the law run at one rate, and topics have no delay. The winds are those of the
-    scenario and, in other flights, the turbulence of `turbulence_of` with `turbulence_seed`. Raises
+    y, y_m and the law have the same rate, and topics have no delay. One wind is that of the
+    scenario, and the other is the turbulence of `turbulence_of` with `turbulence_seed`. Raises
     ParameterError if a campaign cannot fly the scenario, or if the unit of an output has no score.
     """
     require_flyable(scenario)
@@ -181,7 +183,7 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
 def turbulence_of(scenario: Scenario) -> dict[str, float]:
     """Return the turbulence of a benchmark: the scenario's altitude and intensity.
 
-    If the scenario has none, it is moderate at 100 m.
+    If the scenario has no turbulence, the result is moderate turbulence at 100 m.
     """
     turbulence = scenario.aircraft.turbulence
     if turbulence is None:
@@ -192,7 +194,7 @@ def turbulence_of(scenario: Scenario) -> dict[str, float]:
 def _courses(scenario: Scenario) -> dict[str, Course]:
     """Return the courses of a scenario by the model of the feedforward.
 
-    The controller of the scenario has the aircraft as this model.
+    The controller in the scenario must have the aircraft as this model.
     """
     course, controller, (airframe, _) = (
         build_course(scenario),
@@ -213,18 +215,19 @@ def _courses(scenario: Scenario) -> dict[str, Course]:
 
 
 def result_score(result: FleetResult, unit: FloatArray) -> FloatArray:
-    """Return the sum over the channels of (rms of the true error / its unit), (N,).
+    """Return the score of each flight, (N,).
 
-    It is infinite if the flight diverged.
+    It is the sum over the channels of the rms of the true error divided by its unit, and infinite
+    if the flight diverged.
     """
     total = statistics.score(np.asarray(result.rms), unit)
     return np.where(np.asarray(result.diverged) | ~np.isfinite(total), np.inf, total)
 
 
 def cost(result: FleetResult, benchmark: Benchmark) -> FloatArray:
-    """Return score + sum over the channels of mean abs(u_dot) / activity_unit, (N,).
+    """Return the cost of each flight, (N,), at most MAX_COST.
 
-    It is at most MAX_COST.
+    It is the score plus the sum over the channels of mean abs(u_dot) / activity_unit.
     """
     activity = np.sum(np.asarray(result.slew) / benchmark.activity_unit[:, None], axis=0)
     total = result_score(result, benchmark.unit) + activity
@@ -234,7 +237,7 @@ def cost(result: FleetResult, benchmark: Benchmark) -> FloatArray:
 def benchmark_fleet(
     A: FloatArray, B: FloatArray, late: Array, wind: str, benchmark: Benchmark
 ) -> FleetMatrices:
-    """Return aircraft in a wind of the benchmark, with u late by whole ticks.
+    """Return the matrices of aircraft in a wind of the benchmark, with u late by whole ticks.
 
     The shapes are as in `batch_matrices.assemble`.
     """
@@ -250,11 +253,11 @@ class Evaluation(NamedTuple):
 
     wind: str
     fleet: FleetMatrices
-    weight: FloatArray  # (F,) weights of their costs in the sum
+    weight: FloatArray  # (F,) weight of each flight's cost in the sum
 
 
 def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
-    """Return the flights of one evaluation of the cost, by wind.
+    """Return the flights for one evaluation of the cost, by wind.
 
         cost = sum over the winds of weight (mean over the aircraft with u in time
                                             + mean over those with u late)
@@ -279,7 +282,7 @@ def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
 
 
 def repeat_flights(flights: FleetMatrices, times: int) -> FleetMatrices:
-    """Repeat the same flights several times, one set after the other."""
+    """Repeat a set of flights several times, one set after another."""
     tiled = jax.tree.map(
         lambda array: np.tile(np.asarray(array), times), flights._replace(blocks=())
     )
@@ -289,8 +292,9 @@ def repeat_flights(flights: FleetMatrices, times: int) -> FleetMatrices:
 def spread_over(params: Any, single: Any, flights: int) -> Any:
     """Spread the parameters of several candidates over all of their flights.
 
-    (.., candidates) becomes (.., candidates flights). `single` are the parameters of one candidate.
-    A parameter that has the same shape in both is common to all candidates, and stays.
+    The shape (.., candidates) becomes (.., candidates flights). `single` are the parameters of one
+    candidate. A parameter that has the same shape in `params` and `single` is common to all
+    candidates, and stays.
     """
 
     def spread(leaf: FloatArray, single_leaf: FloatArray) -> FloatArray:
@@ -315,7 +319,7 @@ def tune(
     generations: int | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> TuningResult:
-    """Find the gains of the smallest cost, by CMA-ES from the initial ones.
+    """Find the gains of the smallest cost by CMA-ES, beginning at the law's initial gains.
 
     The result is the best of several seeds, which run together. The cost of a candidate is the
     weighted sum over the flights of `evaluations`. If a loop has only a fraction of the margins
@@ -331,7 +335,7 @@ def tune(
     ends = np.cumsum([len(gain) for gain in begin.values()])[:-1]
 
     def gains_of(vectors: FloatArray) -> Gains:
-        """Return the gains by name, (size, N), for logarithms (N, d)."""
+        """Return the gains by name, (size, N), for logarithms of shape (N, d)."""
         return dict(zip(begin, np.split(np.exp(vectors.T), ends), strict=True))
 
     together = POPULATION * len(seeds) // PARTS
@@ -344,13 +348,13 @@ def tune(
     single = law.params(begin, benchmark.model)
 
     def costs(job: tuple[Any, Evaluation]) -> FloatArray:
-        """Return the costs of a part of the candidates in one wind, (together,)."""
+        """Return the costs of a part of the candidates in one wind, one per candidate."""
         params, evaluation = job
         course = benchmark.courses[evaluation.wind][law.feedforward]
         result = batch.fly(evaluation.fleet, benchmark.vehicle, course, control_law, params)
         return cost(result, benchmark).reshape(together, each) @ evaluation.weight
 
-    # Each seed has its own search. All of them fly together, part by part.
+    # Each seed has a separate search. All searches fly together, part by part.
     lacking = partial(_lacking, law, objective, benchmark)
     options = {"popsize": POPULATION, "verbose": -9}
     searches = [
@@ -383,7 +387,7 @@ def _best_result(
     evaluation_count: int,
     gains_of: Callable[[FloatArray], Gains],
 ) -> TuningResult:
-    """Return the gains of the seed with the least cost; `best` has cost and logarithms by seed."""
+    """Return the gains of the seed with the least cost; `best` has cost and logarithms."""
     winner = int(np.argmin([value for value, _ in best]))
     gains = _rounded(gains_of(best[winner][1][None]))
     lowest = [round(value, 4) for value, _ in best]
@@ -399,8 +403,8 @@ def _best_result(
 def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
     """Return the margins of a law around the nominal aircraft, for N sets of gains.
 
-    The gains are (m, N) or (1, N). The margins are (N, m) and (N,), without the margins of all
-    inputs together. u has no delay, as in a benchmark.
+    The gains have shape (m, N) or (1, N), and the margins (N, m) or (N,). The margins of all inputs
+    together are left out. As in a benchmark, u has no delay.
     """
     tuned_law = TunedLaw(law.control_law(model), law.params(gains, model))
     count = max((gain.shape[-1] for gain in gains.values()), default=1)
@@ -411,7 +415,7 @@ def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
 
 
 def _lacking(law: Law, objective: Objective, benchmark: Benchmark, gains: Gains) -> FloatArray:
-    """Return the costs of the missing margins of N candidates, (N,)."""
+    """Return the costs that missing margins add for N candidates, (N,)."""
     if objective.requirement is None or not law.has_margins:
         return np.zeros(next(iter(gains.values())).shape[-1])
     margins = nominal_margins(law, gains, benchmark.model)
@@ -430,12 +434,12 @@ def _rounded(gains: Gains) -> dict[str, list[float]]:
 def _after(
     search: Any, point: FloatArray, values: FloatArray, best: tuple[float, FloatArray]
 ) -> tuple[float, FloatArray]:
-    """Give the search its costs, and return the least cost so far with its candidate."""
+    """Give a search its costs, and return the least cost so far with its candidate."""
     search.tell(list(point), list(values))
     least = int(np.argmin(values))
     return (float(values[least]), point[least]) if values[least] < best[0] else best
 
 
 def as_gains(result: TuningResult) -> Gains:
-    """Return gains of shape (m, 1) and (1, 1)."""
+    """Return the gains of a result as arrays of shape (m, 1) or (1, 1)."""
     return {name: np.array(values)[:, None] for name, values in result.gains.items()}
