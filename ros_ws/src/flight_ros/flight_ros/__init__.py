@@ -2,5 +2,5 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shared ROS code of the RISE-DI flight stack.
 
-Topics, parameters, messages as named vectors, and the base class of a node.
+It has topics, parameters, messages as named vectors, and the base class of a node.
 """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Base class of clients: a node of a command that asks the nodes of a running flight."""
+"""Base class of clients: nodes of a command that talk to the nodes of a running flight."""
 
 import threading
 import time
@@ -20,7 +20,7 @@ from flight_ros.subscriptions import PolledSubscription
 T = TypeVar("T")
 
 SERVICE_TIMEOUT = 10.0  # s
-# s, after which a wait ends if only aircraft of other namespaces have been found
+# s, time after which a wait ends if only aircraft of other namespaces have been found
 DISCOVERY_TIMEOUT = 3.0
 NODES = ("controller", "guidance", "bridge", "aircraft")  # names of the nodes of one aircraft
 
@@ -32,7 +32,7 @@ def start_middleware() -> None:
     """
     transport.prepare()
     try:
-        # the command handles SIGINT, not rclpy
+        # the command handles SIGINT, and not rclpy
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except ARGUMENT_ERRORS as error:
         raise ParameterError(
@@ -43,8 +43,8 @@ def start_middleware() -> None:
 class Client:
     """A client with a node in the default context.
 
-    With a `parent` it uses the node of the parent. If one of them is cancelled, the waits of both
-    end. Use it as a context manager, so that the middleware always shuts down.
+    With a `parent` it uses the node of the parent. If parent or client is cancelled, the waits of
+    both end. Use the client as a context manager, so that the middleware always shuts down.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Client:
     def _decoded(
         self, subscription: PolledSubscription | None, decode: Callable[[bytes], T]
     ) -> list[T]:
-        """Return the messages since the last call, or [] if there is no subscription."""
+        """Return the messages since the last call; [] if there is no subscription."""
         if subscription is None:
             return []
         pairs = self._refused.decoded(subscription, subscription.take(), decode)
@@ -109,7 +109,7 @@ class Client:
             rclpy.spin_once(self._node, timeout_sec=0.02)
 
     def _elsewhere(self) -> list[str]:
-        """Name the namespaces of the aircraft in the graph if no aircraft is in this namespace.
+        """Return the namespaces of the aircraft in the graph, if this namespace has no aircraft.
 
         The root namespace is "/".
         """

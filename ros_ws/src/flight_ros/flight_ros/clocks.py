@@ -1,20 +1,20 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks of the nodes of an aircraft on several hosts: offset and delay.
+"""Compare the clocks of the nodes of an aircraft on several hosts: offset and delay.
 
-Both directions are measured. A node i publishes once a second, on `clocks`, the least difference
-D_ij = (clock of i at the reception) - (clock of the sender) of the messages of a node j. With the
-delay d of a message and theta_j, the clock of j less that of i,
+The delay is measured in both directions. Once a second, a node i publishes on `clocks` the least
+difference D_ij = (clock of i at the reception) - (clock of the sender) of the messages from a node
+j. With the delay d of a message, and theta_j = (clock of j) - (clock of i),
 
     D_ij = d_ji - theta_j,   D_ji = d_ij + theta_j,   so theta_j = (D_ji - D_ij) / 2
         where d_ij = d_ji.
 
-Half of the difference of the two delays is the error. Source: D. L. Mills et al., RFC 5905 (2010),
+The error is half of the difference of the two delays. Source: D. L. Mills et al., RFC 5905 (2010),
 section 8.
 
-Nodes of a host share the monotonic clock. So a node also sends the identity of the host, and the
-lead of the clock of the node over the monotonic clock: theta_j is then exact, and a busy host that
-delays messages shifts no clock.
+Nodes of a host share the monotonic clock. So a node also sends the identity of its host, and the
+lead of its clock over the monotonic clock. For nodes of one host, theta_j is then exact, and a busy
+host that delays messages shifts no clock.
 """
 
 import time
@@ -33,55 +33,56 @@ from flight_ros.receiver import Refusals
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import CLOCKS, offered
 
-WINDOW = 8  # number of differences kept of each node: the least of them has the least delay
+# number of differences that are kept for each node; the least of them has the least delay
+WINDOW = 8
 PEERS = 100  # largest number of nodes that are kept, because names can be forged
-FORGET_NS = 5 * NANOSECONDS  # a node that is silent so long is forgotten
+FORGET_NS = 5 * NANOSECONDS  # a node that is silent for this time is forgotten
 DIFFERS = 0.005
 """s. Half a period of a controller at 100 Hz, and several times the error of the estimate on a
 local network. A larger offset is told: it is in every age, and of a clock ahead it delays u."""
-# Channels of `clocks` beside the names of nodes, which begin with a slash.
-HOST = "host"  # a number of the boot of the host; 0 is unknown
-AHEAD = "ahead"  # clock of the node less the monotonic clock, s
+# Channels of `clocks` beside the names of nodes. Those names begin with a slash.
+HOST = "host"  # a number for the boot of the host; 0 is unknown
+AHEAD = "ahead"  # clock of the node minus the monotonic clock, s
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 SYNCHRONISE = "synchronise the hosts, as by chrony or PTP"
 RESTART = "the system clock of this host was set between the starts of the two: restart all nodes"
 
 
 def number_of_host() -> float:
-    """Return a number of this host's boot that float64 can hold; 0 if the system has none."""
+    """Return a number for this host's boot that float64 can hold; 0 if the system has none."""
     return float(int(BOOT_ID.read_text(encoding="ascii")[:8], 16)) if BOOT_ID.exists() else 0.0
 
 
 class ClockOfPeer(NamedTuple):
-    """Clock of another node less the own one, and the mean delay of a message, s."""
+    """The clock of another node minus that of this node, and the mean delay of a message, s."""
 
     offset: float
     delay: float
-    advice: str = SYNCHRONISE  # for a clock that differs
+    advice: str = SYNCHRONISE  # advice for a clock that differs
 
     def __str__(self) -> str:
         return f"{abs(self.offset):.3f} s {'ahead of' if self.offset > 0.0 else 'behind'} this one"
 
 
 class Peers:
-    """The differences of clocks as a node sees them, and as its peers report them.
+    """The differences of clocks that a node measures, and those that its peers report.
 
-    Times in s and ns.
+    Times are in s and ns.
     """
 
     def __init__(self, own_name: str, host: float = 0.0) -> None:
-        self.ahead = 0.0  # s, lead of the own clock over the monotonic clock
+        self.ahead = 0.0  # s, lead of this node's clock over the monotonic clock
         self._own = own_name
         self._host = host
         self._seen: dict[str, deque[float]] = {}
         self._reported: dict[str, float] = {}
-        self._on_host: dict[str, float] = {}  # offsets of the nodes of this host
+        self._on_host: dict[str, float] = {}  # offsets of the nodes on this host
         self._heard_ns: dict[str, int] = {}
 
     def receive(
         self, sender: str, sent_ns: int, received_ns: int, reported: Mapping[str, float]
     ) -> None:
-        """Take a message of another node, with the instants on both clocks."""
+        """Take a message of another node, with its instants by the clocks of both nodes."""
         for name, heard_ns in list(self._heard_ns.items()):
             if received_ns - heard_ns > FORGET_NS:
                 self.forget(name)
@@ -102,7 +103,7 @@ class Peers:
             table.pop(name, None)
 
     def differences(self) -> dict[str, float]:
-        """Return the report of this node: the least difference for every peer.
+        """Return the report of this node, which has the least difference for every peer.
 
         The report also has HOST and AHEAD, from which nodes of the same host compute exact offsets.
         """
@@ -136,9 +137,9 @@ class PeerClocks:
         self._decoder = NamedDecoder()
 
     def exchange(self, ahead_ns: int) -> None:
-        """Take the reports and send one, once a second.
+        """Once a second, take the reports of other nodes, and send one.
 
-        `ahead_ns` is the system clock less the time of the node.
+        `ahead_ns` is the system clock minus the time of the node.
         """
         self._peers.ahead = (time.time_ns() - ahead_ns - time.monotonic_ns()) / NANOSECONDS
         for sample, received in self._refusals.decoded(
@@ -152,7 +153,7 @@ class PeerClocks:
         self._publish(encoder.encode(time.time_ns() - ahead_ns, np.array([*differences.values()])))
 
     def received(self) -> list[str]:
-        """Name the peers that were received."""
+        """Return the names of the peers from which messages were received."""
         return [name for name in self._peers.differences() if name.startswith("/")]
 
     def clocks(self) -> dict[str, ClockOfPeer]:
@@ -160,7 +161,7 @@ class PeerClocks:
         return self._peers.clocks()
 
     def sentence_on(self, sender: str) -> str | None:
-        """Return the end of a sentence on a stamp: how far the clock of its sender differs.
+        """Return the end of a sentence on a stamp, which says how far its sender's clock differs.
 
         Returns None if no difference is known.
         """

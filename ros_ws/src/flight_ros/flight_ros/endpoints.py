@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compatibility of the publishers and subscribers of a topic.
+"""Check the compatibility of the publishers and subscribers of a topic.
 
 Message type and quality of service (QoS) must match.
 """
@@ -25,7 +25,7 @@ from flight_ros.topics import CLOCK, RECORDED, START, Y
 DISCOVERY_POLL_PERIOD = 0.02  # s
 # topics that a single node must publish: y, and those whose messages do not name their publisher
 OF_ONE_NODE = (Y, START, RECORDED, CLOCK)
-LOG_PERIOD_NS = 5 * NANOSECONDS  # between two lines on one mismatch
+LOG_PERIOD_NS = 5 * NANOSECONDS  # time between two log lines on one mismatch
 
 
 def type_name(message: type) -> str:
@@ -69,14 +69,14 @@ def mismatch(peer: TopicEndpointInfo, message_type: str, qos: QoSProfile) -> Ref
 
 
 class EndpointMonitor:
-    """Logs an error for each peer of a node that does not match: its topic would stay silent."""
+    """Logs an error for each peer that does not match a node and thus would stay silent."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._throttle = Throttle(LOG_PERIOD_NS)
 
     def mismatches(self, subscription: PolledSubscription) -> list[Refusal]:
-        """Refuse every publisher whose type or QoS does not fit a subscription."""
+        """Return a refusal for each publisher whose type or QoS does not fit a subscription."""
         kind = type_name(subscription.topic.type)
         peers = self._node.get_publishers_info_by_topic(subscription.name)
         return [refusal for peer in peers if (refusal := mismatch(peer, kind, subscription.qos))]
@@ -97,7 +97,7 @@ class EndpointMonitor:
     def check_publishers(self, subscription: PolledSubscription) -> None:
         """Log an error for each publisher that does not match a subscription of the node.
 
-        It also logs an error if several nodes publish a topic that a single node must publish.
+        An error is also logged if several nodes publish a topic that a single node must publish.
         """
         refusals = [*self.mismatches(subscription), self.reason_against_publishers(subscription)]
         self._log(subscription.name, refusals)
@@ -105,8 +105,8 @@ class EndpointMonitor:
     def check_subscribers(self, publisher: Publisher) -> None:
         """Log an error for each subscriber that does not match a publisher of the node."""
         topic = publisher.topic_name
-        # The graph reports the QoS of both sides in the same terms. It does not have a new
-        # publisher yet.
+        # The graph reports the QoS of both sides in the same terms. A new publisher is not in the
+        # graph yet.
         for endpoint in self._node.get_publishers_info_by_topic(topic):
             if endpoint.node_name == self._node.get_name():
                 peers = self._node.get_subscriptions_info_by_topic(topic)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Event loop of a node: ticks on the monotonic clock or by /clock, or lockstep steps.
+"""Event loop of a node, with ticks on the monotonic clock or by /clock, or with lockstep steps.
 
-Services are served in between, and the shutdown is clean.
+Between ticks or steps the loop serves services, and its shutdown is clean.
 """
 
 import gc
@@ -41,7 +41,7 @@ from flight_ros.topics import NodeState
 # longest wait of a lockstep flight for its first sample, or after a refused sample
 PEER_TIMEOUT_NS = 30 * NANOSECONDS
 
-# s, between two checks for service calls (and liveliness) in lockstep; longest sleep of several
+# s, time in lockstep between two checks for service calls and liveliness; longest sleep of several
 # nodes in one thread
 SERVICE_POLL_PERIOD = 0.1
 
@@ -61,15 +61,15 @@ TEARDOWN_TIME = 0.8
 ever there, with the interpreter held, where other participants end at the same time
 (eProsima/Fast-DDS, issue 6513). The other nodes then notice the end by the lease, 2 s."""
 
-START_POLL_PERIOD = 0.005  # s, between two polls of a node that waits for t = 0
+START_POLL_PERIOD = 0.005  # s, time between two polls of a node that waits for t = 0
 
-IDLE_POLL_PERIOD = 0.02  # s, the longest sleep, so that signals and service calls are handled soon
+IDLE_POLL_PERIOD = 0.02  # s, longest sleep, so that signals and service calls are handled soon
 
 
 class _Stop:
-    """Set by a signal handler, without a lock.
+    """A flag that a signal handler sets, without a lock.
 
-    The lock of an Event deadlocks when a second signal interrupts the first handler.
+    An Event has a lock, which deadlocks if a second signal interrupts the first handler.
     """
 
     is_requested = False
@@ -81,15 +81,15 @@ class _Stop:
 def run(
     *make_nodes: Callable[[], FlightNode[Any]], early_participant: Participant | None = None
 ) -> None:
-    """Run a node, or several in one thread, until SIGINT, SIGTERM or SIGHUP.
+    """Run a node, or several nodes in one thread, until SIGINT, SIGTERM or SIGHUP.
 
-    The exit status is then 0. Other exit statuses: 2 for invalid parameters, 3 for a flight that
-    cannot continue, 5 for a landing, 6 after another node has ended, 1 for an unexpected exception.
-    The `early_participant` of flight_ros.startup is destroyed once the nodes exist.
+    The exit status is then 0. It is 2 for invalid parameters, 3 for a flight that cannot continue,
+    5 for a landing, 6 after another node has ended, and 1 for an unexpected exception. The
+    `early_participant` of flight_ros.startup is destroyed once the nodes exist.
 
-    Ticks run on the monotonic clock in the main thread and poll the subscriptions. In lockstep
-    there are no ticks: a node advances when its input has arrived. The executor serves parameters
-    and services after a tick and never blocks.
+    Ticks run in the main thread on the monotonic clock, and poll the subscriptions. In lockstep
+    there are no ticks, and a node advances when its input has arrived. The executor serves
+    parameters and services after a tick, and never blocks.
     """
     stop = _Stop()
     handle_shutdown(stop.request)
@@ -112,7 +112,7 @@ def _make_nodes(
         if early_participant is not None:
             destroy_participant(early_participant)
     except (ParameterError, FlightEnded, *ARGUMENT_ERRORS) as error:
-        # one sentence; those of rclpy have several lines
+        # write one sentence, because the messages of rclpy have several lines
         is_stack_error = isinstance(error, ParameterError | FlightEnded)
         print(
             f"error: {error if is_stack_error else ' '.join(str(error).split())}", file=sys.stderr
@@ -126,7 +126,7 @@ def _make_nodes(
 def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> int | None:
     """Run nodes, and return the exit status.
 
-    None means that nodes with the same parameters must begin again.
+    None means that the nodes must begin again with the same parameters.
     """
     node = nodes[0]
     status: int | None = 0
@@ -151,7 +151,7 @@ def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> int | None:
         node.get_logger().error(f"{restart}; this node begins again")
         status = None
     except Exception as error:
-        # the first line alone names the exception: a traceback has many
+        # log only the first line, which names the exception; a traceback has many lines
         cause = bounded(" ".join("".join(traceback.format_exception_only(error)).split()))
         node.get_logger().fatal(
             f"unexpected exception, the node ends: {cause}\n{traceback.format_exc()}"
@@ -159,7 +159,7 @@ def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> int | None:
         status = STATUS_UNEXPECTED
     for node in nodes:
         node.finish()
-    # the log is closed, and u is not sent any more: what is left is the middleware's
+    # the log is closed, and u is not sent any more; only the middleware is left
     deadline = Deadline(TEARDOWN_TIME, STATUS_ENDED_EARLY if status is None else status)
     for node in nodes:
         node.destroy_node()
@@ -176,7 +176,7 @@ def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any], until_ns: in
         try:
             execute()
         except Exception as error:
-            # rclpy cannot serve the request, e.g. an invalid lifecycle transition
+            # rclpy cannot serve the request, such as an invalid lifecycle transition
             node.get_logger().error(bounded(f"request rejected: {' '.join(str(error).split())}"))
         if time.monotonic_ns() >= until_ns:
             return
@@ -195,10 +195,10 @@ def _start(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
 
 
 class _AwaitedInputs:
-    """What the nodes of a lockstep flight need next.
+    """The messages that the nodes of a lockstep flight need next.
 
-    A message that a node takes only later does not wake it up: a wait for all messages
-    would return at once, again and again, until the node takes it.
+    A message that a node takes only later does not wake the node. A wait for all messages would
+    return immediately, again and again, until the node takes this message.
     """
 
     def __init__(self, nodes: Sequence[FlightNode[Any]]) -> None:
@@ -206,7 +206,7 @@ class _AwaitedInputs:
         self._wait_sets: dict[tuple[str | None, ...], WaitSet] = {}
 
     def wait(self, duration: float) -> bool:
-        """Wait for one of these messages, at most `duration` s, and return whether one came."""
+        """Wait at most `duration` s for one of these messages, and return whether one came."""
         topics = tuple(node.awaited_topic() for node in self._nodes)
         if not any(topics):
             time.sleep(duration)
@@ -228,13 +228,13 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     now_ns = advance_ns = serve_ns = report_ns = time.monotonic_ns()
     has_begun = False
     while not stop.is_requested:
-        # each of them, without a short circuit
+        # ask each of them, without a short circuit
         advances = [node.advance() for node in nodes]
         if any(advances):
             has_begun = True
             advance_ns = now_ns
         elif not inputs.wait(IDLE_POLL_PERIOD):
-            serve_ns = 0  # no message: check the liveliness of the peers now
+            serve_ns = 0  # without a message, check the liveliness of the peers now
         now_ns = time.monotonic_ns()
         if now_ns >= serve_ns:
             serve_ns = now_ns + nanoseconds(SERVICE_POLL_PERIOD)
@@ -254,9 +254,9 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
 def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, has_begun: bool) -> None:
     """Raise FlightEnded if a lockstep flight would wait for ever.
 
-    It would do so after a sample was refused, or if its first sample never comes. `advance_ns` is
-    the instant at which it last advanced. A flight that has begun can wait as long as it likes for
-    a peer that is stopped, for example in a debugger.
+    This happens if a sample was refused, or if the first sample never comes. `advance_ns` is the
+    instant at which it last advanced. A flight that has begun may wait without limit for a peer
+    that is stopped, for example in a debugger.
     """
     for node in nodes:
         topic = node.awaited_topic()
@@ -275,7 +275,7 @@ def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, has_begun: 
 class RealTime:
     """The ticks and reports of a node in real time.
 
-    With `spin` a wait for a deadline ends with a busy-wait.
+    With `spin`, the last part of a wait for a deadline is a busy-wait.
     """
 
     def __init__(self, node: FlightNode[Any], start_ns: int, *, spin: bool) -> None:
@@ -294,7 +294,7 @@ class RealTime:
             node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")
         self._report_ns = time.monotonic_ns()
         self._reports: deque[Callable[[], None]] = deque()
-        self._after_each = 1  # reports after each tick
+        self._after_each = 1  # number of reports after each tick
 
     def run_due_tick(self) -> bool:
         """Run the newest due tick, and return whether there was one."""
@@ -304,10 +304,10 @@ class RealTime:
         return True
 
     def report(self) -> None:
-        """Do the next few reports.
+        """Run the next few reports.
 
-        They are spread over several ticks, because together they can take longer than a period of
-        2 ms.
+        Reports are spread over several ticks, because together they may take longer than a period
+        of 2 ms.
         """
         now_ns = time.monotonic_ns()
         if now_ns >= self._report_ns:
@@ -326,7 +326,7 @@ class RealTime:
 def _start_instants(
     nodes: Sequence[FlightNode[Any]], executor: SingleThreadedExecutor, stop: _Stop
 ) -> list[int]:
-    """Return the starts of the nodes, ns of the system clock, as soon as all are known.
+    """Return the start of each node, ns of the system clock, as soon as all are known.
 
     Returns [] after a signal.
     """
@@ -349,9 +349,9 @@ def _start_instants(
 
 
 def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
-    """Run nodes in one thread, a tick at a time.
+    """Run nodes in one thread, one tick after another.
 
-    If several nodes are due, the first one in their order goes first.
+    If several nodes are due, the first of them in `nodes` ticks first.
     """
     executor = _start(nodes)
     starts = _start_instants(nodes, executor, stop)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Base class of every node: parameters, topics, ticks, overruns, diagnostics, clean shutdown."""
+"""Base class of all nodes: parameters, topics, ticks, overruns, diagnostics, clean shutdown."""
 
 import os
 import time
@@ -47,12 +47,13 @@ from flight_ros.topics import (
 P = TypeVar("P", bound=NodeConfig)
 S = TypeVar("S", bound=Sample)
 
-NO_PUBLISHER_WARNING_NS = 3 * NANOSECONDS  # the processes of a flight start one after another
+# time for the processes of a flight to start, one after another
+NO_PUBLISHER_WARNING_NS = 3 * NANOSECONDS
 
 # time for the last messages of a lockstep flight to arrive
 ACKNOWLEDGE_TIMEOUT = Duration(seconds=0.5)
 
-WAITING_PERIOD_NS = 2 * NANOSECONDS  # between two warnings about a topic without samples
+WAITING_PERIOD_NS = 2 * NANOSECONDS  # time between two warnings about a topic without samples
 
 # A late node catches up with its missed ticks, but it ignores a start that is older than this.
 MAX_START_AGE_NS = 10 * NANOSECONDS
@@ -60,14 +61,14 @@ MAX_START_AGE_NS = 10 * NANOSECONDS
 SIM_TIME = "use_sim_time"
 AT_START = "no change: a node chooses its clock when it starts"
 
-# slewing moves a clock by less than 0.01 s in the second between two checks
+# slewing changes a clock by less than 0.01 s in the second between two checks
 CLOCK_STEP_NS = NANOSECONDS // 20
 
 
 class FlightNode(Node, Generic[P]):
     """A node with fixed ticks or in lockstep.
 
-    A subclass defines its rate and the work of a tick or step.
+    A subclass defines the rate, and the work of a tick or a step.
     """
 
     def __init__(self, name: str, schema: type[P]) -> None:
@@ -76,14 +77,14 @@ class FlightNode(Node, Generic[P]):
         self.add_on_set_parameters_callback(self._change_parameters)
         refuse_foreign_parameters(self)
         self.peers = LivelinessMonitor(self, name) if self.parameters.lockstep else None
-        # Two equal lockstep flights give equal bytes, so the process number is left out.
+        # Two equal lockstep flights must give equal bytes, so the process number is left out.
         process = "" if self.parameters.lockstep else f"#{os.getpid()}"
         self.instance = self.get_fully_qualified_name() + process
         self.refusals = Refusals(self, self.clock_of)
         self.endpoints = EndpointMonitor(self)
         is_simulated = self.get_parameter(SIM_TIME).value and not self.parameters.lockstep
         self.simulated = SimulatedTime(self, self.refusals) if is_simulated else None
-        self.host: HostTime = self.simulated or time  # the time of the ticks
+        self.host: HostTime = self.simulated or time  # the source of the time of the ticks
         self.clocks = (
             None
             if is_simulated or self.parameters.lockstep
@@ -92,7 +93,7 @@ class FlightNode(Node, Generic[P]):
         self.polled_subscriptions: list[PolledSubscription] = []
         self.receivers: list[Receiver[Any]] = []
         self._flight_publishers: list[Publisher] = []
-        # by topic: the instants of the last call of `warn_no_publisher` and of its next log line
+        # by topic, the instants of the last call of `warn_no_publisher` and of its next log line
         self._waiting: dict[str, tuple[int, int]] = {}
         self._diagnostics = self.create_publisher(
             DIAGNOSTICS.type, DIAGNOSTICS.name, offered(DIAGNOSTICS)
@@ -109,7 +110,7 @@ class FlightNode(Node, Generic[P]):
         self._is_matched = False
         self._adopted: P | None = None
         self._tick_times = TickTimes()
-        self.time_offset_ns = 0  # time of the ticks less the monotonic clock
+        self.time_offset_ns = 0  # time of the ticks minus the monotonic clock
         self._clock_step_ns = 0  # last logged step of the system clock
 
     # Defined by a subclass
@@ -129,16 +130,16 @@ class FlightNode(Node, Generic[P]):
     def has_time(self) -> bool:
         """Return whether the time of the ticks is known.
 
-        In simulated time it is known from the first /clock on.
+        Simulated time is known from the first message of /clock on.
         """
         return self.host is not self.simulated or self.simulated.known()
 
     def start_ns(self) -> int | None:
-        """Return the system time of tick 0, ns, by the parameter `start_time`.
+        """Return the system time of tick 0, ns, which depends on the parameter `start_time`.
 
-        If `start_time` is -1, the topic `start` gives the instant; before its message the result is
-        None. If `start_time` is 0, tick 0 is at the next whole period of the system clock, so that
-        nodes of equal rates tick together.
+        If `start_time` is -1, the topic `start` gives the instant, and the result is None until its
+        message comes. If `start_time` is 0, tick 0 is at the next whole period of the system clock,
+        so that nodes with equal rates tick together.
         """
         start_time = getattr(self.parameters, "start_time", 0.0)
         if start_time < 0.0:
@@ -146,28 +147,28 @@ class FlightNode(Node, Generic[P]):
         return nanoseconds(start_time) or self.next_period_ns()
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        """Do a tick; `now_ns` is the nominal instant of tick.number on the system clock's scale."""
+        """Run a tick; `now_ns` is the nominal instant of tick.number by the system clock."""
         raise NotImplementedError
 
     def advance(self) -> bool:
-        """Take every lockstep step whose messages have come, and return whether there was one."""
+        """Take all lockstep steps whose messages have come, and return whether there was one."""
         raise NotImplementedError
 
     def awaited_topic(self) -> str | None:
-        """Name the topic for whose next message this node waits in lockstep; None for none."""
+        """Return the topic whose next message the node awaits in lockstep; None for no topic."""
         return None
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
-        """Return level, sentence and more values for the 1 Hz diagnostics."""
+        """Return the level, a sentence and further values for the 1 Hz diagnostics."""
         return DiagnosticStatus.OK, "running", {}
 
     def close(self) -> None:
-        """Clean up, once, when the node ends, also after an error."""
+        """Clean up when the node ends, also after an error; called once."""
 
     def on_parameters(self, parameters: P) -> None:
-        """Take a valid new set in flight, before it becomes `self.parameters`.
+        """Take a valid new set of parameters in flight, before it becomes `self.parameters`.
 
-        Raise ParameterError to refuse it.
+        A subclass raises ParameterError to refuse the set.
         """
 
     # Used by a subclass
@@ -175,14 +176,14 @@ class FlightNode(Node, Generic[P]):
     def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
         """Create a publisher as rclpy does, without its callbacks for peers that do not match.
 
-        `EndpointMonitor` reports these peers, and an executor would ask for two events of each
-        publisher whenever it looks for a request.
+        `EndpointMonitor` reports these peers. With callbacks, an executor would ask for two events
+        of each publisher whenever it looks for a request.
         """
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
         return super().create_publisher(*args, event_callbacks=quiet, **kwargs)
 
     def next_period_ns(self) -> int:
-        """Return the next whole period of the system clock, ns."""
+        """Return the next instant at a whole period of the system clock, ns."""
         now_ns = self.host.time_ns()
         period_ns = self.period_ns()
         return now_ns - now_ns % period_ns + period_ns
@@ -190,7 +191,7 @@ class FlightNode(Node, Generic[P]):
     def advertise(self, topic: Topic) -> Callable[[bytes], None]:
         """Create a publisher of serialised messages on a topic of the flight.
 
-        Returns the function that publishes one.
+        Returns the function that publishes a message.
         """
         qos = LOCKSTEP if self.parameters.lockstep else publisher_qos(self.period_ns())
         publisher = self.create_publisher(topic.type, topic.name, qos)
@@ -198,7 +199,7 @@ class FlightNode(Node, Generic[P]):
         return publisher.publish
 
     def subscribe(self, topic: Topic, qos: QoSProfile | None = None) -> PolledSubscription:
-        """Create a subscription that is polled at the tick, as bytes.
+        """Create a subscription to serialised messages that is polled at the tick.
 
         Its publishers are checked once a second.
         """
@@ -218,9 +219,9 @@ class FlightNode(Node, Generic[P]):
         qos: QoSProfile | None = None,
         max_size: int | None = None,
     ) -> Receiver[S]:
-        """Create a subscription with its `Receiver`.
+        """Create a subscription, and a `Receiver` that checks and takes its samples.
 
-        If this node overruns, the publisher is not blamed for the silence.
+        If this node overruns, the publisher does not count as silent.
         """
         subscription = self.subscribe(topic, qos)
         receiver = Receiver(
@@ -236,7 +237,7 @@ class FlightNode(Node, Generic[P]):
         return receiver
 
     def publisher_lock(self, timeouts_ns: Callable[[], tuple[int, int]]) -> PublisherLock:
-        """Create the lock of a topic; in lockstep it holds for good, without the timeouts."""
+        """Create the publisher lock of a topic; in lockstep it has no timeouts."""
         return LockstepLock() if self.parameters.lockstep else PublisherLock(timeouts_ns)
 
     def encoder(self, names: Sequence[str]) -> Encoder:
@@ -251,9 +252,9 @@ class FlightNode(Node, Generic[P]):
         return self.host.monotonic_ns() + self.time_offset_ns
 
     def clock_step_ns(self) -> int:
-        """Return how far the system clock is ahead of the time of the ticks, ns.
+        """Return the lead of the system clock over the time of the ticks, ns.
 
-        It is 0 for less than CLOCK_STEP_NS, which is no step.
+        A lead of less than CLOCK_STEP_NS is no step of the clock, and the result is 0.
         """
         step_ns = self.host.time_ns() - self.now_ns()
         return step_ns if abs(step_ns) > CLOCK_STEP_NS else 0
@@ -261,7 +262,7 @@ class FlightNode(Node, Generic[P]):
     def adopt(self, parameters: P) -> None:
         """Replace the parameters by a valid set that the node itself has chosen.
 
-        A parameter event reports it; there is no check.
+        A parameter event reports the new set. The set is not checked.
         """
         before, after = (
             dict(flatten(values.model_dump())) for values in (self.parameters, parameters)
@@ -281,17 +282,17 @@ class FlightNode(Node, Generic[P]):
         self.set_parameters_atomically(changes)
 
     def clock_of(self, sender: str) -> str | None:
-        """Return the end of a sentence on the stamp of a node whose clock differs, else None."""
+        """Return the end of a sentence on a stamp if its sender's clock differs, else None."""
         return None if self.clocks is None else self.clocks.sentence_on(sender)
 
     def warn_no_publisher(
         self, subscription: PolledSubscription, lack: str = "no publisher"
     ) -> None:
-        """Warn of a topic without a publisher, at each tick without a sample.
+        """Warn of a topic without samples; called at each tick without a sample.
 
-        The warning is logged after 3 s, then every 2 s. It gives `lack` as the cause if the topic
-        has no publisher. A publisher that the user wrote may be silent because it waits for
-        `start`, as nodes do in a flight by a launch file.
+        The warning is logged after 3 s, and then every 2 s. If the topic has no publisher, the
+        warning gives `lack` as the cause. A publisher that the user wrote may also be silent
+        because it waits for `start`, as nodes do in a flight by a launch file.
         """
         now_ns = time.monotonic_ns()
         last_ns, log_ns = self._waiting.get(subscription.name, (0, 0))
@@ -314,7 +315,7 @@ class FlightNode(Node, Generic[P]):
     def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         """Accept a change of tunable parameters as a whole, or reject it with a sentence.
 
-        A rejected change changes nothing.
+        After a rejection, all parameters keep their values.
         """
         if self._adopted is not None:
             self.parameters = self._adopted
@@ -338,7 +339,7 @@ class FlightNode(Node, Generic[P]):
     # Called by the event loop
 
     def _received_start_ns(self) -> int | None:
-        """Return the instant from the topic `start`, ns, or None if no recent one has come.
+        """Return the instant from the topic `start`, ns; None if no recent instant has come.
 
         An old instant belongs to an earlier flight.
         """
@@ -351,7 +352,7 @@ class FlightNode(Node, Generic[P]):
         return next((stamp_ns for stamp_ns in instants if stamp_ns > oldest_ns), None)
 
     def match(self) -> None:
-        """Publish the state MATCHED, once and in real time, when every input has a publisher."""
+        """Publish the state MATCHED once when every input has a publisher, in real time only."""
         awaited = [
             *self.inputs(),
             *([self._start_subscription] if self._start_subscription is not None else []),
@@ -374,7 +375,7 @@ class FlightNode(Node, Generic[P]):
     def check_clock(self) -> None:
         """Log an error after a step of the system clock.
 
-        The node keeps its own time. A node that starts later uses the new time.
+        This node keeps its time, but a node that starts later uses the new time.
         """
         step_ns = self.host.time_ns() - self.now_ns()
         if abs(step_ns - self._clock_step_ns) > CLOCK_STEP_NS:
@@ -391,9 +392,9 @@ class FlightNode(Node, Generic[P]):
             self._clock_step_ns = step_ns
 
     def compare_clocks(self) -> None:
-        """Exchange the clocks of the nodes.
+        """Exchange clock differences with the other nodes.
 
-        A warning is logged when a clock begins to differ from the node's own, and when it agrees
+        A warning is logged when a clock begins to differ from that of this node, and when it agrees
         again.
         """
         if self.clocks is not None:
@@ -402,16 +403,16 @@ class FlightNode(Node, Generic[P]):
                 self.get_logger().warning(sentence)
 
     def warn_without_time(self) -> None:
-        """Log a warning while no /clock comes in simulated time."""
+        """Log a warning as long as no /clock comes in simulated time."""
         if self.simulated is not None and self.simulated.silent():
             self.warn_no_publisher(self.simulated.subscription)
 
     def graph_checks(self) -> list[Callable[[], None]]:
-        """Return the checks of the graph, one per topic.
+        """Return the checks of the graph, one for each topic.
 
-        Asking the middleware about all topics at once takes about a period of 2 ms. The checks log
-        an error for a peer with a wrong message type or an incompatible QoS, whose topic would stay
-        silent.
+        There are several, because asking the middleware about all topics takes about a period of 2
+        ms. A check logs an error for a peer with a wrong message type or an incompatible QoS,
+        because its topic would stay silent.
         """
         return [
             *(
@@ -431,7 +432,7 @@ class FlightNode(Node, Generic[P]):
     def require_flight(self) -> None:
         """Raise FlightEnded after the loss of a peer of a lockstep flight.
 
-        The other peers get a report of the loss. In simulated time, raise ClockRestarted after a
+        The other peers get a report of the loss. In simulated time, raises ClockRestarted after a
         jump of /clock.
         """
         if self.simulated is not None:
@@ -450,7 +451,7 @@ class FlightNode(Node, Generic[P]):
     def publish_state(self, state: NodeState) -> None:
         """Publish the state of this node on `node_state`.
 
-        The key contains the process number, also in lockstep, so that a subscriber can distinguish
+        The key contains the process number, in lockstep too, so that a subscriber can distinguish
         the nodes of two flights.
         """
         self._node_state.publish(
@@ -460,7 +461,8 @@ class FlightNode(Node, Generic[P]):
     def publish_diagnostics(self) -> None:
         """Publish the 1 Hz report.
 
-        It has loop period, compute time, missed ticks (overruns), rejected samples and more.
+        The report has the loop period, the compute time, missed ticks (overruns), rejected samples
+        and more.
         """
         level, sentence, further = self.status()
         if conflict := self.refusals.pop_conflict():
@@ -477,7 +479,7 @@ class FlightNode(Node, Generic[P]):
                 level=level,
                 name=self.get_fully_qualified_name(),
                 message=sentence,
-                # stable: an aggregator sees one device after a restart
+                # stable, so that an aggregator sees one device also after a restart
                 hardware_id=self.get_fully_qualified_name(),
                 values=[KeyValue(key=key, value=str(value)) for key, value in report.items()],
             )

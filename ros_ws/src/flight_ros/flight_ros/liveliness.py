@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Liveliness monitor of a lockstep flight.
+"""Monitor the liveliness of the nodes in a lockstep flight.
 
-It detects the loss of a peer by DDS liveliness, a watchdog inside the middleware.
+The monitor detects the loss of a peer by DDS liveliness, a watchdog inside the middleware.
 """
 
 import time
@@ -25,21 +25,22 @@ REPORT_TIMEOUT = Duration(seconds=0.2)
 """Longest wait until all peers have a report, after which the node ends. The lost peer never
 acknowledges it."""
 
-ROLES = NODES[:-1]  # without the bridge, which flies in real time only
+ROLES = NODES[:-1]  # all nodes except the bridge, which flies only in real time
 
 
 class LivelinessMonitor:
     """Asserts the liveliness of a node on `alive/<role>` and monitors the other roles.
 
     The middleware sends the heartbeats. It reports the end of a process within the lease duration
-    of `LIVELINESS`, or within that of the participant, two seconds, if the process ended before its
-    first heartbeat. A role can be lost only after it has appeared, because a flight can run without
-    a recorder. The only message of a role is a report: the name of the lost role.
+    of `LIVELINESS`. If the process ended before its first heartbeat, this takes the lease duration
+    of the participant, two seconds. A role can be lost only after it has appeared, because a flight
+    may run without a recorder. The only message of a role is a report with the name of the lost
+    role.
     """
 
     def __init__(self, node: Node, role: str) -> None:
         self._role = role
-        # the first role whose heartbeats stopped, or that a peer reported
+        # the first role whose heartbeats stopped, or which a peer reported as lost
         self._dead: str | None = None
         self._left: str | None = None  # the first role that shut down cleanly
         self._left_ns = 0
@@ -61,12 +62,12 @@ class LivelinessMonitor:
         ]
 
     def lost_role(self) -> str | None:
-        """Name the lost role; None if there is none.
+        """Return the name of the lost role; None if no role is lost.
 
-        After a clean shutdown a role counts as lost after SHUTDOWN_GRACE_NS, unless a report names
-        the role that ended first.
+        A role that shut down cleanly counts as lost after SHUTDOWN_GRACE_NS. If a report names the
+        role that ended first, this role is returned instead.
         """
-        # the executor may serve a report later than the end of its publisher
+        # the executor may serve a report only after the end of its publisher
         for subscription in self._subscriptions:
             for message, _ in take_messages(subscription, 1):
                 self._on_report(message)
@@ -75,7 +76,7 @@ class LivelinessMonitor:
         return self._left
 
     def report(self, role: str) -> None:
-        """Publish the lost role, so that the peers name the role that ended first."""
+        """Publish the name of the lost role, so that all peers name the role that ended first."""
         self._publisher.publish(String(data=role))
         self._publisher.wait_for_all_acked(REPORT_TIMEOUT)
 

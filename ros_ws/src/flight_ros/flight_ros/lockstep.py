@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The inputs of a node in a lockstep flight, where the number of samples of y gives the time."""
+"""Collect the inputs of a node in lockstep, where the number of samples of y gives the time."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -10,18 +10,19 @@ from flight_core.vectors import StampedVector
 
 
 class Instant(NamedTuple):
-    """An instant of y. `others`: the new samples of the second signal up to this instant."""
+    """An instant of y; `others` are the new samples of the second signal up to this instant."""
 
     now_ns: int
     due: bool  # whether the node steps at this instant
-    y: StampedVector | None  # None: a sample did not arrive, or is invalid
+    y: StampedVector | None  # None if a sample did not arrive, or is invalid
     others: list[StampedVector]
 
 
 class LockstepInputs:
-    """y and a second signal, brought together.
+    """Matches the samples of y with those of a second signal.
 
-    A step waits for the y of its instant, and for the second signal up to this instant.
+    A step waits for the y of its instant, and for all samples of the second signal up to this
+    instant.
     """
 
     def __init__(
@@ -32,9 +33,9 @@ class LockstepInputs:
         receive_other: Callable[[], Iterable[StampedVector | None]],
         is_ready: Callable[[int], bool] = lambda now_ns: True,
     ) -> None:
-        """Take the inputs, and `is_ready`, which tells whether all else that a step needs is there.
+        """Take the inputs; `is_ready` says whether all other inputs of a step have arrived.
 
-        `is_ready` gets the instant of the step, ns.
+        `is_ready` is called with the instant of the step, ns.
         """
         self._is_ready = is_ready
         self._y_period_ns = y_period_ns
@@ -46,7 +47,7 @@ class LockstepInputs:
         self._others_due: deque[StampedVector] = deque()
 
     def complete(self) -> Iterator[Instant]:
-        """Yield the instants whose inputs have arrived, in their order, each once."""
+        """Yield the instants whose inputs have arrived, each once, in the order of time."""
         if not self._y_due:
             self._y_due.extend(self._receive_y())
         self._others_due.extend(sample for sample in self._receive_other() if sample is not None)

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Named vectors as messages of sensor_msgs/JointState.
+"""Convert named vectors to messages of sensor_msgs/JointState, and back.
 
-name = channels, position = values, stamp = the sample's instant. The channels are constant during a
-flight. So the bytes of a message are laid out once, and each sample changes only its stamp and its
-values. The layout is several times faster than the serialisation of the middleware, and repeatable
-to the byte: the middleware leaves uninitialised memory between two strings.
+The names of the message are the channels, the positions are the values, and the stamp is the
+instant of the sample. The channels are constant during a flight. So the bytes of a message are laid
+out once, and each sample changes only the stamp and the values. This is several times faster than
+the serialisation by the middleware. It also repeats every byte, while the middleware leaves
+uninitialised memory between two strings.
 """
 
 import math
@@ -28,10 +29,10 @@ ENCAPSULATION = b"\x00\x01\x00\x00"
 BYTE_ORDERS: Mapping[bytes, Literal["big", "little"]] = MappingProxyType(
     {b"\x00\x00": "big", b"\x00\x01": "little"}
 )
-STAMP = struct.Struct("<iI")  # seconds and nanoseconds; they follow the encapsulation
+STAMP = struct.Struct("<iI")  # seconds and nanoseconds, which follow the encapsulation
 STAMP_PLACE = len(ENCAPSULATION)
 LENGTH_PLACE = STAMP_PLACE + STAMP.size  # offset of the length of header.frame_id
-COUNT = struct.Struct("<I")  # length of a sequence or a string, before its elements
+COUNT = struct.Struct("<I")  # length of a sequence or a string, which precedes its elements
 FRAME_ID_PLACE = LENGTH_PLACE + COUNT.size
 MAX_SIZE = 16_384
 """Bytes of a message of named vectors. `internals` of four channels with an observer, the longest
@@ -43,7 +44,7 @@ NO_CHANNELS: FloatArray = np.zeros(0)
 def to_message(
     stamp_ns: int, names: Sequence[str], values: FloatArray, frame_id: str
 ) -> JointState:
-    """Write a named vector as a message; `frame_id` carries the publisher's instance."""
+    """Return a named vector as a message; `frame_id` is the name of the publisher's instance."""
     message = JointState()
     message.header.stamp = Time(sec=stamp_ns // NANOSECONDS, nanosec=stamp_ns % NANOSECONDS)
     message.header.frame_id = frame_id
@@ -53,7 +54,7 @@ def to_message(
 
 
 def from_message(message: JointState, channels: Sequence[str]) -> StampedVector:
-    """Read some channels of a message, in the order of `channels`.
+    """Return some channels of a message, in the order of `channels`.
 
     Raises ChannelError for invalid names, lengths or values.
     """
@@ -65,10 +66,10 @@ def from_message(message: JointState, channels: Sequence[str]) -> StampedVector:
 class Encoder:
     """Encodes the samples of a publisher as the bytes of a message.
 
-    If there are no names, the message has no channels. In lockstep such a message says that there
-    is no sample at this instant. The layout is CDR (OMG Common Object Request Broker Architecture,
-    9.3). The offset of each value from the encapsulation is a multiple of its size. Padding bytes
-    are 0.
+    Without names, the message has no channels. In lockstep such a message says that there is no
+    sample at this instant. The layout is CDR (OMG Common Object Request Broker Architecture, 9.3).
+    The offset of each value from the encapsulation is a multiple of the size of the value. Padding
+    bytes are 0.
     """
 
     def __init__(self, names: Sequence[str], frame_id: str) -> None:
@@ -82,7 +83,7 @@ class Encoder:
             self._align(8)
         self.place = len(self._bytes)  # offset of the values
         self._values = slice(self.place, self.place + 8 * len(names))
-        # an empty velocity and an empty effort follow
+        # an empty velocity and an empty effort follow the values
         self._bytes += bytes(8 * len(names) + 2 * COUNT.size)
 
     def _align(self, size: int) -> None:
@@ -98,7 +99,7 @@ class Encoder:
         self._bytes += encoded
 
     def encode(self, stamp_ns: int, values: FloatArray) -> bytes:
-        """Write the message of a sample; values are in the order of the names."""
+        """Return the message of a sample; the values are in the order of the names."""
         STAMP.pack_into(self._bytes, STAMP_PLACE, *divmod(stamp_ns, NANOSECONDS))
         self._bytes[self._values] = values.tobytes()
         return bytes(self._bytes)
@@ -116,7 +117,7 @@ class Decoder:
         self._sender = ""
 
     def decode(self, raw: bytes) -> StampedVector | None:
-        """Read the sample; None for a vector without channels.
+        """Return the sample in a message; None for a vector without channels.
 
         Raises ChannelError for an invalid message.
         """
@@ -129,7 +130,7 @@ class Decoder:
             return sample
         seconds, nanoseconds = STAMP.unpack_from(raw, STAMP_PLACE)
         value = np.frombuffer(raw, "<f8", len(self._names), self._place)[self._order]
-        # the sum of finite values can overflow
+        # the sum of finite values may overflow
         if not math.isfinite(value.sum()) and not np.isfinite(value).all():
             raise ChannelError(
                 "finite", f"{', '.join(self._channels)} = {value.tolist()} is not finite"
@@ -147,7 +148,8 @@ class Decoder:
             encoder.encode(stamp.sec * NANOSECONDS + stamp.nanosec, np.array(message.position))
             != raw
         ):
-            return  # it has more than a named vector: the middleware decodes it each time
+            # the message has more than a named vector, so the middleware decodes it each time
+            return
         self._names = list(message.name)
         self._place = encoder.place
         self._sender = message.header.frame_id
@@ -156,7 +158,7 @@ class Decoder:
 
 
 class NamedSample(NamedTuple):
-    """A sample with its channels."""
+    """A sample with the names of its channels."""
 
     stamp_ns: int
     channels: dict[str, float]
@@ -166,11 +168,11 @@ class NamedSample(NamedTuple):
 class NamedDecoder:
     """Decodes all channels of the messages of a topic whose channels vary.
 
-    It is several times slower than Decoder.
+    This decoder is several times slower than Decoder.
     """
 
     def decode(self, raw: bytes) -> NamedSample:
-        """Read the sample. Raises ChannelError for an invalid message."""
+        """Return the sample in a message. Raises ChannelError for an invalid message."""
         message = _message(raw)
         sample = from_message(message, message.name)
         names = list(message.name)
@@ -184,8 +186,7 @@ class NamedDecoder:
 def sender_of(raw: bytes) -> str | None:
     """Return the publisher of a message that begins with a header.
 
-    It does not decode the names and values. Returns None if the bytes are too short, or not plain
-    CDR.
+    Names and values are not decoded. Returns None if the bytes are too short, or are not plain CDR.
     """
     if len(raw) < FRAME_ID_PLACE or (order := BYTE_ORDERS.get(raw[:2])) is None:
         return None
@@ -206,7 +207,7 @@ def stamp_of(raw: bytes) -> int:
 
 
 def instant(stamp_ns: int) -> bytes:
-    """Write a message with only an instant: rosgraph_msgs/Clock, builtin_interfaces/Time."""
+    """Return a message that has only an instant: rosgraph_msgs/Clock, builtin_interfaces/Time."""
     return ENCAPSULATION + STAMP.pack(*divmod(stamp_ns, NANOSECONDS))
 
 

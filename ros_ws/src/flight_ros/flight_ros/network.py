@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Profile of the middleware for nodes on several hosts.
+"""Make the profile of the middleware for nodes on several hosts.
 
-It is unicast over UDP, only between the addresses of the hosts.
+The profile is unicast over UDP, and only between the addresses of the hosts.
 """
 
 import ipaddress
@@ -21,7 +21,7 @@ PORTS_A_DOMAIN = 250  # section 9.6.1.1
 
 
 def addresses(text: str) -> tuple[str, ...]:
-    """Read the addresses of the hosts from "10.0.0.1,10.0.0.2". Raises ParameterError."""
+    """Return the addresses in a text like "10.0.0.1,10.0.0.2". Raises ParameterError."""
     hosts = tuple(part.strip() for part in text.split(","))
     for address in hosts:
         try:
@@ -42,7 +42,7 @@ def addresses(text: str) -> tuple[str, ...]:
 
 
 def own_address(peers: Sequence[str], local: Collection[str]) -> str:
-    """Find the address of this host among the peers, by the addresses of its interfaces.
+    """Return the address of this host among the peers; `local` has those of its interfaces.
 
     Raises ParameterError unless exactly one of the peers is an address of this host.
     """
@@ -58,9 +58,9 @@ def own_address(peers: Sequence[str], local: Collection[str]) -> str:
 
 
 def network_profile(own_host: str, peers: Sequence[str]) -> str:
-    """Write the loopback profile with the address of this host in place of 127.0.0.1.
+    """Return the loopback profile, with the address of this host in place of 127.0.0.1.
 
-    The hosts are its initial peers.
+    The hosts are the initial peers in the profile.
     """
     text = LOOPBACK_PROFILE.read_text(encoding="utf-8")
     locators = "".join(

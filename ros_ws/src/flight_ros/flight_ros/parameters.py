@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS parameters of a node as a validated set.
+"""Read the ROS parameters of a node as a validated set.
 
-The overrides are validated as a whole; then each parameter is declared.
+The overrides are validated as a whole, and then each parameter is declared.
 """
 
 import sys
@@ -30,7 +30,8 @@ def read_parameters(node: Node, schema: type[P]) -> P:
     """Validate the overrides of a node, and declare its parameters.
 
     The node was created with automatically_declare_parameters_from_overrides. Every parameter of
-    the set is declared with its description, read-only unless it is tunable. Raises ParameterError.
+    the set is declared with its description. It is read-only if it is not tunable. Raises
+    ParameterError.
     """
     _require_no_octal(sys.argv)
     overrides = _without_global(node, nest(_overrides(node)), schema)
@@ -51,7 +52,7 @@ def read_parameters(node: Node, schema: type[P]) -> P:
     for name, value in flatten(parameters.model_dump()):
         group = name.split(".")[0]
         is_read_only = group not in tunable | own and name not in tunable
-        # dynamic_typing: the set validates the types and accepts an integer as a float
+        # with dynamic_typing, the set validates the types, and accepts an integer as a float
         descriptor = ParameterDescriptor(
             description=descriptions.get(group, ""),
             read_only=is_read_only,
@@ -63,8 +64,8 @@ def read_parameters(node: Node, schema: type[P]) -> P:
         elif value != ():
             node.declare_parameter(name, value, descriptor)
     for name in sorted(tunable):
-        # Also declare an optional parameter without an override, because it can be set in flight. A
-        # group that contains parameters is no parameter itself.
+        # An optional parameter without an override is declared too, because it can be set in
+        # flight. A group that contains parameters is no parameter.
         if not node.has_parameter(name) and not node.get_parameters_by_prefix(name):
             node.declare_parameter(
                 name,
@@ -77,10 +78,10 @@ def read_parameters(node: Node, schema: type[P]) -> P:
 def _without_global(
     node: Node, overrides: dict[str, Any], schema: type[NodeConfig]
 ) -> dict[str, Any]:
-    """Drop the parameters given to all nodes that this node does not know.
+    """Leave out parameters that were given to all nodes and that this node does not know.
 
     The node also undeclares them, because an ordinary node of ROS does not declare a parameter that
-    it does not know. A parameter from a section for this node stays, and is refused if it is
+    it does not know. A parameter from a section for this node stays, and is refused later if it is
     unknown.
     """
     known = schema.keys_beside(overrides)
@@ -98,7 +99,7 @@ def _without_global(
 
 
 def _is_global(node: Node, key: str, arguments: Sequence[str]) -> bool:
-    """Return whether a parameter was given to all nodes and in no section for this one."""
+    """Return whether a parameter was given to all nodes, and in no section for this node."""
     name = node.get_name()
     is_given = False
     for option, value in pairwise(arguments):
@@ -129,8 +130,8 @@ def _require_no_octal(arguments: Sequence[str]) -> None:
 def changed(node: Node, parameters: P, changes: list[Parameter]) -> P:
     """Change some parameters of a set, and validate it as a whole.
 
-    Raises ParameterError for an invalid set, and for a parameter that `learned` names, because such
-    a parameter can only change at a restart.
+    Raises ParameterError for an invalid set. It is also raised for a parameter that `learned`
+    names, because such a parameter can change only at a restart.
     """
     for change in changes:
         is_own = change.name.split(".")[0] in parameters.learned()
@@ -153,7 +154,7 @@ def _overrides(node: Node) -> dict[str, Any]:
 
 
 def _as_list(value: Any) -> Any:
-    """Return a sequence as a list; any other value unchanged."""
+    """Return a sequence as a list, and any other value unchanged."""
     return (
         value
         if isinstance(value, str | bytes | Mapping) or not hasattr(value, "__iter__")

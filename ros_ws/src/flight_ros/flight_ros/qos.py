@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Quality of service (QoS) of recorded topics.
+"""Find the quality of service (QoS) of recorded topics.
 
-This module finds the strongest compatible profile, and writes profiles in the form of rosbag2.
+This module finds the strongest compatible profile, and writes profiles as rosbag2 does.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ INFINITE_NS = 2**63 - 1  # rmw: RMW_DURATION_INFINITE
 
 
 def strongest_compatible(offered: Sequence[QoSProfile]) -> QoSProfile:
-    """Return the strongest profile that is compatible with all offered ones."""
+    """Return the strongest profile that is compatible with all offered profiles."""
     reliable = all(profile.reliability == ReliabilityPolicy.RELIABLE for profile in offered)
     durable = reliable and all(
         profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in offered
@@ -30,7 +30,7 @@ def strongest_compatible(offered: Sequence[QoSProfile]) -> QoSProfile:
 
 
 def rosbag2_profiles(offered: Sequence[QoSProfile]) -> list[dict[str, object]]:
-    """Write profiles as rosbag2 stores them."""
+    """Return profiles in the form in which rosbag2 stores them."""
     return [
         {
             "history": qos.history.short_key,
@@ -48,6 +48,6 @@ def rosbag2_profiles(offered: Sequence[QoSProfile]) -> list[dict[str, object]]:
 
 
 def _duration(duration: Duration) -> dict[str, int]:
-    # 0 stands for an unset duration
+    # 0 means that the duration is not set
     sec, nsec = divmod(duration.nanoseconds or INFINITE_NS, NANOSECONDS)
     return {"sec": sec, "nsec": nsec}

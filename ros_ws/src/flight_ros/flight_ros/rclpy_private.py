@@ -35,7 +35,7 @@ ARGUMENT_ERRORS = (
 def create_participant(name: str, context: Context) -> Participant:
     """Create a node without topics, parameters or services.
 
-    Its process then has a DDS participant.
+    The process then has a DDS participant.
     """
     with context.handle:
         return _rclpy.Node(name, "", context.handle, None, False, False)
@@ -49,7 +49,7 @@ def destroy_participant(participant: Participant) -> None:
 def take_messages(subscription: Subscription, limit: int) -> list[tuple[Any, Any]]:
     """Take at most `limit` messages (or their bytes) with their metadata, oldest first.
 
-    No executor takes part.
+    No executor is involved.
     """
     handle = subscription.handle
     kind = subscription.msg_type
@@ -86,7 +86,7 @@ class WaitSet:
 def answer_invalid_transitions(node: Node) -> None:
     """Let a lifecycle node answer a request for an invalid transition with success false.
 
-    Without this, rclpy raises and sends no answer.
+    Without this function, rclpy raises an exception and sends no answer.
     """
     service = node._service_change_state
     change_state = service.callback
@@ -105,8 +105,9 @@ def answer_invalid_transitions(node: Node) -> None:
 def refuse_foreign_parameters(node: Node) -> None:
     """Let a node refuse a whole request if it has an unknown parameter.
 
-    `ros2 param load` joins the sections of all nodes of a file. Without the refusal, a node would
-    take the values of names it shares, such as an age limit, from the section of another node.
+    `ros2 param load` joins the sections of all nodes in a file. Without the refusal, a node would
+    take values from the section of another node for names that both nodes have, such as an age
+    limit.
     """
     (service,) = (
         service for service in node.services if service.srv_name.endswith("/set_parameters")
@@ -134,9 +135,9 @@ def refuse_foreign_parameters(node: Node) -> None:
 
 
 def ready_callback(executor: SingleThreadedExecutor) -> Callable[[], None] | None:
-    """Return a callback that is ready, or None, without blocking.
+    """Return a callback that is ready, without blocking; None if no callback is ready.
 
-    If you call it, it raises the exceptions of the callback.
+    A call of the result raises the exceptions of the callback.
     """
     try:
         handler, _, _ = executor.wait_for_ready_callbacks(0, None, lambda: False)

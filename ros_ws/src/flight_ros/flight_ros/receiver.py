@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Receivers: the samples of a topic, checked and taken at a tick.
+"""Receive the samples of a topic, which are checked and taken at a tick.
 
 Refused samples are counted and logged.
 """
@@ -22,17 +22,19 @@ from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
 from flight_ros.throttle import Throttle
 from flight_ros.topics import Topic
 
-LOG_PERIOD_NS = 2 * NANOSECONDS  # between two lines on refused samples of one topic and reason
+# time between two log lines on refused samples of the same topic and reason
+LOG_PERIOD_NS = 2 * NANOSECONDS
 GROWTH = 2
 """Size of a message over that of the longest valid one. A publisher may leave channels out, as a
 bridge those of a pose that are not fresh: three of seven channels have half of the bytes."""
 
 RECENT = 9  # number of samples from which the median interval is taken
-FEWEST = 3  # samples that must fit into an age limit, so that one can be late and one be lost
+# number of samples that must fit into an age limit, so that one may be late and one may be lost
+FEWEST = 3
 
 
 class Sample(Protocol):
-    """What a receiver needs to know of a decoded message."""
+    """The properties of a decoded message that a receiver uses."""
 
     @property
     def stamp_ns(self) -> int:
@@ -40,7 +42,7 @@ class Sample(Protocol):
 
     @property
     def sender(self) -> str:
-        """Publisher."""
+        """Name of the publisher."""
 
 
 S = TypeVar("S", bound=Sample)
@@ -60,10 +62,11 @@ class Refusals:
     def __init__(
         self, node: Node, clock_of: Callable[[str], str | None] = lambda sender: None
     ) -> None:
-        # returns the end of a sentence on the stamp of a sender whose clock differs
+        # returns the end of a sentence on a stamp if the sender's clock differs
         self.clock_of = clock_of
-        self.counts: Counter[str] = Counter()  # by "topic: reason"
-        # by full topic name: the instant of the last refusal on the monotonic clock, its sentence
+        self.counts: Counter[str] = Counter()  # number of refusals by "topic: reason"
+        # by full topic name: the instant of the last refusal on the monotonic clock, and its
+        # sentence
         self.last: dict[str, tuple[int, str]] = {}
         self._node = node
         self._throttle = Throttle(LOG_PERIOD_NS)
@@ -72,7 +75,7 @@ class Refusals:
     def add(self, subscription: Source, reason: str, sentence: str) -> None:
         """Count a refused sample, and log at most one in 2 s for each topic and reason.
 
-        A conflicting publisher is logged as an ERROR, and is an ERROR in the diagnostics too.
+        A conflicting publisher is an ERROR in the log and in the diagnostics.
         """
         key = f"{subscription.topic.name}: {reason}"
         self.counts[key] += 1
@@ -130,7 +133,7 @@ class Refusals:
     def since(self, subscription: PolledSubscription, begin_ns: int) -> Refusal | None:
         """Return the last refusal of a topic since an instant of the monotonic clock.
 
-        The refusal states its age and how often it occurred.
+        The text states the age of the refusal, and how often it occurred.
         """
         if subscription.name not in self.last:
             return None
@@ -144,24 +147,24 @@ class Refusals:
         return Refusal(f"{count} samples refused, the last {age:.1f} s ago: {sentence}")
 
     def pop_conflict(self) -> Refusal | None:
-        """Return the refusal of the last conflicting publisher since the last call."""
+        """Return the refusal of the last conflicting publisher since the previous call."""
         conflict, self._conflict = self._conflict, None
         return conflict
 
 
 class Receiver(Generic[S]):
-    """The samples of a topic. Checks go from cheap to costly: size, publisher, content, stamp.
+    """The samples of a topic, which pass checks of size, publisher, content and stamp.
 
-    A message that is too long, or from a conflicting publisher, is refused without decoding names
-    and values, so that a flood of such messages costs no more than valid ones. A message of the
-    locked publisher is too long if it exceeds GROWTH times the longest valid message. This limit
-    lasts until the publisher times out.
+    The cheap checks come first. A message that is too long, or from a conflicting publisher, is
+    refused before names and values are decoded. So a flood of such messages costs no more than
+    valid messages. A message of the locked publisher is too long if it exceeds GROWTH times the
+    longest valid message. This limit lasts until the publisher times out.
 
     `decode` returns None for a vector without channels. `take` gets a sample and the present
-    instant. `lock` admits one publisher at a time; None admits all of them. `max_age_ns` limits the
-    age of a stamp and its lead over the clock. It is None if the sender does not have the clock of
-    the flight. `max_size`, in bytes, is for a topic of reports, whose lengths differ by more than
-    GROWTH. It is None for a topic of samples. Refusals are raised as ChannelError.
+    instant. `lock` admits one publisher at a time; None admits all publishers. `max_age_ns` limits
+    the age of a stamp and its lead over the clock. It is None if the sender does not have the clock
+    of the flight. `max_size`, in bytes, is for a topic of reports, whose lengths differ by more
+    than GROWTH. It is None for a topic of samples. Refusals are raised as ChannelError.
     """
 
     def __init__(
@@ -180,7 +183,7 @@ class Receiver(Generic[S]):
         self._max_size = max_size or MAX_SIZE
         self._grows = max_size is not None
         self._longest = 0  # bytes, length of the longest valid message
-        self._stamps_ns = deque[int](maxlen=RECENT)  # of the last samples
+        self._stamps_ns = deque[int](maxlen=RECENT)  # stamps of the last samples
         self._refusals = refusals
         self._decode = decode
         self._take = take
@@ -202,7 +205,7 @@ class Receiver(Generic[S]):
         ]
 
     def take_message(self, raw: bytes, now_ns: int, sequence: int = 0) -> bool:
-        """Check and take a message. Returns whether the message was valid.
+        """Check and take a message, and return whether it was valid.
 
         `sequence` is the same as for `PublisherLock.require_alone`.
         """
@@ -222,7 +225,7 @@ class Receiver(Generic[S]):
         return True
 
     def _require_publisher(self, raw: bytes, now_ns: int) -> str:
-        """Return the sender of a message, or "" if the topic has no lock.
+        """Return the sender of a message; "" if the topic has no lock.
 
         Raises ChannelError if the message is too long, or comes from a conflicting publisher.
         """
@@ -241,7 +244,7 @@ class Receiver(Generic[S]):
         return sender
 
     def slowness(self, max_age_ns: int) -> Refusal | None:
-        """Say that samples come too slowly for an age limit, if fewer than FEWEST fit into it."""
+        """Say that samples come too slowly, if fewer than FEWEST fit into an age limit."""
         if (
             len(self._stamps_ns) < RECENT
             or (period_ns := float(np.median(np.diff(self._stamps_ns)))) <= 0.0
@@ -260,11 +263,11 @@ class Receiver(Generic[S]):
         return Refusal(f"{slow}: {mend}") if fit < FEWEST else None
 
     def receive(self) -> list[S | None]:
-        """Decode the messages of the flight's publisher in lockstep, for `accept`.
+        """Return the decoded messages of the flight's publisher in lockstep, for `accept`.
 
-        Each message of this publisher stands for an instant. None is an instant without a sample:
-        the publisher sent no channels, or content that is refused. A message of any other publisher
-        has no effect.
+        Each message of this publisher stands for an instant. None means an instant without a
+        sample, because the publisher sent no channels or invalid content. A message of any other
+        publisher has no effect.
         """
         samples: list[S | None] = []
         for received in self.subscription.take():
@@ -278,7 +281,7 @@ class Receiver(Generic[S]):
                 sample = self._decode(received.message)
             except ChannelError as error:
                 self._refusals.add(self.subscription, error.reason, str(error))
-                # Before the first valid message the flight's publisher is not known.
+                # The flight's publisher is not known before the first valid message.
                 if self.lock is None or self.lock.publisher is None:
                     continue
                 sample = None
@@ -317,7 +320,7 @@ class Receiver(Generic[S]):
             self.lock.refresh(sample.sender, now_ns)
 
     def _require_stamp(self, stamp_ns: int, now_ns: int, sender: str) -> None:
-        """Refuse a stamp further from the present than the age limit, if there is one."""
+        """Refuse a stamp that is further from the present than the age limit, if there is one."""
         if self._max_age_ns is None:
             return
         max_age_ns = self._max_age_ns()

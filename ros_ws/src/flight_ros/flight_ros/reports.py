@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reports as messages of diagnostic_msgs/DiagnosticArray.
+"""Write and read reports as messages of diagnostic_msgs/DiagnosticArray.
 
 A report has a stamp, a sentence and named values, which are JSON.
 """
@@ -18,21 +18,22 @@ from flight_core.vectors import ChannelError
 from flight_ros.messages import require_size
 from flight_ros.rclpy_private import DeserializationError
 
-MAX_REPORT_SIZE = 65_536  # bytes; a model of eight states with its observer has 10,000
+# bytes; the report of a model of eight states with its observer has 10,000
+MAX_REPORT_SIZE = 65_536
 
 
 class Report(NamedTuple):
-    """A message with a sentence."""
+    """A report: a sentence with a stamp, a sender and named values."""
 
     stamp_ns: int
-    sender: str  # the publisher
+    sender: str  # name of the publisher
     sentence: str
     values: Mapping[str, Any] = {}
-    warns: bool = False  # level WARN, else OK
+    warns: bool = False  # whether the level is WARN instead of OK
 
 
 def encode(report: Report, name: str) -> bytes:
-    """Write the message of a report; `name` is that of its status."""
+    """Return the message of a report; `name` is the name of its status."""
     message = DiagnosticArray()
     message.header.stamp = Time(
         sec=report.stamp_ns // NANOSECONDS, nanosec=report.stamp_ns % NANOSECONDS
@@ -47,7 +48,7 @@ def encode(report: Report, name: str) -> bytes:
 
 
 def decode(raw: bytes) -> Report:
-    """Read the report in a message, or raise ChannelError, reason "size" or "malformed"."""
+    """Return the report in a message. Raises ChannelError, reason "size" or "malformed"."""
     require_size(raw, MAX_REPORT_SIZE)
     try:
         message = deserialize_message(raw, DiagnosticArray)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated time: the time of the topic /clock, in place of the clocks of the host.
+"""Simulated time, which the topic /clock gives in place of the clocks of the host.
 
-Ticks, stamps and ages are in this time, so a flight takes the same ticks at any speed of the
-simulator, and a pause of /clock is a pause of the flight. What concerns the process stays in the
-time of the host: diagnostics, services and log lines.
+Ticks, stamps and ages are in this time. So a flight takes the same ticks at any speed of the
+simulator, and a pause of /clock is a pause of the flight. The work of the process itself stays in
+the time of the host: diagnostics, services and log lines.
 """
 
 import time
@@ -19,11 +19,11 @@ from flight_ros.receiver import Refusals
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import NEWEST_SAMPLES, SIMULATED_CLOCK
 
-# /clock may be lost for this long; a node then catches up with its missed ticks
+# longest loss of /clock after which a node catches up with its missed ticks
 LARGEST_JUMP_NS = 60 * NANOSECONDS
 LONGEST_WAIT_NS = NANOSECONDS // 50  # so that signals and service calls are handled in a pause
 SILENT_NS = NANOSECONDS  # silence of /clock after which a node says that it waits
-HISTORY = 4096  # number of messages of /clock that are kept, to date other messages by them
+HISTORY = 4096  # number of messages of /clock that are kept to date other messages
 
 
 class ClockRestarted(Exception):  # noqa: N818 - an event of the simulator
@@ -49,17 +49,17 @@ class SimulatedTime:
         return bool(self._instants_ns)
 
     def silent(self) -> bool:
-        """Return whether no message has come for SILENT_NS of the host."""
+        """Return whether no message has come for SILENT_NS by the host's clock."""
         return not self.known() or time.time_ns() - self._received_ns[-1] > SILENT_NS
 
     def time_ns(self) -> int:
-        """Return the newest instant; 0 before the first."""
+        """Return the newest instant; 0 before the first message."""
         return self._instants_ns[-1] if self.known() else 0
 
     monotonic_ns = time_ns
 
     def sleep(self, duration: float, /) -> None:
-        """Wait for the next message, at most LONGEST_WAIT_NS of the host.
+        """Wait for the next message, at most LONGEST_WAIT_NS by the host's clock.
 
         A duration of simulated time has no fixed length on the host, so `duration` is ignored.
         """
@@ -69,7 +69,7 @@ class SimulatedTime:
     def at(self, system_ns: int) -> int:
         """Return the simulated time at an instant of the system clock.
 
-        Between two messages it is interpolated.
+        The time is interpolated between two messages.
         """
         received_ns = self._received_ns
         instants_ns = self._instants_ns
@@ -93,7 +93,7 @@ class SimulatedTime:
 
     @property
     def restarted(self) -> bool:
-        """Whether /clock went back or far ahead; the time stands still since then."""
+        """Whether /clock went back or far ahead; the time has stood still since then."""
         return self._jump_ns != 0
 
     def require_one_simulation(self) -> None:

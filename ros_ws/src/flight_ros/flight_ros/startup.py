@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Start of a node's process: an early DDS participant starts discovery.
+"""Start the process of a node, with a DDS participant that starts discovery early.
 
 Meanwhile the modules of the node are imported. Discovery takes 0.2 s, and the import of NumPy and
-of a node nearly as long. Both run at the same time, so that a node restarts sooner. For this reason
-this module imports rclpy and little else.
+of a node takes nearly as long. Both run at the same time, so that a node restarts sooner. For this
+reason this module imports little except rclpy.
 """
 
 import gc
@@ -43,9 +43,9 @@ def start_nodes(
     `--print-parameters` prints a parameter file for the user to fill in. `parameters` holds the
     name of the node and the "module:class" of its parameter set.
 
-    A signal during the start also ends the process with exit status 0. With `early` a DDS
+    A signal during the start also ends the process with exit status 0. With `early`, a DDS
     participant is created before the imports. The real-time priority is lowered by `lower_by`
-    levels. A node with a longer period has a larger `lower_by`.
+    levels, which is more for a node with a longer period.
     """
     if {"--help", "-h"} & {*sys.argv[1:]}:
         print(USAGE.format(program=os.path.basename(sys.argv[0])))  # noqa: PTH119 - pathlib takes as long to import as the rest
@@ -57,13 +57,14 @@ def start_nodes(
         return
     try:
         require_ros_environment()
-    except ValueError as error:  # a ParameterError, whose module a node loads later
+    except ValueError as error:  # a ParameterError, whose module is loaded later
         print(f"error: {error}", file=sys.stderr)
         sys.exit(BAD_ENVIRONMENT)
     compute_in_one_thread()
     lower_real_time_priority(lower_by)
     limit_memory()
-    # `run` enables it; collections during the imports find nothing and take a tenth of the time
+    # `run` enables it again; collections during the imports find nothing, and take a tenth of the
+    # time
     gc.disable()
     handle_shutdown(_exit)
     early_participant = _create_early_participant() if early else None
@@ -75,7 +76,7 @@ def start_nodes(
 def _create_early_participant() -> "Participant | None":
     """Create a node without topics.
 
-    It is hidden, because its name begins with _ (ROS 2 design, topic and service names).
+    The node is hidden, because its name begins with _ (ROS 2 design, topic and service names).
     """
     import rclpy  # noqa: PLC0415 - on a full /dev/shm the import itself is a bus error
     from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415

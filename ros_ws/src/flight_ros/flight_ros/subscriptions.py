@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Polled subscriptions: a tick takes the newest messages at any rate of the publisher.
+"""Poll subscriptions: a tick takes the newest messages, whatever the publisher's rate is.
 
-No executor takes part. Polling takes about 1 us if there is no message. A flood of messages causes
+No executor is involved. Polling takes about 1 us if there is no message. A flood of messages causes
 no callbacks, and a clock that is set back has no effect.
 """
 
@@ -18,7 +18,7 @@ from flight_ros.topics import Topic
 
 
 class _NeverExecuted(CallbackGroup):
-    """Keeps its subscriptions out of the wait set of every executor."""
+    """A callback group that keeps its subscriptions out of every executor's wait set."""
 
     def can_execute(self, entity: Any) -> bool:
         return False
@@ -31,7 +31,7 @@ class _NeverExecuted(CallbackGroup):
 
 
 class ReceivedMessage(NamedTuple):
-    """A message (or its bytes) and its metadata; times in ns of the system clock."""
+    """A message, or its bytes, and its metadata; times are in ns of the system clock."""
 
     message: Any
     sent_ns: int
@@ -43,8 +43,8 @@ class PolledSubscription:
     """A subscription that is polled by `take`.
 
     If it is `raw`, its messages are CDR bytes. It has no callbacks of rclpy for publishers that do
-    not match. `EndpointMonitor` reports such publishers, and an executor would ask for each of
-    these events whenever it looks for a request.
+    not match, because `EndpointMonitor` reports such publishers. With callbacks, an executor would
+    ask for each of these events whenever it looks for a request.
     """
 
     def __init__(self, node: Node, topic: Topic, qos: QoSProfile, *, raw: bool = False) -> None:
@@ -64,7 +64,7 @@ class PolledSubscription:
     def take(self, most: int | None = None) -> list[ReceivedMessage]:
         """Return the messages since the last call, oldest first.
 
-        It returns at most `most` messages. The default is the depth of the queue.
+        The result has at most `most` messages, by default the depth of the queue.
         """
         return [
             ReceivedMessage(

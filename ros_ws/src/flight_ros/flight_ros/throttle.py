@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Throttle of repeated log lines.
+"""Throttle repeated log lines.
 
-The throttle of rclpy counts by line of code, not by topic and reason.
+The throttle of rclpy distinguishes lines of code, and not topics and reasons.
 """
 
 import time
@@ -13,12 +13,12 @@ class Throttle:
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
-        self._passed_ns: dict[str, int] = {}  # when a line last passed, by its text
+        self._passed_ns: dict[str, int] = {}  # instant at which a line last passed, by its text
 
     def due(self, line: str) -> bool:
         """Return whether the line may pass, since it has not passed for a period.
 
-        If it may, it counts as passed now.
+        If the result is True, the line counts as passed now.
         """
         now_ns = time.monotonic_ns()
         due = now_ns - self._passed_ns.get(line, -self._period_ns) >= self._period_ns

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ticker: a fixed rate with absolute deadlines, without drift.
+"""Tick at a fixed rate with absolute deadlines, without drift.
 
-It ticks on the monotonic clock, or in simulated time.
+The ticker runs on the monotonic clock, or in simulated time.
 """
 
 import math
@@ -11,13 +11,13 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-# s of busy-wait before a deadline: the wake-up of a sleeping thread takes 20 to 250 us
+# s of busy-wait before a deadline, because the wake-up of a sleeping thread takes 20 to 250 us
 SPIN_TIME = 2.5e-4
-MAX_SPIN_FRACTION = 0.2  # maximum of the busy-wait, as a fraction of the period and so of a core
+MAX_SPIN_FRACTION = 0.2  # largest busy-wait, as a fraction of the period and thus of a core
 
 
 class HostTime(Protocol):
-    """What the ticks of a node need from the module `time`."""
+    """The functions of the module `time` that the ticks of a node need."""
 
     def monotonic_ns(self) -> int:
         """Return the time of the ticks."""
@@ -26,26 +26,26 @@ class HostTime(Protocol):
         """Return the time of the stamps."""
 
     def sleep(self, duration: float, /) -> None:
-        """Wait, at most `duration` s."""
+        """Wait for at most `duration` s."""
 
 
 class Tick(NamedTuple):
     """A deadline that has passed."""
 
-    number: int  # number of periods since the start; after an overrun it skips the missed ones
-    previous: int  # number of the previous tick, 0 at the first
-    late_ns: int  # how long after the deadline the tick began
+    number: int  # number of periods since the start; after an overrun it skips the missed periods
+    previous: int  # number of the previous tick; 0 at the first tick
+    late_ns: int  # time from the deadline to the beginning of the tick
 
     @property
     def missed(self) -> int:
-        """Number of periods missed since the previous tick by an overrun."""
+        """Number of periods that an overrun has missed since the previous tick."""
         return max(self.number - self.previous - 1, 0)
 
 
 class Ticker:
-    """Deadlines start + k period, in ns of host.monotonic_ns().
+    """Gives the deadlines start + k period, in ns of host.monotonic_ns().
 
-    `host` is the module `time` by default. Without `spin` a wait does not busy-wait.
+    `host` is the module `time` by default. With `spin`, a wait ends with a busy-wait.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Ticker:
             pass
 
     def due(self) -> Tick | None:
-        """Return the newest deadline that has passed and was not returned yet, else None."""
+        """Return the newest passed deadline that was not returned yet; None if there is none."""
         number, late_ns = divmod(self._host.monotonic_ns() - self._start_ns, self.period_ns)
         if number <= self._last:
             return None
@@ -91,8 +91,8 @@ class TickTimes:
     """
 
     def __init__(self) -> None:
-        self._periods: list[int] = []  # ns
-        self._compute: list[int] = []  # ns
+        self._periods: list[int] = []  # ns, periods of the ticks
+        self._compute: list[int] = []  # ns, compute times of the ticks
         self._missed = 0
         self._begin_ns: int | None = None
 
@@ -105,16 +105,16 @@ class TickTimes:
         self._missed += tick.missed
 
     def end(self) -> None:
-        """Note that the tick that began has ended."""
+        """Note that the present tick has ended."""
         self._compute.append(time.monotonic_ns() - (self._begin_ns or 0))
 
     def report(self) -> dict[str, object]:
-        """Return mean, 99th percentile and maximum in s of the times since the last report."""
+        """Return mean, 99th percentile and maximum of the times since the last report, s."""
         report: dict[str, object] = {"missed ticks": self._missed}
         for key, times in (("period", self._periods), ("compute time", self._compute)):
             if times:
                 values = np.sort(times) * 1e-9
-                # np.percentile would import numpy.ma inside a tick
+                # np.percentile would import numpy.ma during a tick
                 nearest = math.ceil(0.99 * len(values)) - 1
                 report |= {
                     f"{key} mean (s)": f"{values.mean():.6f}",

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Transport of the middleware: loopback only, unless the user configures a profile.
+"""Select the transport of the middleware: loopback only, unless the user configures a profile.
 
-Fast DDS silently falls back to all interfaces if it cannot read its profile. So the file is checked
-before rclpy starts and the sockets afterwards.
+Fast DDS silently uses all interfaces if it cannot read its profile. So the file is checked before
+rclpy starts, and the sockets are checked afterwards.
 """
 
 import os
@@ -24,15 +24,15 @@ def environment() -> dict[str, str]:
     """
     if PROFILE_VARIABLE in os.environ:
         return {}
-    # SYSTEM_DEFAULT leaves discovery to the profile; LOCALHOST would add shared memory to it.
+    # SYSTEM_DEFAULT leaves discovery to the profile, while LOCALHOST would add shared memory.
     return {PROFILE_VARIABLE: str(LOOPBACK_PROFILE), DISCOVERY_VARIABLE: "SYSTEM_DEFAULT"}
 
 
 def prepare() -> None:
     """Set the environment before rclpy starts.
 
-    Raises ParameterError if the profile cannot be read as XML, and as `require_ros_environment`
-    does.
+    Raises ParameterError if the profile cannot be read as XML, and whenever
+    `require_ros_environment` does.
     """
     require_ros_environment()
     os.environ.update(environment())
@@ -48,9 +48,9 @@ def prepare() -> None:
 
 
 def open_to_network() -> list[str]:
-    """Find UDP sockets of this process on all interfaces in spite of the loopback profile.
+    """Return UDP sockets of this process that are open on all interfaces.
 
-    There should be none.
+    With the loopback profile there should be none.
     """
     if os.environ.get(PROFILE_VARIABLE) != str(LOOPBACK_PROFILE):
         return []
