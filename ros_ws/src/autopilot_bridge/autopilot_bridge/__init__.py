@@ -2,5 +2,5 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridge to an autopilot, which replaces the simulated aircraft.
 
-It has the channel maps, their conversion, the engagement, the failsafe and the node.
+The package has the channel maps and their conversion, the engagement, the failsafe and the node.
 """

@@ -1,32 +1,34 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The lock of a MAVLink link to the first autopilot.
+"""Lock a MAVLink link to the first autopilot.
 
-An autopilot is known by the address of its packets and by the time since boot in its messages.
+An autopilot is identified by the address of its packets, and by the time since boot in its
+messages.
 """
 
 from flight_core.publisher_lock import SENDER, PublisherLock
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError
 
-CLOCK_TOLERANCE_NS = NANOSECONDS  # autopilots that were switched on within this time look the same
+# autopilots that were switched on within this time cannot be distinguished
+CLOCK_TOLERANCE_NS = NANOSECONDS
 
 
 class AutopilotLock:
     """Locks to the first autopilot until it is silent, and then to the next one.
 
     Two autopilots behind the same address differ by the time since boot in their messages. This
-    time never goes back, and advances by at most the time that passes here, although a message may
-    come late. If an autopilot starts again, it counts as a second sender until the messages of the
-    earlier start have been missing for the same silence.
+    time never goes back, and it advances by at most the time that passes here, although a message
+    may be late. An autopilot that starts again counts as a second sender. It stops counting as one
+    when messages of its earlier start have been missing for the same silence.
     """
 
     def __init__(self, silence_ns: int) -> None:
         self._silence_ns = silence_ns
         self._addresses, self._starts = self._new_lock(), self._new_lock()
         self._newest_ns = 0  # the largest time since boot
-        # The earliest instant of the boot that the messages so far have shown. It comes from the
-        # message with the least delay.
+        # The earliest instant of the boot that the messages so far imply. It comes from the message
+        # with the least delay.
         self._boot_ns = 0
 
     def _new_lock(self) -> PublisherLock:
@@ -34,18 +36,19 @@ class AutopilotLock:
 
     @property
     def address(self) -> str | None:
-        """The address of the autopilot; None until the first message."""
+        """Address of the autopilot; None until the first message."""
         return self._addresses.publisher
 
     def overran(self, duration_ns: int) -> None:
-        """Take out of the silence a time in which the receiver did not run, ns."""
+        """Subtract a time in which the receiver did not run from the silence, ns."""
         self._addresses.overran(duration_ns)
         self._starts.overran(duration_ns)
 
     def check(self, address: str, since_boot_ns: int | None, now_ns: int) -> None:
-        """Raise ChannelError, reason "sender", if a second sender comes before the first is silent.
+        """Refuse a second sender before the first sender is silent.
 
-        `since_boot_ns` is None for a message without the time since boot.
+        Raises ChannelError, reason "sender". `since_boot_ns` is None for a message without the time
+        since boot.
         """
         try:
             self._addresses.check(address, now_ns)
@@ -69,7 +72,7 @@ class AutopilotLock:
     def refresh(self, address: str, since_boot_ns: int | None, now_ns: int) -> bool:
         """Lock to the sender of a message after `check`.
 
-        Return whether the sender is new, or has started again.
+        Returns whether the sender is new, or has started again.
         """
         is_new_sender = self._addresses.refresh(address, now_ns)
         if is_new_sender:
@@ -89,9 +92,9 @@ class AutopilotLock:
         return is_new_sender
 
     def _start(self, since_boot_ns: int, now_ns: int) -> str:
-        """Name the start of the autopilot to which a time since boot belongs.
+        """Return the name of the start of the autopilot to which a time since boot belongs.
 
-        This is the name of the start that the lock holds, or a new name from the instant of boot.
+        It is the name of the start that the lock holds, or a new name from the instant of boot.
         """
         boot_ns = now_ns - since_boot_ns
         advances = (

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge to an autopilot, without ROS: it makes y from its messages, and setpoints from u.
+"""The bridge to an autopilot, without ROS: y from its messages, and setpoints from u.
 
-It has the engagement, the pilot override and the failsafe. It reads no clock: every instant is an
-argument, in ns on the same clock. The watchdogs of y and u can end an engagement.
+It has the engagement, the pilot override and the failsafe. It reads no clock, because every instant
+is an argument, in ns on the same clock. The watchdogs of y and u can end an engagement.
 """
 
 import math
@@ -27,10 +27,11 @@ UNBOUNDED = Refusal(
     "the loss of the transmitter cannot be seen over this link: set max_engaged in the "
     "map, or engage with --blind"
 )
-# A u that does not change counts as being at a limit of the law if it is beyond this share of the
-# limits of the map. The amplitudes of experiments are smaller.
+# A u that does not change counts as being at a limit of the law if it exceeds this share of the
+# map's limits. The amplitudes of experiments are smaller.
 LARGE = 0.5
-END_WARNING_NS = 10 * NANOSECONDS  # warning before `max_engaged` ends an engagement
+# time from the warning to the end of an engagement by `max_engaged`
+END_WARNING_NS = 10 * NANOSECONDS
 
 
 class Phase(IntEnum):
@@ -44,14 +45,14 @@ class Phase(IntEnum):
 
 
 def trim_key(name: str) -> str:
-    """Return the name under which the bridge takes the source of an input's trim."""
+    """Return the name under which `Bridge.take_output` takes the source of an input's trim."""
     return f"trim of {name}"
 
 
 class Bridge:
-    """The newest y and u, the phase and the pilot override.
+    """The state of a bridge: the newest y and u, the phase and the pilot override.
 
-    Only `engage` engages. The bridge never engages again by itself.
+    Only a call of `engage` engages the bridge. It never engages again by itself.
     """
 
     def __init__(self, channel_map: ChannelMap, *, dry_run: bool) -> None:
@@ -60,12 +61,13 @@ class Bridge:
         self.outputs = tuple(channel_map.outputs)
         self.inputs = tuple(channel_map.inputs)
         self.phase = Phase.DISENGAGED
-        # Why the bridge is not engaged, or what an engagement still waits for.
+        # Why the bridge is not engaged, or for what an engagement still waits.
         self.reason: Refusal | None = Refusal("not engaged yet")
-        # A reason that refuses and ends an engagement, such as another publisher. The node sets it.
+        # A reason that refuses and ends an engagement, such as another publisher. The node sets
+        # this.
         self.conflict: Refusal | None = None
         # A reason that refuses an engagement but does not end one yet, such as a slow rate of the
-        # link. The node sets it.
+        # link. The node sets this.
         self.problem: Refusal | None = None
         sources = {trim_key(name): row for name, row in channel_map.trims.items()}
         self._rows: dict[str, MeasuredRow] = {
@@ -75,21 +77,22 @@ class Bridge:
             **sources,
         }
         self._readings: dict[str, Reading] = {}
-        self._zero: dict[str, float] = {}  # captured outputs: their value at engagement
-        self._trim: dict[str, float] = {}  # captured inputs: their trim at engagement
+        self._zero: dict[str, float] = {}  # value at engagement of each captured output
+        self._trim: dict[str, float] = {}  # trim at engagement of each captured input
         self._last_y_ns = -1  # stamp of the last y
         self._last_pose_ns = -1  # stamp of the last pose
         self._u: FloatArray = np.zeros(len(self.inputs))
-        # Whether the newest u differs from the one before.
+        # Whether each input of the newest u differs from the previous u.
         self._moves = np.ones(len(self.inputs), dtype=bool)
         self.u_lock = PublisherLock(self._u_timeouts_ns)
         self.conditions = Conditions(channel_map)
         self._parameters: dict[str, float] = {}
-        self._phase_ns = 0  # when the phase began
-        # Whether a release keeps the mode, because a pilot chose the mode or because nothing flew.
+        self._phase_ns = 0  # instant at which the phase began
+        # Whether a release keeps the mode, because the pilot chose the mode or because nothing
+        # flew.
         self._keeps_mode = True
-        self._limit_ns: dict[str, int] = {}  # since when inputs are at a limit
-        self._end_ns: int | None = None  # when `max_engaged` ends the engagement
+        self._limit_ns: dict[str, int] = {}  # instants since which inputs are at a limit
+        self._end_ns: int | None = None  # instant at which `max_engaged` ends the engagement
         rows = channel_map.inputs.values()
         self._lower = np.array([row.lower for row in rows])
         self._upper = np.array([row.upper for row in rows])
@@ -101,9 +104,9 @@ class Bridge:
     def take_output(self, name: str, raw: float, stamp_ns: int, now_ns: int) -> None:
         """Take a value of a channel of y, of the pose or of a trim's source.
 
-        The channel becomes sign scale raw + offset. Raises ChannelError with the reason "stamp" if
-        the stamp differs from now by more than the age limit, and with the reason "order" if the
-        stamp is not later than the one before.
+        The channel becomes sign scale raw + offset. Raises ChannelError, reason "stamp", if the
+        stamp differs from the present by more than the age limit. The reason is "order" if the
+        stamp is not later than the previous one.
         """
         row = self._rows[name]
         if abs(now_ns - stamp_ns) > nanoseconds(row.max_age):
@@ -127,7 +130,7 @@ class Bridge:
         self._readings[name] = Reading(stamp_ns, value)
 
     def _u_timeouts_ns(self) -> tuple[int, int]:
-        """Return the timeouts of the publisher of u.
+        """Return the times after which the publisher of u has timed out, ns.
 
         While the bridge is engaged, any other publisher conflicts, even after a timeout, because
         its u would jump. The timeout ends the engagement.
@@ -136,19 +139,19 @@ class Bridge:
         return takeover_ns, takeover_ns
 
     def max_u_age_ns(self) -> int:
-        """Return the age limit of a u by its stamp, which is the instant of a y.
+        """Return the age limit of a u, ns; the age counts from its stamp, the instant of a y.
 
-        This limit prevents that a played log begins to fly the autopilot.
+        This limit prevents the playback of a log from flying the autopilot.
         """
         return self._max_age_ns + self._max_y_age_ns
 
     def take_u(self, sample: StampedVector, now_ns: int) -> None:
-        """Take u, shape (m,) in the map's order, from the publisher of `u_lock`."""
+        """Take u, shape (m,), in the map's order, from the publisher of `u_lock`."""
         self._moves = sample.value != self._u
         self._u = sample.value
 
     def take_effects(self, sample: StampedVector, now_ns: int) -> None:
-        """Take the effects of the inputs as the controller's probe found them, (m,).
+        """Take the effects of the inputs that the controller's probe found, (m,).
 
         They are in the order of the map. If an input has no effect, an engagement ends.
         """
@@ -157,9 +160,9 @@ class Bridge:
             self.disengage(stuck, now_ns)
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
-        """Take the field of a condition.
+        """Take a value of the field of a condition.
 
-        If the condition is lost, the next step ends an engagement.
+        If the condition does not hold any more, the next step ends an engagement.
         """
         self.conditions.take_condition(name, raw, now_ns)
 
@@ -168,9 +171,9 @@ class Bridge:
         self._parameters[name] = value
 
     def take_override(self, name: str, raw: float, now_ns: int) -> None:
-        """Take the field of a pilot override.
+        """Take a value of the field of a pilot override.
 
-        If it is beyond its threshold, the bridge disengages at once.
+        If it is beyond its threshold, the bridge disengages immediately.
         """
         self.conditions.take_override(name, raw, now_ns)
         if self._is_active(name, now_ns):
@@ -179,24 +182,24 @@ class Bridge:
     # State
 
     def stale(self, now_ns: int) -> dict[str, Stale]:
-        """Return the stale channels of y and of the envelope, each with what is wrong.
+        """Return the stale channels of y and of the envelope, each with its fault.
 
-        An example is "0.30 s old (/topic)".
+        An example of a fault is "0.30 s old (/topic)".
         """
         watched = dict.fromkeys((*self.outputs, *self.channel_map.envelope))
         return {name: reason for name in watched if (reason := self._staleness(name, now_ns))}
 
     def _staleness(self, name: str, now_ns: int) -> Stale | None:
-        """Say what is wrong with a channel, unless it is fresh or its last value is held."""
+        """Return the fault of a stale channel; None if it is fresh or its last value is held."""
         row = self._rows[name]
         if isinstance(row, OutputRow) and row.held and name in self._readings:
             return None
         return staleness(row.topic, self._readings.get(name), row.max_age, now_ns)
 
     def _reason_against_values(self, section: str = "envelope") -> Refusal | None:
-        """Say which channels are outside the limits of a section of the map.
+        """Say which channels are outside their limits in a section of the map.
 
-        Every channel must have been received.
+        All channels of the section must have been received before.
         """
         what = "the envelope" if section == "envelope" else section
         values = (
@@ -213,7 +216,7 @@ class Bridge:
         """Say which inputs stay at a limit for longer than their rows allow.
 
         The aircraft does not follow such an input. The limits of the law may be narrower than those
-        of the map, so a large u that does not change counts as being at one.
+        of the map. So a large u that does not change counts as being at a limit.
         """
         reasons = []
         inside, small = (
@@ -234,7 +237,7 @@ class Bridge:
         return joined(reasons)
 
     def _reason_against_commands(self, now_ns: int) -> Refusal | None:
-        """Say why the autopilot must not be commanded any more, whatever y and u are."""
+        """Say why the autopilot must not be commanded any more, independent of y and u."""
         violations = (
             self.conditions.violation(now_ns, awaited=awaited) for awaited in (False, True)
         )
@@ -245,7 +248,7 @@ class Bridge:
         return self.conditions.is_active(name, now_ns, engaged=is_engaged)
 
     def _lack(self, now_ns: int) -> Refusal | None:
-        """Say what an engagement lacks."""
+        """Say which conditions for an engagement are missing."""
         warning = None
         if self._end_ns is not None and now_ns >= self._end_ns - END_WARNING_NS:
             warning = Refusal(
@@ -256,11 +259,11 @@ class Bridge:
         return joined((warning, self.problem, silent, blindness))
 
     def u_timed_out(self, now_ns: int) -> bool:
-        """Return whether no u was received yet, or none for longer than its age limit."""
+        """Return whether no u has been received, or none for longer than its age limit."""
         return self.u_lock.timed_out(now_ns, self._max_age_ns)
 
     def _u_timeout(self, now_ns: int) -> Refusal | None:
-        """Say why u has timed out, if it is not fresh."""
+        """Say why u has timed out; None if it is fresh."""
         if self.u_lock.publisher is None:
             return Refusal("u not received yet")
         if self.u_timed_out(now_ns):
@@ -270,8 +273,8 @@ class Bridge:
     def reason_against_engagement(self, now_ns: int) -> Refusal | None:
         """Say why `engage` would be refused now.
 
-        Awaited conditions do not count. A dry run also states the reason that there would be with
-        `dry_run: false`.
+        Conditions for which an engagement waits do not count. A dry run states the same reason as
+        `dry_run: false` would.
         """
         checks: tuple[Callable[[], Refusal | None], ...] = (
             lambda: self.conflict,
@@ -296,7 +299,7 @@ class Bridge:
         return UNBOUNDED
 
     def _reason_against_parameters(self) -> Refusal | None:
-        """Say which parameters of the autopilot keep the bridge from engaging."""
+        """Say which parameters of the autopilot prevent the engagement."""
         reasons = []
         for name, row in self.channel_map.parameters.items():
             value = self._parameters.get(name)
@@ -321,7 +324,7 @@ class Bridge:
     def _stale_inputs(self, now_ns: int) -> Refusal | None:
         """Say which inputs of the bridge are stale.
 
-        These are y, envelope and engage_if, the trims' sources and u.
+        The inputs are y, the envelope, the conditions engage_if, the sources of trims, and u.
         """
         keys = (*map(trim_key, self.channel_map.trims), *self.channel_map.engage_if)
         sources = {key: stale for key in keys if (stale := self._staleness(key, now_ns))}
@@ -339,7 +342,7 @@ class Bridge:
         return None
 
     def _reason_against_trim(self, name: str) -> Refusal | None:
-        """Refuse the trim of a captured input if the limits around it leave its field's range."""
+        """Refuse the trim of a captured input if the limits around it exceed its field's range."""
         row = self.channel_map.inputs[name]
         trim = self.trim(name)
         (low, high), ends = row.range, (trim + row.lower, trim + row.upper)
@@ -351,10 +354,11 @@ class Bridge:
         )
 
     def engage(self, now_ns: int, *, blind: bool = False) -> Refusal | None:
-        """Engage or begin to engage, or return the reason of a refusal. The phase tells which.
+        """Engage or begin to engage, or return the reason of a refusal.
 
-        If `blind`, the engagement ignores a loss of the transmitter, and has no time limit. A
-        request while engaged starts the time of `max_engaged` again.
+        The phase says whether the bridge is engaged or still begins to engage. If `blind`, the
+        engagement ignores a loss of the transmitter, and has no time limit. A request while the
+        bridge is engaged starts the time of `max_engaged` again.
         """
         if self.phase is Phase.ENGAGED:
             self.conditions.blind |= blind
@@ -377,7 +381,7 @@ class Bridge:
     def _continue_engagement(self, now_ns: int) -> None:
         """Engage once the awaited conditions hold.
 
-        The bridge gives up when the time for them is over, or if there is another refusal.
+        The bridge gives up when the time to wait is over, or if there is another refusal.
         """
         self.reason = self.conditions.violation(now_ns, awaited=True)
         timed_out = now_ns - self._phase_ns > nanoseconds(self.channel_map.engage_timeout)
@@ -399,7 +403,7 @@ class Bridge:
     def disengage(self, reason: Refusal, now_ns: int, *, by_pilot: bool = False) -> None:
         """Disengage from any phase, which returns the channels to the autopilot.
 
-        If `by_pilot`, the pilot requested this, and the mode stays as it is.
+        If `by_pilot`, the pilot has requested the disengagement, and the mode stays as it is.
         """
         self._keeps_mode |= by_pilot
         if self.phase not in {Phase.DISENGAGED, Phase.RELEASE}:
@@ -409,10 +413,10 @@ class Bridge:
     def step(self, now_ns: int) -> Phase:
         """Return the phase at an instant.
 
-        An engagement ends if y or u is stale, a value is outside the envelope, an input stays at
-        its limit, a condition is lost, a publisher conflicts, or `max_engaged` is over. The phases
-        ENGAGING, NEUTRAL and RELEASE end after their times. NEUTRAL also ends if a condition is
-        lost or a publisher conflicts.
+        An engagement ends if y or u is stale, if a value is outside the envelope, or if an input
+        stays at its limit. It also ends if a condition is lost, if a publisher conflicts, or if the
+        time `max_engaged` is over. The phases ENGAGING, NEUTRAL and RELEASE end after their times.
+        NEUTRAL also ends if a condition is lost or a publisher conflicts.
         """
         if self.phase is Phase.ENGAGING:
             self._continue_engagement(now_ns)
@@ -445,7 +449,7 @@ class Bridge:
     def y(self, now_ns: int) -> StampedVector | None:
         """Return the sample of y at the stamp of the map's output `instant`.
 
-        Returns None if this sample was returned before, or if a channel is stale.
+        Returns None if this sample has been returned before, or if a channel is stale.
         """
         newest = self._readings.get(self.channel_map.instant)
         if (
@@ -462,7 +466,7 @@ class Bridge:
     def _value(self, name: str) -> float:
         """Return the newest value of a channel.
 
-        A captured output is 0 until the bridge engages, and then its change since the engagement.
+        For a captured output, it is the change since the engagement, and 0 before the engagement.
         """
         value = self._readings[name].value
         row = self.channel_map.outputs.get(name)
@@ -471,9 +475,9 @@ class Bridge:
         return value - self._zero[name] if self._is_captured() else 0.0
 
     def _is_captured(self) -> bool:
-        """Return whether the trims are those that the engagement captured.
+        """Return whether the trims are those that the engagement has captured.
 
-        If not, they follow their sources.
+        Otherwise the trims follow their sources.
         """
         return self.phase in {Phase.ENGAGED, Phase.NEUTRAL, Phase.RELEASE} and bool(
             self._zero or self._trim
@@ -491,9 +495,9 @@ class Bridge:
         return row.trim if source is None else to_channel(source.value, row.line)
 
     def pose(self, now_ns: int) -> tuple[tuple[str, ...], StampedVector] | None:
-        """Return the names and values of the pose's fresh channels, at the stamp of its first row.
+        """Return the names and values of the pose's fresh channels, at the stamp of the first row.
 
-        Returns None if that stamp is not new. psi is in -pi..pi. A channel is left out if it is
+        Returns None if this stamp is not new. psi is in -pi..pi. A channel is left out if it is
         stale or has not been received yet.
         """
         first = next(iter(self.channel_map.pose), None)
@@ -510,7 +514,7 @@ class Bridge:
     def raw_u(self) -> FloatArray:
         """Return the raw values of the newest u after saturation, (m,).
 
-        They are the raw values of trim + min(max(u, lower), upper).
+        These are the raw values of trim + min(max(u, lower), upper).
         """
         u = np.minimum(np.maximum(self._u, self._lower), self._upper)
         return np.array(
@@ -533,7 +537,7 @@ class Bridge:
         return self._raw(name, 0.0) if row.neutral == "trim" else row.neutral
 
     def sends(self, name: str, now_ns: int) -> bool:
-        """Return whether a message of the map is sent now. A dry run sends none."""
+        """Return whether a message of the map is sent now; a dry run sends no message."""
         if self.dry_run:
             return False
         when = self.channel_map.messages[name].when

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Convert between a field of a message, given by its path, and a channel of y or u.
 
-This works on any object that has the published field names, so that it needs no message package.
-Arrays of a message may be lists, array.array or NumPy arrays.
+The functions work on any object that has the published field names, so they need no message
+package. Arrays of a message may be lists, array.array or NumPy arrays.
 """
 
 import importlib
@@ -22,18 +22,18 @@ from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
-# The path of a field: names separated by dots, each of which may have an index in brackets.
+# The path of a field: names separated by dots. Each name may have an index in brackets.
 PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
 STEP = re.compile(r"(\w+)(?:\[(\d+)\])?")
-VERSION = re.compile(r"_v\d+$")  # at the end of a topic of PX4
-# kg/m^3, ISO 2533. With it, the speed of a dynamic pressure is the indicated airspeed.
+VERSION = re.compile(r"_v\d+$")  # suffix of a versioned topic of PX4
+# kg/m^3, ISO 2533. With this density, the speed of a dynamic pressure is the indicated airspeed.
 SEA_LEVEL_DENSITY = 1.225
 
 
 class LinearConversion(NamedTuple):
-    """channel = sign scale raw + offset.
+    """The conversion between a raw value and a channel: channel = sign scale raw + offset.
 
-    The channel is in SI and radians, the raw value in the autopilot's unit.
+    The channel is in SI and radians, and the raw value is in the autopilot's unit.
     """
 
     sign: int  # +1 or -1
@@ -42,19 +42,19 @@ class LinearConversion(NamedTuple):
 
 
 def to_channel(raw: float, line: LinearConversion) -> float:
-    """Return channel = sign scale raw + offset."""
+    """Return the channel of a raw value, sign scale raw + offset."""
     return line.sign * line.scale * raw + line.offset
 
 
 def to_raw(channel: float, line: LinearConversion) -> float:
-    """Return raw = sign (channel - offset) / scale, the inverse of `to_channel`."""
+    """Return the raw value of a channel, sign (channel - offset) / scale."""
     return line.sign * (channel - line.offset) / line.scale
 
 
 def get_field(message: Any, path: str) -> Any:
     """Return the value at a path such as "twist.angular.y" or "axes[1]".
 
-    Raises ChannelError, reason "field", if there is none.
+    Raises ChannelError, reason "field", if there is no value at the path.
     """
     value = message
     for name, place in STEP.findall(path):
@@ -70,8 +70,8 @@ def get_field(message: Any, path: str) -> Any:
 def set_field(message: Any, path: str, value: Any) -> None:
     """Set the value at a path.
 
-    A number for an integer field is rounded. An integer field refuses NaN, infinity and values
-    outside the range of its type. Raises ChannelError, reason "field" or "range".
+    A number for an integer field is rounded. NaN, infinity and values outside the range of the type
+    are refused for an integer field. Raises ChannelError, reason "field" or "range".
     """
     current = get_field(message, path)
     if isinstance(current, int | np.integer) and isinstance(value, float):
@@ -106,7 +106,7 @@ def _norm(vector: Any) -> float:
 def _airspeed_of_pressure(pressure: Any) -> float:
     """Return the indicated airspeed sqrt(2 dp / rho_0), m/s, for a dynamic pressure in Pa.
 
-    For a negative pressure, which is noise, it is 0.
+    For a negative pressure, which is noise, the result is 0.
     """
     return math.sqrt(2.0 * max(float(pressure), 0.0) / SEA_LEVEL_DENSITY)
 
@@ -114,11 +114,12 @@ def _airspeed_of_pressure(pressure: Any) -> float:
 def _quaternion(field: Any) -> tuple[float, float, float, float]:
     """Return (w, x, y, z) of a quaternion, scaled to the length 1.
 
-    The field has members w, x, y, z, or four elements in this order, as PX4 publishes them.
+    The field has members w, x, y, z. It may also have four elements in this order, as PX4 publishes
+    them.
     """
     w, x, y, z = (field.w, field.x, field.y, field.z) if hasattr(field, "w") else field
     w, x, y, z = float(w), float(x), float(y), float(z)
-    # Squares of the components could underflow, or overflow.
+    # The squares of the components might underflow or overflow.
     if not 0.0 < (length := math.hypot(w, x, y, z)) < math.inf:
         raise ValueError("a quaternion of length 0, infinity or NaN has no angles")
     return w / length, x / length, y / length, z / length
@@ -172,10 +173,10 @@ COMPONENTS: Mapping[str, str] = MappingProxyType(
 
 
 def _turned(message: Any, path: str, attitude: str) -> float:
-    """Return a component of R(q) v, the vector v turned from the body to the world.
+    """Return a component of R(q) v, which is the vector v rotated from the body to the world.
 
-    v is that of the path VECTOR.x, .y or .z, and `attitude` is the path of the quaternion q. R(q) v
-    = v + 2 (w r x v + r x (r x v)) with q = (w, r), |q| = 1.
+    `path` ends in .x, .y or .z after the path of v. `attitude` is the path of the quaternion q.
+    R(q) v = v + 2 (w r x v + r x (r x v)) with q = (w, r), |q| = 1.
     """
     vector, _, axis = path.rpartition(".")
     v = np.array([float(get_field(message, f"{vector}.{name}")) for name in "xyz"])
@@ -188,7 +189,8 @@ def _turned(message: Any, path: str, attitude: str) -> float:
 def read_raw(message: Any, path: str, function: str, turned_by: str | None = None) -> float:
     """Return the raw value of a row.
 
-    Raises ChannelError, reason "field" if the field is missing, and "finite" if it is not finite.
+    Raises ChannelError, reason "field" if the field is missing, and "finite" if its value is not
+    finite.
     """
     value = get_field(message, path)
     try:
@@ -204,7 +206,7 @@ def read_raw(message: Any, path: str, function: str, turned_by: str | None = Non
 
 
 def message_type(name: str, load: Callable[[str], Any] = importlib.import_module) -> type:
-    """Load the class of "package/msg/Type" or "package/srv/Type".
+    """Return the class of "package/msg/Type" or "package/srv/Type".
 
     Raises ParameterError, which names the package to install.
     """
@@ -223,10 +225,10 @@ def message_type(name: str, load: Callable[[str], Any] = importlib.import_module
 
 
 def versioned_topic(topic: str, version: int) -> str:
-    """Return PX4's topic for a version of its definition, /fmu/.../NAME_vVERSION.
+    """Return the name of PX4's topic for a version of its definition, /fmu/.../NAME_vVERSION.
 
-    Any other topic stays as it is. A definition states its version as MESSAGE_VERSION. Version 0
-    has no suffix. Source: PX4 guide, PX4 ROS 2 message translation node.
+    Names of other topics stay as they are. A definition states its version as MESSAGE_VERSION.
+    Version 0 has no suffix. Source: PX4 guide, PX4 ROS 2 message translation node.
     """
     if topic.startswith("/fmu/"):
         return VERSION.sub("", topic) + (f"_v{version}" if version else "")
@@ -234,7 +236,7 @@ def versioned_topic(topic: str, version: int) -> str:
 
 
 def version_fault(topic: str, message_class: Any) -> Refusal | None:
-    """Say what is wrong with the version in a topic of PX4."""
+    """Say why the version in the name of a PX4 topic is wrong; None if it is right."""
     version = getattr(message_class, "MESSAGE_VERSION", None)
     if version is None:
         return None
@@ -252,7 +254,7 @@ def version_faults(
 ) -> list[Refusal]:
     """Return the `version_fault` of each topic whose message package is installed.
 
-    Nothing is known about the other topics.
+    The versions of the other topics cannot be checked.
     """
     faults = []
     for topic, kind in dict.fromkeys(topics):
@@ -262,7 +264,7 @@ def version_faults(
 
 
 def no_publisher(environment: Mapping[str, str]) -> str:
-    """Return a sentence on why a topic of an autopilot has no publisher."""
+    """Return a sentence that says why a topic of an autopilot may have no publisher."""
     domain = environment.get("ROS_DOMAIN_ID") or "0"
     if domain != "0":
         return (

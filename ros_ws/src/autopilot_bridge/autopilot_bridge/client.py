@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The client of a bridge, for `rise-di engage` and the live page."""
+"""Engage and disengage a running bridge, for `rise-di engage` and the live page."""
 
 from collections.abc import Callable
 from typing import Any
@@ -22,7 +22,7 @@ WITHDRAW_TIMEOUT = 1.0  # s
 # s, longest wait for u while the nodes of a flight start. The autopilot may send its first messages
 # late.
 U_TIMEOUT = 30.0
-TRIM_SAMPLES = 20  # equal samples of u in a row, which show that u has reached trim
+TRIM_SAMPLES = 20  # number of successive equal samples of u that show that u has reached trim
 
 
 class EngagementClient(Client):
@@ -37,13 +37,13 @@ class EngagementClient(Client):
         self._u_subscription = PolledSubscription(self._node, U, NEWEST_SAMPLES, raw=True)
 
     def engage(self, progress: Callable[[str], None], *, blind: bool = False) -> Refusal | None:
-        """Wait for u at trim and engage the bridge, which activates the controller.
+        """Wait until u is at trim, and engage the bridge, which activates the controller.
 
-        Returns the reason of a refusal. An engaged bridge takes the request at once, and starts the
-        time of `max_engaged` again. If `blind`, the engagement ignores a loss of the transmitter.
-        `progress` is called with what the bridge waits for, and with what it lacks once it is
-        engaged. If the caller stops waiting, for example after Ctrl-C, the request is withdrawn, so
-        that the autopilot does not change its mode later.
+        Returns the reason of a refusal. A bridge that is engaged takes the request immediately, and
+        starts the time of `max_engaged` again. If `blind`, the engagement ignores a loss of the
+        transmitter. `progress` is called with sentences on what the bridge waits for, and on what
+        is missing once it is engaged. If the caller stops waiting, for example after Ctrl-C, the
+        request is withdrawn, so that the autopilot does not change its mode later.
         """
         self._spin_until(
             lambda: bool(self._received_phases()),
@@ -80,7 +80,7 @@ class EngagementClient(Client):
         return _refusal_in(self._call(Trigger, ENGAGE_BLIND, request, "a flight with a bridge"))
 
     def disengage(self) -> Refusal | None:
-        """Disengage the bridge, or return the reason for which it refuses."""
+        """Disengage the bridge; return the reason if it refuses."""
         return self._set_engaged(engaged=False)
 
     def _set_engaged(self, *, engaged: bool) -> Refusal | None:
@@ -88,9 +88,9 @@ class EngagementClient(Client):
         return _refusal_in(self._call(SetBool, ENGAGE, request, "a flight with a bridge"))
 
     def _withdraw(self) -> None:
-        """Ask the bridge to disengage, and wait for an answer at most WITHDRAW_TIMEOUT.
+        """Ask the bridge to disengage, and wait at most WITHDRAW_TIMEOUT for an answer.
 
-        A bridge that is stopped answers later.
+        A bridge whose process is stopped answers later.
         """
         client = self._node.create_client(SetBool, ENGAGE)
         if client.wait_for_service(WITHDRAW_TIMEOUT):
@@ -104,7 +104,7 @@ class EngagementClient(Client):
         return self._u
 
     def _received_phases(self) -> list[tuple[str, str]]:
-        """Return the phases of the bridge with their reasons, since the request."""
+        """Return the phases of the bridge since the request, each with its reason."""
         self._phases += [
             (bounded(arrival.message.key), bounded(arrival.message.value))
             for arrival in self._engagement_subscription.take()
@@ -112,7 +112,7 @@ class EngagementClient(Client):
         return self._phases
 
     def _settled(self, progress: Callable[[str], None]) -> bool:
-        """Return whether the bridge has engaged, or has given up after it began to.
+        """Return whether the bridge has engaged, or has given up after it began to engage.
 
         Reports from before the request do not count.
         """
@@ -130,5 +130,5 @@ class EngagementClient(Client):
 
 
 def _refusal_in(response: Any) -> Refusal | None:
-    """Read the refusal in the answer of the bridge, whose message is empty if there is none."""
+    """Return the refusal in an answer of the bridge; None if its message is empty."""
     return Refusal(bounded(response.message)) if response.message else None

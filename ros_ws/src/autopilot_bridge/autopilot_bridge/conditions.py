@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The conditions and pilot overrides of a channel map, by which autopilot and pilot can refuse."""
+"""Check the conditions and pilot overrides of a channel map.
+
+By them the autopilot and the pilot can refuse or end an engagement.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +16,7 @@ from flight_core.rates import nanoseconds, seconds
 
 
 class Reading(NamedTuple):
-    """The newest value of a field, and the instant to which it belongs."""
+    """The newest value of a field, with the instant to which it belongs."""
 
     stamp_ns: int
     value: float
@@ -21,7 +24,7 @@ class Reading(NamedTuple):
 
 @dataclass(frozen=True)
 class Stale(Refusal):
-    """A field that is too old, or was not received yet."""
+    """The refusal of a field that is too old, or that was not received yet."""
 
     is_received: bool
 
@@ -29,7 +32,7 @@ class Stale(Refusal):
 class Conditions:
     """The newest fields of the conditions and overrides of a map.
 
-    `blind` says whether an engagement goes on without the transmitter.
+    `blind` says whether an engagement continues without the transmitter.
     """
 
     def __init__(self, channel_map: ChannelMap) -> None:
@@ -37,19 +40,19 @@ class Conditions:
         self.blind = False
         self._conditions: dict[str, Reading] = {}
         self._overrides: dict[str, Reading] = {}
-        self._at_engagement: dict[str, float] = {}  # values of the overrides
+        self._at_engagement: dict[str, float] = {}  # values of the overrides at engagement
         self.watches_transmitter = any(row.transmitter for row in channel_map.conditions.values())
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
-        """Take the field of a condition."""
+        """Take a value of the field of a condition."""
         self._conditions[name] = Reading(now_ns, raw)
 
     def take_override(self, name: str, raw: float, now_ns: int) -> None:
-        """Take the field of a pilot override."""
+        """Take a value of the field of a pilot override."""
         self._overrides[name] = Reading(now_ns, raw)
 
     def engage(self, now_ns: int) -> None:
-        """Keep the present values of the overrides. A `moved` override acts by its later change."""
+        """Store the present values of the overrides; `moved` overrides act by a later change."""
         self._at_engagement = {
             name: reading.value
             for name, reading in self._overrides.items()
@@ -59,7 +62,8 @@ class Conditions:
     def violation(self, now_ns: int, *, awaited: bool) -> Refusal | None:
         """Say which conditions do not hold.
 
-        If `awaited`, they are the conditions that an engagement waits for, otherwise all others.
+        If `awaited`, only the conditions for which an engagement waits are checked, otherwise only
+        the others.
         """
         rows = (
             (name, row)
@@ -77,11 +81,11 @@ class Conditions:
         return Refusal(f"{row.sentence} ({row.field} is {reading.value:g})")
 
     def is_contradicted(self) -> bool:
-        """Return whether the last value of a condition contradicts it.
+        """Return whether the last value of a condition contradicts the condition.
 
-        If so, the pilot or the autopilot chose another mode, or the aircraft has landed. A
-        condition that tells the loss of the transmitter does not count, because the pilot cannot
-        take over then.
+        If it does, the pilot or the autopilot chose another mode, or the aircraft has landed. A
+        condition that shows the loss of the transmitter does not count, because then the pilot
+        cannot take over.
         """
         rows = self._map.conditions.items()
         readings = ((row, self._conditions.get(name)) for name, row in rows if not row.transmitter)
@@ -92,7 +96,7 @@ class Conditions:
     def is_active(self, name: str, now_ns: int, *, engaged: bool) -> bool:
         """Return whether a pilot override is active.
 
-        An override ends with its topic, so that an old one does not block an engagement.
+        An override ends if its topic is silent, so that an old value does not block an engagement.
         """
         row = self._map.overrides[name]
         reading = self._overrides.get(name)
@@ -102,12 +106,12 @@ class Conditions:
         return row.is_active(reading.value, at_engagement)
 
     def _is_silent(self, name: str, now_ns: int) -> bool:
-        """Return whether an override cannot act now, because its topic has ended or never came."""
+        """Return whether an override cannot act now, because its topic is silent."""
         row = self._map.overrides[name]
         return staleness(row.topic, self._overrides.get(name), row.max_age, now_ns) is not None
 
     def silent_overrides(self, now_ns: int) -> Refusal | None:
-        """Say which overrides have no effect."""
+        """Say which overrides have no effect, because their topics are silent."""
         silent = [
             f"no message on {row.topic} for {row.max_age:g} s"
             for name, row in self._map.overrides.items()
@@ -116,9 +120,9 @@ class Conditions:
         return Refusal(f"a pilot override has no effect: {'; '.join(silent)}") if silent else None
 
     def blindness(self, *, bounded: bool) -> Refusal | None:
-        """Say what an engagement lacks if it cannot see the loss of the transmitter.
+        """Say that an engagement does not notice the loss of the transmitter, if so.
 
-        The sentence also names what can still release the aircraft. `bounded` says whether
+        The sentence also says what can still release the aircraft. `bounded` says whether
         `max_engaged` ends the engagement.
         """
         if self.watches_transmitter and not self.blind:
@@ -147,7 +151,7 @@ class Conditions:
 
 
 def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) -> Stale | None:
-    """Say what is wrong with the age of a field, if it is not fresh."""
+    """Return the fault in the age of a field; None if the field is fresh."""
     if reading is None:
         return Stale(f"not received yet ({topic})", is_received=False)
     age_ns = now_ns - reading.stamp_ns
@@ -157,7 +161,7 @@ def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) 
 
 
 def joined_faults(faults: Mapping[str, Stale]) -> Refusal | None:
-    """Join the faults of some channels, by name, to a sentence.
+    """Join the faults of channels, by name, to one sentence.
 
     Channels with the same fault are named together.
     """

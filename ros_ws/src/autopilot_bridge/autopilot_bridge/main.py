@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable `bridge`."""
+"""The entry point of the executable `bridge`."""
 
 from flight_ros.startup import start_nodes
 

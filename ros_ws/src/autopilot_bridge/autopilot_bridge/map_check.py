@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check which rows of a channel map hold for a release of an autopilot.
 
-A row holds if the message definition has its field, with the components that its function takes,
-and if its topic has the version of the definition (PX4). If the source of a condition names a
-constant, this constant must be one of the values.
+A row holds if the message definition has its field, with the components that its function needs.
+For PX4, the topic must also have the version of the definition. If the source of a condition names
+a constant, this constant must be one of the values of the condition.
 """
 
 import re
@@ -30,7 +30,7 @@ Types = Mapping[str, tuple[Any, Any]]
 """Constants (name, type, value) and fields (name, type) by the full name of a message, as rosbags
 has them."""
 
-PACKAGE = re.compile(rb"<name>\s*(\w+)\s*</name>")  # of a package.xml (REP 149)
+PACKAGE = re.compile(rb"<name>\s*(\w+)\s*</name>")  # name in a package.xml (REP 149)
 CONSTANT = re.compile(r"\b[A-Z][A-Z0-9]*_[A-Z0-9_]+\b")
 # The line that ends the request in the definition of a service.
 REQUEST = re.compile(r"^---\s*$", re.MULTILINE)
@@ -47,7 +47,7 @@ class CheckedRow(NamedTuple):
 
 
 def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
-    """Return the message types of the packages below a folder, and those that they contain.
+    """Return the message types of the packages below a folder, with all types they contain.
 
     Raises ParameterError if there is no package.
     """
@@ -82,7 +82,7 @@ def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
 def installed_definitions(kinds: Iterable[str]) -> Types:
     """Return the message types of the installed packages, and those of MAVLink in pymavlink.
 
-    Types that are not installed are absent. Raises ParameterError for a type of MAVLink if
+    Types that are not installed are left out. Raises ParameterError for a type of MAVLink if
     pymavlink is not installed.
     """
     types: dict[str, tuple[Any, Any]] = {}
@@ -105,7 +105,7 @@ def installed_definitions(kinds: Iterable[str]) -> Types:
 def check_map(channel_map: ChannelMap, releases: Iterable[Types]) -> list[CheckedRow]:
     """Check each field that a map uses against the definitions of some releases.
 
-    A definition without a version has version 0.
+    A definition that states no version has version 0.
     """
     releases = list(releases)
     rows = []
@@ -119,12 +119,12 @@ def check_map(channel_map: ChannelMap, releases: Iterable[Types]) -> list[Checke
 
 
 def is_known(types: Types, kind: str) -> bool:
-    """Return whether `types` or ROS 2 Jazzy defines a message."""
+    """Return whether a message is defined in `types` or in ROS 2 Jazzy."""
     return kind in types or kind in typestore().fielddefs
 
 
 def _parsed(text: str, kind: str) -> Types:
-    """Return the types of a definition; for a service, that of its request."""
+    """Return the types in a definition; for a service, those of its request."""
     try:
         if "/srv/" in kind:
             (request,) = get_types_from_msg(REQUEST.split(text)[0], kind).values()
@@ -170,9 +170,9 @@ def _fault(
 
 
 def _has(definitions: Types, field: Any, components: str) -> bool:
-    """Return whether a field has some components, as members or in an array.
+    """Return whether a field has the given components, as members or in an array.
 
-    If `components` is None, return whether the field is a number.
+    If `components` is None, the result says whether the field is a number.
     """
     node, content = field
     if node is Nodetype.NAME:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rows of a channel map. Each is a channel, a message, a condition or a parameter."""
+"""Define the rows of a channel map; a row is a channel, a message, a condition or a parameter."""
 
 from collections.abc import Mapping
 from itertools import product
@@ -11,7 +11,7 @@ from autopilot_bridge.channel_map import PATH, LinearConversion
 from flight_core.fields import Field
 from flight_core.parameters import Config, NonNegative, Number, Numbers, Positive, require
 
-MAVLINK = "mavlink"  # package of the types of MAVLink messages, and first part of their topics
+MAVLINK = "mavlink"  # package of MAVLink's message types, and first part of their topics
 
 Motion = Literal[
     "nose up",
@@ -52,7 +52,7 @@ MessageType = Annotated[str, Field(pattern=r"^[a-z]\w*/msg/[A-Z]\w*$")]
 SentType = Annotated[str, Field(pattern=r"^[a-z]\w*/(msg|srv)/[A-Z]\w*$")]
 TopicName = Annotated[str, Field(pattern=r"^/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*$")]
 SystemId = Annotated[int, Field(ge=1, le=255)]
-# A value of a message field. NaN, infinity or FLT_MAX may mean "no value".
+# A value of a message field. NaN, infinity and FLT_MAX may mean "no value".
 Raw = Annotated[float, Field(allow_inf_nan=True)]
 Integer = Annotated[int, Field(ge=-(2**63), lt=2**64)]  # a message field may be int64 to uint64
 Mask = Annotated[int, Field(gt=0, lt=2**64)]
@@ -63,7 +63,7 @@ Value = bool | Integer | Raw | str | tuple[Integer, ...] | tuple[Raw, ...]
 
 
 class Row(Config):
-    """The base of the rows of a map, channel = sign scale raw + offset, with frame and source."""
+    """The base of a map's rows: channel = sign scale raw + offset, with frame and source."""
 
     field: str = Field(
         description="the path of the field in the message, such as twist.angular.y or axes[1]"
@@ -87,19 +87,19 @@ class Row(Config):
 
 
 class MovingRow(Row):
-    """A row whose sign can be checked by a motion of the aircraft."""
+    """A row whose sign can be checked by a motion of the aircraft in flight."""
 
     positive: Motion = Field(description="motion of the aircraft for an increasing raw value")
 
     @property
     def motion(self) -> tuple[str, int]:
-        """The output that an increasing channel moves, a key of UNITS, and its sign."""
+        """The output that a growing channel moves, a key of UNITS, and the motion's sign."""
         output, sign = MOTIONS[self.positive]
         return output, sign * self.sign
 
 
 class MeasuredRow(Row):
-    """A channel that the autopilot publishes, with the topic and the field that it comes from."""
+    """A channel that the autopilot publishes, with its topic and its field."""
 
     topic: TopicName = Field(description="the autopilot's topic")
     type: MessageType = Field(description="its type, package/msg/Type")
@@ -137,14 +137,14 @@ class MeasuredRow(Row):
 
 
 class PoseRow(MeasuredRow):
-    """A channel of the pose, as an absolute value.
+    """A channel of the pose, which is an absolute value.
 
     `sign` and `offset` convert the channel from the frame of the message to FRD, north, east, up.
     """
 
 
 class OutputRow(MeasuredRow, MovingRow):
-    """A channel of y, as the deviation from trim."""
+    """A channel of y, which is a deviation from trim."""
 
     captured: bool = Field(
         default=False,
@@ -164,9 +164,9 @@ class OutputRow(MeasuredRow, MovingRow):
 
 
 class InputRow(MovingRow):
-    """A channel of u, as the deviation from trim: trim + u = sign scale raw + offset.
+    """A channel of u, which is a deviation from trim: trim + u = sign scale raw + offset.
 
-    The row has the message and the field of its setpoint.
+    The row also has the message and the field of the setpoint.
     """
 
     message: str = Field(description="the message that has the field, one of `messages`")
@@ -213,7 +213,7 @@ class MessageRow(Config):
 
     @property
     def is_service(self) -> bool:
-        """Whether it is a request of a service."""
+        """Whether the message is a request of a service."""
         return "/srv/" in self.type
 
     def _check(self) -> None:
@@ -227,7 +227,7 @@ class MessageRow(Config):
 
 
 class WatchedRow(Config):
-    """A field of the autopilot on which the engagement depends."""
+    """A field of the autopilot's messages on which the engagement depends."""
 
     topic: TopicName = Field(description="the topic")
     type: MessageType = Field(description="its type, package/msg/Type")
@@ -238,12 +238,12 @@ class WatchedRow(Config):
     )
 
     def masked(self, raw: float) -> float:
-        """Return the value of the bits that count."""
+        """Return the value of the bits in the mask."""
         return raw if self.bits is None else float(int(raw) & self.bits)
 
 
 class ConditionRow(WatchedRow):
-    """A condition of the engagement: the field must have one of some values.
+    """A condition of the engagement: the field must have one of the row's values.
 
     If the field has another value, the bridge disengages.
     """
@@ -269,7 +269,7 @@ class ConditionRow(WatchedRow):
     )
 
     def holds(self, raw: float) -> bool:
-        """Return whether the condition holds."""
+        """Return whether a raw value meets the condition."""
         value = self.masked(raw)
         if self.within is None:
             return value in self.one_of
@@ -277,7 +277,7 @@ class ConditionRow(WatchedRow):
 
 
 class OverrideRow(WatchedRow):
-    """A pilot override: if the field is beyond the threshold, the bridge disengages at once."""
+    """A pilot override: the bridge disengages immediately if the field exceeds the threshold."""
 
     above: Number | None = Field(
         default=None, description="the override is active if the field is above this"
@@ -299,9 +299,9 @@ class OverrideRow(WatchedRow):
     )
 
     def is_active(self, raw: float, at_engagement: float | None) -> bool:
-        """Return whether the override is active.
+        """Return whether the override is active at a raw value.
 
-        `at_engagement` is its value at engagement, or None if the bridge is not engaged.
+        `at_engagement` is the value at engagement; None if the bridge is not engaged.
         """
         raw = self.masked(raw)
         if self.moved is not None:
@@ -332,7 +332,7 @@ class QosRow(Config):
 
 
 class LinkConfig(Config):
-    """A MAVLink link, for rows with the type mavlink/msg/NAME."""
+    """The settings of a MAVLink link, for rows with the type mavlink/msg/NAME."""
 
     url: str = Field(
         pattern=r"^((udpin|udpout|tcp|tcpin):[^:]+:\d+|/dev/\S+)$",
@@ -363,9 +363,9 @@ class LinkConfig(Config):
 
 
 class SilenceConfig(Config):
-    """The failsafe if u times out while engaged.
+    """The failsafe that acts if u times out while the bridge is engaged.
 
-    The bridge sends neutral values, then release values, then nothing.
+    The bridge then sends neutral values, then release values, and then nothing.
     """
 
     max_age: Positive = Field(description="the age above which u has timed out, s")

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A MAVLink link to an autopilot, as a source and a sink of messages of a channel map.
+"""Connect to an autopilot by MAVLink, as a source and a sink of messages of a channel map.
 
-A thread receives, sends a heartbeat each second, requests the rates of messages and reads
-parameters. It sends all of these as a companion computer of the autopilot. Only the messages of the
-map have the number of the ground station, because ArduPilot takes RC overrides from nobody else.
-Its failsafe FS_GCS_ENABL counts these overrides as heartbeats of the station. It does not count the
+A thread receives messages, sends a heartbeat each second, requests the rates of messages and reads
+parameters. It sends as a companion computer of the autopilot. Only the messages of the map have the
+system number of the ground station, because ArduPilot takes RC overrides from no other system. Its
+failsafe FS_GCS_ENABL counts these overrides as heartbeats of the station, but does not count the
 heartbeats of a companion. Sources: MAVLink guide (heartbeat and parameter protocols,
 SET_MESSAGE_INTERVAL); common.xml and ardupilotmega.xml of pymavlink; ArduPilot, GCS_Common.cpp,
-handle_rc_channels_override and handle_heartbeat. It was tried with ArduPlane in SITL.
+handle_rc_channels_override and handle_heartbeat. The link was tried with ArduPlane in SITL.
 """
 
 import hashlib
@@ -34,33 +34,35 @@ from flight_core.vectors import ChannelError
 
 DIALECT = "ardupilotmega"
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
-# MAV_COMP_ID_ONBOARD_COMPUTER4: other companions mostly have 191. With a component of the ground
-# station, such as 0 or 190, ArduPilot would not forward the station's heartbeats any more
-# (MAVLink_routing.cpp, handle_heartbeat).
+# MAV_COMP_ID_ONBOARD_COMPUTER4, because other companions mostly have 191. If the link were a
+# component of the ground station, such as 0 or 190, ArduPilot would not forward the heartbeats of
+# the station any more (MAVLink_routing.cpp, handle_heartbeat).
 COMPANION = 194
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD
 ACCEPTED = 0  # MAV_RESULT
-SIGNED = 1  # MAVLINK_IFLAG_SIGNED, of a header
+SIGNED = 1  # MAVLINK_IFLAG_SIGNED in a header
 GCS = 6  # MAV_TYPE_GCS
 ONBOARD = 18  # MAV_TYPE_ONBOARD_CONTROLLER
 INVALID = 8  # MAV_AUTOPILOT_INVALID
-# Parameters with the systems whose RC overrides ArduPilot takes. Since 4.7 they are MAV_GCS_SYSID,
-# or the range from it to MAV_GCS_SYSID_HI if that is not 0. Before 4.7 it is SYSID_MYGCS.
+# Parameters that have the systems whose RC overrides ArduPilot takes. Since 4.7 it is
+# MAV_GCS_SYSID, or the range from MAV_GCS_SYSID to MAV_GCS_SYSID_HI if the latter is not 0. Before
+# 4.7 it is SYSID_MYGCS.
 STATION, LAST_STATION, OLD_STATION = "MAV_GCS_SYSID", "MAV_GCS_SYSID_HI", "SYSID_MYGCS"
 STATION_PARAMETERS = (STATION, LAST_STATION, OLD_STATION)
 STICKS = frozenset({"RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"})  # messages of a joystick
-BEAT = 1.0  # s
-ANSWER = 1.0  # s, longest wait for an answer; then the request is repeated
+BEAT = 1.0  # s, time between two heartbeats
+ANSWER = 1.0  # s, longest wait for an answer, after which the request is repeated
 # s without a message of the autopilot, after which all rates are requested again, and another
-# sender can take its place.
+# sender may take its place
 SILENCE = 3.0
-READ_AGAIN = 5.0  # s, after which a parameter is read again: a ground station may have set it
-QUEUE = 256  # most messages that are kept between two ticks
+# s, time after which a parameter is read again, because a ground station may have set it
+READ_AGAIN = 5.0
+QUEUE = 256  # largest number of messages that are kept between two ticks
 TAKEN = Refusal(
     "requested again; a ground station on this link requests rates of its own (MAVProxy: set "
     "streamrate -1), or the link is too slow: give the bridge a port of its own"
 )
-RETRIES = 2  # retries of a connection over TCP, 1 s each
+RETRIES = 2  # number of retries of a connection over TCP, 1 s each
 POLL = 0.1  # s, longest wait for a packet
 PACKET = 65535  # bytes, size of the largest packet of UDP
 
@@ -70,14 +72,14 @@ Address = tuple[Any, ...]
 
 
 class MavlinkMessage(NamedTuple):
-    """A message and when it arrived, ns on the system clock."""
+    """A message, and the instant of its arrival, ns by the system clock."""
 
     message: Any
     received_ns: int
 
 
 def mavlink_type(name: str) -> Any:
-    """Return a class with a message's numeric fields, all zero; `fields` has their names.
+    """Return a class that has a message's numeric fields, all zero, and their names in `fields`.
 
     Raises ParameterError if there is no such message.
     """
@@ -107,7 +109,7 @@ def _zero(kind: str) -> Any:
 
 
 def _connection(config: LinkConfig) -> Any:
-    """Connect by pymavlink with MAVLink 2, and sign if a passphrase is set.
+    """Connect by pymavlink with MAVLink 2, and sign messages if a passphrase is set.
 
     Raises ParameterError if the address cannot be opened.
     """
@@ -124,15 +126,15 @@ def _connection(config: LinkConfig) -> Any:
             dialect=DIALECT,
             autoreconnect=True,
             retries=RETRIES,
-            force_connected=True,  # the serial device may come later
+            force_connected=True,  # because the serial device may appear later
         )
     except (OSError, ValueError) as error:
         expected = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or a serial device"
         raise ParameterError(
             f"link.url: found {config.url}, which cannot be opened ({error}), expected {expected}"
         ) from None
-    # The MAVLink object that pymavlink makes is of version 1 until a packet of MAVLink 2 comes, and
-    # then forgets the passphrase.
+    # The MAVLink object of pymavlink is of version 1 until a packet of MAVLink 2 comes. It then
+    # forgets the passphrase.
     connection.mav = dialect.MAVLink(connection, srcSystem=config.system, srcComponent=COMPANION)
     if config.passphrase_file is not None:
         passphrase = read_file(
@@ -146,10 +148,10 @@ class Link:
     """A MAVLink connection, which receives from the call of `start` on.
 
     Only messages of the sender in `AutopilotLock` are taken, and over UDP no other address gets
-    messages. `parameters` are the names of the autopilot's parameters to read. `further` are more
-    of them, which some releases lack. If there is a passphrase, each message is signed, and
-    messages without a valid signature are refused. Source: MAVLink guide, message signing. The key
-    is derived from the passphrase in the same way as by MAVProxy and Mission Planner.
+    messages. `parameters` are the names of the autopilot's parameters to read. `further` are names
+    of more parameters, which some releases lack. If there is a passphrase, each message is signed,
+    and messages without a valid signature are refused. Source: MAVLink guide, message signing. The
+    key is derived from the passphrase as MAVProxy and Mission Planner do.
     """
 
     def __init__(
@@ -160,28 +162,28 @@ class Link:
         self._connection = _connection(config)
         self._parser = self._new_parser(self._connection.mav.signing)
         self._lock = AutopilotLock(nanoseconds(SILENCE))
-        # a conflict that only another configuration can end
+        # a conflict that only a change of the configuration can end
         self._clash: Refusal | None = None
-        self._second: Refusal | None = None  # about a second sender
-        self._second_at = 0.0  # when the second sender sent last
+        self._second: Refusal | None = None  # refusal of a second sender
+        self._second_at = 0.0  # time of the last message from the second sender
         self.stations: set[int] = set()  # systems of other ground stations
-        # why the signature of the last message was refused
+        # the reason if the signature of the last message was refused
         self._refused: Refusal | None = None
         self._queues: dict[str, deque[MavlinkMessage]] = {}
         self.parameters: dict[str, float] = {}  # the last received parameters of the autopilot
         self._to_read = tuple(parameters)
         self._further = tuple(further)
-        self._systems: set[int] = set()  # systems of other autopilots than that of the map
+        self._systems: set[int] = set()  # systems of autopilots other than that of the map
         self._to_request = dict(config.rates)
-        # The message whose interval was requested, and when.
+        # The message whose interval was requested, and the time of the request.
         self._requested: tuple[str, float] | None = None
         self._denied: dict[str, Refusal] = {}
         self._beat = 0.0
         self._alive = 0.0
         self._began = time.monotonic()
         self._rates = MessageRates(config.rates, self._began)
-        self._read = 0.0  # when the parameters were requested
-        # When the ground station with a number of the RC overrides was last heard.
+        self._read = 0.0  # time at which the parameters were requested
+        # Time at which a ground station was last heard whose number is that of the RC overrides.
         self._station_heard: float | None = None
         self._sending = Lock()
         self._closed = Event()
@@ -189,25 +191,26 @@ class Link:
 
     @property
     def conflict(self) -> Refusal | None:
-        """Who else sends as the autopilot or as the bridge, or which setting prevents engagement.
+        """A reason that prevents an engagement or ends it.
 
-        The setting is one of the autopilot, without which no engagement works.
+        It names who else sends as the autopilot or as the bridge, or a setting of the autopilot
+        that prevents every engagement.
         """
         second = self._second if time.monotonic() - self._second_at <= SILENCE else None
         return joined((self._clash, second))
 
     def listen(self, name: str) -> deque[MavlinkMessage]:
-        """Return the queue in which messages of a name arrive."""
+        """Return the queue in which messages with a name arrive."""
         return self._queues.setdefault(name, deque(maxlen=QUEUE))
 
     def start(self) -> None:
-        """Begin to receive, after the last `listen`."""
+        """Begin to receive; call this after the last `listen`."""
         self._thread.start()
 
     def send(self, message: Any) -> None:
         """Send a message of `mavlink_type` to the autopilot.
 
-        The sender has the number of the ground station.
+        It is sent with the system number of the ground station.
         """
         fields = message.packed.fieldnames
         values = {field: getattr(message, field) for field in fields}
@@ -222,7 +225,7 @@ class Link:
         self._connection.close()
 
     def problem(self, name: str | None = None) -> Refusal | None:
-        """Say what is wrong with the link, or with the message of a name."""
+        """Say what is wrong with the link, or with the messages of one name."""
         now = time.monotonic()
         silent = now - max(self._alive, self._began) > SILENCE
         if silent or (self._refused and not self._alive):
@@ -256,7 +259,7 @@ class Link:
         return range(int(first), int(last) + 1)
 
     def _dropped_overrides(self) -> Refusal | None:
-        """Say why the autopilot drops the RC overrides."""
+        """Say why the autopilot drops the RC overrides; None if it takes them."""
         numbers = self._station_numbers()
         system = self._config.source_system
         if system in numbers:
@@ -283,9 +286,9 @@ class Link:
         return joined((self._rates.lasting(now), silence))
 
     def station(self) -> str:
-        """Say what the autopilot's failsafe FS_GCS_ENABL watches.
+        """Say which ground station the failsafe FS_GCS_ENABL of the autopilot watches.
 
-        It watches while RC overrides are sent.
+        The sentence holds while RC overrides are sent.
         """
         system = self._stations_text()
         limit = self._config.station_silence
@@ -305,13 +308,13 @@ class Link:
         return str(numbers[0]) if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]}"
 
     def _send(self, message: Any, system: int) -> None:
-        """Send a message with a system number and the component COMPANION."""
+        """Send a message with a system number, as the component COMPANION."""
         with self._sending:
             try:
                 self._connection.mav.srcSystem = system
                 self._connection.mav.send(message)
             except OSError:
-                # The cable is out. The ages of the received messages will show this.
+                # The cable may be out. The ages of the received messages will show this.
                 return
 
     def _receive(self) -> None:
@@ -338,9 +341,9 @@ class Link:
                 self._take(message, address, received_ns)
 
     def _packet(self) -> tuple[bytes, Address]:
-        """Receive the next bytes and their sender, or no bytes after a silence of POLL.
+        """Return the next bytes and their sender; no bytes after a silence of POLL.
 
-        Over TCP and a serial line, the sender is the URL.
+        For TCP and for a serial line, the sender is the URL.
         """
         if not self._connection.select(POLL):
             return b"", ()
@@ -350,14 +353,14 @@ class Link:
         return self._connection.recv(self._parser.bytes_needed()), (self._config.url,)
 
     def _parsed(self, data: bytes, address: Address) -> Sequence[Any]:
-        """Parse the messages of a packet.
+        """Return the messages in a packet.
 
         Messages that span several packets are only read from the locked sender.
         """
         if not self._is_udp or _text(address) == self._lock.address:
             return self._parser.parse_buffer(data) or ()
-        # This needs a copy. After a forged signature with a late time, each later signature of the
-        # autopilot would count as replayed.
+        # A copy of the signing state is used. Otherwise, after a forged signature with a late time,
+        # each later signature of the autopilot would count as replayed.
         return self._new_parser(deepcopy(self._connection.mav.signing)).parse_buffer(data) or ()
 
     def _new_parser(self, signing: Any) -> Any:
@@ -369,7 +372,8 @@ class Link:
     def _signature_fault(self, packet: bytes) -> Refusal:
         """Say why the signature of a packet was refused.
 
-        A signature has 6 bytes of a time in units of 10 us, and 6 bytes of a hash (MAVLink guide).
+        A signature has 6 bytes for a time in units of 10 us, and 6 bytes for a hash (MAVLink
+        guide).
         """
         signing = self._connection.mav.signing
         if hashlib.sha256(signing.secret_key + packet[:-6]).digest()[:6] != packet[-6:]:
@@ -411,7 +415,7 @@ class Link:
             self._systems.add(system)
         if name == "BAD_DATA" and "signature" in str(message.reason):
             self._refused = self._signature_fault(bytes(message.data))
-        # From here on, only messages of the autopilot count, and only from the locked sender.
+        # From here on, only messages of the autopilot from the locked sender count.
         if (message.get_srcSystem(), message.get_srcComponent()) != (
             self._config.system,
             AUTOPILOT,
@@ -434,7 +438,7 @@ class Link:
             queue.append(MavlinkMessage(message, received_ns))
 
     def _admits(self, message: Any, address: Address, now: float) -> bool:
-        """Return whether a message of the autopilot is from the locked sender.
+        """Return whether a message of the autopilot comes from the locked sender.
 
         The link requests rates from a new sender.
         """
@@ -471,9 +475,9 @@ class Link:
         return True
 
     def _request(self, now: float) -> None:
-        """Request one rate after another, and slow ones again.
+        """Request the rates of the messages one after another, and slow rates again.
 
-        They cannot be requested together, because an answer does not say to which message it
+        The requests cannot be sent together, because an answer does not say to which message it
         belongs.
         """
         self._to_request |= self._rates.step(now)
@@ -528,7 +532,7 @@ class Link:
 
 
 class MavlinkReader:
-    """A message of a link, in place of a subscription."""
+    """The messages of one name on a link, in place of a subscription."""
 
     def __init__(self, link: Link, topic: Any) -> None:
         self.link = link
@@ -539,17 +543,17 @@ class MavlinkReader:
         self._queue = link.listen(self.message_name)
 
     def take(self) -> list[MavlinkMessage]:
-        """Take the messages since the last call, the oldest first."""
+        """Return the messages since the last call, the oldest first."""
         return [self._queue.popleft() for _ in range(len(self._queue))]
 
 
 class MavlinkPublisher:
-    """A message of a link, in place of a publisher."""
+    """Sends messages on a link, in place of a publisher."""
 
     def __init__(self, link: Link, topic: str) -> None:
         self._link = link
         self.topic_name = topic
 
     def publish(self, message: Any) -> None:
-        """Send a message."""
+        """Send a message on the link."""
         self._link.send(message)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check whether the messages of a link come at their requested rates.
 
-No clock is read: every instant is an argument, in s.
+The module reads no clock, because every instant is an argument, in s.
 """
 
 from collections import deque
@@ -10,24 +10,23 @@ from collections.abc import Mapping
 
 from flight_core.outcome import Refusal, joined
 
-# s over which messages are counted. If the host pauses for half a second, no rate becomes slow.
+# s over which messages are counted. A pause of the host for half a second makes no rate slow.
 COUNTED = 2.0
 MESSAGES = 4  # least number of messages to count, if COUNTED has fewer
-GRANTED = 0.7  # share of a requested rate below which it is slow
-# s for which a rate must be slow to end an engagement. A rate that is requested again comes back
+GRANTED = 0.7  # share of a requested rate below which a rate is slow
+# s for which a rate must be slow to end an engagement. A rate that is requested again recovers
 # sooner.
 SLOW_ENDS = 2.0
-# s after a rate was slow in which an engagement is refused. MAVProxy requests its own rates every
-# 15 s.
+# s after a slow rate in which an engagement is refused. MAVProxy requests its rates every 15 s.
 REMEMBERED = 20.0
-REPEATED = 1.0  # s between two requests of a slow rate
-JUDGED = 0.1  # s between two judgements of the rates
-PAUSE = 0.4  # s without a judgement, which show that the host paused
-GAPS = 3  # gaps between the newest messages, whose mean gives the present rate
+REPEATED = 1.0  # s, time between two requests of a slow rate
+JUDGED = 0.1  # s, time between two judgements of the rates
+PAUSE = 0.4  # s without a judgement that show that the host paused
+GAPS = 3  # number of gaps between the newest messages, whose mean gives the present rate
 
 
 class MessageRates:
-    """Counts messages by name. `requested` has their requested rates, Hz."""
+    """Counts the messages of each name; `requested` has the requested rates, Hz."""
 
     def __init__(self, requested: Mapping[str, float], now: float) -> None:
         self._requested = dict(requested)
@@ -36,18 +35,18 @@ class MessageRates:
     def begin(self, now: float) -> None:
         """Begin to count again, because the autopilot may have started again.
 
-        The rates are then requested again.
+        All rates are then requested again.
         """
         self._rates = {name: _Rate(rate, now) for name, rate in self._requested.items()}
         self._last_step = now
 
     def take(self, name: str, now: float) -> None:
-        """Count a message."""
+        """Count a message of a name."""
         if (rate := self._rates.get(name)) is not None:
             rate.take(now)
 
     def step(self, now: float) -> dict[str, float]:
-        """Judge each rate every JUDGED, and return the rates to request again, Hz by name.
+        """Judge each rate every JUDGED, and return those to request again, Hz by name.
 
         After a pause of the host, the messages that came in the meantime are counted first.
         """
@@ -60,10 +59,10 @@ class MessageRates:
         return {name: rate.requested for name, rate in self._rates.items() if rate.step(now)}
 
     def slow(self, now: float) -> dict[str, Refusal]:
-        """Return what is wrong with slow messages, by name.
+        """Return the faults of slow messages, by name.
 
-        A message is slow if it is slow now. It also counts as slow if it was slow less than
-        REMEMBERED ago, after it had reached its rate.
+        A message counts as slow if its rate is slow now. It also counts as slow if its rate had
+        been reached and then was slow less than REMEMBERED ago.
         """
         reasons = {name: rate.slowness(name, now) for name, rate in self._rates.items()}
         return {name: reason for name, reason in reasons.items() if reason is not None}
@@ -81,24 +80,25 @@ class MessageRates:
         return rate.is_known(now) and rate.slowness(name, now) is None
 
     def unknown(self, now: float) -> list[str]:
-        """Name the messages that have not been counted for the full length yet."""
+        """Return the names of messages that have not been counted for their full window yet."""
         return [name for name, rate in self._rates.items() if not rate.is_known(now)]
 
 
 class _Rate:
-    """The rate of a message."""
+    """The rate of the messages of one name."""
 
     def __init__(self, requested: float, now: float) -> None:
         self.requested = requested  # Hz
-        self._window = max(COUNTED, MESSAGES / requested)  # s
+        # s, length of the window in which messages are counted
+        self._window = max(COUNTED, MESSAGES / requested)
         self._began = now
-        self._instants: deque[float] = deque()  # of its messages within the window
-        self._lowest = requested  # Hz, lowest rate since it became slow
+        self._instants: deque[float] = deque()  # instants of the messages within the window
+        self._lowest = requested  # Hz, lowest rate since the rate became slow
         self._slow_since: float | None = None
         self._was_reached = False
-        # When the rate was slow last, if it had been reached before.
+        # Instant at which the rate was last slow, if it had been reached before.
         self._last_slow: float | None = None
-        self._repeated: float | None = None  # when the rate was requested again
+        self._repeated: float | None = None  # instant of the last repeated request
 
     def take(self, now: float) -> None:
         self._instants.append(now)
@@ -131,7 +131,7 @@ class _Rate:
         return True
 
     def slowness(self, name: str, now: float) -> Refusal | None:
-        """Say how slow the message of a name is, or was."""
+        """Say how slow the messages of a name are, or were."""
         rate = f"at {self._lowest:.2g} Hz, requested are {self.requested:g} Hz"
         if self._slow_since is not None:
             return Refusal(f"{name} comes {rate}")
@@ -146,7 +146,7 @@ class _Rate:
     def _present(self) -> float:
         """Return the mean rate of the newest messages, Hz.
 
-        The count over the whole window still has messages from before the rate fell.
+        A count over the whole window would include messages from before the rate fell.
         """
         if len(self._instants) <= GAPS:
             return len(self._instants) / self._window

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridge node, which replaces the aircraft node.
 
-With a channel map, it makes y from the messages of an autopilot, and the autopilot's setpoints from
+By a channel map, it makes y from the messages of an autopilot, and the autopilot's setpoints from
 u.
 """
 
@@ -63,13 +63,13 @@ LEFT = (
     "itself: start its agent again"
 )
 RC_OVERRIDE = f"{MAVLINK}/RC_CHANNELS_OVERRIDE"  # topic of the overrides
-# Number of messages with release values when the node ends, since a single one may be lost.
+# Number of messages with release values when the node ends, as a single one may be lost.
 RELEASES_AT_SHUTDOWN = 5
 
 NOT_ACTIVATED = Refusal("the controller refused to activate, or was active already: see its log")
 ACTIVATION_TIMED_OUT = Refusal("timed out waiting for the controller to activate")
 
-# ns to wait until the controller is active at an engagement. It answers within some ticks.
+# ns, longest wait for the controller to be active at an engagement; it answers within some ticks.
 ACTIVATION_TIMEOUT_NS = NANOSECONDS
 
 NamedRow = tuple[str, MeasuredRow | WatchedRow]
@@ -94,10 +94,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
             message.topic == RC_OVERRIDE for message in self._map.messages.values()
         )
         self._link = self._open_link()
-        # Systems of ground stations that were already reported.
+        # Systems of ground stations that were reported already.
         self._known_stations: set[int] = set()
         self._conflict: Refusal | None = None  # which topics have two publishers
-        # Publishers and encoders of what comes over MAVLink, as named vectors.
+        # Publishers and encoders of messages over MAVLink, as named vectors.
         self._recorded: dict[str, tuple[Callable[[bytes], None], Encoder]] = {}
         self._readers = self._read_topics()
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
@@ -119,14 +119,14 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._advertise_all()
         self._first_y = False
         self._start_ns = 0
-        self._report_ns = 0  # when the engagement was last reported
+        self._report_ns = 0  # instant of the last report of the engagement
         self._controller = self.create_client(ChangeState, "controller/change_state")
         self._controller_state = self.create_client(GetState, "controller/get_state")
         self._controller_ready = False
         self._u_sender: str | None = None
         self._activation: Any = None  # the pending activation of the controller
         self._activation_ns = 0
-        self._awaits_controller = False  # whether it engaged before it found the controller
+        self._awaits_controller = False  # whether the bridge engaged before it found the controller
         if self._link is not None:
             self._link.start()
         waits = f"disengaged, waiting for {self.get_name()}/engage"
@@ -139,7 +139,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._publish_would_send = self.advertise(WOULD_SEND)
         self._y_encoder = self.encoder(self._bridge.outputs)
         self._publish_pose = self.advertise(POSE) if self._map.pose else None
-        # Encoders, by the names of the channels that are fresh.
+        # Encoders by the names of the fresh channels.
         self._pose_encoders: dict[tuple[str, ...], Encoder] = {}
         names = [f"{row.message}.{row.field}" for row in self._map.inputs.values()]
         self._would_send_encoder = self.encoder(names)
@@ -148,7 +148,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._engagement = self.create_publisher(ENGAGEMENT.type, ENGAGEMENT.name, PUBLISH)
 
     def _open_link(self) -> mavlink_link.Link | None:
-        """Open the MAVLink link of the map, or return None if it has none."""
+        """Open the MAVLink link of the map; return None if the map has no link."""
         if self._map.link is None:
             return None
         key = f"{self.get_name()}.use_sim_time"
@@ -243,7 +243,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._log_phase()
         if now_ns - self._report_ns >= NANOSECONDS:
             self._report(now_ns)
-        # After a longer pause, the tick was stopped half-way and its u is old.
+        # After a longer pause, the tick was stopped half-way, and its u is old.
         if self._pause_ns() <= self._longest_pause_ns:
             self._send(now_ns, self.period_ns() // 2)
         self._warn_stale_inputs(now_ns)
@@ -270,7 +270,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return self.simulated.time_ns()
 
     def _arrived_ns(self, arrival: Any, now_ns: int) -> int:
-        """Return the instant of a message that has no stamp, on the clock of the stamps."""
+        """Return the instant of a message without a stamp, by the clock of the stamps."""
         if not arrival.received_ns:
             return now_ns + self.clock_step_ns()
         return int(
@@ -282,7 +282,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _disengage_after_pause(self, now_ns: int) -> None:
         """Disengage if the bridge did not run for a while.
 
-        The autopilot or its pilot may have flown on their own since then.
+        The autopilot or its pilot may have flown without it in the meantime.
         """
         pause_ns = self._pause_ns()
         self._began_ns += pause_ns
@@ -301,7 +301,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
     ) -> None:
         """Give the fields of a message to the bridge.
 
-        The system clock, to which its stamps belong, is ahead by `step_ns`.
+        Its stamps are by the system clock, which is ahead of the ticks' time by `step_ns`.
         """
         if isinstance(subscription, MavlinkReader):
             message = raw
@@ -373,11 +373,11 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _activate(self, active: bool) -> None:
         """Ask the controller to be active, or not to be.
 
-        It is active only while engaged, so that its integrals do not wind up.
+        The controller is active only while engaged, so that its integrals do not wind up.
         """
         self._awaits_controller = active and not self._controller.service_is_ready()
         if not self._controller.service_is_ready():
-            # It is not discovered yet, or u comes from another node, which has no lifecycle.
+            # The controller is not discovered yet, or u comes from a node without a lifecycle.
             return
         transition = Transition.TRANSITION_ACTIVATE if active else Transition.TRANSITION_DEACTIVATE
         future = self._controller.call_async(
@@ -399,7 +399,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._bridge.disengage(ACTIVATION_TIMED_OUT, now_ns)
 
     def _report(self, now_ns: int) -> None:
-        """Publish the phase and its reason, and each second what would refuse an engagement."""
+        """Publish the phase and its reason, and each second the reason against an engagement."""
         bridge = self._bridge
         self._report_ns = now_ns
         refusal = None
@@ -411,7 +411,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         ready = self._controller.service_is_ready() and self._controller_state.service_is_ready()
         before = self._u_sender
         self._u_sender = bridge.u_lock.publisher
-        # A restart can take less time than the loss of the service takes to show.
+        # A restart can take less time than it takes to notice the loss of the service.
         restarted = bool(before) and self._u_sender != before
         if (
             ready
@@ -426,7 +426,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._activate(active=True)
 
     def _deactivate_unengaged(self, state: Future) -> None:
-        """Deactivate a controller that was found active, as it is with `ros2 run`."""
+        """Deactivate a controller that was already active, as it is with `ros2 run`."""
         if (
             state.result().current_state.id == State.PRIMARY_STATE_ACTIVE
             and self._bridge.phase is not Phase.ENGAGED
@@ -509,8 +509,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def graph_checks(self) -> list[Callable[[], None]]:
         """Return the checks of the graph, also of the topics that the autopilot must receive.
 
-        It cannot receive a topic if it subscribes with another type or an incompatible quality of
-        service. A second publisher of a topic ends the engagement.
+        The autopilot cannot receive a topic if it subscribes with another type or an incompatible
+        quality of service. A second publisher of a topic ends the engagement.
         """
         outgoing = (
             partial(self.endpoints.check_subscribers, outgoing_message.publisher)
@@ -522,9 +522,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _find_conflicts(self) -> None:
         """Tell the bridge which topics have two publishers.
 
-        With two autopilots, y would be mixed and both would be flown. So the topics that the bridge
-        reads are checked, and the topics of setpoints. Several transmitters may override, and any
-        node may request a mode.
+        With two autopilots, y would be mixed, and both autopilots would be flown. So the topics
+        that the bridge reads, and those of setpoints, are checked. Overrides and requests of a mode
+        may have several publishers.
         """
         read_topics = set()
         for subscription, rows in self._readers:
@@ -535,7 +535,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         setpoints = {
             publisher.topic_name for publisher in publishers if isinstance(publisher, Publisher)
         }
-        # Two messages may share one topic.
+        # Two messages may share a topic.
         publishers_here = Counter(
             outgoing.publisher.topic_name for outgoing in self._outgoing.values()
         )

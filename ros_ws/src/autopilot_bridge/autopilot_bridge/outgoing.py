@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The messages to an autopilot, and the fields of its messages, for the bridge node."""
+"""Send the messages to an autopilot, and check the fields of its messages, for the bridge node."""
 
 from typing import Any
 
@@ -21,14 +21,14 @@ class ServiceCaller:
         self.topic_name = str(client.srv_name)
 
     def publish(self, request: Any) -> None:
-        """Send a request, without waiting for the answer. Raises ChannelError without a service."""
+        """Send a request, and do not wait for the answer. Raises ChannelError without a service."""
         if not self._client.service_is_ready():
             raise ChannelError("service", f"{self.topic_name}: no such service")
         self._client.call_async(request)
 
 
 class OutgoingMessage:
-    """A message to the autopilot and its publisher. Its constant fields are set once."""
+    """A message to the autopilot with its publisher; its constant fields are set only once."""
 
     def __init__(
         self, publisher: Any, message: Any, row: MessageRow, inputs: list[tuple[int, InputRow]]
@@ -43,12 +43,12 @@ class OutgoingMessage:
     def due(self, now_ns: int, slack_ns: int) -> bool:
         """Return whether the message's period has passed since it was last sent.
 
-        `slack_ns` is the tolerance.
+        `slack_ns` is the tolerance of the period.
         """
         return now_ns - self._sent_ns >= self._period_ns - slack_ns
 
     def send(self, now_ns: int, raw: list[float]) -> None:
-        """Send the message. It takes its own inputs from the raw values `raw` of all inputs."""
+        """Send the message with its inputs; `raw` has the raw values of all inputs."""
         for number, row in self._inputs:
             set_field(self._message, row.field, raw[number])
         if self.row.stamped:
@@ -61,7 +61,7 @@ class OutgoingMessage:
 def prepare_message(
     channel_map: ChannelMap, name: str, row: MessageRow
 ) -> tuple[Any, list[tuple[int, InputRow]]]:
-    """Prepare a message of a map: fill its constant fields, and list its inputs with places in u.
+    """Return a message of a map with its constant fields, and its inputs with their places in u.
 
     Raises ParameterError if a field is missing, or cannot hold its constant value.
     """
@@ -97,7 +97,7 @@ def field_type(name: str) -> Any:
 def require_field(empty: Any, name: str, row: MeasuredRow | WatchedRow) -> None:
     """Raise ParameterError if a field is missing.
 
-    A field inside a sequence is only checked with the first message.
+    A field inside a sequence is checked only when the first message comes.
     """
     if "[" in row.field:
         return

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The schema of a channel map file, and the parameters of the bridge node."""
+"""Define the schema of a channel map file, and the parameters of the bridge node."""
 
 import re
 from collections.abc import Mapping
@@ -32,12 +32,12 @@ from flight_core.files import find_file, names_in, read_yaml
 from flight_core.parameters import Config, Name, NodeConfig, NonNegative, Positive, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
-# The name of a parameter, which has up to 16 characters (common.xml, PARAM_VALUE).
+# The name of a parameter of the autopilot, up to 16 characters (common.xml, PARAM_VALUE).
 PARAMETER = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
 
 
 class ChannelMap(Config):
-    """A channel map, which gives the topic and the field of each channel of y and u."""
+    """A channel map, which states the topic and the field of each channel of y and u."""
 
     name: str
     source: str = Field(
@@ -141,7 +141,7 @@ class ChannelMap(Config):
         self._check_parameters()
 
     def _check_inputs(self) -> None:
-        """Check the fields of the inputs, and their values against the range of the field.
+        """Check the fields of the inputs, and whether their values fit the ranges of the fields.
 
         The values are those in trim and at the limits.
         """
@@ -186,7 +186,7 @@ class ChannelMap(Config):
             )
 
     def _check_channels(self) -> None:
-        """Check the names of channels by section."""
+        """Check the names of the channels in each section."""
         for name in self.trims:
             require(
                 name in self.inputs,
@@ -320,9 +320,9 @@ class ChannelMap(Config):
 
     @property
     def recorded_topics(self) -> list[str]:
-        """The topics that are recorded in the log.
+        """Topics that are recorded in the log.
 
-        They are the topics with a quality of service, and those of MAVLink messages.
+        They are the topics with a quality of service, and the topics of MAVLink messages.
         """
         rows = chain.from_iterable(
             rows_by_name.values() for rows_by_name in self._readers().values()
@@ -346,9 +346,10 @@ class ChannelMap(Config):
         return topics
 
     def used_fields(self) -> list[tuple[str, str, str, str, str | None]]:
-        """Return each field that is read or set: (key of the row, topic, type, path, components).
+        """Return each field that is read or set, as (key, topic, type, path, components).
 
-        The components are those of `COMPONENTS` if a function reads the field, else None.
+        The key is that of the row. The components are those of `COMPONENTS` if a function reads the
+        field, and otherwise None.
         """
         fields: list[tuple[str, str, str, str, str | None]] = []
         for kind, rows_by_name in self._readers().items():
@@ -372,7 +373,7 @@ class ChannelMap(Config):
         return fields
 
 
-ROUNDING = 1e-6  # tolerance for limits with six digits that are ends of a range
+ROUNDING = 1e-6  # tolerance for limits, rounded to six digits, at the ends of a range
 
 
 def maps() -> list[str]:
@@ -381,7 +382,7 @@ def maps() -> list[str]:
 
 
 def find_map(name: str) -> Path:
-    """Find the file of a channel map by its name in the library, or by a path that ends in .yaml.
+    """Return the file of a channel map, by its name in the library or by a path ending in .yaml.
 
     Raises ParameterError.
     """
