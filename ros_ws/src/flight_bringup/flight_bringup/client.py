@@ -17,13 +17,14 @@ from flight_ros.clocks import ClockOfPeer, PeerClocks
 from flight_ros.network import addresses, network_profile, own_address, ports
 from flight_ros.transport import DISCOVERY_VARIABLE
 
-EXCHANGE_PERIOD = 0.1  # s
-# s, for which we go on once every host was received: the least delay of many exchanges counts.
+EXCHANGE_PERIOD = 0.1  # s, time between two exchanges of clocks
+# s, time for which the exchange continues once every host was received, because the least delay of
+# many exchanges counts.
 SETTLE_TIME = 1.0
 
 
 def write_profile(peers: str, file: Path) -> tuple[str, tuple[str, ...], Mapping[str, str]]:
-    """Write the profile of this host to a file. Raises ParameterError.
+    """Write the middleware profile of this host to a file. Raises ParameterError.
 
     Returns the address of this host, the addresses of all hosts, and the environment that selects
     the profile.
@@ -48,7 +49,7 @@ def domain_ports() -> tuple[int, int]:
 
 
 class NetworkClient(Client):
-    """Exchanges clocks with the same command on the other hosts."""
+    """Exchanges clocks with the same command that runs on the other hosts."""
 
     def __init__(self, own_host: str, peers: Sequence[str]) -> None:
         super().__init__("network", rosout=False)
@@ -56,9 +57,10 @@ class NetworkClient(Client):
         self._clocks = PeerClocks(self._node, _instance(own_host), self._refused)
 
     def exchange(self, timeout: float) -> tuple[set[str], dict[str, ClockOfPeer]]:
-        """Exchange until each host receives all the others, for at most `timeout` s.
+        """Exchange clocks until each host receives all other hosts, for at most `timeout` s.
 
-        Returns the hosts that we receive, and the clocks of those that also receive us.
+        Returns the hosts that this host receives, and the clocks of those that also receive this
+        host.
         """
         heard_hosts: set[str] = set()
         clocks: dict[str, ClockOfPeer] = {}

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a fleet: several aircraft at once over topics.
 
-Every aircraft has its own namespace, nodes, log and report.
+Every aircraft has a separate namespace, nodes, log and report.
 """
 
 import signal
@@ -34,16 +34,16 @@ from flight_guidance.routes.route_file import Origin, read_route
 if TYPE_CHECKING:
     from flight_bringup.monitor import FlightMonitor
 
-BEGIN_TIME = 0.05  # s, in which the nodes of an aircraft receive t = 0, beside those of the others
+BEGIN_TIME = 0.05  # s for the nodes of an aircraft to receive t = 0 while others do
 A_FLEET = "a file of a fleet (.yaml): aircraft by name"
 Degrees = Annotated[float, Field(ge=-180, le=180)]
 Overrides = dict[str, dict[str, object]]
 
 
 def is_fleet(name: FilePath) -> bool:
-    """Return whether the path names the file of a fleet, with its aircraft by name.
+    """Return whether a path is that of a fleet file, which has the aircraft by name.
 
-    A scenario has a section `aircraft` too, but with `ros__parameters` in it.
+    A scenario has a section `aircraft` too, but this section contains `ros__parameters`.
     """
     with suppress(ParameterError):
         content = read_yaml(Path(name), str(name), A_FLEET)
@@ -54,7 +54,7 @@ def is_fleet(name: FilePath) -> bool:
 
 
 class AircraftOfFleet(Config):
-    """An aircraft of a fleet, as in the file."""
+    """An aircraft of a fleet, as the file describes it."""
 
     scenario: str | None = Field(
         default=None, description="name or path of a scenario; by default that of the fleet"
@@ -72,7 +72,7 @@ class AircraftOfFleet(Config):
 
 
 class FleetConfig(Config):
-    """A fleet, as in the file. Paths are relative to the folder of the file."""
+    """A fleet, as the file describes it; paths are relative to the folder of the file."""
 
     scenario: str = Field(
         default="osprey_route", description="scenario of the aircraft that name none"
@@ -105,9 +105,9 @@ class FleetConfig(Config):
 
 @dataclass(frozen=True)
 class Member:
-    """An aircraft of a fleet: its name, which is its namespace too, and its scenario.
+    """An aircraft of a fleet, with its scenario and its name, which is also its namespace.
 
-    Its t = 0 comes `delay` s after that of the fleet.
+    t = 0 of the aircraft is `delay` s after t = 0 of the fleet.
     """
 
     name: str
@@ -124,13 +124,13 @@ class Fleet:
     lockstep: bool = False
     composed: bool = False
     use_sim_time: bool = False
-    separation: float = SEPARATION  # m
+    separation: float = SEPARATION  # m, least distance between two aircraft
 
     def participants(self) -> int:
-        """Return how many DDS participants a flight has: the command, and the processes."""
+        """Return the number of DDS participants: one for the command, and one for each process."""
         scenarios = [member.scenario for member in self.members]
         if self.composed:
-            # A learner has a process of its own even then.
+            # A learner has a separate process even then.
             return 1 + sum(1 + scenario.learns() for scenario in scenarios)
         return 1 + sum(len(FIRST_STAGE) + len(second_stage(scenario)) for scenario in scenarios)
 
@@ -165,7 +165,7 @@ def read_fleet(
             f"{aircraft.delay:g} s",
             "0 in lockstep, which has no common time",
         )
-    # The rest concerns the fleet as a whole.
+    # The following checks concern the fleet as a whole.
     by_clock = use_sim_time or config.use_sim_time
     require(
         not (by_clock and config.lockstep),
@@ -216,7 +216,7 @@ def _scenario(
 def _nested(
     scenario: Scenario, changes: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """Return changes in which a mapping changes some keys of a group and keeps the others."""
+    """Return changes; where a change is a mapping, the other keys of the group stay."""
 
     def merged(old: Any, new: Any) -> Any:
         if not (isinstance(new, Mapping) and isinstance(old, Config)):
@@ -249,7 +249,8 @@ class _Flight:
     def start(self, fleet: Fleet, pause: Callable[[float], None]) -> None:
         """Start the processes, and in real time wait until they are ready.
 
-        This may `pause` between two looks: a host does not start many processes at once.
+        `pause` is called between two checks, because a host should not start many processes at
+        once.
         """
         self.progress(0.0, "starting")
         try:
@@ -274,7 +275,7 @@ class _Flight:
     def begin(self, start: tuple[float, float]) -> None:
         """Begin with t = 0 at an instant of the system clock and of the monotonic clock, s.
 
-        In lockstep the flight has begun already.
+        In lockstep this has no effect, because the flight has begun already.
         """
         if self.processes is None or self.stopping is not None:
             return
@@ -285,7 +286,7 @@ class _Flight:
             self.steps = follow(self.processes, self.progress)
 
     def step(self) -> bool:
-        """Look at the flight once, and return whether it goes on."""
+        """Check the flight once, and return whether it continues."""
         if self.steps is not None:
             try:
                 next(self.steps)
@@ -294,9 +295,9 @@ class _Flight:
         return self.steps is not None
 
     def end(self, outcome: Outcome) -> None:
-        """Stop the processes, in another thread.
+        """Stop the processes of the flight in another thread.
 
-        A recorder takes a while to close its log, and meanwhile the fleet flies on.
+        A recorder takes a while to close its log, and the fleet flies on in the meantime.
         """
         self.outcome = outcome
         self.steps = None
@@ -319,7 +320,7 @@ class _Flight:
 
 @dataclass(frozen=True)
 class MemberFlight:
-    """How the flight of an aircraft of a fleet ended, and the folder of its run."""
+    """The outcome of the flight of an aircraft in a fleet, and the folder of its run."""
 
     member: Member
     run: Path
@@ -327,7 +328,7 @@ class MemberFlight:
 
 
 def new_runs(fleet: Fleet, runs: Path) -> list[Path]:
-    """Create the folder of the run of each aircraft."""
+    """Create the folder of each aircraft's run, and return the folders."""
     return [new_run(member.scenario, runs, f"{member.name}-") for member in fleet.members]
 
 
@@ -338,9 +339,9 @@ def fly_fleet(
 
     `progress` is called with the name of an aircraft, its flight time, s, and a text.
 
-    In real time the aircraft share t = 0, which is set once every node is ready; an aircraft with a
-    delay begins that much later. If an aircraft ends early, or never begins, the others fly on.
-    Ctrl-C ends all. Raises ParameterError if none can begin.
+    In real time the aircraft share t = 0, which is set once every node is ready. An aircraft with a
+    delay begins later by its delay. If an aircraft ends early, or never begins, the others fly on.
+    Ctrl-C ends all flights. Raises ParameterError if no aircraft can begin.
     """
     require_ros_environment()
     from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
@@ -372,7 +373,7 @@ def fly_fleet(
         except KeyboardInterrupt:
             pass
         finally:
-            # A second Ctrl-C must not interrupt FlightProcesses.stop, which runs in other threads.
+            # A second Ctrl-C must not interrupt FlightProcesses.stop, which runs in another thread.
             with handle_signals(signal.SIG_IGN):
                 for flight in flights:
                     flight.end(flight.outcome)

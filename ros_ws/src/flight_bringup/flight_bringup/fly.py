@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fly a scenario: over topics in real time or in lockstep, or in one process."""
+"""Fly a scenario over topics, in real time or in lockstep, or in one process."""
 
 import math
 import re
@@ -44,10 +44,10 @@ from rise_di_controller.learning.proposals import Event
 if TYPE_CHECKING:
     from flight_bringup.monitor import FlightMonitor
 
-POLL_PERIOD = 0.05  # s, of the progress bar
-NUMBER = re.compile(r"-?\d+(\.\d+)?(e[-+]\d+)?")  # in a reason: "q is 0.30 s old"
+POLL_PERIOD = 0.05  # s, period of the progress bar
+NUMBER = re.compile(r"-?\d+(\.\d+)?(e[-+]\d+)?")  # a number in a reason, such as "q is 0.30 s old"
 
-STAMP_ERROR = 1e-5  # s, of a time of day as a float
+STAMP_ERROR = 1e-5  # s, rounding error of a time of day as a float
 
 STALL_TIMEOUT = 40.0
 """s. A lockstep flight ends if it makes no progress for so long. If contact with a node is lost, it
@@ -73,17 +73,17 @@ def fly_over_topics(
     announce: Callable[[str], None] = lambda line: None,
     engaged_for: float = math.inf,
 ) -> Outcome:
-    """Fly over topics, record the bag into `run`, and return the outcome.
+    """Fly a scenario over topics, record the bag into `run`, and return the outcome.
 
     The nodes are separate processes, or share one if `one_process` is set. They fly in real time,
-    in `lockstep` as fast as the machine allows, or with `use_sim_time` by /clock. All of them are
-    in the `namespace`, as "/uav1". An `autopilot` takes the place of the aircraft, in real time
+    in `lockstep` as fast as the machine allows, or with `use_sim_time` by /clock. All nodes are in
+    the `namespace`, such as "/uav1". An `autopilot` takes the place of the aircraft, in real time
     only.
 
-    `announce` gets a line when the engagement or its reason changes, though not if only a number in
-    it does; when it is known what became of a learner's proposal; and when a process had to be
-    killed. If `engaged_for`, s, is given, the flight ends that long after its first engagement, or
-    earlier: when the engagement ends, or when too little time is left for one.
+    `announce` gets a line when the engagement or its reason changes, except if only a number in the
+    reason changes. It also gets a line on what became of a learner's proposal, and when a process
+    had to be killed. If `engaged_for`, s, is given, the flight ends this long after its first
+    engagement. It ends earlier if the engagement ends, or if too little time is left for one.
 
     The outcome is COMPLETED, LANDED, INTERRUPTED (by Ctrl-C, SIGTERM or SIGHUP), or names the
     process that ended early.
@@ -158,11 +158,11 @@ def follow(
 
 
 class _Span:
-    """Tells when a flight in real time has begun, and when it is over.
+    """Determines when a flight in real time has begun, and when it is over.
 
-    It has begun once the aircraft takes u, and is over once the log holds y, y_m and u to the end.
-    With an autopilot, or with a controller that a user activates, there may never be a u: then
-    `begins` is False.
+    A flight has begun once the aircraft takes u. It is over once the log holds y, y_m and u up to
+    its end. With an autopilot, or with a controller that a user activates, there may never be a u.
+    In this case `begins` is False.
     """
 
     def __init__(
@@ -180,10 +180,10 @@ class _Span:
         self._last_change = 0.0 if begins else -math.inf  # s, flight time of the last change
         self._flies = not begins
         self._begins = begins
-        self.engaged = False  # the controller has published
+        self.engaged = False  # whether the controller has published
 
     def outcome(self, t: float) -> Outcome | None:
-        """Return the outcome once the log holds the flight, or will not any more; else None."""
+        """Return the outcome once the log holds the flight or has stopped growing; else None."""
         if (
             stamp := self._monitor.recorded()
         ) is not None and stamp - self._processes.start_time > self._until:
@@ -198,7 +198,7 @@ class _Span:
         return log_ends_at(self._until, self._duration) if self._begins else COMPLETED
 
     def failed(self, t: float) -> Outcome | None:
-        """Return why the flight has not begun; None while it still may, and once it has."""
+        """Return why the flight has not begun; None if it has, or if it still may."""
         self._flies = self._flies or self._processes.is_flying()
         if self._flies or t < FIRST_U:
             return None
@@ -261,7 +261,7 @@ def _announce_learned(
     start_time: float,
     announce: Callable[[str], None],
 ) -> None:
-    """Announce what became of proposals since the last call, and if the learner has ended."""
+    """Announce what became of proposals since the last call, and the end of the learner."""
     for instant, sentence in processes.monitor.learned():
         announce(f"t = {instant - start_time:.2f} s: {sentence}")
     if (outcome := processes.pop_end_of_learner()) is not None:
@@ -285,7 +285,8 @@ def _follow_lockstep(
     last_change = time.monotonic()
     text = "lockstep, starting"
     timeout = SEARCH_TIMEOUT if scenario.learns() else STALL_TIMEOUT
-    first: tuple[float, float] | None = None  # monotonic and flight time, s
+    # monotonic time and flight time of the first instant, s
+    first: tuple[float, float] | None = None
     while t < end or not processes.is_completed():
         if (outcome := processes.ended()) is not None:
             return outcome
@@ -316,7 +317,7 @@ def fly_in_process(
     """Fly in one process without ROS, write the bag into `run`, and return the outcome.
 
     The flight is as fast as the machine allows. `learn` makes the learner if the scenario has one.
-    What the learner does goes to `announce` and to log/learner.log, a line each.
+    The actions of the learner are announced and written to log/learner.log, a line each.
     """
     interrupt = DeferredInterrupt()
 
@@ -356,7 +357,7 @@ def fly_and_report(
     progress: Callable[[float], None] | None = None,
     learn: Learn | None = None,
 ) -> FlightResult:
-    """Fly a scenario in one process, its log and report in a new folder of `runs`.
+    """Fly a scenario in one process, with log and report in a new folder of `runs`.
 
     `rise-di fly --in-process` does the same. A scenario that differs from its file is written
     beside the log. The log holds the outcome of a flight that ended early.
@@ -365,7 +366,7 @@ def fly_and_report(
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
         runs: Folder for the folder of the run.
         progress: Called with the flight time, s, once per simulated second.
-        learn: Makes the learner of a scenario with a learner, as for `simulate`.
+        learn: Makes the learner, if the scenario has one, as for `simulate`.
 
     Returns:
         The flight, and the paths of log and report.
@@ -394,7 +395,7 @@ def fly_and_report(
 
 
 def _is_its_file(scenario: Scenario) -> bool:
-    """Return whether a scenario is what its file holds."""
+    """Return whether a scenario is equal to the content of its file."""
     try:
         return load_scenario(scenario.path) == scenario
     except ParameterError:
@@ -402,9 +403,10 @@ def _is_its_file(scenario: Scenario) -> bool:
 
 
 def as_file(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
-    """Return the scenario with a file that holds it: its own, or a new one in the run's folder.
+    """Return the scenario with a file that holds it: its own file, or a new one of the run.
 
-    Nodes in the namespace read from it what `as_flown` gives them. Raises ParameterError.
+    The nodes in the namespace read from this file the parameters of `as_flown`. Raises
+    ParameterError.
     """
     if _is_its_file(scenario):
         return as_flown(scenario, run, namespace)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Say which nodes a flight has, in which order they start, and with which parameters.
 
-The launch files and the process runner share this.
+The launch files and the process runner share this module.
 """
 
 import re
@@ -19,10 +19,10 @@ from rise_di_controller.learning.proposals import AUTHORITY_TICKS
 
 
 class NodeSpec(NamedTuple):
-    """A process of a flight."""
+    """A process of a flight, by its package and its executable."""
 
     package: str
-    executable: str  # also the node's name, and its section in a scenario
+    executable: str  # also the name of the node, and of its section in a scenario
 
     @property
     def module(self) -> str:
@@ -38,16 +38,16 @@ CONTROLLER = NodeSpec("rise_di_controller", "controller")
 LEARNER = NodeSpec("flight_design", "learner")
 BRIDGE = NodeSpec("autopilot_bridge", "bridge")
 
-# All nodes in one process. Each reads its own section of the scenario.
+# All nodes in one process. Each reads its section of the scenario.
 ONE_PROCESS = NodeSpec("flight_bringup", "one_process")
 
-# The second stage starts once every node of the first is ready, so that the log holds the whole
-# flight and the aircraft always has a controller.
+# The second stage starts once every node of the first stage is ready. So the log holds the whole
+# flight, and the aircraft always has a controller.
 FIRST_STAGE = (RECORDER, CONTROLLER)
 SECOND_STAGE = (AIRCRAFT, REFERENCE_MODEL)
 SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 
-# A word of a namespace. ROS 2 would permit _ at its ends too.
+# A word of a namespace. ROS 2 would permit _ at the ends of the word too.
 NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")
 
 
@@ -72,7 +72,7 @@ class Autopilot(NamedTuple):
 
     channel_map: ChannelMap
     map_path: Path
-    dry_run: bool  # publish on `bridge/would_send` what the map would send, and send nothing
+    dry_run: bool  # whether the bridge only publishes on `bridge/would_send` what it would send
 
     @property
     def topics(self) -> list[str]:
@@ -88,10 +88,10 @@ def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:
 def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
     """Raise ParameterError if the controller may command more than the map sends.
 
-    The bridge would clip u, and the law's anti-windup would not know. We do not narrow the limits
-    of the scenario instead, because the log must hold the parameters that flew. A dry run sends
-    nothing, and passes. A controller that holds u while it is inactive is refused too: the bridge
-    engages only if u is near trim.
+    The bridge would clip u, and the anti-windup of the law would not know of it. The limits of the
+    scenario are not narrowed instead, because the log must hold the parameters that flew. A dry run
+    sends nothing, so it passes. A controller that holds u while it is inactive is refused too,
+    because the bridge engages only if u is near trim.
     """
     if autopilot.dry_run:
         return
@@ -110,7 +110,7 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
         controller.effectors, limits.lower.tolist(), limits.upper.tolist(), strict=True
     ):
         if (row := channel_map.inputs.get(name)) is None:
-            # Another check refuses channels that differ, and names them.
+            # A different check refuses channels that differ, and names them.
             continue
         of_map = (
             f"of {name} in the map {channel_map.name}: what the bridge clips, the law's "
@@ -133,8 +133,8 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
 def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec, ...]:
     """Return the second stage of a scenario.
 
-    It has the aircraft or the bridge, the reference model, and guidance and a learner if the
-    scenario has them. Raises ParameterError if guidance cannot fly the simulated aircraft, and if a
+    The stage has the aircraft or the bridge, the reference model, and guidance and a learner if the
+    scenario has them. Raises ParameterError if guidance cannot fly the simulated aircraft, or if a
     bridge is to fly with a learner.
     """
     if not bridge:
@@ -156,14 +156,14 @@ def _optional(scenario: Scenario) -> tuple[NodeSpec, ...]:
 
 
 ON_START = -1.0  # `start_time` of nodes that wait for t = 0 on the topic `start`
-LEAD = 0.5  # s, from the sending of t = 0 on `start` to t = 0: a busy host delivers within it
+LEAD = 0.5  # s from the message of t = 0 on `start` to t = 0, within which a busy host delivers it
 
 
 def start_lead(startup: float) -> float:
     """Return the time from the start of the second stage to t = 0, s.
 
-    `startup` is how long the first stage took until it was ready. The second stage gets half as
-    long again, and half a second more so that the nodes discover each other.
+    `startup` is the time, s, that the first stage took until it was ready. The second stage gets
+    1.5 times as long, and half a second more in which the nodes discover each other.
     """
     return 0.5 + 1.5 * startup
 
@@ -171,13 +171,13 @@ def start_lead(startup: float) -> float:
 def start_instant(lead: float, now: float) -> float:
     """Return the time of t = 0, s, which is `lead` from `now`.
 
-    It is a whole 0.01 s, so that nodes with and without `start_time` tick together.
+    It is a whole multiple of 0.01 s, so that nodes with and without `start_time` tick together.
     """
     return round(now + lead, 2)
 
 
 def _airframe(scenario: Scenario) -> ParameterOverrides:
-    """Return the airframe if it was found beside the scenario: a node does not know that folder."""
+    """Return the airframe if its file lies beside the scenario, in a folder that no node knows."""
     airframe = scenario.aircraft.airframe
     return {"airframe": airframe} if Path(airframe).is_absolute() else {}
 
@@ -193,22 +193,22 @@ def parameter_overrides(
     autopilot: Autopilot | None = None,
     replaced: Collection[NodeSpec] = (),
 ) -> ParameterOverrides:
-    """Return what a process gets beside its section of the scenario file.
+    """Return the parameters of a process that its section of the scenario file lacks.
 
-    For several nodes in one process the keys are "node:name". Each parameter goes where it is
-    needed:
+    For several nodes in one process the keys are "node:name". Each parameter goes to the nodes that
+    need it:
 
     - In real time the nodes with a t = 0 get its instant, or ON_START.
-    - In lockstep the aircraft gets the rate of u and the duration, controller and guidance the
-      rate of y, the reference model the rate of u_m.
-    - Guidance gets the numbers that follow by rule, and the learner gets the scenario.
+    - In lockstep the aircraft gets the rate of u and the duration, controller and guidance get the
+      rate of y, and the reference model gets the rate of u_m.
+    - Guidance gets the numbers that follow by rule. The learner gets the scenario.
     - The recorder gets the files to attach to the log. This function writes them into the
       folder of the run.
     - With an autopilot the bridge gets the channel map, the recorder the topics of the
       autopilot, and the controller starts inactive.
     - With `use_sim_time` every node ticks by /clock.
 
-    Nodes of the user fly in place of those that are `replaced`.
+    Nodes of the user fly in place of the `replaced` ones.
     """
     clock: ParameterOverrides = {"use_sim_time": True} if use_sim_time else {}
     if spec is BRIDGE:
@@ -219,7 +219,7 @@ def parameter_overrides(
     overrides = _stage_overrides(scenario, lockstep=lockstep)
     overrides[RECORDER] |= _recording(scenario, run, autopilot)
     if autopilot is not None:
-        overrides[CONTROLLER]["start_active"] = False  # the bridge activates it: only while engaged
+        overrides[CONTROLLER]["start_active"] = False  # the bridge activates it, only while engaged
     if lockstep:
         for node, rates in _lockstep_rates(scenario).items():
             overrides[node] |= rates
@@ -234,7 +234,7 @@ def parameter_overrides(
     if not one_process:
         return overrides[spec] | clock
     if not lockstep:
-        overrides.pop(LEARNER, None)  # which has a process of its own
+        overrides.pop(LEARNER, None)  # the learner has a separate process
     return {
         f"{node.executable}:{name}": value
         for node, values in overrides.items()
@@ -254,7 +254,7 @@ def _stage_overrides(scenario: Scenario, *, lockstep: bool) -> dict[NodeSpec, Pa
             name: list(value) if isinstance(value, tuple) else value
             for name, value in scenario.guidance.by_rule()
         }
-        # Without a learner no controller publishes `authority`, and guidance must not wait for it.
+        # Without a learner no controller publishes `authority`, so guidance must not wait for it.
         authority_rate = scenario.learns() * scenario.controller.rate / AUTHORITY_TICKS
         overrides[GUIDANCE]["authority_rate"] = authority_rate
     if scenario.learns():
@@ -263,7 +263,7 @@ def _stage_overrides(scenario: Scenario, *, lockstep: bool) -> dict[NodeSpec, Pa
 
 
 def _recording(scenario: Scenario, run: Path, autopilot: Autopilot | None) -> ParameterOverrides:
-    """Return the recorder's folder, and the topics that not every flight has."""
+    """Return the folder of the recorder, and the topics that not every flight has."""
     further: list[str] = []
     if scenario.guidance is not None:
         further += topics.recorded_with("guidance")
@@ -317,14 +317,15 @@ def replayed_topics(
     namespace: str = "",
     autopilot: Autopilot | None = None,
 ) -> list[str]:
-    """Return the topics of a log that none of the nodes publishes, as full names, in order.
+    """Return the full names of a log's topics that none of the nodes publishes, in order.
 
     `namespace` is that of the nodes. A bridge among them also publishes the messages of its channel
     map.
     """
     prefix = f"/{namespace.strip('/')}/".replace("//", "/")
     names = {name for node in nodes for name in topics.published_by(node.executable)}
-    # Topics with an absolute name do not belong to the nodes alone: others publish them too.
+    # Topics with an absolute name do not belong to the nodes alone, because other nodes publish
+    # them too.
     topics_of_nodes = {prefix + name for name in names if not name.startswith("/")}
     if BRIDGE in nodes and autopilot is not None:
         setpoint_topics = (message.topic for message in autopilot.channel_map.messages.values())

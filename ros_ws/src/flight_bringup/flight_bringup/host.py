@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure whether this host can fly in real time.
 
-We spin as many processes as will fly, and each says which share of a core it got. The load of a
-host does not tell, and neither does how late a sleeping process wakes: both look alike whether a
-host can fly or not.
+As many processes as will fly spin, and each says which share of a core it got. The load of a host
+says little about this, and so does the time by which a sleeping process wakes late. Both look alike
+on a host that can fly and on one that cannot.
 """
 
 import subprocess
@@ -18,7 +18,7 @@ from flight_bringup.graph import FIRST_STAGE, LEARNER, second_stage
 from flight_core.outcome import Refusal
 from flight_core.parameters import require
 
-LOOK = 0.5  # s, that the processes spin: a hundred slices of the scheduler
+LOOK = 0.5  # s for which the processes spin, a hundred slices of the scheduler
 
 CORES_A_NODE = 0.35
 """Cores that a node needs in a process of its own. The four nodes of osprey_servo take 1.3 on two
@@ -45,9 +45,10 @@ CoresGiven = Callable[[int], float]
 
 
 def processes_of(scenario: Scenario, *, composed: bool) -> int:
-    """Return how many processes of a flight compute all the time.
+    """Return the number of processes of a flight that compute all the time.
 
-    The learner does not count: it searches now and then, and a late model harms no flight.
+    The learner does not count, because it searches only now and then, and a late model harms no
+    flight.
     """
     if composed:
         return 1
@@ -58,10 +59,10 @@ def processes_of(scenario: Scenario, *, composed: bool) -> int:
 def shortage(
     scenarios: Sequence[Scenario], cores_given: CoresGiven, *, composed: bool = False
 ) -> Refusal | None:
-    """Say what the host lacks for these flights at once, in real time.
+    """Say which share of the cores is missing for flying scenarios together in real time.
 
-    The sentence goes on behind "this host": "gives 0.5 of the 1.4 cores that a flight in real time
-    needs".
+    The text continues a sentence that begins with "this host", as in "gives 0.5 of the 1.4 cores
+    that a flight in real time needs". None means that nothing is missing.
     """
     processes = sum(processes_of(scenario, composed=composed) for scenario in scenarios)
     needed = processes * (CORES_A_PROCESS if composed else CORES_A_NODE)
@@ -73,7 +74,7 @@ def shortage(
 
 
 def cores_given(processes: int) -> float:
-    """Return how many cores the host gives to processes that spin side by side for LOOK.
+    """Return how many cores the host gives to processes that spin together for LOOK.
 
     Raises ParameterError if they cannot be started.
     """
@@ -91,7 +92,7 @@ def cores_given(processes: int) -> float:
         for spinner in spinners:
             if spinner.stdout is not None:
                 spinner.stdout.read(1)
-        # All have started, so they spin over the same time.
+        # All processes have started, so they spin over the same time.
         for spinner in spinners:
             if spinner.stdin is not None:
                 spinner.stdin.write(".")

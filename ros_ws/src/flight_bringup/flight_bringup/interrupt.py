@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Turn SIGINT, SIGTERM and SIGHUP into a KeyboardInterrupt where one does no harm."""
+"""Convert SIGINT, SIGTERM and SIGHUP to a KeyboardInterrupt at places where it does no harm."""
 
 import os
 import signal
@@ -19,7 +19,7 @@ from flight_core.signals import handle_shutdown
 def handle_signals(handler: Any) -> Iterator[None]:
     """Handle the signals of `handle_shutdown` within the block.
 
-    Python lets only the main thread set handlers: in another thread nothing changes.
+    Python lets only the main thread set handlers, so in another thread this changes nothing.
     """
     before = (
         handle_shutdown(handler) if threading.current_thread() is threading.main_thread() else {}
@@ -34,10 +34,10 @@ def handle_signals(handler: Any) -> Iterator[None]:
 def interrupt(number: int, frame: FrameType | None) -> None:
     """End the flight by a KeyboardInterrupt, and ignore further signals.
 
-    A second signal would interrupt the clean-up while `subprocess` holds the lock of a process.
+    A second signal could interrupt the clean-up while `subprocess` holds the lock of a process.
     """
     handle_shutdown(signal.SIG_IGN)
-    # The terminal is lost: writing to it is an error.
+    # If the terminal is lost, writing to it is an error.
     if number == signal.SIGHUP:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         for stream in (sys.stdout, sys.stderr):
@@ -48,9 +48,9 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 class DeferredInterrupt:
     """Handles signals, but interrupts only outside the blocks of `deferred`.
 
-    While the log is written, for example, a signal waits. With `only_in_pauses` it interrupts only
-    in `pause`: if Python code is called from a module in C, as when rclpy makes a message, an
-    exception there becomes an error of that module.
+    For example, a signal waits while the log is written. With `only_in_pauses` a signal interrupts
+    only in `pause`. The reason is Python code that a module in C calls, as when rclpy makes a
+    message: an exception in such code would become an error of the module.
     """
 
     def __init__(self, *, only_in_pauses: bool = False) -> None:
@@ -75,7 +75,7 @@ class DeferredInterrupt:
         self._interrupt_if_pending()
 
     def pause(self, duration: float) -> None:
-        """Sleep for a duration, s. Raises KeyboardInterrupt if a signal has come by the end."""
+        """Sleep for a duration, s. Raises KeyboardInterrupt if a signal comes before its end."""
         time.sleep(duration)
         self._interrupt_if_pending()
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""See a flight from outside: what `rise-di fly` learns of its nodes."""
+"""Observe a flight from outside, for `rise-di fly`."""
 
 import time
 
@@ -33,9 +33,9 @@ from flight_ros.topics import (
     offered,
 )
 
-# s, until we know the publishers of another flight on this host: twice the measured 0.25 s.
+# s, time to discover the publishers of another flight on this host: twice the measured 0.25 s.
 DISCOVERY_TIME = 0.5
-LOOP_INPUTS = (Y.name, Y_M.name)  # from which a controller computes u
+LOOP_INPUTS = (Y.name, Y_M.name)  # topics from which a controller computes u
 FREE_DOMAIN = (
     "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own: --namespace"
 )
@@ -46,7 +46,7 @@ MODES = {float(mode): mode.name for mode in Mode}
 class FlightMonitor(Client):
     """Follows a flight by the states of its nodes and the internals of its controller.
 
-    In lockstep it also follows how far the log has come.
+    In lockstep it also follows the progress of the log.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class FlightMonitor(Client):
         self._created = time.monotonic()
         self.by_clock = use_sim_time
         self._simulated = SimulatedTime(self._node, self._refused) if use_sim_time else None
-        self.clock: HostTime = self._simulated or time  # of the flight
+        self.clock: HostTime = self._simulated or time  # clock of the flight
         self._namespace = self._node.get_namespace().rstrip("/")
         # Each subscription slows a lockstep flight down.
         if lockstep:
@@ -71,7 +71,7 @@ class FlightMonitor(Client):
             self._internals = PolledSubscription(self._node, INTERNALS, NEWEST_SAMPLES, raw=True)
         self._recorded = PolledSubscription(self._node, RECORDED, LOCKSTEP, raw=True)
         self._node_state = PolledSubscription(self._node, NODE_STATE, STATES)
-        self._states: dict[str, str] = {}  # by process
+        self._states: dict[str, str] = {}  # last state of each process
         self._publish_start = self._node.create_publisher(
             START.type, START.name, offered(START)
         ).publish
@@ -89,11 +89,11 @@ class FlightMonitor(Client):
         return self._simulated is None or self._simulated.known()
 
     def ahead(self, lead: float) -> float:
-        """Convert a time of the host, s, to one of the flight that is at least as long."""
+        """Return a duration of the flight that takes the host at least `lead`, both in s."""
         return lead if self._simulated is None else lead * max(self._simulated.speed(), 1.0)
 
     def end_of_clock(self) -> Outcome | None:
-        """Return the outcome if the simulation behind /clock is over; None while it goes on."""
+        """Return the outcome if the simulation behind /clock is over; None while it continues."""
         if self._simulated is None or not self._simulated.known():
             return None
         try:
@@ -108,7 +108,7 @@ class FlightMonitor(Client):
     def is_ready(self, node: str, pid: int) -> bool:
         """Return whether the loop of a node runs.
 
-        The process id tells it from a node of the same name in another flight.
+        The process id distinguishes it from a node of the same name in another flight.
         """
         return self._state(node, pid) in {*NodeState}
 
@@ -117,7 +117,7 @@ class FlightMonitor(Client):
         return self._state(node, pid) in {*NodeState} - {NodeState.READY}
 
     def start(self, start_time: float) -> None:
-        """Tell the nodes the system time of t = 0, s."""
+        """Publish the system time of t = 0, s, for the nodes."""
         self._publish_start(instant(nanoseconds(start_time)))
 
     def is_flying(self, node: str, pid: int) -> bool:
@@ -151,7 +151,7 @@ class FlightMonitor(Client):
     def learned(self) -> list[tuple[float, str]]:
         """Return what has become of a learner's proposals since the last call.
 
-        Each is an instant by the clock of the stamps, s, and a sentence.
+        Each element is an instant by the clock of the stamps, s, and a sentence.
         """
         return [
             (seconds(report.stamp_ns), bounded(report.sentence))
@@ -169,8 +169,8 @@ class FlightMonitor(Client):
     def require_free_domain(self) -> None:
         """Raise ParameterError if the namespace already has an aircraft or a reference model.
 
-        It looks in this domain only, and first waits for DISCOVERY_TIME after the monitor was made,
-        because publishers are not known before.
+        Only this domain is checked. The check waits until DISCOVERY_TIME after the monitor was
+        made, because publishers are not known earlier.
         """
         remaining = self._created + DISCOVERY_TIME - time.monotonic()
         require_no_publishers(self._node, LOOP_INPUTS, FREE_DOMAIN, remaining)

@@ -20,9 +20,9 @@ from flight_ros.flight_node import ACKNOWLEDGE_TIMEOUT
 from flight_ros.messages import STAMP, STAMP_PLACE, instant, stamp_of
 from flight_ros.topics import CLOCK, LOCKSTEP
 
-DISCOVERY_TIME = 1.0  # s, to discover other publishers
+DISCOVERY_TIME = 1.0  # s, time to discover other publishers
 EXPECTED = "no publisher: set ROS_DOMAIN_ID to an unused domain, or choose other --topics"
-MATCHING_TIME = 0.5  # s, to discover the subscribers
+MATCHING_TIME = 0.5  # s, time to discover the subscribers
 CLOCK_PERIOD_NS = 10_000_000  # ns of the log between two samples of `/clock`
 CLOCK_NAME = f"/{CLOCK.name}"  # the name that ROS uses for simulated time
 PROGRESS_PERIOD_NS = 100_000_000
@@ -32,7 +32,7 @@ Outgoing = tuple[int, str, bytes, bool]
 
 
 class Player(Client):
-    """Publishes on the topics of a log and on `/clock`.
+    """Publishes the messages of a log on its topics, and the time of the log on `/clock`.
 
     Raises ParameterError if a topic already has a publisher, unless it is one of `shared`, or if a
     message type is not installed.
@@ -64,11 +64,11 @@ class Player(Client):
     ) -> None:
         """Publish all messages with the timing of the log, divided by `rate`.
 
-        The first message is sent at once. Each other one is sent when its time since the first,
-        divided by `rate`, has passed. Deadlines are absolute on the monotonic clock, so that delays
-        do not add up. `stamps_now` moves the stamps: the age of a message by the system clock
-        becomes its age in the log divided by `rate`. `progress` is called with the instant of the
-        log, ns, ten times a second.
+        The first message is sent immediately. Each further message is sent when its time since the
+        first, divided by `rate`, has passed. Deadlines are absolute on the monotonic clock, so
+        delays do not add up. `stamps_now` moves the stamps, so that the age of a message by the
+        system clock is its age in the log divided by `rate`. `progress` is called ten times a
+        second with the instant of the log, ns.
         """
         begin_ns = begin_system_ns = first_ns = clock_ns = progress_ns = 0
         for due_ns, topic, message, has_stamp in messages:
@@ -96,7 +96,7 @@ def _restamped(data: bytes, begin_ns: int, first_ns: int, rate: float) -> bytes:
     try:
         since_ns = stamp_of(data) - first_ns
     except ChannelError:
-        # The message is too short to have a stamp: we send it as it is in the log.
+        # The message is too short for a stamp, so it is sent as it is in the log.
         return data
     stamp_ns = begin_ns + (since_ns if rate == 1.0 else round(since_ns / rate))
     message = bytearray(data)
@@ -112,7 +112,8 @@ def _sleep_until(deadline_ns: int) -> None:
 def unsendable(types: Mapping[str, str]) -> dict[str, str]:
     """Return the topics that cannot be sent, each with its type.
 
-    Either the message type is not installed, or ROS does not permit the name of the topic.
+    This means that the message type is not installed, or that ROS does not permit the name of the
+    topic.
     """
     lacking = {}
     for topic, name in types.items():
@@ -129,7 +130,7 @@ def _message_type(topic: str, name: str) -> Any:
     try:
         return getattr(import_module(f"{package}.msg"), kind)
     except (ImportError, AttributeError, ValueError):
-        # This also catches a log that has something else than the name of a type there.
+        # This also catches a log whose type name is no name of a type.
         raise ParameterError(
             f"{topic}: its type {name} is not installed, expected the package {package}"
         ) from None

@@ -58,32 +58,32 @@ from flight_log.bag import OUTCOME_FILE
 if TYPE_CHECKING:
     from flight_bringup.monitor import FlightMonitor
 
-STOP_TIMEOUT = 2.5  # s, for all processes but the recorder together; a node needs 0.2 s
-# s, for the recorder: it needs 0.2 s, but must close its log on a busy host or disk too.
+STOP_TIMEOUT = 2.5  # s for all processes together except the recorder; a node needs 0.2 s
+# s for the recorder. It needs 0.2 s, but must also close its log on a busy host or disk.
 CLOSE_TIMEOUT = 30.0
-SEARCH_TIMEOUT = 300.0  # s, for a learner in lockstep: a search takes 5 s of a core
+SEARCH_TIMEOUT = 300.0  # s for a learner in lockstep; a search takes 5 s of a core
 READY_TIMEOUT = 20.0  # s
 NO_CLOCK = "/clock: no message of a simulator"
-FIRST_Y = 20.0  # s, that a bridge waits for the first y of its autopilot
-BEFORE_END = 0.8  # of the duration: a short flight ends with the bridge's reason, too
-FIRST_U = 5.0  # s, from t = 0 to the first u that the aircraft takes
-LOG_TIMEOUT = 5.0  # s, after the duration, without a change of the log
-POLL_PERIOD = 0.005  # s, while nodes start
+FIRST_Y = 20.0  # s for which a bridge waits for the first y of its autopilot
+BEFORE_END = 0.8  # share of the duration, so that a short flight ends with the bridge's reason, too
+FIRST_U = 5.0  # s, longest time from t = 0 to the first u that the aircraft takes
+LOG_TIMEOUT = 5.0  # s without a change of the log, after the duration
+POLL_PERIOD = 0.005  # s, time between two checks while nodes start
 
 
 def end_with_parent() -> list[str]:
     """Return the words before a command that send it SIGTERM when this process dies.
 
-    There are none if the host has no setpriv of util-linux.
+    The list is empty if the host has no setpriv of util-linux.
     """
     setpriv = shutil.which("setpriv")
     return [setpriv, "--pdeathsig", "TERM"] if setpriv else []
 
 
 def start_instants(lead: float, monitor: "FlightMonitor") -> tuple[float, float]:
-    """Return t = 0 by the clock of the stamps and by that of the ticks, s.
+    """Return t = 0 by the clock of the stamps, and by the clock of the ticks, s.
 
-    It is `lead` s of the host from now.
+    t = 0 is `lead` s from now by the host's clock.
     """
     clock = monitor.clock
     lead = monitor.ahead(lead)
@@ -91,28 +91,28 @@ def start_instants(lead: float, monitor: "FlightMonitor") -> tuple[float, float]
 
 
 def leave_outcome(run: Path, outcome: Outcome) -> None:
-    """Leave the outcome of a flight for the recorder; nothing is recorded in `Path()`.
+    """Write the outcome of a flight for the recorder; without a recorder `run` is `Path()`.
 
-    If the disk is full, the log lacks its outcome but nothing else.
+    If the disk is full, only the outcome is missing in the log.
     """
     if run.name:
         with suppress(OSError, ParameterError):
             write_file(run / OUTCOME_FILE, outcome.text())
 
 
-# How the line begins in which a node says why it ends.
+# The beginning of the line in which a node says why it ends.
 CAUSE = re.compile(r"\[FATAL\]|error: ")
 
 
 class NotReadyError(ParameterError):
-    """A node was not ready in time, or ended before it was, though its input was good."""
+    """Raised if a node was not ready in time, or ended before, although its input was valid."""
 
 
 class NodeProcess:
     """One node as a process.
 
-    Its output goes to a file. `lines` holds the last lines; `cause` is the line that says why it
-    ended, even if a long traceback follows it.
+    The output of the process goes to a file. `lines` has the last lines. `cause` is the line that
+    says why the process ended, even if a long traceback follows this line.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class NodeProcess:
         self.node = node
         self.lines: deque[str] = deque(maxlen=20)
         self.cause = ""
-        # -P: a package in the working folder must not replace a package of the stack
+        # -P, because a package in the working folder must not replace a package of the stack
         module = ["-P", "-m", node.module]
         command = [*end_with_parent(), sys.executable, *module]
         arguments = ["--ros-args", "--params-file", str(scenario_file)]
@@ -148,7 +148,7 @@ class NodeProcess:
             arguments = [*sections, *arguments, "--params-file", str(file)]
             overrides = {}
         for name, value in overrides.items():
-            # JSON is valid YAML, and quotes what needs quotes
+            # JSON is valid YAML, and has quotes wherever they are needed
             arguments += ["-p", f"{name}:={json.dumps(value)}"]
         self._log = log.open("x", encoding="utf-8")
         self.popen = subprocess.Popen(  # noqa: S603 - our own interpreter and modules
@@ -157,7 +157,7 @@ class NodeProcess:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            # Ctrl-C must reach only the command, which then stops the nodes in order
+            # Ctrl-C must reach only the command, which then stops the nodes in their order
             process_group=0,
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -189,10 +189,10 @@ class NodeProcess:
 class FlightProcesses:
     """All processes of one flight, as a context manager that stops them when it exits.
 
-    `monitor` reports which nodes are ready and must be in the same `namespace`. With an autopilot,
-    the bridge starts in the aircraft's place. A flight in real time with an aircraft gets its t = 0
-    from `begin`, once `match` has seen it ready. `announce` gets a line if processes had to be
-    killed. `pause` sleeps for a duration, s, between two looks at nodes that start.
+    `monitor` reports which nodes are ready, and must be in the same `namespace`. With an autopilot,
+    the bridge starts in place of the aircraft. A flight in real time with an aircraft gets its t =
+    0 from `begin`, once `match` has found that it is ready. `announce` gets a line if processes had
+    to be killed. `pause` sleeps for a duration, s, between two checks of nodes that start.
     """
 
     def __init__(
@@ -218,7 +218,7 @@ class FlightProcesses:
         self.autopilot = autopilot
         self._first: tuple[NodeSpec, ...] = FIRST_STAGE
         self._second = second_stage(scenario, bridge=autopilot is not None)
-        # In the same process a search would delay ticks.
+        # In the same process, a search of the learner would delay ticks.
         apart = (LEARNER,) if LEARNER in self._second and not lockstep else ()
         self._in_one_process = [
             spec.executable for spec in (*self._first, *self._second) if spec not in apart
@@ -227,22 +227,22 @@ class FlightProcesses:
             self._first = ()
             self._second = (ONE_PROCESS, *apart)
         self.processes: list[NodeProcess] = []
-        self.outcome = INTERRUPTED  # what the log says of the flight
+        self.outcome = INTERRUPTED  # outcome of the flight in the log
         self.start_time = math.inf  # time of t = 0 by the stamps, s
-        # The same by the clock of the ticks: when the system clock steps, t does not.
+        # The same by the clock of the ticks, so that a step of the system clock does not change t.
         self.started = math.inf
         self._on_start = not lockstep and autopilot is None
 
     def __enter__(self) -> Self:
         try:
-            # We check before any node starts: a controller would engage on the y and y_m of
+            # Check before any node starts, because a controller would engage on the y and y_m of
             # another flight.
             self.monitor.require_free_domain()
             begin = time.monotonic()
             for node in self._first:
                 self._start(node)
             self._wait_until_ready(begin + READY_TIMEOUT)
-            self.monitor.require_free_domain()  # another flight may have begun meanwhile
+            self.monitor.require_free_domain()  # another flight may have begun in the meantime
             if not self._on_start:
                 lead = start_lead(time.monotonic() - begin)
                 self._set_start(start_instants(lead, self.monitor))
@@ -276,9 +276,9 @@ class FlightProcesses:
         """Set t = 0 after `match`. Returns an outcome if the flight cannot begin, else None.
 
         `start` is the system time and the monotonic time of t = 0, s, for several flights at once.
-        By default it is LEAD from now.
+        By default t = 0 is LEAD from now.
         """
-        leave_real_time_priority()  # the nodes have it
+        leave_real_time_priority()  # the nodes have this priority
         outcome = self.match()
         if outcome is None and self._on_start:
             self._set_start(start or start_instants(LEAD, self.monitor))
@@ -297,7 +297,7 @@ class FlightProcesses:
         return nodes
 
     def _unmatched(self) -> list[str]:
-        """Return what the flight waits for before t = 0, a sentence for each node."""
+        """Return a sentence for each node for which the flight waits before t = 0."""
         names = self._nodes()
         ready = {name: self.monitor.is_ready(name, pid) for name, pid in names}
         unmatched = [name for name, pid in names if not self.monitor.is_matched(name, pid)]
@@ -354,9 +354,9 @@ class FlightProcesses:
     def ended(self) -> Outcome | None:
         """Return the outcome if a process or the simulated time has ended, else None.
 
-        In real time the law flies on without a learner. On a busy host several processes may have
-        ended since the last call. Then a landing is the cause, and a process that lost contact with
-        another is not.
+        In real time the end of a learner is no outcome, because the law flies on. On a busy host
+        several processes may have ended since the last call. In this case a landing counts as the
+        cause, and a process that only lost contact with another process does not.
         """
         processes = [
             process for process in self.processes if self.lockstep or process.node is not LEARNER
@@ -369,7 +369,7 @@ class FlightProcesses:
         return self.monitor.end_of_clock()
 
     def pop_end_of_learner(self) -> Outcome | None:
-        """Return how the learner has ended, once; None at any other time."""
+        """Return how the learner has ended; only once, and None otherwise."""
         for process in self.processes:
             if process.node is LEARNER and process.popen.poll() is not None:
                 self.processes.remove(process)
@@ -389,7 +389,7 @@ class FlightProcesses:
         )
 
     def is_completed(self) -> bool:
-        """Return whether the aircraft has completed a lockstep flight, with the last u."""
+        """Return whether the aircraft has completed a lockstep flight with the last u."""
         return any(
             self.monitor.is_completed(name, pid)
             for name, pid in self._nodes()
@@ -397,7 +397,7 @@ class FlightProcesses:
         )
 
     def last_words(self, node: NodeSpec) -> str | None:
-        """Return the last line in which a node waits for a topic or refuses a sample, if any."""
+        """Return a node's last line about a topic it awaits or a sample it refuses, or None."""
         lines: list[str] = []
         for process in self.processes:
             if node.executable in self._names(process):
@@ -410,10 +410,10 @@ class FlightProcesses:
     def stop(self) -> None:
         """Stop all processes, the recorder last.
 
-        A process that has not ended after STOP_TIMEOUT is killed, the recorder after CLOSE_TIMEOUT.
-        At the end of a lockstep flight a learner completes its search first.
+        A process that has not ended after STOP_TIMEOUT is killed, and the recorder after
+        CLOSE_TIMEOUT. At the end of a lockstep flight, a learner first completes its search.
         """
-        # A second Ctrl-C must not interrupt this: it would truncate the log.
+        # A second Ctrl-C must not interrupt this, because it would truncate the log.
         with handle_signals(signal.SIG_IGN):
             if self.processes:
                 leave_outcome(self._run, self.outcome)
@@ -434,7 +434,7 @@ class FlightProcesses:
                 group = [process for process in self.processes if process.node in timeouts]
                 for process in group:
                     if process.popen.poll() is None:
-                        # SIGINT would print a traceback if Python is still importing.
+                        # SIGINT would print a traceback while Python is still importing.
                         process.popen.terminate()
                 for process in group:
                     try:
@@ -450,7 +450,7 @@ class FlightProcesses:
 
 
 def _outcome(process: NodeProcess) -> Outcome:
-    """Return the outcome of a flight in which this process has ended."""
+    """Return the outcome of a flight in which a process has ended."""
     name = process.node.executable
     status = process.finish()
     if status < 0:

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a fleet on a full ROS 2: ros2 launch flight_bringup fleet.launch.py fleet:=fleet.yaml.
 
-It runs `rise-di fly`, which starts, follows and ends every aircraft. The launch ends with it, and
-with exit status 1 if an aircraft did not complete its flight.
+It runs `rise-di fly`, which starts, follows and ends every aircraft. The launch ends with this
+command. The exit status is 1 if an aircraft did not complete its flight.
 """
 
 from pathlib import Path
@@ -42,7 +42,7 @@ def generate_launch_description() -> LaunchDescription:
 
 def _fly(context: LaunchContext) -> list[Action]:
     file = argument(context, "fleet")
-    # We refuse a mistake in the file in one sentence, before anything starts.
+    # A mistake in the file is refused in one sentence, before anything starts.
     fleet = read_fleet(Path(file))
     has_own_time = fleet.lockstep or fleet.use_sim_time
     return by_rise_di(Flight(context), file, has_own_time=has_own_time)

@@ -3,9 +3,10 @@
 """Fly a scenario on a full ROS 2: ros2 launch flight_bringup fly.launch.py scenario:=osprey_servo.
 
 The graph and the scenario file are those of `rise-di fly`. The flight begins once each node is
-ready and matched. It ends once the log holds the scenario's duration; in lockstep, when the
-aircraft has completed it. If a node ends or is not ready, or if no u reaches the aircraft, it ends
-early with exit status 1. When another launch file includes this one, it ends only its own nodes.
+ready and matched. It ends once the log holds the duration of the scenario, or in lockstep once the
+aircraft has completed this duration. It ends early with exit status 1 if a node ends or is not
+ready, or if no u reaches the aircraft. If another launch file includes this one, the end of the
+flight ends only its own nodes.
 """
 
 from collections.abc import Sequence
@@ -61,7 +62,7 @@ from flight_core.topics import published_by
 from flight_ros.topics import NodeState
 from launch import LaunchContext, LaunchDescription
 
-# Nodes that users may replace by their own, and what they publish.
+# Nodes that users may replace, and the topics that these nodes publish.
 OPTIONAL = {AIRCRAFT: "y", REFERENCE_MODEL: "y_m"}
 
 
@@ -146,7 +147,7 @@ def _fly(context: LaunchContext) -> list[Action]:
                 flies=AIRCRAFT not in others,
             )
         else:
-            # A user activates the controller, or nobody does.
+            # A user activates the controller, or nobody activates it.
             end = end_with_log(flight, lead, start_time + duration, duration, by_rosbag2=by_rosbag2)
         return [*end, *(node(spec, ON_START if begins else start_time) for spec in then)]
 
@@ -177,7 +178,7 @@ def _require_possible(
 ) -> None:
     """Raise ParameterError if arguments exclude each other.
 
-    `own` are the arguments by which users put nodes or values of their own into a flight.
+    `own` are the arguments by which users add other nodes or values to a flight.
     """
     require(
         not (by_rosbag2 and lockstep),

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Play a recorded flight on a full ROS 2, with nodes against it.
+"""Play a recorded flight on a full ROS 2, beside nodes that answer it.
 
 ros2 launch flight_bringup replay.launch.py run:=runs/latest
 
 Like `rise-di play`, it publishes the topics of the log with their timing, and /clock with the time
-of the log. It plays only those topics that none of the nodes publishes, so that a controller
-answers the recorded y and y_m with its own u. It begins once all nodes are ready and ends with the
-log. If a node ends before, it ends with exit status 1.
+of the log. It plays only topics that none of the nodes publishes, so that a controller answers the
+recorded y and y_m with a new u. The playback begins once all nodes are ready, and ends with the
+log. If a node ends earlier, the exit status is 1.
 """
 
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ from flight_core.topics import published_by
 from flight_log.playback import read_playback
 from launch import LaunchContext, LaunchDescription
 
-# Nodes that run when the argument of their name is true.
+# Nodes that run if the argument with their name is true.
 OPTIONAL = (RECORDER, CONTROLLER, REFERENCE_MODEL, AIRCRAFT)
 
 
@@ -114,7 +114,7 @@ def _play(context: LaunchContext) -> list[Action]:
         f"true with {', '.join(others)}",
         "controller and recorder alone",
     )
-    # We play the topics of the log that none of the nodes publishes.
+    # Play the topics of the log that none of the nodes publishes.
     types = read_playback(log).types
     recorded = types.keys() - unsendable(types)
     topics = argument(context, "topics") or ",".join(
@@ -130,7 +130,7 @@ def _play(context: LaunchContext) -> list[Action]:
     player = _player(flight, topics)
     if scenario is None:
         return flight.in_scope([player])
-    # With nodes, the player is the second stage: it begins once all are ready.
+    # If there are nodes, the player is the second stage, which begins once all nodes are ready.
     first_stage = {}
     for spec in nodes:
         overrides = parameter_overrides(
@@ -147,7 +147,7 @@ def _play(context: LaunchContext) -> list[Action]:
 
 
 def _player(flight: Flight, topics: str) -> ExecuteProcess:
-    """Run `rise-di play` with the arguments of the launch, which is complete when it ends."""
+    """Return `rise-di play` with the launch's arguments; the launch completes when it ends."""
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action] | None:
         if event.returncode != 0:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Share code between the launch files.
+"""Code that the launch files share.
 
 It needs `launch` and `launch_ros`, which only a full ROS 2 has.
 """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Keep what belongs to one flight of a launch: its arguments, its processes, its end."""
+"""Hold the arguments and the processes of one flight of a launch, and end the flight."""
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
@@ -31,27 +31,27 @@ SIM_TIME = "use_sim_time"
 
 
 class Flight:
-    """One flight of a launch: the arguments in its scope, its processes, its end.
+    """One flight of a launch, with the arguments in its scope and its processes.
 
     A launch file may include several flights, in groups that have ended by the time a node starts.
-    We therefore copy the launch configurations once, and use the copy for whatever the flight
-    starts later: its arguments, and what PushRosNamespace, SetParameter and SetRemap of the group
-    say. At its end a flight stops only its own processes. If the launch has nothing else to do, it
-    then ends by itself.
+    So the flight copies the launch configurations once, and uses the copy for all that it starts
+    later. The copy has its arguments, and the effects of PushRosNamespace, SetParameter and
+    SetRemap in the group. At its end a flight stops only its own processes. If the launch then has
+    nothing else to do, it ends too.
     """
 
     _of_launch: ClassVar[WeakKeyDictionary[LaunchContext, list["Flight"]]] = WeakKeyDictionary()
 
     def __init__(self, context: LaunchContext) -> None:
         self.context = context
-        self.run = Path()  # the folder of the run; Path() without a recorder
+        self.run = Path()  # folder of the run; Path() without a recorder
         self.states: dict[str, str] = {}  # the last state of each node by its full name
-        # A later SetParameter or SetRemap of the launch extends the list that it finds.
+        # A copy of each list, because a later SetParameter or SetRemap of the launch extends it.
         self.configurations: dict[str, Any] = {
             name: [*value] if isinstance(value, list) else value
             for name, value in context.launch_configurations.items()
         }
-        # If anything but SIGINT ends it, launch leaves its processes running.
+        # If any other signal than SIGINT ends launch, it leaves its processes running.
         self.configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
         self.namespace = _namespace(context)
         self._processes: list[Action] = []
@@ -72,10 +72,10 @@ class Flight:
         return self.argument(SIM_TIME) == "true" or self.has_sim_time
 
     def given_to_nodes(self) -> list[str]:
-        """Name what the scope gives all its nodes, apart from their time.
+        """Return what the scope gives to all of its nodes, except their time.
 
-        SetParameter, SetParametersFromFile and SetRemap reach the nodes that the launch starts, and
-        no node that another process starts.
+        SetParameter, SetParametersFromFile and SetRemap reach only the nodes that the launch starts,
+        and no nodes of another process.
         """
         names = []
         for each in self._given_parameters():
@@ -86,13 +86,13 @@ class Flight:
         return names + [f"SetRemap {name}" for name, _ in self.configurations.get("ros_remaps", ())]
 
     def _given_parameters(self) -> Sequence[tuple[str, Any] | str]:
-        """Return the parameters of the scope as launch_ros keeps them: values or paths."""
+        """Return the parameters of the scope in the form of launch_ros, as values or paths."""
         given: Sequence[tuple[str, Any] | str] = self.configurations.get("global_params", ())
         return given
 
     @property
     def is_over(self) -> bool:
-        """Return whether the flight has ended, or the launch has."""
+        """Return whether the flight or the launch has ended."""
         return self._is_stopped or bool(self.context.is_shutdown)
 
     def argument(self, name: str) -> str:
@@ -120,7 +120,7 @@ class Flight:
     def complete(
         self, reason: str = "flight completed", outcome: Outcome = COMPLETED
     ) -> list[Action]:
-        """Return the actions that end a flight which has reached its end.
+        """Return the actions that complete a flight.
 
         The recorder closes the log with the outcome.
         """
@@ -131,17 +131,17 @@ class Flight:
     def fail(self, outcome: Outcome) -> list[Action]:
         """End the flight early, and leave the outcome in the folder of the run.
 
-        While other flights of the launch go on, they are not disturbed. When the last one ends,
-        this raises RuntimeError, so that the launch ends with exit status 1.
+        Other flights of the launch continue undisturbed. If this was the last flight, raises
+        RuntimeError, so that the launch ends with exit status 1.
         """
         leave_outcome(self.run, outcome)
         self._failure = str(outcome)
         return [LogInfo(msg=str(outcome)), *self._stop()]
 
     def _stop(self) -> list[Action]:
-        """Stop what the flight has started.
+        """Return the actions that stop all that the flight has started.
 
-        Raises RuntimeError if no other flight goes on and one of them has failed.
+        Raises RuntimeError if no other flight continues, and one of them has failed.
         """
         self._is_stopped = True
         for timer in self._timers:
@@ -157,20 +157,20 @@ class Flight:
 
 
 class _Restore(Action):
-    """Restores the launch configurations of a scope that has ended."""
+    """An action that restores the launch configurations of a scope that has ended."""
 
     def __init__(self, configurations: Mapping[str, Any]) -> None:
         super().__init__()
         self.configurations = configurations
 
     def execute(self, context: LaunchContext) -> None:
-        """Replace the configurations of the launch, which the caller has pushed."""
+        """Replace the configurations of the launch; the caller has pushed the previous ones."""
         context.launch_configurations.clear()
         context.launch_configurations.update(self.configurations)
 
 
 def argument(context: LaunchContext, name: str) -> str:
-    """Return the value of an argument."""
+    """Return the value of a launch argument."""
     return str(LaunchConfiguration(name).perform(context))
 
 

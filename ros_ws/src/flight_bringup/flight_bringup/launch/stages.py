@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the nodes of a launch in stages.
 
-A stage waits until each node of the stage before has published the `node_state` "ready".
+A stage waits until each node of the previous stage has published the `node_state` "ready".
 """
 
 import math
@@ -77,7 +77,7 @@ WAITED_FOR = "the lines of the nodes say what they wait for"
 
 
 class NodeStateEvent(Event):
-    """A node of this launch has published its state."""
+    """The event that a node of this launch has published its state."""
 
     name = "flight_bringup.NodeStateEvent"
 
@@ -87,7 +87,7 @@ class NodeStateEvent(Event):
 
 
 class FlownEvent(Event):
-    """The flight has reached its end."""
+    """The event that the flight has reached its end."""
 
     name = "flight_bringup.FlownEvent"
 
@@ -96,7 +96,7 @@ class FlownEvent(Event):
 
 
 def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgument:
-    """Declare the argument `scenario`; `otherwise` says what an empty one means."""
+    """Declare the argument `scenario`; `otherwise` says what an empty value means."""
     description = (
         f"name of a scenario ({', '.join(scenarios())}), or path of a scenario file "
         f"(.yaml){otherwise}"
@@ -119,7 +119,7 @@ def runs_argument() -> DeclareLaunchArgument:
 
 
 def recorder_argument(*further: str) -> DeclareLaunchArgument:
-    """Declare the argument `recorder`. Its value can also be one of the words in `further`."""
+    """Declare the argument `recorder`; its value may also be one of the words in `further`."""
     description = (
         "true: the stack's recorder; rosbag2: `ros2 bag record` into the folder rosbag2 of the run"
     )
@@ -137,7 +137,7 @@ def watch_argument() -> DeclareLaunchArgument:
 
 
 def watch_page(flight: Flight) -> list[Action]:
-    """Return the process that serves the live page of a run, if the user asked for it.
+    """Return the process that serves the live page of a run, if the user wants it.
 
     The flight does not depend on this process.
     """
@@ -175,12 +175,12 @@ def sim_time_argument() -> DeclareLaunchArgument:
 def by_rise_di(flight: Flight, file: str, *, has_own_time: bool = False) -> list[Action]:
     """Run `rise-di fly` of a scenario or of a fleet, with the arguments of the launch.
 
-    It keeps to real time, because a launch file flies beside other nodes, unless the fleet
-    `has_own_time`. If it ends with an error, because a flight was not completed, the launch ends
-    with exit status 1.
+    The command flies in real time, because a launch file flies beside other nodes. A fleet that
+    `has_own_time` may fly otherwise. If the command ends with an error, because a flight was not
+    completed, the launch ends with exit status 1.
 
-    Raises ParameterError if the scope gives its nodes parameters or names, which would not reach
-    these.
+    Raises ParameterError if the scope gives parameters or names to its nodes, because they would
+    not reach the nodes of the command.
     """
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action]:
@@ -213,11 +213,12 @@ def by_rise_di(flight: Flight, file: str, *, has_own_time: bool = False) -> list
 def flight_node(
     spec: NodeSpec, scenario: Scenario, overrides: ParameterOverrides, flight: Flight
 ) -> Node:
-    """Return a node of a flight, with its section of the scenario and the overrides."""
+    """Return the action of a flight's node, with its section of the scenario and overrides."""
     return Node(
         package=spec.package,
         executable=spec.executable,
-        name=spec.executable,  # its own name: the overrides then go to this node, after its section
+        # a separate name, so that the overrides go to this node after its section
+        name=spec.executable,
         exec_name=spec.executable,  # otherwise the log names each process by its prefix
         namespace=flight.argument("namespace"),
         parameters=[str(scenario.path), overrides],
@@ -230,8 +231,8 @@ def flight_node(
 def rosbag2(flight: Flight, scenario: Scenario, overrides: ParameterOverrides) -> ExecuteProcess:
     """Run `ros2 bag record` in place of the stack's recorder, with the same topics.
 
-    `overrides` are the parameters that the recorder would get. What it would attach to its log
-    becomes a log of its own in the folder of the run.
+    `overrides` are the parameters that the recorder would get. The files that it would attach to
+    its log become a separate log in the folder of the run.
     """
     run = Path(overrides["directory"])
     with BagWriter(run) as bag:
@@ -265,7 +266,7 @@ def rosbag2(flight: Flight, scenario: Scenario, overrides: ParameterOverrides) -
 def fail_on_exit(
     event: ProcessExited, context: LaunchContext, flight: Flight
 ) -> Sequence[Action] | None:
-    """End the flight when a process ends before it.
+    """End the flight if a process ends before the flight does.
 
     If the exit status says that the aircraft has landed, the flight is complete.
     """
@@ -277,7 +278,7 @@ def fail_on_exit(
 
 
 def say_on_exit(event: ProcessExited, context: LaunchContext, flight: Flight) -> list[Action]:
-    """Say that the learner has ended before the flight."""
+    """Say that the learner has ended before the flight did."""
     sentence = (
         f"{event.process_name} ended before the flight did: the law flies on with the model "
         "that it has"
@@ -290,9 +291,9 @@ def on_state(
 ) -> Action:
     """Run the actions of `then` once, when a node of this launch has reached a state.
 
-    A later state counts, too. If the node has reached it already, they run at once. A node can be
-    matched before we wait for that: if its inputs are nodes of the user, these may have started
-    before it.
+    A later state counts too. If the node has reached the state already, the actions run
+    immediately. A node may be matched before this function is called, if its inputs are nodes of
+    the user that started before it.
     """
     node = f"{flight.namespace}/{spec.executable}"
     states = [*NodeState]
@@ -320,12 +321,13 @@ def start_in_stages(
     beside: Sequence[Action] = (),
     publishes: Collection[str] = LOOP_INPUTS,
 ) -> list[Action]:
-    """Start the first stage of a flight, and `beside`; then run the actions of `second`.
+    """Start the first stage of a flight and `beside`, and then run the actions of `second`.
 
     `second` is called once the nodes are ready, with the time until t = 0 and the system time of t
-    = 0, s. The flight ends early if a node is not ready after READY_TIMEOUT. It does too if another
-    flight is under way, which we see by a publisher of a topic in `publishes` before any node
-    starts. Raises ParameterError in simulated time, in which the instant of t = 0 is unknown here.
+    = 0, s. The flight ends early if a node is not ready after READY_TIMEOUT. It also ends early if
+    another flight is under way, which shows by a publisher of a topic in `publishes` before any
+    node starts. Raises ParameterError in simulated time, because the instant of t = 0 is unknown
+    then.
     """
     require(
         not flight.has_sim_time,
@@ -338,7 +340,7 @@ def start_in_stages(
     if flight.run.name:
         link_latest(flight.run)
     begin = time.monotonic() + DISCOVERY_TIME
-    waiting = dict.fromkeys(first)  # in order
+    waiting = dict.fromkeys(first)  # nodes in order
 
     def ready(spec: NodeSpec) -> Sequence[Action]:
         del waiting[spec]
@@ -373,9 +375,9 @@ def begin_when_matched(
 ) -> list[Action]:
     """Begin the flight once each node is ready and each input has a publisher.
 
-    t = 0 goes to the topic `start`. The flight ends once the log holds y, y_m and u to the end;
-    with rosbag2, once u has the stamp of the end. It ends early if a node does not get so far, or
-    if the aircraft `flies` as a node of the stack but takes no u.
+    t = 0 is published on the topic `start`. The flight ends once the log holds y, y_m and u to the
+    end. With rosbag2 it ends once u has the stamp of the end. It ends early if a node is never
+    ready and matched, or if the aircraft `flies` as a node of the stack but takes no u.
     """
     begin = _Begin(flight, nodes, duration, flies=flies)
     return [
@@ -390,7 +392,7 @@ def begin_when_matched(
 
 
 class _Begin:
-    """Begins a flight by the topic `start`, and ends one that does not begin."""
+    """Begins a flight by the topic `start`, and ends a flight that does not begin."""
 
     def __init__(
         self, flight: Flight, nodes: Sequence[NodeSpec], duration: float, *, flies: bool
@@ -399,14 +401,14 @@ class _Begin:
         self._duration = duration
         self._waiting = dict.fromkeys(nodes)
         self._flies = not flies  # another aircraft does not say that it has taken u
-        self._start_ns = 0  # of t = 0; 0 before it is sent
-        self._held_ns = -1  # the stamp up to which the log holds y, y_m and u
+        self._start_ns = 0  # instant of t = 0; 0 before t = 0 is sent
+        self._held_ns = -1  # stamp up to which the log holds y, y_m and u
         topic = f"{flight.namespace}/{START.name}"
         node = get_ros_node(flight.context)
         self._publish = node.create_publisher(START.type, topic, offered(START)).publish
 
     def matched(self, spec: NodeSpec) -> Sequence[Action]:
-        """Send t = 0 once the last node is matched."""
+        """Note that a node is matched; after the last node, send t = 0."""
         del self._waiting[spec]
         if self._waiting:
             return []
@@ -423,7 +425,7 @@ class _Begin:
         return []
 
     def held(self, stamp_ns: int) -> bool:
-        """Return whether a log up to a stamp holds the whole flight."""
+        """Return whether a log that is whole up to a stamp holds the flight."""
         self._held_ns = stamp_ns
         return self._start_ns > 0 and stamp_ns >= self._start_ns + nanoseconds(self._duration)
 
@@ -451,11 +453,11 @@ def end_with_log(
 ) -> list[Action]:
     """End a flight once the log holds y, y_m and u up to the system time `end_time`, s.
 
-    The flight lasts `lead` and `duration`, s. If the log gets no u, as when a bridge is not
-    engaged, the flight ends after that. If the log stops growing before `end_time`, it ends
-    LOG_TIMEOUT after its duration.
+    The flight lasts `lead` plus `duration`, s. If the log gets no u, for example because a bridge
+    is not engaged, the flight ends after this time. If the log still grows then, the flight waits
+    for LOG_TIMEOUT more.
     """
-    last = [-math.inf]  # monotonic time of the last change of the log, s
+    last = [-math.inf]  # monotonic time of the log's last change, s
 
     def held(stamp_ns: int) -> bool:
         last[0] = time.monotonic()
@@ -475,9 +477,9 @@ def end_with_log(
 def _complete_at(
     flight: Flight, held: Callable[[int], bool], *, by_rosbag2: bool
 ) -> RegisterEventHandler:
-    """Complete the flight once `held` is true of the stamp up to which the log is whole.
+    """Complete the flight once `held` is true for the stamp up to which the log is whole.
 
-    Up to that stamp the log holds y, y_m and u; with rosbag2 it is the stamp of u.
+    Up to this stamp the log holds y, y_m and u. With rosbag2 it is the stamp of u.
     """
     context = flight.context
 
@@ -505,7 +507,7 @@ def _complete_at(
 def _subscribe_states(flight: Flight) -> None:
     """Emit a NodeStateEvent whenever a node of this launch publishes its state.
 
-    launch_ros.actions.LifecycleNode does likewise.
+    launch_ros.actions.LifecycleNode does the same with lifecycle states.
     """
 
     def receive(message: KeyValue) -> None:
@@ -514,7 +516,8 @@ def _subscribe_states(flight: Flight) -> None:
             context.asyncio_loop.call_soon_threadsafe(reach, node, message.value)
 
     def reach(node: str, state: str) -> None:
-        # In the thread of the launch: whoever asks for a state finds it here, or gets the event.
+        # In the thread of the launch, so that a state that is not stored here yet comes as an
+        # event.
         flight.states[node] = state
         context.emit_event_sync(NodeStateEvent(node, state))
 
@@ -524,15 +527,15 @@ def _subscribe_states(flight: Flight) -> None:
     ros_node.create_subscription(
         NODE_STATE.type, f"{flight.namespace}/{NODE_STATE.name}", receive, STATES
     )
-    # At shutdown launch_ros waits for its executor before it stops the nodes, for up to 1 s unless
-    # a timer wakes it.
+    # At shutdown, launch_ros waits for its executor before it stops the nodes. This takes up to 1 s
+    # if no timer wakes the executor.
     ros_node.create_timer(SHUTDOWN_DELAY, lambda: None)
 
 
 def _is_descendant(pid: int) -> bool:
     """Return whether this launch started a process, directly or behind a launch prefix.
 
-    A process of a second flight is not one of ours.
+    A process of another flight is no descendant of this launch.
     """
     with suppress(psutil.Error):
         return os.getpid() in {parent.pid for parent in psutil.Process(pid).parents()}
