@@ -52,7 +52,7 @@ class Conditions:
         self._overrides[name] = Reading(now_ns, raw)
 
     def engage(self, now_ns: int) -> None:
-        """Store the present values of the overrides; `moved` overrides act by a later change."""
+        """Store the present values of the overrides, from which `moved` overrides are measured."""
         self._at_engagement = {
             name: reading.value
             for name, reading in self._overrides.items()
@@ -120,7 +120,7 @@ class Conditions:
         return Refusal(f"a pilot override has no effect: {'; '.join(silent)}") if silent else None
 
     def blindness(self, *, bounded: bool) -> Refusal | None:
-        """Say that an engagement does not notice the loss of the transmitter, if so.
+        """If an engagement does not notice the loss of the transmitter, say so.
 
         The sentence also says what can still release the aircraft. `bounded` says whether
         `max_engaged` ends the engagement.

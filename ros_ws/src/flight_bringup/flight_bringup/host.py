@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure whether this host can fly in real time.
 
-As many processes as will fly spin, and each says which share of a core it got. The load of a host
-says little about this, and so does the time by which a sleeping process wakes late. Both look alike
-on a host that can fly and on one that cannot.
+As many processes as will fly spin, and each says which share of a core it got. The load of the host
+is no measure of this, because it looks alike on a host that can fly and on one that cannot. The
+same holds for the time by which a sleeping process wakes late.
 """
 
 import subprocess

@@ -397,7 +397,7 @@ class FlightProcesses:
         )
 
     def last_words(self, node: NodeSpec) -> str | None:
-        """Return a node's last line about a topic it awaits or a sample it refuses, or None."""
+        """Return the last line in which a node awaits a topic or refuses a sample, or None."""
         lines: list[str] = []
         for process in self.processes:
             if node.executable in self._names(process):

@@ -289,7 +289,7 @@ class Guidance:
         self._paused = paused
 
     def _forget_commands(self) -> None:
-        """Forget all commands except a route that were given while guidance did not fly.
+        """Forget the commands that came while guidance did not fly, except a route.
 
         Commands from before the first step are kept.
         """

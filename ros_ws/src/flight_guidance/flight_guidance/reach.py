@@ -95,7 +95,7 @@ AUTHORITY = tuple(f"{side}.{name}" for side, name in product(SIDES, ("q", "p", "
 
 
 def authority_of(channels: Mapping[str, float]) -> Authority:
-    """Read the authority from the topic's channels; q and p have the lesser of two directions."""
+    """Read the authority from the topic's channels; for q and p the lesser direction counts."""
     q = min(channels[f"{side}.q"] for side in SIDES)
     p = min(channels[f"{side}.p"] for side in SIDES)
     return Authority(q, p, *(channels[f"{side}.V"] for side in SIDES))

@@ -143,8 +143,8 @@ def controller_starts(number: FloatArray) -> list[int]:
     """Return the indices at which a new controller begins, from the numbers of ticks, (N,).
 
     The numbers are in the order of time. Two ticks of one instant may be stored in either order. So
-    a number slightly below the previous one does not begin a new controller if this controller has
-    not had the number yet.
+    a number slightly below the previous one does not begin a new controller if the present
+    controller has not had the number yet.
     """
     starts = []
     first = 0

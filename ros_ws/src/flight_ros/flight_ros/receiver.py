@@ -320,7 +320,7 @@ class Receiver(Generic[S]):
             self.lock.refresh(sample.sender, now_ns)
 
     def _require_stamp(self, stamp_ns: int, now_ns: int, sender: str) -> None:
-        """Refuse a stamp that is further from the present than the age limit, if there is one."""
+        """Refuse a stamp more than the age limit from the present; without a limit, accept all."""
         if self._max_age_ns is None:
             return
         max_age_ns = self._max_age_ns()

@@ -45,7 +45,7 @@ def start_nodes(
 
     A signal during the start also ends the process with exit status 0. With `early`, a DDS
     participant is created before the imports. The real-time priority is lowered by `lower_by`
-    levels, which is more for a node with a longer period.
+    levels. A node with a longer period has a larger `lower_by`.
     """
     if {"--help", "-h"} & {*sys.argv[1:]}:
         print(USAGE.format(program=os.path.basename(sys.argv[0])))  # noqa: PTH119 - pathlib takes as long to import as the rest

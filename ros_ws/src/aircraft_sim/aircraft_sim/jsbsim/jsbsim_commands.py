@@ -124,7 +124,7 @@ def _first(command: Command) -> str:
 
 
 def _moves(fdm: jsbsim.FGFDMExec, paths: Iterable[tuple[str, float]], part: float) -> bool:
-    """Return whether properties change an acceleration by more than two equal runs differ."""
+    """Return whether properties change an acceleration more than it varies between equal runs."""
     before = {path: fdm[path] for path, _ in paths}
     runs = []
     for deflection in (0.0, 0.0, part):

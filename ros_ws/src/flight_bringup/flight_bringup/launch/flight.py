@@ -74,8 +74,8 @@ class Flight:
     def given_to_nodes(self) -> list[str]:
         """Return what the scope gives to all of its nodes, except their time.
 
-        SetParameter, SetParametersFromFile and SetRemap reach only the nodes that the launch starts,
-        and no nodes of another process.
+        SetParameter, SetParametersFromFile and SetRemap reach only the nodes that the launch
+        starts, and no nodes of another process.
         """
         names = []
         for each in self._given_parameters():

@@ -148,11 +148,12 @@ def failing(conditions: Sequence[GainCondition]) -> tuple[GainCondition, ...]:
 
 
 def bound_U(Omegas: FloatArray) -> FloatArray:
-    """Return the largest abs(U_ij), j > i, over samples of Omega, shape (m, m), else zero.
+    """Return the largest abs(U_ij) for j > i over samples of Omega, shape (m, m).
 
-    `Omegas` has shape (N, m, m). U comes from the decomposition Omega = S D U (11). The result also
-    bounds the off-diagonal entries of D U D, because they have the same magnitudes. Raises
-    DecompositionError if a sample has no such decomposition.
+    `Omegas` has shape (N, m, m). The other entries of the result are 0. U comes from the
+    decomposition Omega = S D U (11). The result also bounds the off-diagonal entries of D U D,
+    because they have the same magnitudes. Raises DecompositionError if a sample has no such
+    decomposition.
     """
     return np.asarray(np.max([np.triu(np.abs(decompose(Omega).U), 1) for Omega in Omegas], axis=0))
 
@@ -382,11 +383,11 @@ def check_loop(
         implicit: lag:    lag_i + delay <= period / 2
         implicit: omega:  omega_i >= largest_i
 
-    If the first condition fails, beta may cause a limit cycle. This condition holds in inputs of
-    unit response, to which the check converts beta and the rate limit. If one of the other
-    conditions fails, the implicit sign chatters. response_i is the nominal abs(Omega_ii) in the
-    inputs of the law, and `largest` is an upper bound of abs(Omega_ii). rate_limit is in the same
-    inputs, in units of y / s^2, and infinite without a limit. All have shape (m,).
+    If the first condition fails, beta may cause a limit cycle. For this condition, beta and the
+    rate limit are converted to inputs of unit response. If one of the other conditions fails, the
+    implicit sign chatters. response_i is the nominal abs(Omega_ii) in the inputs of the law, and
+    `largest` is an upper bound of abs(Omega_ii). rate_limit is in the same inputs, in units of y /
+    s^2, and infinite without a limit. All have shape (m,).
     """
     fastest = MAX_BETA_TO_RATE_LIMIT * rate_limit * response
     conditions = _by_channel("beta below rate", params.beta * response, fastest, at_least=False)

@@ -472,13 +472,13 @@ def selected_observer(
 
     The gains are those of the file `weights` if there is one. Otherwise they are those that
     `rise-di compare --tune` found in the scenario, or in a shipped one with the same airframe and
-    lags. They only count if the model has the same states and no total lag is SLOWER times the one
-    of the search. If there are none, a rule derives gains from the lags. The search for the least
-    error begins at each of these gain sets. Gains of a file or beside a sketch are only relaxed, if
-    the margins need it. With `uncertain` the phase margin of uncertain aircraft counts too. With
+    lags. They count if the model has the same states and each total lag is below SLOWER times that
+    of the search. If none count, a rule derives gains from the lags. The search for the least error
+    begins at each of these gain sets. Gains of a file or beside a sketch are only relaxed, if the
+    margins need it. With `uncertain` the phase margin of uncertain aircraft counts too. With
     `sketched` the gains are those for a model from a sketch. `speeds` are two ratios to the trim
-    speed, each with its own model. `margin`, `is_free`, `activity`, `progress` and `earlier_design`
-    are as for `with_aircraft_observer`. Channels that are not free keep their earlier gains.
+    speed, each with a model. `margin`, `is_free`, `activity`, `progress` and `earlier_design` are
+    as for `with_aircraft_observer`. Channels that are not free keep their gains.
     """
     seen = through_allocation(model, controller)
     noise, vanes = _noise(controller, scenario, seen)

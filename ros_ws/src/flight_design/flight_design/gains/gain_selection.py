@@ -423,7 +423,7 @@ def assess_gains(
     Rate, lag and delay come from the controller, gamma_2 and rate limits from the setting.
 
     The conditions of the theorem are those of `_rise_di_conditions`, and without an observer the
-    rules are those of `check_rules`. The loop must meet those of `check_loop` (without an
+    rules are those of `check_rules`. The loop must meet the conditions of `check_loop` (without an
     observer), be stable for every sample, and have the required margins, with an observer 35
     degrees of phase. The delay margin of the nominal loop must be one period, so that a tick may be
     missed. With an observer it must be the observer's margin minus the delay. With the implicit

@@ -262,7 +262,7 @@ class ObserverSearch(NamedTuple):
         return all(is_stable(plant, law, self.loop, late) for plant, law in loops.around)
 
     def _delay_fraction(self, plant: LinearPlant, law: LinearLaw) -> float:
-        """Return the ratio of the delay margin to the needed delay margin, at most 1.
+        """Return the delay margin divided by the needed delay margin, at most 1.
 
         The delays of the inputs are in proportion to the delay margins that they need.
         """

@@ -359,14 +359,13 @@ def with_extended_state_observer(
     margin: float,
     requirement: Requirement = OBSERVER_REQUIREMENT,
 ) -> SelectedObserver:
-    """Add an observer that knows only Omega and the lags, and no A, f or wind, to a controller.
+    """Add to a controller an observer that knows Omega and the lags, but no A, f or wind.
 
     The gains of the law stay, unless the margin needs slower gains. The model of the feedforward is
-    y_dot = Omega u, and the model of the observer is y_dot = diag(Omega) u. With all of Omega in
-    its observer, the elevator would correct V, and turn the aircraft. Omega, (m, m), is in the
-    law's order. `noise`, (m,), is the noise of the outputs, rms per sample. `size`, (m,), holds the
-    units of the outputs, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer`
-    does.
+    y_dot = Omega u, and the model of the observer is y_dot = diag(Omega) u. If the observer had all
+    of Omega, the elevator would correct V, and turn the aircraft. Omega, (m, m), is in the law's
+    order. `noise`, (m,), is the noise of the outputs, rms per sample. `size`, (m,), holds the units
+    of the outputs, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer` does.
     """
     m = len(controller.outputs)
     require_same_signs(Omega, controller.D, "Omega")

@@ -104,11 +104,11 @@ def to_set(outputs: Iterable[str], parameters: Mapping[str, float]) -> str:
 def to_fly(
     outputs: Mapping[str, float], scenario: Scenario, airframe: Airframe, y: FloatArray
 ) -> str:
-    """Say which doublets would show the effects on some `outputs`.
+    """Say which doublets would show the effects on some outputs.
 
-    `outputs` has the factor on the amplitude of each of them. The doublets have the size and length
-    of the scenario's pulses. Their size is at least that of the motion in the log, y, (T, m).
-    Returns "" if there are no outputs.
+    `outputs` has each of these outputs with the factor on its amplitude. The doublets have the size
+    and length of the scenario's pulses. Their size is at least that of the motion in the log, y,
+    (T, m). Returns "" if there are no outputs.
     """
     pulses = scenario.reference_model.pulses
     texts = []

@@ -289,9 +289,9 @@ def airspeed_slew(bandwidth: float, effect: float) -> float:
     """Return the throttle slew from which beta of V follows, 1/s.
 
     `bandwidth` is that of V, rad/s, and `effect` is that of the throttle, m/s^2. The airspeed V
-    contains the wind itself. With beta = K bandwidth / 4 sigma, where sigma is LIGHT_SIGMA, the
-    sign moves the throttle in light turbulence no faster than the Lambda of the rule, bandwidth /
-    4, would.
+    contains the wind itself. With beta = K bandwidth / 4 sigma (sigma is LIGHT_SIGMA), the sign
+    moves the throttle in light turbulence at most as fast as the rule's Lambda, bandwidth / 4,
+    would.
     """
     return bandwidth**2 / 4.0 * LIGHT_SIGMA / (gain_selection.BETA_TO_SLEW * effect)
 

@@ -116,7 +116,7 @@ class Unknown(NamedTuple):
 
     They are those of delay and angles, of the entries of A and B, and of the noise of the
     disturbances. Hidden states, such as alpha, are states that y does not contain. If y has only
-    the rates, mass and lift give the rows of the hidden states, which count as known then.
+    the rates, the rows of the hidden states count as known, because mass and lift give them.
     """
 
     delay: float = 0.0  # s, deviation of the delay of u
@@ -387,7 +387,7 @@ class Likelihood:
         return np.repeat(np.asarray(values), self._spans[0].stop)[: len(self._y)]
 
     def innovations(self, models: Models, levels: NDArray[np.int64]) -> Normalised:
-        """Return the innovations of N models, with the level of the wind in each span given."""
+        """Return the innovations of N models at the given level of the wind in each span."""
         place = self._of_span(np.searchsorted(models.levels, levels))
         r = Passage(models.bank, self._y, models.u, place[::HOLD]).run(models.begin)[0][
             :, : len(self._y)
@@ -395,7 +395,7 @@ class Likelihood:
         return normalised(r, models.bank.covariance, place)
 
     def passed(self, theta: FloatArray, levels: NDArray[np.int64]) -> Normalised:
-        """Return the innovations for theta, (p,), with the level of the wind in each span given.
+        """Return the innovations for theta, (p,), at the given level of the wind in each span.
 
         If the last call of `levels` had this theta, its innovations are returned.
         """

@@ -61,7 +61,7 @@ class Slopes(NamedTuple):
 
 
 class Doubt(NamedTuple):
-    """Two sources of error beside the innovations' noise that the deviations of a fit include."""
+    """Two sources of error that the deviations of a fit include beside the innovations' noise."""
 
     timing: float  # s, standard deviation of the delay of u, which is not identified
     whiteness: FloatArray  # (m,) `whiteness` of the innovations of the held-out samples

@@ -176,9 +176,9 @@ def scaled_torques(parameters: Mapping[str, float]) -> list[str]:
 def broadened(recorded: FlightData, cutoff: float) -> tuple[FlightData, float]:
     """Replace the low-pass of the gyro, with its cut-off at `cutoff`, by one at BROAD, Hz.
 
-        y' = F_BROAD(z) / F_cutoff(z) y,  F of Butterworth's, of second order
+        y' = F_BROAD(z) / F_cutoff(z) y,  F is a Butterworth filter of second order
 
-    Returns the flight with the new y, and the time in s by which this y is earlier.
+    Returns the flight with the new y, and the time, s, by which the new y is ahead of the old one.
 
     Behind a narrow filter the noise of y is coloured, and so are the innovations. The zeros of the
     two filters at z = -1 cancel. A sample counts as lost if it depends on a lost sample.

@@ -270,7 +270,7 @@ class Learner:
         return LearnerResult(self._last, told)
 
     def _damaged(self, changes: Sequence[Change], end_ns: int) -> LearnerResult:
-        """Decide on parts that have changed; one with a dead input flies without it at once.
+        """Decide on parts that have changed; a part with a dead input flies without it at once.
 
         Any other part is identified again, from the record since the change and about the flown
         model.
@@ -582,7 +582,7 @@ class Learner:
         latest: Mapping[str, float],
         dead: Collection[str],
     ) -> str | None:
-        """Say what `learn.margin` costs compared with the file's margin; None if one is missing."""
+        """Say what `learn.margin` costs compared with the file's; None if a margin is missing."""
         start = self._controller
         settings = start.learn
         if settings is None or settings.margin is None or self._design_of_rough is None:

@@ -82,7 +82,7 @@ def has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) 
 
 
 def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
-    """Return whether an aircraft may leave a circle, because it is at its end on the right course.
+    """Return whether an aircraft may leave a circle: it is at the end and on the right course.
 
     It must be beyond the end, and within `reach`, m, of the end.
     """
