@@ -11,7 +11,7 @@ doublets of each rate for a minute.
 
 import csv
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,9 +24,10 @@ from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.excitation import gust_warning, own_shares
 from flight_design.identification.innovation_filters import Actuation, FlightData, coarser
 from flight_design.identification.likelihood import Unknown
-from flight_design.identification.model_identification import identify_model
+from flight_design.identification.model_identification import Identification, identify_model
 from flight_design.identification.model_quality import NoBetter
-from flight_design.identification.rates_log import SPARSE
+from flight_design.identification.rates_log import SPARSE, scaled_torques
+from flight_design.identification.trim_check import doubted, without_trim
 
 ROOT = Path(__file__).parents[1]
 STEP = 5e-4  # s, of the aircraft
@@ -57,6 +58,9 @@ class Case(NamedTuple):
     colour: float = 0.0  # e_k = colour e_(k-1) + white noise
     late: float = 0.0  # s, by which u acts later than known
     gusts: float = 0.0  # m/s rms
+    climb: float = 0.0  # rad, trim of the elevator in the first third, which has no doublets
+    # effects of each surface on roll, pitch and yaw by PX4's CA_SV_CSk_TRQ; without: one an axis
+    surfaces: tuple[tuple[float, float, float], ...] = ()
     plane: str = "px4_airplane"
 
 
@@ -70,6 +74,16 @@ CASES = (
     Case("u acts 2 ms later", late=0.002),
     Case("gusts of 0.5 m/s", gusts=0.5),
     Case("gusts, coloured noise, u 2 ms later", gusts=0.5, colour=0.5, late=0.002),
+    Case("a climb before the doublets", climb=0.04),
+    Case("two ailerons", surfaces=((-0.5, 0, 0), (0.5, 0, 0), (0, 1, 0), (0, 0, 1))),
+    Case("two ailerons at 1", surfaces=((-1, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))),
+    Case("elevons and a rudder", surfaces=((-0.5, 0.5, 0), (0.5, 0.5, 0), (0, 0, 1))),
+    Case(
+        "ailerons and a V-tail",
+        surfaces=((-0.5, 0, 0), (0.5, 0, 0), (0, 0.5, 0.5), (0, 0.5, -0.5)),
+    ),
+    Case("another airframe", plane="heavy"),
+    Case("a quadrotor", plane="px4_quadrotor"),
     Case("ArduPlane, servos at 25 Hz", every=8, plane="arduplane"),
 )
 
@@ -84,9 +98,10 @@ class Plane(NamedTuple):
     end: float  # rad, u at the torque 1
     changes: Mapping[str, float]  # of the rows of A and B, by output
     lag: float  # s
+    folder: str  # of examples
 
 
-PLANES = {
+PLANES: dict[str, Plane] = {
     "px4_airplane": Plane(
         period=0.004,
         size=(0.3, 0.6, 0.2),
@@ -95,6 +110,7 @@ PLANES = {
         end=0.261799,
         changes={"q": 1.0 / 0.9, "p": 1.0 / 1.3, "r": 1.0 / 1.5},
         lag=0.0,
+        folder="px4_airplane",
     ),
     "arduplane": Plane(
         period=0.005,
@@ -104,8 +120,39 @@ PLANES = {
         end=0.5,
         changes={"q": 0.9, "p": 0.85},
         lag=0.03,
+        folder="arduplane",
+    ),
+    "px4_quadrotor": Plane(
+        period=0.004,
+        size=(0.6, 0.6, 0.4),
+        noise=(0.02, 0.02, 0.02),
+        gains=((0.0, 0.0, 0.0), (0.15, 0.15, 0.2), (0.2, 0.2, 0.1)),
+        end=1.0,
+        changes={"q": 0.8, "p": 0.75, "r": 1.3},
+        lag=0.02,
+        folder="px4_quadrotor",
     ),
 }
+PLANES["heavy"] = PLANES["px4_airplane"]._replace(changes=dict.fromkeys("qpr", 0.3))
+
+
+def nominal_of(plane: Plane) -> Airframe:
+    """Return the airframe of the rates that the scenario of a plane has."""
+    folder = ROOT / "examples" / plane.folder
+    if plane.folder != "px4_quadrotor":
+        return load_airframe(str(folder / "rates_airframe.yaml"))
+    whole = load_airframe(str(folder / "airframe.yaml"))
+    rows = [whole.index(name) for name in ("q", "p", "r")]
+    columns = [list(whole.inputs).index(name) for name in ("pitch", "roll", "yaw")]
+    return whole.model_copy(
+        update={
+            "states": {name: whole.states[name] for name in ("q", "p", "r")},
+            "inputs": {name: whole.inputs[name] for name in ("pitch", "roll", "yaw")},
+            "outputs": ("q", "p", "r"),
+            "A": whole.matrix_a()[np.ix_(rows, rows)].tolist(),
+            "B": whole.matrix_b()[np.ix_(rows, columns)].tolist(),
+        }
+    )
 
 
 def true_model(nominal: Airframe, plane: Plane) -> tuple[FloatArray, FloatArray]:
@@ -115,6 +162,24 @@ def true_model(nominal: Airframe, plane: Plane) -> tuple[FloatArray, FloatArray]
         A[nominal.index(name)] *= factor
         B[nominal.index(name)] *= factor
     return A, B
+
+
+class Allocation(NamedTuple):
+    """How PX4 turns the torques of the axes into servos, and what these do, shares of the stops."""
+
+    servos: FloatArray  # (surfaces, m)
+    on_axes: FloatArray  # (m, surfaces)
+
+
+def allocated(case: Case, outputs: Sequence[str]) -> Allocation:
+    """Return the allocation of a case: PX4's pseudo-inverse, before the surfaces that it drives.
+
+    The surfaces of an axis, all at their end stops, are the end stop of the axis.
+    """
+    if not case.surfaces:
+        return Allocation(np.eye(len(outputs)), np.eye(len(outputs)))
+    effects = np.array(case.surfaces).T[["pqr".index(name) for name in outputs]]
+    return Allocation(np.linalg.pinv(effects), effects / np.abs(effects).sum(axis=1)[:, None])
 
 
 def flown(case: Case, nominal: Airframe, plane: Plane) -> FlightData:
@@ -129,6 +194,7 @@ def flown(case: Case, nominal: Airframe, plane: Plane) -> FlightData:
     FF, P, gain = (np.array(row) for row in plane.gains)
     controlled = np.array([name != case.still for name in outputs], dtype=float)
     axes = [i for i, name in enumerate(outputs) if name not in (case.still, case.silent)]
+    allocation = allocated(case, outputs)
     follows = 1.0 - np.exp(-STEP / plane.lag) if plane.lag else 1.0
     line = [np.zeros(m)] * round(case.late / STEP)
     G = len(nominal.gusts)
@@ -138,16 +204,20 @@ def flown(case: Case, nominal: Airframe, plane: Plane) -> FlightData:
     for k in range(count):
         number, phase = divmod(k * plane.period, APART)
         setpoint = np.zeros(m)
+        is_climbing = bool(case.climb) and k < count // 3
         axis = axes[int(number) % len(axes)]
         setpoint[axis] = plane.size[axis] * ((phase < 0.5) - float(0.5 <= phase < 1.0))
+        setpoint = setpoint * (not is_climbing)
         noise = case.colour * noise + np.sqrt(1.0 - case.colour**2) * rng.normal(size=m)
         y[k] = C @ x + np.array(plane.noise) * noise
         error = setpoint - y[k]
         integral = np.clip(integral + gain * error * plane.period, -0.4, 0.4)
         torque = controlled * np.clip(FF * setpoint + P * error + integral, -1.0, 1.0)
         u[k] = plane.end * torque
+        acting = plane.end * allocation.on_axes @ np.clip(allocation.servos @ torque, -1.0, 1.0)
+        acting[outputs.index("q")] -= case.climb * is_climbing
         for _ in range(steps):
-            line.append(u[k])
+            line.append(acting)
             air = air - air * STEP / 0.5 + case.gusts * np.sqrt(4.0 * STEP) * rng.normal(size=G)
             position = position + follows * (line.pop(0) - position)
             x = both[:n, :n] @ x + both[:n, n:] @ position + STEP * nominal.matrix_gusts() @ air
@@ -172,28 +242,44 @@ def logged(
     return rare._replace(u=(rare.u + following) / 2.0)
 
 
+def identified(
+    recorded: FlightData, nominal: Airframe, plane: Plane, timing: float | None
+) -> Identification:
+    """Identify the aircraft of a log, as `rise-di tune` does."""
+    return identify_model(
+        recorded,
+        nominal,
+        Actuation(np.full(len(nominal.inputs), plane.lag), 0.0),
+        ChannelPairing(nominal.outputs, tuple(nominal.inputs)),
+        unknown=Unknown(has_hidden_rows=False),
+        searches_again=True,
+        timing=timing,
+    )
+
+
 def rows(case: Case) -> list[list[str]]:
     """Return the rows of a case: one for each entry, or one for a log that is refused at once."""
     plane = PLANES[case.plane]
-    nominal = load_airframe(str(ROOT / "examples" / case.plane / "rates_airframe.yaml"))
+    nominal = nominal_of(plane)
     recorded = flown(case, nominal, plane)
     pairing = ChannelPairing(nominal.outputs, tuple(nominal.inputs))
     period = case.every * plane.period
-    if case.plane == "px4_airplane" and case.every > SPARSE:
+    if case.plane != "arduplane" and case.every > SPARSE:
         sentence = f"refused: torque: found a sample each {1e3 * period:.0f} ms, expected each one"
         return [[case.name, "", "", "", "", "", sentence]]
     still = [each for each in own_shares(recorded, nominal, pairing) if each.is_still]
     if still:
         return [[case.name, "", "", "", "", "", f"refused: {each.sentence}"] for each in still]
-    found = identify_model(
-        recorded,
-        nominal,
-        Actuation(np.full(len(nominal.inputs), plane.lag), 0.0),
-        pairing,
-        unknown=Unknown(has_hidden_rows=False),
-        searches_again=True,
-        timing=period / np.sqrt(12.0) / (2.0 if case.every > 1 else 1.0),
+    timing = period / np.sqrt(12.0) / (2.0 if case.every > 1 else 1.0)
+    found = doubted(
+        identified(recorded, nominal, plane, timing),
+        identified(without_trim(recorded), nominal, plane, None),
     )
+    parameters = {"CA_SV_CS_COUNT": float(len(case.surfaces))}
+    for k, effects in enumerate(case.surfaces):
+        for letter, effect in zip("RPY", effects, strict=True):
+            parameters[f"CA_SV_CS{k}_TRQ_{letter}"] = effect
+    warnings = "".join(f"; warning: {sentence}" for sentence in scaled_torques(parameters))
     A, B = true_model(nominal, plane)
     inputs = list(nominal.inputs)
     lines = []
@@ -215,7 +301,7 @@ def rows(case: Case) -> list[list[str]]:
             true = float(value / entry.nominal - 1.0)
             off = abs(entry.error - true) / entry.deviation
             figures = (100 * true, 100 * entry.error, 100 * entry.deviation, off)
-            verdict = f"refused: {refusal}" if is_refused else kept
+            verdict = (f"refused: {refusal}" if is_refused else kept) + warnings
             lines.append([case.name, entry.name, *(f"{figure:.1f}" for figure in figures), verdict])
     return lines
 

@@ -40,7 +40,7 @@ from flight_design.identification.excitation import (
     to_fly,
     to_set,
 )
-from flight_design.identification.innovation_filters import Actuation, measured_noise
+from flight_design.identification.innovation_filters import Actuation, FlightData, measured_noise
 from flight_design.identification.likelihood import Unknown
 from flight_design.identification.log_import import Window, lost_share
 from flight_design.identification.model_identification import (
@@ -54,6 +54,7 @@ from flight_design.identification.model_quality import NoBetter
 from flight_design.identification.model_refusals import best_known, in_time
 from flight_design.identification.own_loop import own_loop
 from flight_design.identification.rates_log import SPARSE, RatesLog, rates_of_log, scaled_torques
+from flight_design.identification.trim_check import doubted, without_trim
 from flight_log.px4_parameters import low_pass_delay, rate_loop
 from flight_log.vehicle_log import read_foreign_log
 from rise_di.c_code import export
@@ -299,21 +300,26 @@ def _identified(
     pairing = ChannelPairing(controller.outputs, controller.inputs)
     unknown = Unknown(has_hidden_rows=False)
     with progress_bar(*COUNT_COLUMNS, quiet=console.quiet) as bar:
-        show: Callable[..., None] = partial(
-            bar.update, bar.add_task(f"search, u {1e3 * actuation.delay:.1f} ms late")
-        )
-        identification = identify_model(
-            of_log.recorded,
-            nominal,
-            actuation,
-            pairing,
-            show,
-            unknown=unknown,
-            searches_again=True,
-            timing=of_log.timing,
-        )
-        show(completed=1, total=1)
-    return identification
+        late = f"u {1e3 * actuation.delay:.1f} ms late"
+
+        def identified(recorded: FlightData, name: str, timing: float | None) -> Identification:
+            show: Callable[..., None] = partial(bar.update, bar.add_task(f"search, {name}"))
+            found = identify_model(
+                recorded,
+                nominal,
+                actuation,
+                pairing,
+                show,
+                unknown=unknown,
+                searches_again=True,
+                timing=timing,
+            )
+            show(completed=1, total=1)
+            return found
+
+        found = identified(of_log.recorded, late, of_log.timing)
+        steady = without_trim(of_log.recorded)
+        return doubted(found, identified(steady, "without slow changes of trim", None))
 
 
 def _require_shown(

@@ -114,7 +114,10 @@ def reason_against_signs(
 
 
 def in_time(entries: Iterable[Entry], by_timing: Iterable[float]) -> list[Entry]:
-    """Return the entries with the deviations that they would have if the delay of u were known."""
+    """Return the entries with the deviations that they would have if the delay of u were known.
+
+    `by_timing` is the part of each deviation that comes from the delay, or from another cause.
+    """
     return [
         entry._replace(deviation=float(np.sqrt(max(entry.deviation**2 - late**2, 0.0))))
         for entry, late in zip(entries, by_timing, strict=True)
