@@ -75,10 +75,10 @@ def fly_over_topics(
 ) -> Outcome:
     """Fly a scenario over topics, record the bag into `run`, and return the outcome.
 
-    The nodes are separate processes, or share one if `one_process` is set. They fly in real time,
-    in `lockstep` as fast as the machine allows, or with `use_sim_time` by /clock. All nodes are in
-    the `namespace`, such as "/uav1". An `autopilot` takes the place of the aircraft, in real time
-    only.
+    The nodes are separate processes, or share one if `one_process` is set. By default they fly in
+    real time. With `lockstep` they fly as fast as the machine allows, and with `use_sim_time` by
+    /clock. All nodes are in the `namespace`, such as "/uav1". An `autopilot` takes the place of the
+    aircraft, in real time only.
 
     `announce` gets a line when the engagement or its reason changes, except if only a number in the
     reason changes. It also gets a line on what became of a learner's proposal, and when a process

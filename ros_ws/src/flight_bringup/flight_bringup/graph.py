@@ -278,7 +278,7 @@ def _recording(scenario: Scenario, run: Path, autopilot: Autopilot | None) -> Pa
 
 
 def _lockstep_rates(scenario: Scenario) -> dict[NodeSpec, ParameterOverrides]:
-    """Return the rates of the inputs that nodes wait for in lockstep, and the duration."""
+    """Return the rates of the inputs that nodes wait for in lockstep, and the flight's duration."""
     guidance = scenario.guidance
     control_rate = scenario.controller.rate
     y_rate: ParameterOverrides = {"y_rate": scenario.aircraft.rate}

@@ -18,7 +18,10 @@ from flight_core.vectors import FloatArray
 
 
 class DrawnFleet(NamedTuple):
-    """Aircraft of a campaign on the host, drawn while the device may fly other aircraft."""
+    """Drawn aircraft of a campaign, in the memory of the host.
+
+    They can be drawn while the device flies other aircraft.
+    """
 
     scenario: Scenario
     A: FloatArray  # (N, n, n)

@@ -73,7 +73,7 @@ class GainSets(NamedTuple):
 
     @property
     def first(self) -> Assessment:
-        """The first gain set. After a check, it is the checked one."""
+        """The first gain set. After a check there is only this one."""
         return next(iter(self.answers.values()))
 
     @property

@@ -383,11 +383,12 @@ def _kept_model(part: Part) -> str:
 
 
 def _uncertainty(identification: Identification) -> float:
-    """Return twice the largest standard deviation of the best known effects, in LEAST to MOST.
+    """Return the uncertainty of A and B that the margins must cover, from LEAST to MOST.
 
-    The deviation of an effect is a fraction of the identified value. An uncertain delay does not
-    count. If the delay is wrong, A and B are wrong as well, and compensate it, so that the loop is
-    still that of the log.
+    For each output the effect that is known best counts. The result is twice the largest standard
+    deviation of these effects, as a fraction of the identified value. The uncertainty of the delay
+    does not count: if the delay is wrong, A and B are wrong as well, and compensate it, so that the
+    loop is still that of the log.
     """
     relative = [
         effect.deviation * abs(effect.nominal / effect.value)

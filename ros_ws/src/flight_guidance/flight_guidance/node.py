@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The guidance node: it turns pose, y, target and route into u_m, in real time or in lockstep."""
+"""Run guidance as a node, which turns pose, y, target and route into u_m.
+
+It runs in real time or in lockstep.
+"""
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -320,9 +323,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
                 self._guidance.keep_link()
 
     def _receive_authority(self) -> Receiver[StampedVector] | None:
-        """Make the receiver of `authority`; None in a flight without a learner.
+        """Make the receiver of `authority`, or return None in a flight without a learner.
 
-        In a flight without a learner, only an unexpected publisher would send it.
+        There only an unexpected publisher would send it.
         """
         rate = self.parameters.authority_rate
         self._authority_period_ns = period_ns(rate, "authority_rate") if rate else 0
@@ -419,6 +422,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             setattr(message.twist.twist.linear, key, value)
         speed = self.parameters.speed + y.get("V", 0.0)  # a multicopter has no V, but measures r
         r = yaw_rate(y, pose["phi"], pose["theta"], speed)
+        # axes forward, left, up (REP 103); those of y are forward, right, down
         for key, value in zip("xyz", (y["p"], -y["q"], -r), strict=True):
             setattr(message.twist.twist.angular, key, value)
         return message

@@ -19,8 +19,8 @@ SINK = 0.5
 
 REVERSALS = 9.3
 """Least period of path following, divided by bank / roll rate. A reversal of the bank takes
-2 bank / roll rate. With a period of 3.5 reversals the osprey went into a limit cycle in turbulence,
-so 4.65 are required."""
+2 bank / roll rate, so this is the time of 4.65 reversals. With a period of 3.5 reversals the osprey
+went into a limit cycle in turbulence."""
 
 
 LEAST = 1e-3
@@ -36,9 +36,10 @@ MEMORY = 10.0
 """Time over which the roll rate is compared with its command, s."""
 
 ASKED = 2.0
-"""Least amount of command that is evidence, in s of the largest roll rate. Without an aileron the
-osprey is by then 40 deg off its commanded bank, or 7 deg for a time of MEMORY. A turn of the osprey
-onto a course needs less command."""
+"""Evidence a above which the test decides, divided by the square of the largest roll rate, s. A
+command of the largest roll rate gives it in about this time. Without an aileron the osprey is by
+then 40 deg off its commanded bank, or 7 deg for a time of MEMORY. A turn of the osprey onto a
+course needs less command."""
 
 IGNORED = 0.3
 """Largest fraction of a command that counts as ignored. In strong turbulence the osprey, the c172p
@@ -79,7 +80,7 @@ class RollTest(NamedTuple):
     def after(self, dt: float, command: float, p: float, largest: float) -> "RollTest":
         """Return the test after a step of a command, at most `largest`, and a measured p, rad/s.
 
-        If the evidence a is below ASKED, the verdict stays.
+        If the evidence a is at most ASKED largest^2, the verdict stays.
         """
         memory = math.exp(-dt / MEMORY)
         asked = memory * self.asked + dt * command**2

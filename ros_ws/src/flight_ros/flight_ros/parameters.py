@@ -23,7 +23,7 @@ from flight_core.text import bounded
 
 P = TypeVar("P", bound=NodeConfig)
 AT_RESTART = "a change at a restart only"
-"""What is expected of the parameters `learned` from everybody but the node itself."""
+"""Change that is expected of a parameter in `learned`, which in flight only the node changes."""
 
 
 def read_parameters(node: Node, schema: type[P]) -> P:

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute an airframe at other airspeeds than the trim speed.
 
-Its A, B and trim are those of level flight at the same altitude. They follow powers of the
-airspeed.
+Its A, B and trim are those of level flight at the same altitude. The entries of A and B follow
+powers of the airspeed, and the trim is integrated over the airspeed.
 """
 
 from collections.abc import Mapping
@@ -126,11 +126,12 @@ def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
 def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatArray, FloatArray]:
     """Return the trim at `ratio` times V0: deviations x, (n,), and u, (p,), from that at V0, SI.
 
-        (A + gravity) dx + B du = 0,
-            dx = dV, dalpha = dtheta in level flight, along the ratio from 1 on
+        (A + gravity) dx + B du = 0
 
-    The ratio is reached in TRIM_STEPS steps. In each of them A and B are those of the airspeed, and
-    du is the smallest solution if several inputs can serve. Raises as `exponents` does.
+    In level flight dx consists of the step dV and of dalpha = dtheta, and the other states keep
+    their values. The ratio is reached from 1 in TRIM_STEPS steps. In each of them A and B are those
+    of the airspeed, and du is the smallest solution if several inputs can serve. Raises as
+    `exponents` does.
     """
     names = list(airframe.states)
     powers = exponents(airframe, thrust)

@@ -47,7 +47,7 @@ def share(t: Array, start: Any, duration: Any) -> Array:
 
 
 class OverAirspeed(NamedTuple):
-    """The powers by which A, B and the trim follow the airspeed V0 + V.
+    """Powers by which A and B follow the airspeed V0 + V, and the trims at some airspeeds.
 
     Entries are multiplied by powers of the airspeed divided by V0. The exponents are in `A`, `B`,
     `gravity` and `wind`. The trim is given at K ratios.

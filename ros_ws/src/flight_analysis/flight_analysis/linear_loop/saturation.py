@@ -199,10 +199,10 @@ def sensitivity(part: Channels, w: FloatArray, radius: float) -> ComplexArray:
 def multiplier_for(part: Channels, size: float, slowest: float) -> Multiplier | None:
     """Find taps that serve the middle of a box and its worst corners.
 
-    The room of an aircraft is its least Re(m S) / abs(S) over the frequencies. A linear program
-    finds the taps that leave the most room to some aircraft. A search then adds the corners with
-    the least room, until these have at least ENOUGH of the room in the program. Returns None if no
-    taps serve all of them.
+    The room of an aircraft is the least Re(m S) / abs(S) over the frequencies, as a part of
+    `_expected`. A linear program finds the taps that leave the most room to some aircraft. A search
+    then adds the corners with the least room, until these have at least ENOUGH of the room in the
+    program. Returns None if no taps serve all of them.
     """
     k = len(part.entries)
     generator = np.random.default_rng(SEED)
@@ -226,8 +226,8 @@ def multiplier_for(part: Channels, size: float, slowest: float) -> Multiplier | 
 def _expected(slowest: float, w: FloatArray) -> FloatArray:
     """Return the Re(m S) / abs(S) that counts as a room of 1 at the frequencies w, rad/s.
 
-    Towards 0 rad/s an integrator in the loop takes room from S, so that less room is expected of m
-    there.
+    If `slowest` is 0, it is 1 at all frequencies. Otherwise it falls below KNEE, because an
+    integrator in the loop turns S away from the positive real axis towards 0 rad/s.
     """
     return np.minimum(w / KNEE, 1.0) ** 2 if slowest else np.ones(len(w))
 

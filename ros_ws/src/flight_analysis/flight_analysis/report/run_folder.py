@@ -513,8 +513,8 @@ def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scen
     """Return the outcome of a flight from the log, the summary, a launch, or the samples.
 
     The first of these that has an outcome counts. The summary must be that of this flight. A launch
-    leaves its outcome beside the log, and counts if the log has the name of the folder. If nodes
-    were started by hand, only the samples in the log show the outcome.
+    leaves a file with its outcome beside the log. This file counts only if the log is named after
+    the folder. If nodes were started by hand, only the samples in the log show the outcome.
     """
     tape = recorded.tape
     outcome = tape.outcome

@@ -71,7 +71,8 @@ def descend(
     """Move from a start until no move of a single channel helps, and return the last trial.
 
     `lowest` and `highest`, (k, m), bound the exponents. As long as there is a shortage, the search
-    takes the best move of all channels, and doubles the reach if no move helps. Then each channel
+    takes the best move of all channels, and doubles the reach if no move helps. If no move helps up
+    to the reach REACH, the last trial still has a shortage. Without a shortage, each channel then
     moves in turn, beginning with the reach that the search has at that moment, and the reach is
     halved whenever no move helps.
     """

@@ -26,7 +26,7 @@ EXTENDED_STATE_PRODUCTS: Mapping[str, tuple[float, ...]] = {
 together; no other aircraft took part."""
 
 
-# product for an output that is not in EXTENDED_STATE_PRODUCTS
+# products for an output that is not in EXTENDED_STATE_PRODUCTS
 DEFAULT_PRODUCTS = EXTENDED_STATE_PRODUCTS["p"]
 
 

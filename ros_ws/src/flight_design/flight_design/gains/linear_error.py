@@ -92,7 +92,7 @@ def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air)
     noise = noise_input * air.noise
     covariance, transition = _turbulent(matrix, blown, noise, loop.period, air)
     variance = np.einsum("ij,jk,ik->i", C, covariance[:n, :n], C)
-    # rows of u = K z + D v, and of u one tick later
+    # rows of u = K z + D v with the noise v, and of u one tick later
     K = np.hstack([law.D @ C_sampled, law.C, law.D @ air.reading])
     direct = law.D * air.noise
     after = transition @ covariance @ K.T
@@ -106,7 +106,10 @@ def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air)
 def _gust_energy(
     matrix: FloatArray, response: FloatArray, C: FloatArray, period: float, air: Air
 ) -> FloatArray:
-    """Return the integral of the squared outputs over a gust on each axis, summed, shape (m,)."""
+    """Return the integral of the square of each output in a gust, shape (m,).
+
+    The gusts on the axes come one at a time, and their integrals are summed.
+    """
     state = np.zeros(response.shape)
     energy = np.zeros(len(C))
     for k in range(round(GUST_HORIZON / period)):

@@ -102,7 +102,7 @@ class SelectedObserver(NamedTuple):
 
 
 class AtSpeed(NamedTuple):
-    """The design of an observer at a ratio to the trim speed."""
+    """The design of an observer for `ratio` times the trim speed."""
 
     ratio: float
     plant: LinearPlant

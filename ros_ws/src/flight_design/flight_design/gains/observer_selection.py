@@ -296,7 +296,7 @@ class _AircraftDesigns(NamedTuple):
         )
 
     def at_speed(self, ratio: float, gains: ObserverGains) -> AtSpeed:
-        """Design the observer at a ratio to the trim speed."""
+        """Design the observer for `ratio` times the trim speed."""
         outputs = self.base.outputs
         frame = at_speed(self.airframe, ratio, self.base.inputs[outputs.index("V")])
         model = model_for(frame, self.base, self.noise)

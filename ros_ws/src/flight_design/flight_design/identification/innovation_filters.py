@@ -233,9 +233,9 @@ class Passage:
 
         r = y - H z,  z+ = Phi (z + L r) + Gamma u + period gravity (sin(x) - x)
 
-    If y is lost, there is no update by r. A block of HOLD periods has one `level`, (T / HOLD,).
-    sin(x) - x is held over a block, so that a block is linear. Blocks with the same level and the
-    same lost samples share a matrix.
+    If y is lost, there is no update by r. The flight is a sequence of blocks of HOLD periods, and
+    `level` has the level of the wind in each block. sin(x) - x is held over a block, so that a
+    block is linear. Blocks with the same level and the same lost samples share a matrix.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compare the parameters of ArduPilot in a log with a channel map's rows of the transmitter.
+"""Compare the parameters of ArduPilot in a log with what a channel map says of the transmitter.
 
 Sources: ArduPilot, RC_Channel.cpp and SRV_Channel.cpp (ends, trim, reversal), RCMapper.cpp,
 SRV_Channel.h (functions of servos); ArduPlane, mode_fbwa.cpp (if RCn_REVERSED is 0, high is roll
@@ -28,6 +28,7 @@ CHANNEL = re.compile(r"channels\[(\d+)\]|chan(\d+)_raw")
 AXES: Mapping[str, str] = {"p": "ROLL", "q": "PITCH", "V": "THROTTLE", "r": "YAW"}
 # SERVOn_FUNCTION: aileron, elevator, throttle, rudder
 FUNCTIONS = {"ROLL": 4, "PITCH": 19, "THROTTLE": 70, "YAW": 21}
+# line of an input without a row of `trims`: its raw value is the pulse
 SAME_LINE = LinearConversion(1, 1.0, 0.0)
 
 # Largest difference of an end of the range, as a share of half the range. The effect of the input
@@ -59,7 +60,7 @@ MENDS = {  # remedies by a part of the parameter's name; none reverses what the 
 class Stick(NamedTuple):
     """What a map says about an input and its channel of the transmitter.
 
-    `trim_line` turns the pulse, us, into the raw value.
+    `trim_line`, from the input's row of `trims`, turns the pulse, us, into the raw value.
     """
 
     axis: str  # ROLL, PITCH, THROTTLE or YAW

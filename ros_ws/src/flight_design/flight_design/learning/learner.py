@@ -538,8 +538,8 @@ class Learner:
     ) -> tuple[RiseDiConfig, str | None]:
         """Design the controller for a model, and say what `learn.margin` costs.
 
-        Parts without a learned model fly by the law of the start, or by the rough model if it
-        flies. Raises ParameterError.
+        Parts without a learned model fly by the law of the start, or by the rough model as long as
+        it is in use. Raises ParameterError.
         """
         start = self._controller
         without_learning = start.model_copy(update={"learn": None})

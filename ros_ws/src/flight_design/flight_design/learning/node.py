@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner node: it proposes feedforward and observer from the ticks of the controller.
+"""Run a learner as a node, which proposes feedforward and observer from the controller's ticks.
 
 The search runs in a thread of low priority. In real time the loop does not wait for it.
 """

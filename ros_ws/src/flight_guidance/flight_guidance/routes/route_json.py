@@ -43,7 +43,10 @@ def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def json_route(tree: Any, key: str, line: str | None) -> Places:
-    """Read the route in a parsed GeoJSON file."""
+    """Read the route in a parsed GeoJSON file.
+
+    `line` chooses one of several lines, see `one_route`. Raises ParameterError.
+    """
     require_wgs84(tree, key)
     geometries: list[Geometry] = []
     others: list[str] = []
@@ -92,7 +95,7 @@ def read_lines(content: bytes, key: str) -> list[list[Place]]:
 
 
 def _ring(rings: list[Any]) -> list[list[Any]]:
-    """Return the rings of a Polygon as lines.
+    """Return the members that are lists, such as the rings of a Polygon.
 
     The outer ring is a route if it is the only line. Further rings are holes.
     """

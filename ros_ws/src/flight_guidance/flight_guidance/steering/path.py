@@ -98,9 +98,10 @@ class Route(NamedTuple):
         return max(self.radius, self.V[leg])
 
     def start(self, leg: int, along: float = 0.0) -> tuple[Point, float]:
-        """Return the start of a leg and the course at it, rad; for an orbit its centre.
+        """Return the start of a leg, and the course at it, rad.
 
-        For a line the start is the point at the distance `along`, m.
+        For a line the start is the point at the distance `along`, m. For an orbit it is the centre,
+        and the course is 0.
         """
         path = self.legs[leg]
         if isinstance(path, Line):

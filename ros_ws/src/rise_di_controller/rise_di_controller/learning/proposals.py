@@ -241,9 +241,10 @@ class Learning:
     def _end_divergence(
         self, diverging: Collection[str], controller: Controller, now_ns: int
     ) -> RiseDiConfig:
-        """Fall back to the first law in the parts of the model that diverge.
+        """Fall back to the parameters of the start in all parts, because some of them diverge.
 
-        A part with FALLBACKS fallbacks keeps the first law until the engagement ends.
+        A fallback counts only for the parts that diverge. A part with FALLBACKS fallbacks keeps
+        the first law until the engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
