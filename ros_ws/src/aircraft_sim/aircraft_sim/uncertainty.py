@@ -213,9 +213,9 @@ def row_sizes(airframe: Airframe) -> dict[str, FloatArray]:
 
         row_i / size_j,   row_i = max over A and B of abs(A_ik) size_k, abs(B_ik) size_k
 
-    With this value, the entry would change x_dot_i as much as the largest entry in its row does, if
-    the states or inputs of both entries have their sizes. The sizes are 1 m/s, 0.1 rad (/s), a
-    tenth of a throttle, and THRUST_SIZE of the thrust in trim.
+    With this value, the entry would change x_dot_i as much as the largest entry in its row does. In
+    this comparison each state and each input deviates by its size. The sizes are 1 m/s, 0.1 rad
+    (/s), a tenth of a throttle, and THRUST_SIZE of the thrust in trim.
 
     The result is 0 for entries that are not 0, and for entries that stay 0 in every aircraft. These
     are the entries in rows of angles, and in columns of angles, because gravity is the only force

@@ -49,9 +49,9 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
 
     y_hat is a step of the predictor y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat. This
     sigma_hat cancels the rest of y_hat - y in a tick. The reference input is u_r = u_trim +
-    Omega^-1 y_m_dot. With `feedforward`, u_r = u_trim, which then has the feedforward. u_r cancels
-    the part sigma_r of sigma. At engagement sigma_f = -K e and u = u_r (bumpless transfer). If
-    y_m_dot = 0, retuning also keeps u. As anti-windup, the predictor takes u after saturation.
+    Omega^-1 y_m_dot. With `feedforward`, u_r = u_trim, which then contains the feedforward. u_r
+    cancels the part sigma_r of sigma. At engagement sigma_f = -K e and u = u_r (bumpless transfer).
+    If y_m_dot = 0, retuning also keeps u. As anti-windup, the predictor takes u after saturation.
     Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
     """
 

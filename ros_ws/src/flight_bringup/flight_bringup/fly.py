@@ -83,7 +83,8 @@ def fly_over_topics(
     `announce` gets a line when the engagement or its reason changes, except if only a number in the
     reason changes. It also gets a line on what became of a learner's proposal, and when a process
     had to be killed. If `engaged_for`, s, is given, the flight ends this long after its first
-    engagement. It ends earlier if the engagement ends, or if too little time is left for one.
+    engagement. It ends earlier if the engagement ends. It also ends earlier if the law has not
+    engaged when less than `engaged_for` of the duration is left.
 
     The outcome is COMPLETED, LANDED, INTERRUPTED (by Ctrl-C, SIGTERM or SIGHUP), or names the
     process that ended early.

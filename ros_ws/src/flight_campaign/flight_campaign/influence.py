@@ -45,11 +45,11 @@ def rank_correlations(table: "pl.DataFrame", published: Mapping[str, float]) -> 
 
 
 def chance_level(aircraft: int, entries: int) -> float:
-    """Return the rank correlation that in 95 % of campaigns no entry without effect exceeds.
+    """Return the rank correlation that entries without effect rarely exceed.
 
-    The correlation of independent values has mean 0 and variance 1 / (N - 1), and is normal for
-    large N. Source: Kendall, Rank Correlation Methods, 1948. The level allows for the number of
-    entries (Bonferroni).
+    In 95 % of campaigns none of them exceeds it. The correlation of independent values has mean 0
+    and variance 1 / (N - 1), and is normal for large N. Source: Kendall, Rank Correlation Methods,
+    1948. The level allows for the number of entries (Bonferroni).
     """
     from scipy.stats import norm  # noqa: PLC0415 - takes half a second
 

@@ -49,10 +49,10 @@ class Candidate(NamedTuple):
 
     @property
     def score(self) -> float:
-        """The geometric mean over the outputs of the rms error over all airs, rad/s.
+        """The geometric mean of the rms errors of the outputs, rad/s.
 
-        A relative change of the error counts the same in each output. An air counts by the size of
-        its errors.
+        The rms error of an output is taken over all airs together. A relative change of it counts
+        the same in each output. An air counts by the size of its errors.
         """
         in_all = np.sqrt(np.mean(np.square(list(self.rms.values())), axis=0))
         return float(np.exp(np.mean(np.log(in_all))))

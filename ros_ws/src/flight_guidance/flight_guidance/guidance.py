@@ -322,8 +322,8 @@ class Guidance:
     def reason_to_wait(self, now_ns: int) -> Refusal | None:
         """Return why guidance publishes no u_m, or None.
 
-        The result is None until guidance has waited for STALE_TIME. It waits for a young pose, or
-        for a step that does not fail.
+        Guidance waits for a young pose, or for a step that does not fail. The result is None until
+        it has waited for STALE_TIME.
         """
         since = self._waits_from_ns
         pose = self._pose

@@ -236,8 +236,9 @@ class TopicSamples:
     def signal(self, name: str) -> Signal | None:
         """Return the samples of a topic in the order of the stamps, or None if none has a stamp.
 
-        In RESTING topics, stamps may repeat, so several stamps of 0 may be flight time. A plan
-        needs no stamp.
+        Samples whose stamp was left at 0 do not count as stamped. A single stamp of 0 may be the
+        flight time 0. In RESTING topics stamps may repeat, so several stamps of 0 may be this time.
+        UNSTAMPED topics need no stamp.
         """
         for publisher in self._publishers.values():
             while publisher.batch:

@@ -21,10 +21,11 @@ TOPIC_SILENCE_NS = NANOSECONDS
 
 
 class Silences:
-    """The silences of a flight, each with a warning and a line with its length at its end.
+    """The silences of the topics in a flight, and their lines in the log.
 
-    Instants are in the time of the flight, in which a pause of /clock is no silence. `inform` and
-    `warn` are functions that take a line for the log.
+    A silence gets a warning, and at its end a line with its length. Instants are in the time of the
+    flight, in which a pause of /clock is no silence. `inform` and `warn` are functions that take a
+    line for the log.
     """
 
     def __init__(

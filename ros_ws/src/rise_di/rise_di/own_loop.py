@@ -299,7 +299,8 @@ def as_control(
 
     The inputs are `y_NAME` and `y_m_NAME`, and the outputs `u_NAME`. The system has limits and
     anti-windup. Its state is that of the law, then u and y_m of the last tick, and 0 is the
-    engagement in trim. With an allocation the outputs are the effectors, which also end the state.
+    engagement in trim. With an allocation the outputs are the effectors, and the effectors are also
+    the last values of the state.
 
     If `linear`, the result is the law near e = 0 without limits, for Bode plots and margins. It is
     a StateSpace from `y_NAME`, and the effectors are T u.

@@ -251,7 +251,8 @@ class ControllerSection(NodeConfig):
         """Return the nominal model with which the feedforward follows y_m.
 
         With an observer whose `part` is 0, the feedforward adds no input. The model is then kept
-        only if there is a learner, which needs its states. Otherwise the result is None.
+        for its states if there is a learner, which needs them. Without a learner the result is
+        None.
         """
         nominal = self.nominal()
         if nominal is None or self.observer is None or self.observer.part > 0.0:

@@ -133,9 +133,9 @@ class LearnConfig(Config):
     def least_margin(self, margin: float) -> float:
         """Return the delay margin that a learned model must keep, s.
 
-        It is the configured margin. If none is configured, it is `margin`, which is the delay
-        margin at the start, but at most LEAST_MARGIN. This is because the first loop can have less
-        margin around the real aircraft than around the model in the file.
+        It is the configured margin. If none is configured, it is the smaller of LEAST_MARGIN and
+        `margin`, the delay margin at the start. More than LEAST_MARGIN is not required, because the
+        first loop can have less margin around the real aircraft than around the model in the file.
         """
         return min(margin, LEAST_MARGIN) if self.margin is None else self.margin
 

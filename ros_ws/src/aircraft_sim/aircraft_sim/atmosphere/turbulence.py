@@ -115,23 +115,23 @@ def filters(
     """Build the shaping filters, discretised exactly.
 
     At multiples of dt the winds are distributed as in continuous time. With a = V0/L for each axis
-    and white noise n of unit intensity,
+    and white noise n of unit intensity, the filters are
 
         u       z_dot = -a z + sqrt(2a) n,  u = sigma z
         v, w    z1_dot = -a z1 + sqrt(2a) n,  z2_dot = a (z1 - z2),
             v = sigma/sqrt(2) (sqrt(3) z1 + (1 - sqrt(3)) z2)
 
-    have the published spectra, one-sided in omega, T = L/V0:
+    They have the published spectra, one-sided in omega, with T = L/V0:
 
         Phi_u = sigma^2 2T/pi / (1 + (T omega)^2)
         Phi_v = sigma^2 T/pi (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2,  Phi_w alike
 
-    In a step, z becomes transition z plus noise with a covariance. With h = a dt, and only the
-    first entries for u,
+    In a step, z becomes transition z plus noise with the covariance spread spread'. With h = a dt,
+    these are as follows, where u has only the first entries:
 
         transition = exp(-h) [[1, 0], [h, 1]],  spread spread' = [[g_1, g_2/2], [g_2/2, g_3/2]]
 
-    where g_k = gammainc(k, 2h), from the integrals of 2 s^(k-1) exp(-2s) from 0 to h. The product
+    Here g_k = gammainc(k, 2h), from the integrals of 2 s^(k-1) exp(-2s) from 0 to h. The product
     stationary stationary' is this covariance for h = inf.
 
     `airspeed` is V0, m/s, and `dt` is in s. `axes` are the required axes as indices in AXES and

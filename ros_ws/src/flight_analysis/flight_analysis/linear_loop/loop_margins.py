@@ -135,12 +135,14 @@ def margins(
 ) -> LoopMargins:
     """Compute the margins of a scenario's loop, and the least margins among uncertain aircraft.
 
-    A search finds the least margins. In an uncertain aircraft, every entry of A and B deviates by
-    up to `uncertainty`, or by the deviation that `spread` has for this entry. The rows of angles
-    are exact. Drawn samples only serve to count the stable aircraft, because the least margins lie
-    at corners of the box, where no sample falls. Lags and delay are those of the aircraft that
-    flies, even if the controller was told others. A lag deviates only if `spread` has an entry
-    1/lag[INPUT]. The uncertainty in the scenario itself is ignored.
+    In an uncertain aircraft, every entry of A and B deviates by up to `uncertainty`, or by the
+    deviation that `spread` has for this entry. Entries in the rows of theta, phi and psi do not
+    deviate. A lag deviates only if `spread` has an entry 1/lag[INPUT]. The uncertainty in the
+    scenario itself is ignored.
+
+    The least margins lie at corners of the box of these deviations, where no drawn sample falls. A
+    search therefore finds them, and the drawn samples only serve to count the stable aircraft. Lags
+    and delay are those of the aircraft that flies, even if the controller was told others.
 
     Args:
         scenario: Scenario with the aircraft and the controller.

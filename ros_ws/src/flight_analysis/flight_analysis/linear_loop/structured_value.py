@@ -80,9 +80,9 @@ def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
 def is_below_one(M: ComplexArray, scaling: Scaling) -> NDArray[np.bool_]:
     """Return for each of the matrices (N, p, p) whether its bound is below 1.
 
-    It is if I less the form of the bound is positive definite. Cholesky's factorisation of all of
-    them shows this in a fraction of the time of their eigenvalues, which are only computed if one
-    of them has no factor.
+    The bound is below 1 if I minus the matrix of `_form` is positive definite. Cholesky's
+    factorisation of all these differences shows this in a fraction of the time that eigenvalues
+    take. Eigenvalues are only computed if a difference has no factor.
     """
     H = _form(M, scaling)
     try:

@@ -5,7 +5,7 @@
 The difference of a signal is taken at the instants of the first log. The other log must have
 samples at most LONGEST_INTERVAL apart there. Between these, y and pose are interpolated linearly,
 and u is held. A value that is not finite is not compared. The table states which part was compared.
-Each signal has a tolerance, given by its name. Otherwise it is the fraction TOLERANCE of the
+The tolerance of a signal can be given by its name. Otherwise it is the fraction TOLERANCE of the
 largest absolute value in the first log.
 """
 

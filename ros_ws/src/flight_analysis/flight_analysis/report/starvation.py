@@ -58,7 +58,7 @@ def starvation(
 
     `end` is the length of the flight, s.
 
-    There are none in lockstep, in one process or by the clock of a simulator.
+    There are no such spans in lockstep, in one process or by the clock of a simulator.
     """
     if not is_real_time(tape) or tape.is_by_clock or end <= 0.0:
         return Starvation()

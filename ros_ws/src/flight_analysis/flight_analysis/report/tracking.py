@@ -4,19 +4,24 @@
 
 The rms error of an output, over any WINDOW and over the last END of the flight, may be at most
 
-    FACTOR rms(e by commands) + excuse + floor,  of an output with a command of its own at most
-    COMMAND_PART rms(y_m) + excuse + floor,      and never above FACTOR rms(e) + floor
+    min(FACTOR rms(e by commands) + excuse, FACTOR rms(e)) + floor
 
-Here e is the error of the linear loop from `linear_flight.error_pair`. The second line holds for an
-output with its own command. The excuse is FACTOR times the error that noise and wind cause, and at
-most MOST over a WINDOW. If an aircraft shakes more than this, the flight is no success, whatever
-the cause. The floor is
+Here e is the error of the linear loop from `linear_flight.error_pair`, and "e by commands" is the
+part of e that the commands cause. For an output with a command of its own, the first term is at
+most COMMAND_PART rms(y_m).
 
-- the fraction HARMLESS of the least errors of a divergence, plus the noise of a measured error, at
-  most MOST. This fraction is 0.02 rad/s for a rate and 0.2 m/s for the airspeed;
-- the fraction SPEED_PART of the trim speed, while V changes by its command or by the wind, if the
-  model of the aircraft and therefore its drag is unknown;
-- the least errors of a divergence, 0.1 rad/s and 1 m/s, if the wind is unknown.
+The excuse is FACTOR times the part of e that noise and wind cause, and at most MOST over a WINDOW.
+If an aircraft shakes more than this, the flight is no success, whatever the cause.
+
+The floor is the sum of
+
+- the fraction HARMLESS of the least errors of a divergence, which is 0.02 rad/s for a rate and 0.2
+  m/s for the airspeed. If the wind is unknown, it is the whole of these least errors, 0.1 rad/s and
+  1 m/s;
+- FACTOR times the noise of a measured error, at most MOST.
+
+If the model of the aircraft is unknown, its drag is unknown too. While V changes by its command or
+by the wind, the floor of V is then at least the fraction SPEED_PART of the trim speed.
 
 `rise_di_controller.learning.divergence` keeps a learned model below these least errors.
 """

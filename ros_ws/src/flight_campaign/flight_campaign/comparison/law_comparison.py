@@ -80,8 +80,8 @@ def compare(
 ) -> Iterator[LawResult]:
     """Simulate the laws with their gain sets on the same flights, one law in each thread.
 
-    In each wind, the nominal aircraft and, for each level of uncertainty, `aircraft` uncertain
-    aircraft of `seed` fly. In gusts, the aircraft of the first level also fly with u late by
+    In each wind the nominal aircraft flies, and so do `aircraft` uncertain aircraft of `seed` for
+    each level of uncertainty. In gusts, the aircraft of the first level also fly with u late by
     `delays`, ticks. Raises ParameterError if an uncertainty is outside [0, 1).
     """
     airframe, _ = benchmark.scenario.aircraft.load()

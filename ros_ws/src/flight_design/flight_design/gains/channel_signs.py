@@ -33,7 +33,7 @@ def signs_of_pairing(
     2. The input signs fit the D that is given.
     3. D fits Omega.
 
-    Raises ParameterError, which names what contradicts Omega and a choice that fits.
+    Raises ParameterError, which names what contradicts Omega, and then a choice that fits Omega.
     """
     m = len(Omega)
     flips = np.ones(m) if input_signs is None else np.array(input_signs, dtype=np.float64)

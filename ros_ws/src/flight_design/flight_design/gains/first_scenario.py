@@ -208,10 +208,11 @@ def scenario_to_design(scenario: FilePath | Scenario) -> Scenario:
 
 
 def scenario_to_check(scenario: FilePath | Scenario) -> Scenario:
-    """Load a scenario, or the scenario COMMANDED if a file has only the section controller.
+    """Load a scenario, or put a controller alone into the scenario COMMANDED.
 
-    In the second case COMMANDED gives the commands, gusts and rate limits. Its aircraft may differ
-    from the aircraft that the controller is for. Raises ParameterError.
+    A file with only the section controller gets the commands, gusts and rate limits of COMMANDED.
+    The aircraft in COMMANDED may differ from the aircraft that the controller is for. Raises
+    ParameterError.
     """
     controller = controller_alone(scenario)
     if controller is None:

@@ -310,10 +310,10 @@ def engineering_gains(
         beta_i = min(factor slew_i, 0.7 rate_limit_i) / response_i
 
     The bandwidth of channel i is then K_i response_i. `slew` is the largest rate of the ideal
-    control, and `rate_limit` is that of the actuator (infinite without a limit). Their inputs are
-    scaled to unit response, so their units are those of y / s^2. Raises ParameterError for a factor
-    below 1. Source: this project. The formula of beta follows from N_d = -D U v*_dot at e = 0, see
-    `N_d`.
+    control, and `rate_limit` is that of the actuator (infinite without a limit). Both are rates of
+    inputs that are scaled to unit response, so their units are those of y / s^2. Raises
+    ParameterError for a factor below 1. Source: this project. The formula of beta follows from N_d
+    = -D U v*_dot at e = 0, see `N_d`.
     """
     require(factor >= 1.0, "factor", factor, "at least 1: beta above the slew of the ideal control")
     K = np.maximum(bandwidth, max(MIN_K, float(bandwidth[-1])))

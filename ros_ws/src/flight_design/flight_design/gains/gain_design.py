@@ -130,9 +130,8 @@ def select_gains(
         observer: Whether a feedforward and an observer are added to the gains.
         model: Airframe that the observer takes as its model; None for `airframe`.
         margin: Least delay margin that the nominal loop with the observer must have, s.
-        speeds: Two fractions of the trim speed, one below 1 and one above, with models of their
-            own. A schedule then flies the observer from one to the other. If it is empty, the
-            observer holds only at the trim speed.
+        speeds: Two fractions of the trim speed, one below 1 and one above. The observer then has
+            models of these speeds and a schedule. If empty, it holds only at the trim speed.
         weights: File of gains and weights from which the search for the margins begins
             (`observer_gains.read_gains`); with `accept` they are taken as they are. None for those
             that a search for the scenario found, or that a rule gives.
@@ -470,15 +469,16 @@ def selected_observer(
 ) -> SelectedObserver:
     """Return a controller with feedforward and observer of a model, and where its gains come from.
 
-    The gains are those of the file `weights` if there is one. Otherwise they are those that
-    `rise-di compare --tune` found in the scenario, or in a shipped one with the same airframe and
-    lags. They count if the model has the same states and each total lag is below SLOWER times that
-    of the search. If none count, a rule derives gains from the lags. The search for the least error
-    begins at each of these gain sets. Gains of a file or beside a sketch are only relaxed, if the
-    margins need it. With `uncertain` the phase margin of uncertain aircraft counts too. With
-    `sketched` the gains are those for a model from a sketch. `speeds` are two ratios to the trim
-    speed, each with a model. `margin`, `is_free`, `activity`, `progress` and `earlier_design` are
-    as for `with_aircraft_observer`. Channels that are not free keep their gains.
+    The search for the least error begins at these gain sets:
+
+    - If there is a file `weights`: the gains in it.
+    - If `sketched`: gains for a model from a sketch.
+    - Otherwise: the gains that `rise-di compare --tune` found in the scenario, or in a shipped one
+      with the same airframe and lags. If the model has other states, or a total lag of SLOWER times
+      that of the search, they do not count, and a rule derives gains from the lags.
+
+    Gains of a file or for a sketch stay, and are only relaxed if the margins need it. Channels that
+    are not free keep their gains. The other arguments are as for `with_aircraft_observer`.
     """
     seen = through_allocation(model, controller)
     noise, vanes = _noise(controller, scenario, seen)

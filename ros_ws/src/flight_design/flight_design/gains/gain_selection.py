@@ -422,14 +422,12 @@ def assess_gains(
 
     Rate, lag and delay come from the controller, gamma_2 and rate limits from the setting.
 
-    The conditions of the theorem are those of `_rise_di_conditions`, and without an observer the
-    rules are those of `check_rules`. The loop must meet the conditions of `check_loop` (without an
-    observer), be stable for every sample, and have the required margins, with an observer 35
-    degrees of phase. The delay margin of the nominal loop must be one period, so that a tick may be
-    missed. With an observer it must be the observer's margin minus the delay. With the implicit
-    sign, the loop is linear inside the sign's width, dt^2 omega beta. Its margin is then the delay
-    at which chatter begins, at most half a period. A law other than RISE-DI has the conditions of
-    the linear loop.
+    RISE-DI has the conditions of `_rise_di_conditions`. The linear loop of any law must be stable
+    for every sample, and have the required margins. With an observer, 35 degrees of phase suffice.
+    The delay margin of the nominal loop must be one period, so that a tick may be missed. With an
+    observer it must be the observer's margin minus the delay. With the implicit sign, the loop is
+    linear only inside the sign's width, dt^2 omega beta. Its margin is then the delay at which
+    chatter begins, at most half a period.
     """
     rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
@@ -480,6 +478,8 @@ def _rise_di_conditions(
     study: Study, controller: RiseDiConfig, setting: LoopSetting, D: FloatArray
 ) -> tuple[tuple[GainCondition, ...], tuple[GainCondition, ...], tuple[GainCondition, ...], Bounds]:
     """Evaluate the conditions of Theorem 1, `check_rules`, `check_loop`, and the theorem's bounds.
+
+    `check_rules` and `check_loop` apply only without an observer.
 
     "D" and "zero dynamics" are the fractions of the samples that meet each condition. The bounds of
     (29), (30), steps 2 and 3 are the largest over the samples that meet both. "V2_dot" is the

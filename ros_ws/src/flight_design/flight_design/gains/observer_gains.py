@@ -112,9 +112,10 @@ def read_gains(path: Path, T: FloatArray, axes: int, states: int) -> ObserverGai
 def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> ObserverGains:
     """Convert gains that `rise-di compare --tune` finds for rise_observer or pi_observer, by name.
 
-    T is the total lag, (m,), s. Inside the width of its softened sign, RISE-DI acts as a PI law
-    with gains K and Lambda. It does so if it has the same K and SHARE times this Lambda, and if 1 /
-    (softening T) is the rest of this Lambda.
+    T is the total lag, (m,), s. Gains of rise_observer stay as they are. Gains K and Lambda of
+    pi_observer become gains of RISE-DI that act as the same PI law inside the width of the softened
+    sign. RISE-DI gets the same K and SHARE times Lambda, and 1 / (softening T) is the rest of
+    Lambda.
     """
     values = {name: np.array(row, dtype=np.float64) for name, row in gains.items()}
     weights = Weights(**{name: values[name] for name in Weights._fields})

@@ -284,9 +284,10 @@ class ObserverSearch(NamedTuple):
         return float(np.maximum(1.0 - np.concatenate(goals), 0.0).sum())
 
     def _cost(self, loops: _Loops) -> float:
-        """Sum the logarithms of error and activity in wind and noise over the channels.
+        """Return the cost of a trial, which is the sum of log(error + activity) over the channels.
 
-        Error and activity are in the units of a score. Without `air`, only the relaxation counts.
+        Error and activity are those in wind and noise, in the units of a score. Without `air`, the
+        cost is the sum of log(relaxation).
         """
         if self.air is None:
             return float(np.log(loops.relaxation).sum())

@@ -113,19 +113,24 @@ def with_aircraft_observer(
 ) -> SelectedObserver:
     """Add the feedforward and the observer of an airframe to a controller, and select its gains.
 
-    The gains of each channel are relaxed or made faster. The search minimises the error of the
-    linear loop in moderate turbulence with the noise of the sensors, and the loop must have its
-    margins. If there are several gain sets, the result with the least error is taken. `margin` is
-    the least delay margin, s, for all inputs or for each, (m,). `vanes` has the noise of each vane,
-    rms per sample in rad, by its channel, alpha or beta. If the airframe is `uncertain`, WORST_OF
-    uncertain aircraft must have the phase margin too. Aircraft with a zero on the right do not
-    count, because no gains can hold all of their outputs. If `speeds` has two ratios to the trim
-    speed, the controller gets a schedule, and must have the margins at these speeds too. With
-    `keeps_gains` the gains stay as they are, and are only relaxed if the margins need it.
+    A search relaxes the gains of each channel, or makes them faster. It minimises the error of the
+    linear loop in moderate turbulence with the noise of the sensors, while the loop must have its
+    margins. The search is made with each of the gain `sets`, and the result with the least error is
+    taken. With `keeps_gains` the gains stay as they are, and are only relaxed if the margins need
+    it.
 
-    The search begins at the loop of the `earlier_design` with the new feedforward. It changes the
-    relaxation of free channels only, so this loop stays if no change lowers the error. `activity`
-    is the weight of the activity of u against the error. `progress` gets a sentence for each loop.
+    `margin` is the least delay margin, s, either one value for all inputs, or one for each, (m,).
+    If the airframe is `uncertain`, WORST_OF uncertain aircraft must have the phase margin too.
+    Aircraft with a zero on the right do not count, because no gains can hold all of their outputs.
+    `speeds` are two airspeeds, divided by the trim speed. With them the controller gets a schedule,
+    and the loop must have the margins at these speeds too. `vanes` has the noise of each vane, rms
+    per sample in rad, by its channel, alpha or beta.
+
+    If there is an `earlier_design`, the search begins at its loop with the new feedforward. It
+    changes the relaxation of free channels only, so this loop stays if no change lowers the error.
+    `activity` is the weight of the activity of u against the error. `progress` gets a sentence for
+    each loop.
+
     Raises ParameterError for margins that no relaxation reaches. It is also raised for an airframe
     that has another D, has no wind, or cannot be the model of a feedforward.
     """

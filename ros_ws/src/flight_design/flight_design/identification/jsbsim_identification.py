@@ -173,18 +173,20 @@ def identify_jsbsim(
     2. Pair the channels, with outputs in units of the manoeuvre, and take D from the minors.
 
     3. Select gains by the engineering procedure for the airframe behind the lags, along the
-    commands and gusts: `gain_selection.gain_sets`. The beta of V follows from `airspeed_slew`. With
-    `observer_margin`, the gains are those beside an extended-state observer for y_dot = Omega u,
-    and it is the delay margin, in s, of the loop around this model. The margins of that loop meet
-    `requirement`, with 35 degrees of phase.
+    commands and gusts: `gain_selection.gain_sets`. The beta of V follows from `airspeed_slew`. If
+    `observer_margin` is given, the gains are those beside an extended-state observer for y_dot =
+    Omega u. The loop around this model then has the delay margin `observer_margin`, s, and its
+    margins meet `requirement`, with 35 degrees of phase.
 
     4. Simulate the result in calm air, with a gust, and in turbulence.
 
     If `guided`, guidance flies a turn by 90 degrees and a climb by 100 m in place of the pulses.
-    Its stall speed is that of `slowest_trim`. Its sideslip feedback can also fly an aircraft whose
-    `sideslip_zero` is positive. With `learns`, the flight learns in moderate turbulence. It begins
-    with the gains alone, its designs have the `observer_margin`, and the rough model is the
-    `sketch` of Omega and speed.
+    The stall speed of guidance is that of `slowest_trim`. Its sideslip feedback can also fly an
+    aircraft whose `sideslip_zero` is positive.
+
+    If `learns`, the flight learns in moderate turbulence. The flight begins with the gains alone.
+    The designs of the learner have the `observer_margin`, and its rough model is the `sketch` of
+    Omega and speed.
 
     Raises FlightEnded if the aircraft does not trim or does not respond, and ParameterError if its
     outputs and inputs cannot be paired, or if the speed is below guidance's speed floor.
@@ -289,9 +291,9 @@ def airspeed_slew(bandwidth: float, effect: float) -> float:
     """Return the throttle slew from which beta of V follows, 1/s.
 
     `bandwidth` is that of V, rad/s, and `effect` is that of the throttle, m/s^2. The airspeed V
-    contains the wind itself. With beta = K bandwidth / 4 sigma (sigma is LIGHT_SIGMA), the sign
-    moves the throttle in light turbulence at most as fast as the rule's Lambda, bandwidth / 4,
-    would.
+    contains the wind itself. Here beta is K sigma bandwidth / 4, with sigma = LIGHT_SIGMA. In light
+    turbulence the sign term then moves the throttle at most as fast as a Lambda of bandwidth / 4
+    would, which is the Lambda of the rule.
     """
     return bandwidth**2 / 4.0 * LIGHT_SIGMA / (gain_selection.BETA_TO_SLEW * effect)
 

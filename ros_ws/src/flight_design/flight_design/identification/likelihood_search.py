@@ -85,14 +85,17 @@ class Search(Likelihood):
         the normalised innovations, S is the covariance of the innovations, and N is the number of
         samples. The cost has several minima, because a wrong wind can explain a wrong model.
 
-        So the search begins several times, with means over the shortest lag. One start has each
-        level of STARTS in all spans, and two more have either sign of the effect of the wind's
-        slope on q. The search goes on from the REFINED best of these starts and theta = 0. Now
-        theta decides the level of each span, and the strengths of the winds are free. At last, the
-        search goes on from the best end with the most frequent level in every span. Turbulence is
-        the same in every span, and levels that change with theta could hold the search at a worse
-        minimum. After the starts, spans that no level explains do not count, and a few gusts do not
-        count either.
+        So the search has several starts, which use means over the shortest lag:
+
+        - theta = 0;
+        - for each level in STARTS, a start with this level in all spans;
+        - for either sign of the effect of the wind's slope on q, a start with this sign.
+
+        The search goes on from the REFINED best starts. Now theta decides the level of each span,
+        and the strengths of the winds are free. At last, the search goes on from the best end with
+        the most frequent level in every span. Turbulence is the same in every span, and levels that
+        change with theta could hold the search at a worse minimum. After the starts, spans that no
+        level explains do not count, and a few gusts do not count either.
 
         If `begin`, (p,), is given, it is the only start. Otherwise `flown`, the theta of the model
         in flight, is one more start.
@@ -225,7 +228,7 @@ class Search(Likelihood):
         """Search from one start, and return the end of the search.
 
         `levels` gives the level of each span. If it is None, theta decides the levels. In the first
-        step and in the next `unsettled` steps every span counts, and the search goes on.
+        step and in the next `unsettled` steps every span counts, and the search does not end.
         """
         for iteration in range(STEPS):
             self.progress()

@@ -93,13 +93,17 @@ def imported(
 ) -> Imported:
     """Return y, u, `commands` and the pose of a log, as the bridge would have published them.
 
-    y and the pose hold the newest values, at the stamps of the map's `instant` and of the first
-    channel of the pose. u is the command minus its median. With PX4, the command is the setpoint
-    that the map names. With ArduCopter, it is the output of the rate controllers, and with
-    ArduPlane it is the stick in MANUAL. With `servos` it is the position of the servo, scaled like
-    the stick. Without a window the longest stretch in the air is taken. If the command is the
-    stick, this stretch must be in MANUAL. `show` gets the comparison of the log with the map before
-    a mismatch is refused.
+    y holds the newest values at the stamps of the map's `instant`, and the pose holds those at the
+    stamps of its first channel. u is the command minus its median. The command is
+
+    - with PX4: the setpoint that the map names;
+    - with ArduCopter: the output of the rate controllers;
+    - with ArduPlane: the stick in MANUAL, or with `servos` the position of the servo, scaled like
+      the stick.
+
+    Without a window the longest stretch in the air is taken. If the command is the stick, this
+    stretch must be in MANUAL. `show` gets the comparison of the log with the map before a mismatch
+    is refused.
 
     Raises ParameterError if the log lacks a channel, is of another vehicle, or has no such stretch.
     It is also raised if the parameters differ from the map or change between the samples. If the

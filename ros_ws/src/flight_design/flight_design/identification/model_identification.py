@@ -304,8 +304,8 @@ def identify_model(
             nominal model is computed.
         after: The advantage counts only samples after this flight time, s.
         may_couple: Whether the parts may be joined to one if they couple.
-        quick: Whether a single start of the search suffices if the air is the same in every span
-            and the model may be used.
+        quick: Whether the search begins with a single start. It suffices if the air is the same in
+            every span, and if the model that is found may be used.
         searches_again: Whether a part with too many entries of A at their bounds is searched again,
             about the result of the first search.
         timing: Standard deviation of the delay in `actuation`, s. If it is given, even as 0, the

@@ -100,10 +100,10 @@ def change_test(
     of LOSS exceeds G = 12 with a probability of 5e-7, two such inputs together with 2e-6, and
     inputs with smaller losses even more seldom.
 
-    The input j is dead if J with -OFF_CENTRE <= kappa_j + 1 <= NONE meets two conditions: it is
-    lower than the first minimum by more than MAX_GAIN, and at most DEAD_WITHIN above the second
-    minimum. `delays` has the delays of u, s, by the outputs of a part. The default is the delay of
-    `actuation`. `drift` is the noise of the disturbances, as in `Unknown`.
+    The input j is dead if the minimum of J for -OFF_CENTRE <= kappa_j + 1 <= NONE meets two
+    conditions. It is lower than the first minimum in G by more than MAX_GAIN, and at most
+    DEAD_WITHIN above the second one. `delays` has the delays of u, s, by the outputs of a part. The
+    default is the delay of `actuation`. `drift` is the noise of the disturbances, as in `Unknown`.
     """
     changes = []
     flown = in_rolling_air(flown)

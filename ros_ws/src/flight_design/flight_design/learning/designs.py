@@ -82,11 +82,16 @@ def goal(
 ) -> Goal:
     """Return the goal of a design for a model of which some parts are learned.
 
-    The delay margin that each part needs is `learn.margin` if that is set. Otherwise it is the
-    margin that the loop of the file has around the model, but at most the margin of the start, and
-    for a learned part at least LEAST_MARGIN. If there is no design for the file either, it is the
-    margin of the start. Each input must keep at least DELAY_LEFT beyond its `latest` delay, s. A
-    `dead` output flies without this design, so it needs no margin. With a design for the file, the
+    Each part needs a delay margin:
+
+    - If `learn.margin` is set, it is this margin.
+    - Otherwise, with no design for the file, it is the margin of the start.
+    - With a design for the `file`, it is the margin that the loop of the file has around the model,
+      but at most the margin of the start. A learned part needs at least LEAST_MARGIN, or the margin
+      of the start if this is smaller.
+
+    A `dead` output flies without this design, so it needs no margin. In any case an input must
+    tolerate DELAY_LEFT, s, beyond its `latest` delay, s. With a design for the file, the
     sensitivity is at most 2, or that of the file's loop if it is larger. This bounds the phase and
     gain margins (Astrom, Murray, "Feedback Systems", 10.5).
     """

@@ -203,8 +203,9 @@ class Learner:
 
         The last RECORD seconds are tested for a loss of effect. If an input has no effect any more,
         its part flies the law of the start without this input. After a loss of effect, older
-        samples are left out, and the flown model becomes the prior. If nothing is due, there is no
-        sentence.
+        samples are left out, and the flown model becomes the prior. If nothing is due, nothing is
+        proposed. The result then has a sentence only if a single test has found that an input may
+        have no effect.
 
         While the rough model flies, the first model of a part is only on trial. The next
         identification proposes it if the samples since then show its advantage over the rough one.
@@ -420,8 +421,8 @@ class Learner:
     def _is_due(self, end_ns: int, *, lost: bool) -> bool:
         """Return whether an identification is due: at `learn.updates`, then once in every window.
 
-        An identification is also due RETRY after the last one if the last proposal does not fly or
-        a part has changed, but not within AFTER_FALLBACK of a fallback.
+        If the last proposal does not fly, or if a part has changed, an identification is also due
+        RETRY after the last one. Within AFTER_FALLBACK of a fallback this is not so.
         """
         is_planned = False
         elapsed_ns = -1 if self._first_ns is None else end_ns - self._first_ns

@@ -160,12 +160,15 @@ def read_route_file(
     Latitudes and longitudes are turned to north and east of the origin, by default the home in the
     file. If the file has no altitudes, `altitude` is the altitude to fly at, m. If the file counts
     altitudes from the ground or from the home, `altitude` is that of the ground or of the home.
-    `above_sea` says whether the altitudes of `pose` count from the sea. If not, they count from the
-    start, which is the home in the file. It is None if the reference of `pose` is unknown.
+    `above_sea` says whether the altitudes of `pose` count from the sea (True), or from the start,
+    which is the home in the file (False). None means that this is unknown.
+
     Successive equal positions become one waypoint. A waypoint is left out if the line without it
     passes within `simplify`, m. In a file with several lines, `line` chooses one by its number from
-    1 on, or by its name. Raises ParameterError for an unreadable file, for a geometry that is no
-    route, for a value that is missing or out of range, and for latitudes without an origin.
+    1 on, or by its name.
+
+    Raises ParameterError for an unreadable file, for a geometry that is no route, for a value that
+    is missing or out of range, and for latitudes without an origin.
     """
     suffix = path.suffix.lower()
     require(

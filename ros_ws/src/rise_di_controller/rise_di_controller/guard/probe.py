@@ -153,9 +153,9 @@ class EffectTest:
         Y and U are the complex amplitudes, fitted by least squares together with a cubic. q is the
         quantile of Student's t with two degrees of freedom per frequency. If the noise is Gaussian
         and flat over the frequencies, the result falls below the true effect of an input with a
-        probability of at most `false_alarm`. The law responds to both the sine and the
-        disturbances, so H is the ratio of y to the command, where y and the command are each
-        correlated with the sine.
+        probability of at most `false_alarm`. The command contains the law's response to the
+        disturbances too, so y is not fitted to the command. H is instead the ratio of two
+        correlations with the sine, that of y to that of the command.
         """
         window = np.array(self._means)
         t = (window[:, 0] - window[-1, 0]) / (self._probe.window_ns / NANOSECONDS)

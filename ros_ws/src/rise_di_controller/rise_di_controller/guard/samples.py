@@ -9,8 +9,8 @@ An impossible sample is lost, which means that it counts as a sample that did no
   it, and uses no model, so a wrong model does not lock any sample out. If y really jumps, two
   samples are lost. The controller takes the third sample in a row that agrees with the sample
   before it.
-- `step` also finds a y that stands still. It is then equal to the last bit in every value, after it
-  has changed with every sample.
+- `step` also finds a y that stands still. Such a y repeats every bit of every value, although each
+  sample before brought a change.
 """
 
 from collections.abc import Sequence

@@ -159,11 +159,15 @@ def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
     Up to MANY channels, every order of the outputs is combined with every order of the inputs,
     which is (m!)^2 cases. With more channels only three orders are tried: the given one, the inputs
     by their largest responses, and the order of complete pivoting. A smaller change may then exist,
-    even if None is returned. Each combination determines the signs of the inputs, which are those
-    in D, because the sign of input k changes only D_k. Pairings are preferred in this order: most
-    outputs keep their input, most outputs keep their place, most inputs keep their sign, and max
-    abs(U - I) in inputs of unit response is smallest. Orders with a zero on the diagonal, or with
-    max abs(U - I) above `largest_U`, are excluded.
+    even if None is returned. The signs of the inputs need no search: an input k is reversed where
+    D_k = -1, because its sign changes only D_k. Orders with a zero on the diagonal, or with max
+    abs(U - I) above `largest_U`, are excluded. The others are compared by these criteria, one after
+    the other:
+
+    - Most outputs keep their input.
+    - Most outputs keep their place.
+    - Most inputs keep their sign.
+    - max abs(U - I) in inputs of unit response is smallest.
 
     Raises DecompositionError if Omega is not square or not finite.
     """
