@@ -92,9 +92,10 @@ class AutopilotLock:
         return is_new_sender
 
     def _start(self, since_boot_ns: int, now_ns: int) -> str:
-        """Return the name of the start of the autopilot to which a time since boot belongs.
+        """Return a name that tells the present run of the autopilot from a run after a restart.
 
-        It is the name of the start that the lock holds, or a new name from the instant of boot.
+        If the time since boot continues that of the locked run, it is the name of this run.
+        Otherwise it is a new name, from the instant of boot.
         """
         boot_ns = now_ns - since_boot_ns
         advances = (

@@ -251,7 +251,7 @@ def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Re
 
 
 def _rows(values: Mapping[str, FloatArray], groups: Sequence[str]) -> FloatArray:
-    """Return the values of groups, each (values, steps), as rows (steps, w), in that order."""
+    """Return the values of groups, (values, steps) each, side by side in a row for each step."""
     return np.ascontiguousarray(np.vstack([values[name] for name in groups]).T)
 
 

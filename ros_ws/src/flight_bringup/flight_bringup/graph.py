@@ -243,7 +243,10 @@ def parameter_overrides(
 
 
 def _stage_overrides(scenario: Scenario, *, lockstep: bool) -> dict[NodeSpec, ParameterOverrides]:
-    """Return the parameters of both stages, with guidance's by rule and the learner's scenario."""
+    """Return the parameters of both stages that the sections of the scenario lack.
+
+    Among them are the parameters of guidance that follow by rule, and the learner's scenario file.
+    """
     stages = (*FIRST_STAGE, *SECOND_STAGE, *_optional(scenario))
     overrides: dict[NodeSpec, ParameterOverrides] = {
         node: {"lockstep": lockstep} for node in stages

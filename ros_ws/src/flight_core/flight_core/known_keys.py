@@ -102,7 +102,7 @@ def unknown_keys(parameters: Config, known: Set[str]) -> list[SetKey]:
 
 
 def _outermost(parameters: Config, found: SetKey, known: Set[str]) -> SetKey:
-    """Return the outermost optional section around a key in which no key is known.
+    """Return the outermost optional section that contains a key and has no known key.
 
     Returns the key itself if there is no such section.
     """

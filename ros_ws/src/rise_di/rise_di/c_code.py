@@ -267,7 +267,7 @@ def _units(scenario: Scenario, controller: RiseDiConfig) -> Units:
 
 
 def _logged(run: FilePath | RecordedRun, controller: RiseDiConfig, title: str) -> Material:
-    """Return the parameters and the ticks of a recorded flight, with a line on equal u.
+    """Return the parameters and ticks of a recorded flight, and in how many ticks u is equal.
 
     Raises ParameterError if the flight had other parameters.
     """

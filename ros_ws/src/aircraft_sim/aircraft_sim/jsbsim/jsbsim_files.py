@@ -172,9 +172,10 @@ def _relative(name: str, path: Path) -> str:
 
 
 def _sentence(model: Path, missing: Mapping[str, str]) -> str:
-    """Write a sentence about missing files; `missing` has the element by the file's name.
+    """Write a sentence about missing files of a model.
 
-    It names the files of elements of the same kind as the first.
+    `missing` has the names of the files, each with the element of the model that names it. The
+    sentence is about the first file, and about the other files with the same kind of element.
     """
     element = next(iter(missing.values()))
     names = sorted(

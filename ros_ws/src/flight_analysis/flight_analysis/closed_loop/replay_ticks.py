@@ -73,7 +73,7 @@ class ParametersInForce:
     def change(
         self, digest: int, number: int, state: ControllerState | None
     ) -> ControllerState | None:
-        """Apply the changes up to the parameters with a digest, and return the retuned state.
+        """Apply changes until the parameters have a digest, and return the retuned state.
 
         If no sequence of changes leads to this digest, no change is applied.
         """

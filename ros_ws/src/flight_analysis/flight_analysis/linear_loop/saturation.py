@@ -178,7 +178,8 @@ def _proof(
 def _with_limit(part: Channels) -> Channels:
     """Turn a part with a disk in one input into a part with a limit of that input.
 
-    The result leads from the w of the entries and the cut-off w to the z of the entries and a.
+    The inputs of the result are w of the entries, and the w that the limit cuts off from u. Its
+    outputs are z of the entries, and the a that the aircraft gets.
     """
     W, D = part.W.copy(), part.D.copy()
     D[-1, -1] += 0.5

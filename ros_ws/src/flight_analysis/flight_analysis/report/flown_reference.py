@@ -217,9 +217,10 @@ def _computed(
 def _next_paths(
     path: _Path, commands: Sequence[_Command], before_ns: int, max_age_ns: int
 ) -> list[_Path]:
-    """Return the paths that can follow a path.
+    """Return the paths that can follow a path, which is a possible history of the received u_m.
 
-    They take as the newest u_m any one that may have arrived since `before_ns`, or none.
+    In each of them, another one of the u_m that may have arrived since `before_ns` is the newest.
+    In the last path, none has arrived.
     """
     arrived = path.taken
     while arrived < len(commands) and commands[arrived].t_ns <= before_ns + AHEAD_NS:

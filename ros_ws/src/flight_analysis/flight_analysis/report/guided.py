@@ -391,7 +391,7 @@ def landing_results(landing: Mapping[str, Any] | None) -> str:
 
 
 def control_errors(tape: Tape) -> dict[str, FloatArray]:
-    """Return the errors of the quantities of guidance, measured less commanded, shape (N,).
+    """Return the measured minus the commanded quantities of guidance, shape (N,) each.
 
     There is a value for each sample of `guidance`. The cross-track error comes from the log, and is
     positive to the right. Errors of angles lie within half a turn.

@@ -298,7 +298,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
 def _with_cause(
     error: ParameterError, recorded: RecordedRun, run: Path, outcome: Outcome
 ) -> ParameterError:
-    """Return the error as an UnflownError with the last messages of the nodes, without y or y_m.
+    """Return an UnflownError with the last messages of the nodes if the log lacks y or y_m.
 
     If the log has y and y_m, return the error itself.
     """

@@ -369,7 +369,7 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
 def _pairing(
     inputs: str | Sequence[str], controller: ControllerConfig, airframe: Airframe
 ) -> tuple[str, ...]:
-    """Return the input of each output, in this order: from `inputs`, from the controller, or ().
+    """Return the input of each output from `inputs`, else from the controller, else ().
 
     The pairs of the controller count only if it has the same inputs as the airframe.
     """

@@ -144,8 +144,9 @@ def experiment(
     airframe_file: str,
     wait: float = WAIT,
 ) -> Experiment:
-    """Plan the experiment of a channel map, with every input at `amplitude` of its smaller limit.
+    """Plan the experiment of a channel map.
 
+    `amplitude` is the amplitude of each input as a fraction of the smaller of its two limits.
     `speed` is the airspeed in trim, m/s, or None in hover.
     """
     pairing, sign = channel_pairs(channel_map)

@@ -75,8 +75,8 @@ class FlightData(NamedTuple):
 def coarser(recorded: FlightData, factor: int) -> FlightData:
     """Average a flight over `factor` periods.
 
-    The time of each mean of u lies between the middles of two means of y, as u is held over a
-    period.
+    A u is held from one sample of y to the next. In the result it is therefore the mean from the
+    middle of one mean of y to the middle of the next.
     """
     count = len(recorded.t) // factor
     leads = [

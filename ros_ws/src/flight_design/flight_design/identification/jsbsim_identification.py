@@ -299,7 +299,7 @@ def airspeed_slew(bandwidth: float, effect: float) -> float:
 
 
 def _too_weak(linear: Linearization) -> str:
-    """Say in sentences after a "; " which outputs their paired input moves too weakly.
+    """Return a sentence, after a "; ", for each output that its paired input moves too weakly.
 
     At full travel, the paired input of such an output moves it less than a tenth as much as another
     input does.

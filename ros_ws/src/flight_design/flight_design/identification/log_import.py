@@ -368,7 +368,8 @@ def _flight(
 ) -> tuple[tuple[int, int], str | None]:
     """Return the first and the last instant to import, and a sentence on other flights.
 
-    They are those of the window or of the longest stretch in the air, with sticks in MANUAL.
+    The longest stretch in the window is imported, or without a window the longest one in the air.
+    If `needs_manual`, only stretches in MANUAL count.
     """
     start_ns = int(stamps[0])
     keep = np.ones(len(stamps), dtype=bool)

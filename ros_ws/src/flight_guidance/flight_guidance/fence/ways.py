@@ -185,7 +185,7 @@ def _neighbours(values: FloatArray, fill: float) -> list[FloatArray]:
 
 
 def _uphill(values: FloatArray) -> NDArray[np.intp]:
-    """Return for each cell the neighbour in whose direction the values rise; at a peak the cell."""
+    """Return for each cell the neighbour towards which the values rise, at a peak the cell."""
     slopes = np.gradient(values)
     steepness = np.maximum(np.hypot(*slopes), 1e-6)
     last = np.array(values.shape).reshape(2, 1, 1) - 1

@@ -255,9 +255,9 @@ class Side(IntEnum):
 
 
 def joining_centre(point: Point, course: Scalar, radius: Scalar) -> Point:
-    """Return the centre of the circle that touches the line through a point on a course, rad.
+    """Return the centre of the circle that touches a line at a point.
 
-    The radius is positive to the right, m.
+    `course` is the course of the line, rad. The radius, m, is positive to the right.
     """
     xp = array_namespace(course)
     return point[0] - radius * xp.sin(course), point[1] + radius * xp.cos(course)
