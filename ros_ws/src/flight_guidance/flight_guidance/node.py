@@ -120,7 +120,6 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._publish_u_m, self._publish_log = self.advertise(U_M), self.advertise(GUIDANCE)
         self._u_m_encoder = self.encoder((*outputs, *channels.ATTITUDE))
         self._log_encoder = self.encoder(self._guidance.names)
-        self._allowed = True
         self._mode = GuidanceMode.OFF
         self._wait_reason: Refusal | None = None
         self._authority = self._receive_authority()
