@@ -258,14 +258,14 @@ class Check(_Gains):
             answer = self._checked()
         sets = GainSets({"scenario": answer}, checked=Path(self.scenario).stem)
         self._show(sets, ())
-        self._exit(sets)
+        self._exit_if_loop_fails(sets)
 
     def _checked(self) -> GainAssessment[Any]:
         entries = named_numbers("entry", self.entry or (), "1/lag[elevator]=0.3")
         words = values_of(self, *STUDY, "zeros")
         return check_gains(self.airframe, self.scenario, **words, entries=entries)
 
-    def _exit(self, sets: GainSets) -> None:
+    def _exit_if_loop_fails(self, sets: GainSets) -> None:
         if not loop_verdict(sets.first, sets.promise).holds:
             raise typer.Exit(LOOP_FAILS)
 
@@ -324,7 +324,7 @@ class Guarantee(Check):
         name = Path(self.scenario).stem
         sets = GainSets({"scenario": answer}, checked=name, promise=promise)
         self._show(sets, lines, certificate=self.certificate)
-        self._exit(sets)
+        self._exit_if_loop_fails(sets)
 
     def _bound_limited(self, answer: GainAssessment[Any], loop: LinearLoop) -> None:
         """Bound the loop with limits of one input, write the certificate, and print the result."""
@@ -337,7 +337,7 @@ class Guarantee(Check):
         )
         sets = GainSets({"scenario": answer}, checked=Path(self.scenario).stem, limited=promise)
         self._show(sets, lines, certificate=self.certificate)
-        self._exit(sets)
+        self._exit_if_loop_fails(sets)
         if promise is None or not promise.holds:
             raise typer.Exit(LOOP_FAILS)
 
