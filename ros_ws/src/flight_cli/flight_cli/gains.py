@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Implement `rise-di gains`, which selects gains, checks them, or bounds them for a box."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -118,8 +118,13 @@ class _Gains:
     def _status(self, text: str) -> Status:
         return Console(quiet=self.as_json).status(text)
 
-    def _show(self, sets: GainSets, sentences: Sequence[str], **files: Path | None) -> None:
-        """Write the page, and print tables, sentences and paths, or JSON with --json."""
+    def _show(
+        self, sets: GainSets, sentences: Sequence[str], files: Mapping[str, Path | None] = {}
+    ) -> None:
+        """Write the page, and print tables, sentences and paths, or JSON with --json.
+
+        `files` has the paths of the written files by their names in the output.
+        """
         if self.page is not None:
             _write_page(self.page, sets.last)
         if self.as_json:
@@ -227,7 +232,7 @@ class Select(_Gains):
         written = selection.theorem if self.theorem else selection.engineering
         chatter = gain_yaml.chatter_sentence(written.controller, written.margins)
         sentences = [selection.origin, origin, chatter]
-        self._show(GainSets(answers, selection), sentences, gains=self.write)
+        self._show(GainSets(answers, selection), sentences, {"gains": self.write})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -323,7 +328,7 @@ class Guarantee(Check):
             lines += write_unstable(self.worst, promise, self.airframe, self.scenario)
         name = Path(self.scenario).stem
         sets = GainSets({"scenario": answer}, checked=name, promise=promise)
-        self._show(sets, lines, certificate=self.certificate)
+        self._show(sets, lines, {"certificate": self.certificate})
         self._exit_if_loop_fails(sets)
 
     def _bound_limited(self, answer: GainAssessment[Any], loop: LinearLoop) -> None:
@@ -336,7 +341,7 @@ class Guarantee(Check):
             self.certificate, loop, promise, self.airframe, self.scenario
         )
         sets = GainSets({"scenario": answer}, checked=Path(self.scenario).stem, limited=promise)
-        self._show(sets, lines, certificate=self.certificate)
+        self._show(sets, lines, {"certificate": self.certificate})
         self._exit_if_loop_fails(sets)
         if promise is None or not promise.holds:
             raise typer.Exit(LOOP_FAILS)

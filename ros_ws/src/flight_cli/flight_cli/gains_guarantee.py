@@ -151,9 +151,9 @@ def write_unstable(
     require(not others, "worst", ", ".join(others), f"lags of the actuators of {base.name} alone")
     with writing("--worst", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
-    first = promise.unstable.deviation
+    least_unstable = promise.unstable.deviation
     lines = []
-    for factor, prefix in ((1.0, ""), (min(FARTHER, LARGEST / first), "farther_")):
+    for factor, prefix in ((1.0, ""), (min(FARTHER, LARGEST / least_unstable), "farther_")):
         entries = {name: factor * value for name, value in promise.unstable.entries.items()}
         path = folder / f"{prefix}airframe.yaml"
         matrices = {name: value for name, value in entries.items() if name not in declared}
@@ -167,7 +167,7 @@ def write_unstable(
         varied = scenario_with_equipment(varied, lags)
         flight = folder / f"{prefix}scenario.yaml"
         write_text("worst", flight, scenario_yaml(varied))
-        deviation = factor * first
+        deviation = factor * least_unstable
         place = "inside" if deviation <= promise.uncertainty else "outside"
         far = math.ceil(1e3 * deviation) / 10.0
         lines.append(

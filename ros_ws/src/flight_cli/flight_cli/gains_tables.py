@@ -198,9 +198,10 @@ def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
         "scaled by 1 / abs(Omega_ii)"
     )
     table = new_table(title, ["channel", "D", *headings], left_aligned=("channel",))
-    first = next(iter(answers.values())).controller
-    for i, (output, name) in enumerate(zip(first.outputs, first.inputs, strict=True)):
-        row = [f"{output} by {name}", f"{first.D[i]:+d}"]
+    # all gain sets have the same channels and D
+    controller = next(iter(answers.values())).controller
+    for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
+        row = [f"{output} by {name}", f"{controller.D[i]:+d}"]
         for answer in answers.values():
             params = answer.controller.law_params()
             response = gain_selection.response(answer.study, answer.controller)[i]
