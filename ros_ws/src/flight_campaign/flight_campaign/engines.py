@@ -28,8 +28,10 @@ workers."""
 AHEAD = 2  # number of queued chunks per worker, which keeps it busy without much memory
 
 Job = tuple[int, ...]
-Work = Callable[[Job], Any]
+"""Numbers by which `Work` knows what to compute, (case, chunk) in a campaign. An engine only hands
+them on."""
 
+Work = Callable[[Job], Any]
 
 Engine = Callable[[Work, Iterable[Job]], Iterator[tuple[Job, Any]]]
 """Runs jobs, and yields each with its result in the order in which they are complete."""
