@@ -18,6 +18,7 @@ from flight_core.parameters import ParameterError
 from flight_design.identification.parameter_agreement import (
     Servo,
     Stick,
+    absence_sentence,
     change_sentences,
     compared,
     require_agreement,
@@ -37,14 +38,16 @@ PARAMETERS = {
 def agreement(
     channel_map: ChannelMap, values: Mapping[str, float], later: Mapping[str, float] | None = None
 ) -> str | None:
-    """The sentence of `require_agreement` for parameters at the samples.
+    """The sentence on absent parameters, if the parameters at the samples agree with the map.
 
     `later`: others that the log has after them.
     """
     sticks = [stick_of(channel_map, name) for name in channel_map.inputs]
     recorded = {name: (ParameterRecord(0, value),) for name, value in values.items()}
     recorded |= {name: (ParameterRecord(10**12, value),) for name, value in (later or {}).items()}
-    return require_agreement(channel_map.name, compared(sticks, recorded, values))
+    rows = compared(sticks, recorded, values)
+    require_agreement(channel_map.name, rows)
+    return absence_sentence(rows)
 
 
 def changed(name: str, section: str, **values: Any) -> ChannelMap:

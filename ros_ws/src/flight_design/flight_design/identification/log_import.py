@@ -23,6 +23,7 @@ from flight_design.identification.parameter_agreement import (
     Agreement,
     Servo,
     Stick,
+    absence_sentence,
     change_sentences,
     compared,
     require_agreement,
@@ -160,9 +161,10 @@ def _imported(
             name: _commands(channel_map, log, name, servos, parameters)
             for name in channel_map.inputs
         }
-        notes.append(require_agreement(channel_map.name, rows_compared))
+        require_agreement(channel_map.name, rows_compared)
     except ParameterError as error:
         raise ParameterError("; ".join([str(error), *filter(None, notes)])) from None
+    notes.append(absence_sentence(rows_compared))
     tape = _tape(channel_map, log, sources, readers, taken)
     return Imported(tape=tape, parameters=parameters, notes=tuple(filter(None, notes)))
 

@@ -223,11 +223,8 @@ def compared(
     return rows
 
 
-def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str | None:
-    """Return a sentence on the parameters that have no value at the samples, or None.
-
-    Raises ParameterError if a parameter differs from that of the map.
-    """
+def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> None:
+    """Raise ParameterError if a parameter in the log differs from that of the map."""
     differing = [row for row in rows if row.differs]
     if differing:
         logged = ", ".join(f"{row.what} {row.logged}" for row in differing)
@@ -241,6 +238,10 @@ def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str | None
             f"the log: found {logged}, expected {expected} as in the map {name_of_map}: "
             f"{'; '.join(mends)}"
         )
+
+
+def absence_sentence(rows: Iterable[Agreement]) -> str | None:
+    """Return a sentence on the parameters that have no value at the samples, or None."""
     absent = ", ".join(row.what for row in rows if not row.is_known)
     if not absent:
         return None
