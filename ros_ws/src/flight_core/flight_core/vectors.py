@@ -170,10 +170,7 @@ def select(
     """
     if len(names) != len(values):
         raise ChannelError("length", f"{len(names)} names for {len(values)} values")
-    if names is channels:
-        vector = np.array(values, dtype=np.float64)
-    else:
-        vector = np.asarray(values, dtype=np.float64)[_places(tuple(channels), tuple(names))]
+    vector = np.asarray(values, dtype=np.float64)[_places(tuple(channels), tuple(names))]
     # For few channels, this loop takes a third of the time of np.isfinite.
     if not all(map(math.isfinite, vector.tolist())):
         raise ChannelError("finite", f"{', '.join(channels)} = {vector.tolist()} is not finite")
