@@ -17,9 +17,11 @@ from flight_core.vectors import FloatArray
 def names(airframe: Airframe) -> tuple[str, ...]:
     """Return the names of the channels of `truth`, group by group.
 
-    They are "x.state", "f.state" (f of equation (1), with the disturbances), "gust.axis" (the wind
-    along the axes of the airframe's gusts, 1-cosine gust plus turbulence, m/s) and "actuator.input"
-    (the present position).
+    - "x.state": the states of the airframe.
+    - "f.state": f of equation (1), with the disturbances.
+    - "gust.axis": the wind along the axes of the airframe's gusts, m/s, which is 1-cosine gust plus
+      turbulence.
+    - "actuator.input": the present position.
     """
     groups = (
         ("x", airframe.states),

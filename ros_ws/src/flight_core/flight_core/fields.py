@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the values of a parameter set by their annotations, and refuse them in sentences.
 
-Types are strict. An int is accepted as a float, a sequence as a tuple, an array or a scalar of
-NumPy as lists or a number, and a path as a str. Nothing else is converted. The annotations are
+Types are strict. Only these values are converted: an int to a float, a sequence to a tuple, an
+array of NumPy to lists, a scalar of NumPy to a number, and a path to a str. The annotations are
 float, int, bool, str, object, Literal, tuple, dict, unions of these, and parameter sets. Rules such
 as a limit come from `Field(...)` in Annotated.
 """

@@ -172,9 +172,9 @@ class Tape:
 
     `start_ns` is the stamp of flight time t = 0, and `outcome` comes from flight_core.outcome. A
     flight of `simulate` also has its `scenario`, and the `changes` of the controller's parameters
-    in flight. The tape of a log also has the `recording` by topic, the `duration` of the whole
-    flight, s, if it is known, the `processes` by name, and how many samples of a topic were
-    `refused`. `is_by_clock` says whether the flight followed the simulated time of /clock.
+    in flight. The tape of a log also has the `recording` by topic, the `processes` by name, and how
+    many samples of a topic were `refused`. If it is known, the `duration` of the whole flight is
+    there too, s. `is_by_clock` says whether the flight followed the simulated time of /clock.
     `lost_parts` are parts that the log lost, which the `notes` mention as well. `account` is what
     `rise_di.read_run` found in the log, and what it lacks.
 

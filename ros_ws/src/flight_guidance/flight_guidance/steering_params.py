@@ -196,9 +196,9 @@ class SteeringConfig(NodeConfig):
     def climb_limits(self) -> tuple[float, float]:
         """Return the largest climb and sink rate, m/s.
 
-        By rule the climb and sink rates are 0.7 and 0.5 of the rates a V0 / g, where a is the
-        authority of the throttle, and at most a tenth of V0. The rest of the throttle holds the
-        airspeed. If this rest is too small, `protection.climb_range` reduces the climb.
+        By rule the climb rate is 0.7 a V0 / g and the sink rate 0.5 a V0 / g, where a is the
+        authority of the throttle. Both are at most a tenth of V0. The rest of the throttle holds
+        the airspeed. If this rest is too small, `protection.climb_range` reduces the climb.
         """
         steepest = STEEPEST * self.speed
         down, up = self.throttle_authority or (math.inf, math.inf)

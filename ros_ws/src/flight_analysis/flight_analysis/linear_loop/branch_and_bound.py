@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prove stability for every aircraft of a box, if one bound for the whole box is too large.
 
-The box is halved along one parameter, and each half again, over the frequencies at which nothing is
-proved yet.
-Source: M. P. Newlin, P. M. Young, International Journal of Robust and Nonlinear Control 7, 1997.
+The box is halved along one parameter, and a half that is not proved is halved again. A half is only
+examined at the frequencies at which nothing is proved yet. Source: M. P. Newlin, P. M. Young,
+International Journal of Robust and Nonlinear Control 7, 1997.
 """
 
 from typing import Any, NamedTuple

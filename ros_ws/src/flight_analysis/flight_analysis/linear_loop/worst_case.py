@@ -273,9 +273,9 @@ class WorstCase(NamedTuple):
 def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box) -> WorstCase:
     """Search the corners of a box around a plant, A (n, n), for the least margins.
 
-    The search follows each figure, such as the phase margin of an input, from the corners where it
-    is least to the corner to which its slope points, until no new corner is found. The margins are
-    computed by `input_margins`.
+    The search is made for each figure, such as the phase margin of an input. From the corners where
+    the figure is least, it goes to the corner to which the slope of the figure points, until it
+    finds no new corner. The margins are computed by `input_margins`.
     """
     rng = np.random.default_rng(SEED)
     k = len(box.names)

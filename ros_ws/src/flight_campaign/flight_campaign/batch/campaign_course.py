@@ -191,9 +191,13 @@ def _references(scenario: Scenario, ticks: int, tick_ns: int) -> tuple[FloatArra
 def build_course(scenario: Scenario) -> Course:
     """Build the course of a scenario, with the feedforward of the controller.
 
-    Raises ParameterError if a campaign cannot fly the scenario. It cannot fly an aircraft of
-    JSBSim, a delay of y or u that is not a whole number of ticks, dropouts of a y whose rate is not
-    that of the ticks, dropouts longer than the age limit, or vanes with faults.
+    Raises ParameterError if a campaign cannot fly the scenario because of
+
+    - an aircraft of JSBSim,
+    - a delay of y or u that is not a whole number of ticks,
+    - dropouts of a y whose rate is not that of the ticks,
+    - dropouts longer than the age limit, or
+    - vanes with faults.
     """
     aircraft = scenario.aircraft
     controller = scenario.controller

@@ -374,9 +374,9 @@ def damped_steps(
 ) -> FloatArray:
     """Return steps of theta: -(hessian + d diag hessian)^-1 slope for each damping d, (k, p).
 
-    After them come the first step times each of FRACTIONS. Only the parameters in the mask `free`,
-    (p,), move. A parameter at its bound does not move outwards. Source: D. W. Marquardt, J. SIAM
-    11(2), 1963.
+    The last steps are the first step multiplied by each of FRACTIONS. Only the parameters in the
+    mask `free`, (p,), move. A parameter at its bound does not move outwards. Source: D. W.
+    Marquardt, J. SIAM 11(2), 1963.
     """
     steps = np.zeros((len(DAMPINGS), len(theta)))
     while True:

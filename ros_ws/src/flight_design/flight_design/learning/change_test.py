@@ -97,8 +97,8 @@ def change_test(
 
     G is 0 while the losses are within LOSS. If a loss is z standard deviations larger than LOSS, 2
     G = z^2, by S. S. Wilks (Ann. Math. Statist. 9(1), 1938). In one test a single input with a loss
-    of LOSS exceeds G = 12 with a probability of 5e-7, two such inputs together with 2e-6, and
-    inputs with smaller losses even more seldom.
+    of LOSS gives a G above 12 with a probability of 5e-7. For two such inputs together the
+    probability is 2e-6, and for smaller losses it is smaller.
 
     The input j is dead if the minimum of J for -OFF_CENTRE <= kappa_j + 1 <= NONE meets two
     conditions. It is lower than the first minimum in G by more than MAX_GAIN, and at most
