@@ -211,9 +211,9 @@ class _Study(NamedTuple):
     ) -> Fit:
         """Search again about a fit that has too many entries at a bound, because the file is rough.
 
-        There is no further search if the effect of an input is at a bound. No law designed from the
-        file can fly an aircraft beyond these bounds. A part that couples with another part also
-        seems to have such effects.
+        There is no further search if the effect of an input is at a bound, for two reasons. No law
+        designed from the file can fly an aircraft beyond these bounds. Besides, the cause may be
+        that the part couples with another part.
         """
         for _ in range(AGAIN * self.searches_again):
             entries = search.about_centre(search.entries(fit))

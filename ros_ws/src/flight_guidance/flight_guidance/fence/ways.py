@@ -105,10 +105,10 @@ def ways(fence: Fence) -> Ways:
     to another if their circles of clearance overlap, because the line between them is then inside.
     A metre of a way costs `radius / clearance`, but at least 1.
 
-    The aim of an open cell is on the way home, about a radius ahead. If there is no way home, it
-    leads to the cell with the largest clearance nearby, where the aircraft holds. In a closed cell
-    inside the fence, the way leads away from the border. The aim of a cell outside is the nearest
-    cell with a way home.
+    The aim of an open cell is on the way home, about a radius ahead. If there is no way home, the
+    aim is on a way to the cell with the largest clearance nearby, where the aircraft holds. In a
+    closed cell inside the fence, the way leads away from the border. The aim of a cell outside is
+    the nearest cell with a way home.
     """
     north, east, cell = _cells(fence)
     room = clearance(fence.zones, north, east)
