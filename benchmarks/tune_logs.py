@@ -281,6 +281,8 @@ def rows(case: Case) -> list[list[str]]:
             parameters[f"CA_SV_CS{k}_TRQ_{letter}"] = effect
     warnings = "".join(f"; warning: {sentence}" for sentence in scaled_torques(parameters))
     A, B = true_model(nominal, plane)
+    allocation = allocated(case, nominal.outputs)
+    B = B @ allocation.on_axes @ allocation.servos  # effects of the torques of the log
     inputs = list(nominal.inputs)
     lines = []
     for part in found.parts:

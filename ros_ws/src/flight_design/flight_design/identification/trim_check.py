@@ -32,8 +32,10 @@ def without_trim(recorded: FlightData) -> FlightData:
 
         y' = F(z) y,  u' = F(z) u,  F(z) = (1 + a)/2 (1 - 1/z)/(1 - a/z),  a = exp(-period / SLOW)
 
-    F commutes with a linear aircraft, so the model from u' to y' is the model from u to y. To
-    filter across lost samples of y, a line joins their neighbours. The samples stay lost.
+    F commutes with a linear aircraft, so the model from u' to y' is the model from u to y. F begins
+    at rest at the mean of the first 2 SLOW, which is close to the trim there: the first sample may
+    lie within a doublet. To filter across lost samples of y, a line joins their neighbours. The
+    samples stay lost.
     """
     a = math.exp(-recorded.period / SLOW)
     numerator = (1.0 + a) / 2.0 * np.array([1.0, -1.0])
@@ -41,8 +43,9 @@ def without_trim(recorded: FlightData) -> FlightData:
     y = recorded.y.copy()
     for channel in y.T:
         channel[is_lost] = np.interp(recorded.t[is_lost], recorded.t[~is_lost], channel[~is_lost])
+    first = max(1, round(2.0 * SLOW / recorded.period))
     y, u = (
-        np.asarray(signal.lfilter(numerator, [1.0, -a], values - values[0], axis=0))
+        np.asarray(signal.lfilter(numerator, [1.0, -a], values - values[:first].mean(0), axis=0))
         for values in (y, recorded.u)
     )
     y[is_lost] = np.nan
