@@ -25,6 +25,7 @@ import rise_di
 from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.linear_loop import guarantee as guarantee_module
 from flight_analysis.linear_loop.certificate import certificate, keep
 from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
 from flight_analysis.linear_loop.loop_margins import LinearLoop, scenario_loop
@@ -69,6 +70,13 @@ def servo() -> Content:
     linear = loop_of("osprey_servo")
     content: Content = json.loads(certificate(linear, promise_of("osprey_servo"), {}))
     return content
+
+
+@pytest.fixture
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prove half of what is unstable, and no disks: for tests of what is done with a guarantee."""
+    monkeypatch.setattr(guarantee_module, "GAPS", (1.28,))
+    monkeypatch.setattr(guarantee_module, "FEWER_BOXES", 2)
 
 
 def signed(content: Content) -> Content:
@@ -274,6 +282,7 @@ def test_certificate_with_the_name_of_another_loop_is_refused(
     assert "the loop is not the one that its name says" in refused.stderr
 
 
+@pytest.mark.usefixtures("coarse")
 def test_command_writes_a_certificate_and_refuses_what_it_cannot_state(tmp_path: Path) -> None:
     path = tmp_path / "certificate.json"
     words = ["gains", "guarantee", "osprey", "--samples", "1", "--certificate", str(path)]
@@ -318,6 +327,7 @@ gusts:
 """
 
 
+@pytest.mark.usefixtures("coarse")
 def test_section_that_gains_wrote_has_margins_and_a_certificate(tmp_path: Path) -> None:
     """The conditions are those of its selection, to the six digits of the section."""
     frame, section = tmp_path / "one.yaml", tmp_path / "gains.yaml"
@@ -388,6 +398,7 @@ def test_command_certifies_an_aircraft_of_jsbsim_or_refuses_before_the_work(
         rise_di.check_gains("osprey", "jsbsim_c172p")
 
 
+@pytest.mark.usefixtures("coarse")
 def test_law_without_c_code_has_a_certificate_without_constants(tmp_path: Path) -> None:
     """Vanes are no condition of the proof, only of the C code: an entry shows it."""
     path = tmp_path / "certificate.json"
