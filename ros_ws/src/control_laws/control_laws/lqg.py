@@ -26,7 +26,10 @@ class LqgState(NamedTuple):
 def _limited(
     state: LqgState, measurements: Measurements, dt: Array, params: LqgParams, limits: Limits
 ) -> tuple[LqgState, Array, Array]:
-    """Saturate u = u_trim, shape (m,). u_trim contains u_o of the observer."""
+    """Limit u_trim, shape (m,), and return it without and with the limits.
+
+    The law adds nothing to u_trim, which already contains u_o of the observer.
+    """
     u, _ = saturate_with_excess(measurements.u_trim, measurements, dt, limits)
     return state, measurements.u_trim, u
 

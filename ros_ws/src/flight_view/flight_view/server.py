@@ -212,7 +212,10 @@ def _epoch(flight: Flight | FleetView) -> str:
 
 
 def _first_rows(flight: Flight | FleetView, query: Mapping[str, str]) -> dict[str, int]:
-    """Return the first row that a browser lacks by topic. Raises HTTPError as `Server.answer`."""
+    """Return, by topic, the first row that a browser lacks.
+
+    Raises HTTPError as `Server.answer`.
+    """
     is_same_epoch = query.get("epoch") == _epoch(flight)
     rows = {
         name: query.get(name, "") if is_same_epoch else "" for name in (*flight.samples, "events")

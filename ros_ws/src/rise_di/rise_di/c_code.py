@@ -287,9 +287,10 @@ def _flights(scenario: Scenario, drawn: int, seed: int, samples: int) -> Materia
 def _recordings(
     scenario: Scenario, sets: Sequence[RiseDiConfig], drawn: int, seed: int, samples: int
 ) -> Iterator[Recording]:
-    """Yield recordings of flights, drawn commands, drawn calls and `drawn` single steps.
+    """Yield recordings of flights, and of drawn commands, calls, standstills and single steps.
 
-    There are a tenth as many calls as steps. The recordings are parts that fit into memory.
+    `drawn` is the number of steps, and there are a tenth as many calls. If it is 0, only flights
+    and commands are recorded. The steps are divided into recordings that fit into memory.
     """
     yield from flight_recordings(scenario, sets, samples)
     yield drawn_commands(scenario.reference_model, max(drawn // 10, 1000), seed)

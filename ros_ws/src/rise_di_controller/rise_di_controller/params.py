@@ -212,7 +212,8 @@ class ControllerConfig(ControllerSection):
     def _check_observer(self, observer: ObserverConfig, nominal: Nominal) -> Iterator[None]:
         """Check sizes, stability of filter and feedback, and the delay margin of the nominal loop.
 
-        The nominal loop must be stable up to fractions of its delay margin.
+        For each of MARGIN_PARTS, the nominal loop must be stable if u is late by this part of
+        `observer.margin`, or of `delay` if that is longer.
         """
         expected = (
             tuple(f"x.{name}" for name in self.feedforward.states) if self.feedforward else ()

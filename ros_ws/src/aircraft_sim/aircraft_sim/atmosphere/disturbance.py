@@ -92,7 +92,7 @@ def bias(t: Array, params: Bias) -> Array:
 def sines(t: Array, params: Sines) -> Array:
     """Compute the sines at t, shape (n,), [x]/s: amplitude sin(frequency t + phase).
 
-    The derivative is at most amplitude frequency.
+    The derivative is at most the product of amplitude and frequency.
     """
     return params.amplitude * array_namespace(params.amplitude).sin(
         params.frequency * t + params.phase

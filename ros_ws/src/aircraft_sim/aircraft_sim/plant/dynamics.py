@@ -62,7 +62,7 @@ def f(t: Any, x: Array, params: Aircraft, turbulence: Array | None = None) -> Ar
         f = gravity @ sin(x) + gain @ (x[first] x[second]) + gust_direction @ (w(t) + turbulence)
             + bias(t) + sines(t) + kinematics(x)
 
-    `turbulence` is the wind of the turbulence along the G axes, shape (G,), m/s; None means no
+    `turbulence` is a wind along the axes of `gust_direction`, shape (G,), m/s; None means no
     turbulence. x can hold N states in columns, (n, N).
     """
     return f_state(x, params) + f_time(t, wind(t, params, turbulence), params)

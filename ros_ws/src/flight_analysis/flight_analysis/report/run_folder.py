@@ -444,10 +444,10 @@ def write_report(
 
     runs/latest becomes a link to the run. The files are written beside the log, or into the new
     folder `output`. If no outcome is given, the report of an old run is written again, and
-    runs/latest stays. If `scenario` replaces the scenario in the log, it is not written. Raises
+    runs/latest stays. A `scenario` that replaces the one in the log is not written. Raises
     ParameterError as `read_flight` does, before any file is written, and UnwrittenReportError if a
-    file cannot be written. If a run lacks y or y_m, summary.json gets only the outcome, and
-    UnflownError is raised.
+    file cannot be written. If a run lacks y or y_m, UnflownError is raised. Before that,
+    summary.json gets the outcome alone, unless `outcome` is given.
     """
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
 

@@ -383,8 +383,8 @@ def _instants_with_y(tape: Tape, internals: Signal, step_ns: int) -> int:
     """Return the number of ticks that have a new y or are in a failsafe.
 
     The controller publishes u only if there is a new y. An aircraft outside of the stack has
-    another rate of y, and a sensor may be declared to drop samples. Samples of y that only the log
-    lacks are counted as well, because the controller had them.
+    another rate of y, and a sensor may be declared to drop samples. Samples that the log lost are
+    counted as well, because the controller received them.
     """
     age_ns = internals["age"] * NANOSECONDS
     first_tick_ns = internals.stamp_ns[0] + age_ns[0]

@@ -177,7 +177,7 @@ def _has_engaged(tape: Tape) -> bool:
 
 
 def _floor(pair: ErrorPair, i: int, unit: str) -> float:
-    """Return the floor of output i, which has the unit `unit`, in SI."""
+    """Return the floor of the error of output i, SI. `unit` is the unit of the output."""
     is_speed = quantity(unit).dimension == SPEED
     smallest = LEAST[AIRSPEED] if is_speed else LEAST_RATE
     if pair.knowledge.has_wind:

@@ -141,7 +141,7 @@ class Flight:
     def _stop(self) -> list[Action]:
         """Return the actions that stop all that the flight has started.
 
-        Raises RuntimeError if no other flight continues, and one of them has failed.
+        If this was the last flight of the launch, and any flight has failed, raises RuntimeError.
         """
         self._is_stopped = True
         for timer in self._timers:

@@ -292,9 +292,9 @@ def repeat_flights(flights: FleetMatrices, times: int) -> FleetMatrices:
 def spread_over(params: Any, single: Any, flights: int) -> Any:
     """Spread the parameters of several candidates over all of their flights.
 
-    The shape (.., candidates) becomes (.., candidates flights). `single` are the parameters of one
-    candidate. A parameter that has the same shape in `params` and `single` is common to all
-    candidates, and stays.
+    On the last axis, each candidate is repeated `flights` times, side by side. `single` are the
+    parameters of one candidate. A parameter that has the same shape in `params` and `single` is
+    common to all candidates, and stays.
     """
 
     def spread(leaf: FloatArray, single_leaf: FloatArray) -> FloatArray:

@@ -256,7 +256,10 @@ def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) 
 
 
 def chatter_sentence(controller: ControllerConfig, margins: LoopMargins | None) -> str:
-    """Say from which delay on an implicit sign may chatter; "" for any other sign."""
+    """Say how late u may act before an implicit sign may chatter.
+
+    Returns "" for any other sign, or without margins.
+    """
     if margins is None or not isinstance(controller, RiseDiConfig):
         return ""
     if controller.sampled_sign()[0] is not Sign.IMPLICIT:

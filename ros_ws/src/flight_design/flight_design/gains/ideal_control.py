@@ -60,7 +60,7 @@ class ChannelPairing(NamedTuple):
 
 
 class Effected(NamedTuple):
-    """An airframe with uncertain entries whose effectors an allocation u = T v moves."""
+    """An airframe with uncertain entries, and the allocation u = T v that moves its effectors."""
 
     airframe: Airframe
     T: FloatArray  # (p, m) matrix of the allocation

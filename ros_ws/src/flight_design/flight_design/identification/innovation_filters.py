@@ -75,8 +75,8 @@ class FlightData(NamedTuple):
 def coarser(recorded: FlightData, factor: int) -> FlightData:
     """Average a flight over `factor` periods.
 
-    A u is held from one sample of y to the next. In the result it is therefore the mean from the
-    middle of one mean of y to the middle of the next.
+    Each y is the mean over `factor` periods. Each u is the mean from the middle of these periods to
+    the middle of the next ones, because a u is held from one sample of y to the next.
     """
     count = len(recorded.t) // factor
     leads = [

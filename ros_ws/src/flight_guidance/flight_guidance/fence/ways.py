@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compute the ways home inside a fence, and the ways back inside from outside.
+"""Compute the ways home inside a fence, and the ways back into it from outside.
 
 A map of square cells stores the ways. It is made once for a fence. The map has the shortest ways
 over cells that stay inside the fence and, where possible, leave room for a turn. Each cell has an
-aim, which is a place on the way about a radius ahead. An aircraft comes home if it always flies the
-course to the aim of the cell in which it is.
+aim, which is the place on its way that is about `Fence.radius` ahead. An aircraft comes home if it
+always flies the course to the aim of the cell in which it is.
 """
 
 import math
