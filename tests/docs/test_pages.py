@@ -3,18 +3,22 @@
 """The commands and the Python of the tutorials run page by page, each in an empty folder.
 
 They run as they stand but for their length: campaigns of two aircraft, two samples of margins,
-flights of two seconds, or three in Python. So do the notebooks.
+flights of two seconds, or three in Python. So do the notebooks. They run in the process of the
+tests, which imports the stack once.
 """
 
 import json
 import os
 import re
+import runpy
+import shlex
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, invoke
 from tools import parameters
 
 PAGES = [
@@ -65,6 +69,51 @@ def run(command: list[str], folder: Path) -> None:
     assert process.returncode == 0, f"{' '.join(command)}\n{process.stdout}\n{process.stderr}"
 
 
+RISE_DI = """rise-di() {
+    local status size
+    echo "${@@Q}" >&3
+    read -r status size <&4
+    head --bytes "$size" <&4
+    return "$status"
+}
+"""
+"""A function of bash: asks the process of the tests for a command, and answers as it does."""
+
+
+def run_shell(text: str) -> None:
+    """Run a block with bash, and each `rise-di` of it in this process."""
+    (asked, asks), (answered, answers) = os.pipe(), os.pipe()
+    script = f"exec 3>&{asks} 4<&{answered}\n{RISE_DI}{text}"
+    command = ["bash", "-euo", "pipefail", "-c", script]
+    with (
+        tempfile.TemporaryFile("w+") as output,
+        os.fdopen(asked) as questions,
+        os.fdopen(answers, "wb", buffering=0) as reply,
+        subprocess.Popen(
+            command,
+            env=environment(),
+            pass_fds=(asks, answered),
+            stdout=output,
+            stderr=output,
+        ) as process,
+    ):
+        os.close(asks)
+        os.close(answered)
+        for words in map(shlex.split, questions):
+            done = invoke(*words)
+            said = f"{done.output}{done.exception or ''}\n".encode()
+            reply.write(b"%d %d\n" % (done.exit_code, len(said)) + said)
+        process.wait(TIMEOUT)
+        output.seek(0)
+        assert process.returncode == 0, f"{text}\n{output.read()}"
+
+
+def run_python(text: str) -> None:
+    """Run a program of Python in this process."""
+    Path("page.py").write_text(text)
+    runpy.run_path("page.py", run_name="__main__")
+
+
 SHORTER = (
     (r"(--aircraft|--samples) \d+", r"\1 2"),
     (r"--duration \d+", "--duration 2"),
@@ -83,16 +132,18 @@ def shortened(text: str) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
-def test_blocks_of_page_run_in_order(page: Path, tmp_path: Path) -> None:
+def test_blocks_of_page_run_in_order(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(REPOSITORY / "examples")
     executed: list[str] = []  # the Python blocks of a page are one session
     for kind, text, reason in blocks(page):
         if kind == "sh" and not reason:
-            run(["bash", "-euo", "pipefail", "-c", shortened(text)], tmp_path)
+            run_shell(shortened(text))
         elif kind == "python" and not reason:
             executed.append(shortened(text))
-    if executed:
-        run([sys.executable, "-c", "\n".join(executed)], tmp_path)
+    run_python("\n".join(executed))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
@@ -102,12 +153,15 @@ def test_each_block_of_page_is_run_or_says_why_not(page: Path) -> None:
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs_and_stored_without_output(notebook: Path, tmp_path: Path) -> None:
+def test_notebook_runs_and_stored_without_output(
+    notebook: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cells = json.loads(notebook.read_text())["cells"]
     code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     assert code
     assert not any(cell.get("outputs") for cell in cells)
-    run([sys.executable, "-c", shortened("\n".join(code))], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    run_python(shortened("\n".join(code)))
 
 
 @pytest.fixture(scope="module")
