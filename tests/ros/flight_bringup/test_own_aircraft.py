@@ -8,6 +8,7 @@ Each is a shell of its own, to its last command.
 import re
 import signal
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -121,7 +122,8 @@ def test_shells_of_page_run_to_the_last_command(
         samples, q, reference = largest()
         return samples > SAMPLES and reference > 0.9 * COMMAND and q > 0.7 * reference
 
-    until(follows, "a log with a command that y follows")
+    # each look reads the whole log
+    until(follows, "a log with a command that y follows", each=lambda: time.sleep(0.5))
     recorder.send_signal(signal.SIGINT)
     assert recorder.wait(timeout=60) == 0
     assert "incompatible QoS" not in texts()  # of the first subscription of the recorder
