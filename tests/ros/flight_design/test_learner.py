@@ -40,14 +40,14 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
 
     It ends at the tick that waits for the third proposal, and that begins the fourth search.
     """
-    guided = scenario(tmp_path, updates=[14.0, 14.5, 15.0]).vary(
-        flight={"duration": 15.0},
+    guided = scenario(tmp_path, updates=[10.0, 10.5, 11.0]).vary(
+        flight={"duration": 11.0},
         aircraft={"kinematics": "euler", "uncertainty": {"A": 0.3, "B": 0.3, "seed": 3}},
         reference_model={"pulses": {}, "coordinated_turn": None, "live": {"speed": 25.0}},
         guidance={
             "program": {
-                "heading": {"start": [1.0, 8.0], "value": [0.5, -0.5]},
-                "altitude": {"start": [1.0, 6.0], "value": [20.0, 0.0]},
+                "heading": {"start": [1.0, 4.0], "value": [0.5, -0.5]},
+                "altitude": {"start": [1.0, 3.0], "value": [20.0, 0.0]},
             }
         },
     )
@@ -61,7 +61,7 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
     assert outcome == COMPLETED
     tape = simulate(flight_scenario, learn=learner(flight_scenario), announce=events.append)
     proposals = [event for event in events if event.kind is not EventKind.FALLBACK]
-    assert [event.stamp_ns for event in proposals] == [nanoseconds(t) for t in (0.5, 14.5, 15.0)]
+    assert [event.stamp_ns for event in proposals] == [nanoseconds(t) for t in (0.5, 10.5, 11.0)]
     # the airframe file, before there is a record, and two models
     assert all(event.change for event in proposals)
     assert lines == [f"t = {event.stamp_ns / 1e9:.2f} s: {event.sentence}" for event in events]
