@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lifecycle_msgs.msg import Transition
+from tests.conftest import invoke
 from tests.ros.conftest import Start
 from tests.ros.flight_bringup.test_lockstep import both_cores_busy, scenario_file
 from tests.ros.flight_recorder.test_recorder import recorded
@@ -26,17 +27,16 @@ from flight_ros.topics import publisher_qos
 PEER_TOPICS = ("internals", "/diagnostics")
 
 
-def replayed(start: Start, run: Path, *settings: str, equal: bool = True) -> dict[str, Any]:
+def replayed(run: Path, *settings: str, equal: bool = True) -> dict[str, Any]:
     """The JSON output of `rise-di replay`.
 
     Its exit status tells a log without 99 % of the ticks.
     """
-    process = start("flight_cli.cli", "replay", str(run), "--json", *settings)
-    status = process.end()
-    output: dict[str, Any] = json.loads(process.output)
+    done = invoke("replay", run, "--json", *settings)
+    output: dict[str, Any] = json.loads(done.output)
     assert output["equal"] is equal
     incomplete = output["checked"] < 0.99 * output["expected"]
-    assert status == ((STATUS_SHORTFALL if incomplete else 0) if equal else 1), process.output
+    assert done.exit_code == ((STATUS_SHORTFALL if incomplete else 0) if equal else 1), done.output
     return output
 
 
@@ -75,7 +75,7 @@ def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_ho
     flight.interrupt()
     assert flight.end() == 130, flight.output
     run = tmp_path / "runs" / "latest"
-    output = replayed(start, run)
+    output = replayed(run)
     # the host can stop a tick half-way, which then publishes no u to compare
     unsent = [
         note.split()[0] for note in output["notes"] if "ticks have no sample on the topic u" in note
@@ -88,9 +88,7 @@ def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_ho
     ]
     assert changes == ["Lambda, k_g", "upper"]
     # a change of one bit in one gain is detected
-    assert replayed(start, run, "--set", "controller.k_g=1.0000000000000002", equal=False)[
-        "open_loop"
-    ]
+    assert replayed(run, "--set", "controller.k_g=1.0000000000000002", equal=False)["open_loop"]
 
 
 def test_late_recorder_leaves_first_tick_unchecked_and_notes_missing_samples(
@@ -101,7 +99,7 @@ def test_late_recorder_leaves_first_tick_unchecked_and_notes_missing_samples(
     parameters = ("--ros-args", "--params-file", str(scenario))
     for package in ("rise_di_controller", "aircraft_sim", "reference_model"):
         start(f"{package}.main", *parameters)
-    more_than_history = publisher_qos(period).depth + 200
+    more_than_history = publisher_qos(period).depth + 50
     peer_node.until(
         lambda: len(peer_node.received["internals"]) > more_than_history,
         "more ticks than the publishers keep",
@@ -116,13 +114,13 @@ def test_late_recorder_leaves_first_tick_unchecked_and_notes_missing_samples(
         "directory:=run",
     )
     recorder.wait_for("recording to")
-    with_history = 2 * publisher_qos(period).depth
+    with_history = publisher_qos(period).depth + 50
     peer_node.until(
         lambda: min(recorded(peer_node, "/u"), recorded(peer_node, "/internals")) > with_history,
         "the history and more in the log",
     )
     recorder.interrupt().succeed()
-    output = replayed(start, tmp_path / "run")
+    output = replayed(tmp_path / "run")
     assert output["checked"] < 0.99 * output["expected"]
     # the recorder is matched with one topic after the other: further first ticks may lack y or u, 7
     # on a busy host
