@@ -21,17 +21,17 @@ from flight_log.tape_reader import read_run
 
 pytestmark = pytest.mark.alone
 
-DURATION = 12.0
+DURATION = 8.0
 
 
 @pytest.fixture
 def short_scenario(osprey_gust: Scenario, tmp_path: Path) -> Path:
-    """The default scenario with a command on each channel and both gusts within 12 s."""
+    """The default scenario with a command on each channel and both gusts within 8 s."""
     text = osprey_gust.path.read_text()
     for old, new in (
         ("duration: 60.0", f"duration: {DURATION}"),
-        ("start: 40.0", "start: 7.0"),
-        ("start: 46.0", "start: 9.5"),
+        ("start: 40.0", "start: 4.0"),
+        ("start: 46.0", "start: 6.0"),
         ("{start: [10.0], stop: [30.0]", "{start: [1.0], stop: [30.0]"),
         (
             "{start: [12.0, 17.0, 20.0, 24.0], stop: [13.5, 18.5,",
@@ -87,7 +87,7 @@ def test_flight_over_topics_recorded_and_as_accurate_as_in_one_process(
                 reader.messages([c for c in reader.connections if c.topic == "/internals"])
             )
             internals: Any = reader.deserialize(raw, connection.msgtype)
-        # 500 Hz and 100 Hz for 12 s and some tenths at the end; a few ticks may be missing at the
+        # 500 Hz and 100 Hz for 8 s and some tenths at the end; a few ticks may be missing at the
         # start
         missing = [
             topic for topic, rate in RATES.items() if not rate * DURATION * 0.98 <= counts[topic]
