@@ -66,8 +66,11 @@ class Peer:
         """Spin until a condition is true; what it returned. `each` is called every 5 ms."""
 
         def serve() -> None:
+            end = time.monotonic() + LOOK
             self._executor.spin_once(timeout_sec=LOOK)
             if each is not None:
+                while (rest := end - time.monotonic()) > 0.0:
+                    self._executor.spin_once(timeout_sec=rest)
                 each()
 
         return until(condition, because, serve, timeout)
