@@ -188,6 +188,21 @@ def _in_repository(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(REPOSITORY)
 
 
+def brief(scenario: Path, folder: Path, **size: float) -> Path:
+    """A scenario with one doublet of each output, of these sizes, in 4 or 5 s in place of 20 s."""
+    doublets = {
+        name: {"start": [0.5 + 1.5 * number], "width": [0.5], "value": [value]}
+        for number, (name, value) in enumerate(size.items())
+    }
+    flight = find_scenario(str(scenario)).vary(
+        flight={"duration": 0.5 + 1.5 * len(size)},
+        reference_model={"pulses": {}, "doublets": doublets},
+    )
+    path = folder / "brief.yaml"
+    path.write_text(scenario_yaml(flight))
+    return path
+
+
 def errors(output: str, air: str, name: str) -> FloatArray:
     """The errors of a controller in an air, in a table of `tune`, mrad/s."""
     lines = [line for line in output.splitlines() if f"{air}: " in line and name in line]
@@ -195,13 +210,19 @@ def errors(output: str, air: str, name: str) -> FloatArray:
     return np.array([float(cell) for cell in row])
 
 
-def test_log_of_px4_becomes_a_module_and_the_next_log_another_one(tmp_path: Path) -> None:
+class StoppedError(Exception):
+    """The part of the command that is tested has ended."""
+
+
+def test_log_of_px4_becomes_a_module_and_the_next_log_another_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The effects are those that flew, 10 % less than in the scenario, and so the errors fall."""
     pytest.importorskip("pyulog", reason="pyulog is not installed: make autopilot")
     log = px4_log(tmp_path / "flight.ulg", (0.3, 0.6, 0.2), 60.0)
     folder = tmp_path / "first"
     words = ["tune", str(log), "--px4", str(folder), "--calm", "--no-proof", "--lag", "0"]
-    result = invoke(*words, "--scenario", str(PX4))
+    result = invoke(*words, "--scenario", brief(PX4, tmp_path, q=0.3, p=0.6, r=0.2))
     assert result.exit_code == 0, result.output
     nominal = load_airframe(str(REPOSITORY / "examples/px4_airplane/rates_airframe.yaml"))
     found = load_airframe(str(folder / "airframe.yaml"))
@@ -231,12 +252,14 @@ def test_log_of_px4_becomes_a_module_and_the_next_log_another_one(tmp_path: Path
     module = errors(result.output, "calm", "the module")
     assert np.all(module < 0.9 * errors(result.output, "calm", "own loop"))
     words[3] = str(tmp_path / "second")
+    chosen = Mock(side_effect=StoppedError)
+    monkeypatch.setattr("flight_cli.tune.best_of", chosen)
     next_result = invoke(*words, "--scenario", str(folder / "scenario.yaml"))
-    assert next_result.exit_code == 0, next_result.output
-
-
-class IdentifiedError(Exception):
-    """The model is written, and no gains are sought yet."""
+    assert isinstance(next_result.exception, StoppedError), next_result.output
+    former, of_aircraft, new = chosen.call_args.args[0]
+    # The same log chooses the same gains again, and nearly the same feedforward.
+    assert former.score == approx(of_aircraft.score, rel=0.02)
+    assert former.score < new.score
 
 
 def test_part_that_the_log_does_not_improve_stays_nominal_and_is_told(
@@ -244,12 +267,12 @@ def test_part_that_the_log_does_not_improve_stays_nominal_and_is_told(
 ) -> None:
     """In the noise of PX4's simulator doublets of q of 0.3 rad/s do not show 10 % of B."""
     pytest.importorskip("pyulog", reason="pyulog is not installed: make autopilot")
-    monkeypatch.setattr("flight_cli.tune.candidates", Mock(side_effect=IdentifiedError))
+    monkeypatch.setattr("flight_cli.tune.candidates", Mock(side_effect=StoppedError))
     log = px4_log(tmp_path / "flight.ulg", (0.3, 0.6, 0.2), 60.0, (0.07, 0.14, 0.028))
     folder = tmp_path / "module"
     words = ["tune", str(log), "--px4", str(folder), "--calm", "--no-proof", "--lag", "0"]
     result = invoke(*words, "--scenario", str(PX4))
-    assert isinstance(result.exception, IdentifiedError), result.output
+    assert isinstance(result.exception, StoppedError), result.output
     assert "warning: q: held-out samples: found a log-likelihood of" in result.output
     assert "the model stays nominal" in result.output
     nominal = load_airframe(str(REPOSITORY / "examples/px4_airplane/rates_airframe.yaml"))
@@ -352,7 +375,8 @@ def test_log_of_arduplane_becomes_a_task(tmp_path: Path) -> None:
     pytest.importorskip("pymavlink", reason="pymavlink is not installed: make autopilot")
     log = ardupilot_log(tmp_path / "flight.bin", 80.0)
     folder = tmp_path / "task"
-    words = ["tune", str(log), "--ardupilot", str(folder), "--scenario", str(PLANE), "--calm"]
+    scenario = brief(PLANE, tmp_path, q=0.15, p=0.3)
+    words = ["tune", str(log), "--ardupilot", str(folder), "--scenario", str(scenario), "--calm"]
     result = invoke(*words, "--float32", "--no-proof", "--accept")
     assert result.exit_code in (0, 1), result.output
     assert (folder / "ArduPlane" / "rise_di.cpp").is_file()
