@@ -71,12 +71,12 @@ def _example(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
 
 
 def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
-    """Two seconds of a scenario with commands and lost samples, under another controller."""
+    """A second of a scenario with commands and lost samples, under another controller."""
     tree = yaml.safe_load(find_scenario("osprey_servo").path.read_text())
     sections = {
         name.removeprefix("/**/"): section["ros__parameters"] for name, section in tree.items()
     }
-    sections["flight"]["duration"] = 2.0
+    sections["flight"]["duration"] = 1.0
     sections["reference_model"]["pulses"] = PULSES
     sections["aircraft"]["sensors"]["dropout"] = 0.2
     sections["controller"].clear()
@@ -108,4 +108,4 @@ def test_law_of_another_package_flies_in_lockstep_as_without_ros_and_replayed(
     require_equal_bits(recorded, tape)
     replay = invoke("replay", runs[0])
     assert replay.exit_code == 0
-    assert replay.stdout.startswith("201 ticks, every bit equal\naircraft.sensors.dropout: ")
+    assert replay.stdout.startswith("101 ticks, every bit equal\naircraft.sensors.dropout: ")

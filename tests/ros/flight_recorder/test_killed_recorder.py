@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.conftest import invoke
 from tests.recordings import count_messages
 from tests.ros.conftest import Recorder, Start, logged
 from tests.ros.peer import Peer
@@ -117,13 +118,14 @@ def test_log_of_killed_recorder_reported_and_repairable(
     assert {stored.name for stored in before.attachments} == {"parameters.yaml", "airframe.yaml"}
     filled = {name for name in before.metadata if before.metadata[name]}
     assert filled >= {"rise_di_flight", "rise_di_host", "rise_di_versions"}
-    report = start("flight_cli.cli", "report", str(run))
-    assert report.end() == STATUS_ENDED_EARLY, "the status of an archive is that of its flight"
+    report = invoke("report", run)
+    assert report.exit_code == STATUS_ENDED_EARLY, "the status of an archive is that of its flight"
     assert "is truncated: read up to its last complete chunk, t = " in " ".join(
         report.output.split()
     )
     assert (run / "report.html").stat().st_size > 10_000
-    repair = start("flight_cli.cli", "report", "--repair", str(run)).succeed()
+    repair = invoke("report", "--repair", run)
+    assert repair.exit_code == 0
     assert "of the 30 s of the scenario" in repair.output
     assert count_messages(run)["/y"] == len(before.tape["y"].stamp_ns)
     after = read_run(run)
