@@ -13,7 +13,7 @@ from typing import Any
 from lifecycle_msgs.msg import Transition
 from tests.conftest import invoke
 from tests.ros.conftest import Start
-from tests.ros.flight_bringup.test_lockstep import both_cores_busy, scenario_file
+from tests.ros.flight_bringup.test_lockstep import AT_200_HZ, both_cores_busy, scenario_file
 from tests.ros.flight_recorder.test_recorder import recorded
 from tests.ros.peer import Peer
 from tests.ros.waiting import HostDelays
@@ -49,10 +49,8 @@ def receive_more(peer_node: Peer, count: int) -> None:
 def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_host(
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
-    # ended below
-    flight = start(
-        "flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")), "--real-time"
-    )
+    scenario = scenario_file(tmp_path, 1e4, "osprey_gust", **AT_200_HZ)
+    flight = start("flight_cli.cli", "fly", str(scenario), "--real-time")  # ended below
 
     def modes() -> list[int]:
         return peer_node.modes()[-1:]
@@ -94,7 +92,7 @@ def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_ho
 def test_late_recorder_leaves_first_tick_unchecked_and_notes_missing_samples(
     start: Start, tmp_path: Path, peer_node: Peer, host_delays: HostDelays
 ) -> None:
-    scenario = scenario_file(tmp_path, 1e3, "osprey_gust")
+    scenario = scenario_file(tmp_path, 1e3, "osprey_gust", **AT_200_HZ)
     period = period_ns(load_scenario(scenario).controller.rate, "rate")
     parameters = ("--ros-args", "--params-file", str(scenario))
     for package in ("rise_di_controller", "aircraft_sim", "reference_model"):

@@ -49,6 +49,12 @@ ROUGH = {
     },
 }
 
+AT_200_HZ: dict[str, dict[str, Any]] = {
+    "aircraft": {"rate": 200.0, "step": 0.005},
+    "reference_model": {"rate": 200.0},
+}
+"""Sections of a flight in real time that costs less than with y and y_m 500 times a second."""
+
 
 def scenario_file(
     folder: Path, duration: float, name: str = "osprey_servo", **sections: Mapping[str, Any]

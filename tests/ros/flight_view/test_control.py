@@ -16,7 +16,7 @@ from urllib.error import HTTPError
 
 from tests.conftest import invoke
 from tests.ros.conftest import Process, Start
-from tests.ros.flight_bringup.test_lockstep import scenario_file
+from tests.ros.flight_bringup.test_lockstep import AT_200_HZ, scenario_file
 from tests.ros.peer import Peer
 from tests.ros.waiting import until
 
@@ -87,11 +87,9 @@ class Page:
 def test_flight_commanded_from_page_recorded_and_replayed(
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
-    # ended below
-    flight = start(
-        "flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")), "--real-time"
-    )
-    flight.wait_for_log(tmp_path / "runs", 50_000)
+    scenario = scenario_file(tmp_path, 1e4, "osprey_gust", **AT_200_HZ)
+    flight = start("flight_cli.cli", "fly", str(scenario), "--real-time")  # ended below
+    flight.wait_for_log(tmp_path / "runs", 20_000)
     run = next(
         path for path in (tmp_path / "runs").iterdir() if path.is_dir() and not path.is_symlink()
     )
