@@ -20,13 +20,20 @@ from flight_log.tape_reader import read_run
 
 ENDED = 10.0  # s, until no process of a flight is left: about one on an idle host
 
+# y and y_m come 200 times a second in place of 500: the tests are of the ends of a flight.
+SLOWER = ("aircraft.rate=200", "aircraft.step=0.005", "reference_model.rate=200")
+FLY = (
+    *("flight_cli.cli", "fly", "osprey_gust", "--real-time"),
+    *(word for setting in SLOWER for word in ("--set", setting)),
+)
+
 Engaged = tuple[Process, list[psutil.Process]]
 
 
 @pytest.fixture
 def engaged(start: Start, tmp_path: Path) -> Engaged:
     """A flight whose controller has engaged, and its four processes."""
-    flight = start("flight_cli.cli", "fly", "osprey_gust", "--real-time")
+    flight = start(*FLY)
     flight.until(lambda: is_engaged(tmp_path), "a flight that has engaged")
     return flight, flight.children()
 
@@ -45,16 +52,7 @@ def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(
     """
     flight, nodes = engaged
     assert len(nodes) == 4
-    second_flight = start(
-        "flight_cli.cli",
-        "fly",
-        "osprey_gust",
-        "--real-time",
-        "--namespace",
-        "uav2",
-        "--runs",
-        "beside/runs",
-    )
+    second_flight = start(*FLY, "--namespace", "uav2", "--runs", "beside/runs")
     second_flight.until(
         lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged"
     )
@@ -91,10 +89,7 @@ def test_lost_terminal_ends_flight_with_log_and_report(tmp_path: Path) -> None:
         "--ctty",
         sys.executable,
         "-m",
-        "flight_cli.cli",
-        "fly",
-        "osprey_gust",
-        "--real-time",
+        *FLY,
     ]
     flight = subprocess.Popen(
         words, cwd=tmp_path, stdin=of_flight, stdout=of_flight, stderr=of_flight
@@ -115,7 +110,7 @@ def test_lost_terminal_ends_flight_with_log_and_report(tmp_path: Path) -> None:
 def test_an_early_interrupt_causes_no_traceback(start: Start) -> None:
     # Seconds of processor time; an earlier interrupt stops the interpreter itself.
     for seconds in (0.3, 0.6):
-        flight = start("flight_cli.cli", "fly", "osprey_gust", "--real-time")
+        flight = start(*FLY)
         processor_times = psutil.Process(flight.popen.pid).cpu_times
 
         def is_due(processor_times: Any = processor_times, seconds: float = seconds) -> bool:
@@ -133,21 +128,12 @@ def test_second_flight_is_refused_and_killed_node_ends_flight_and_killed_command
     start: Start, engaged: Engaged, tmp_path: Path
 ) -> None:
     flight, nodes = engaged
-    second_flight = start(
-        "flight_cli.cli",
-        "fly",
-        "osprey_gust",
-        "--real-time",
-        "--namespace",
-        "uav2",
-        "--runs",
-        "beside/runs",
-    )
+    second_flight = start(*FLY, "--namespace", "uav2", "--runs", "beside/runs")
     second_flight.until(
         lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged"
     )
     nodes_beside = second_flight.children()
-    third_flight = start("flight_cli.cli", "fly", "osprey_gust", "--real-time")
+    third_flight = start(*FLY)
     assert third_flight.end() == 2
     assert (
         "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own"
