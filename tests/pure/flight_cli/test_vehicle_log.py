@@ -749,11 +749,17 @@ def test_messages_of_a_tlog_have_the_time_of_their_autopilot(
         == 0
     )
     tape = read_run(bag).tape
-    assert np.diff(tape["y"].stamp_ns) == approx(1e9 / RATE)
-    assert len(tape["y"].stamp_ns) == approx(len(flight.y), abs=1)
-    response = recorded_response(bag, OUTPUTS, INPUTS)
-    deviations = response.Omega_deviation.diagonal()
-    assert np.abs(response.Omega.diagonal() - OMEGA) / deviations == approx(np.zeros(4), abs=3.0)
+    # V, alone, comes without the time of the autopilot: 0.1 s earlier or later it differs by 0.08.
+    # The pulses of u are whole us.
+    for topic, values, bound in (
+        ("y", flight.y, [1e-5, 0.1, 1e-5, 1e-5]),
+        ("u", flight.u, [1e-3] * 4),
+    ):
+        read = tape[topic]
+        assert np.diff(read.stamp_ns) == approx(1e9 / RATE)
+        assert len(read.stamp_ns) == len(values)
+        error = read.values - values
+        assert (np.abs(error - np.median(error, axis=0)).max(axis=0) < bound).all()
 
 
 def sensors(
