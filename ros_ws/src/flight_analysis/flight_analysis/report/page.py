@@ -13,11 +13,12 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 from numpy.typing import NDArray
 
@@ -283,7 +284,19 @@ def page_html(page: Page) -> str:
 
 
 def page_parts(page: Page) -> Iterator[str]:
-    """Yield the text of a page in parts, because that of a long flight has some 100 MB."""
+    """Return the text of a page in parts, because that of a long flight has some 100 MB."""
+    return _template().generate(
+        page=page,
+        dark=plotting.DARK | figures.DARK,
+        library=pack((HERE / "vendor" / "plotly-basic.min.js").read_bytes()),
+        style=Markup((HERE / "page.css").read_text(encoding="utf-8")),  # noqa: S704 - our own file
+        script=Markup((HERE / "page.js").read_text(encoding="utf-8")),  # noqa: S704 - our own file
+    )
+
+
+@cache
+def _template() -> Template:
+    """Return the template of a page. It takes longer to compile it than to fill it."""
     environment = Environment(
         loader=FileSystemLoader(HERE),
         autoescape=True,
@@ -297,13 +310,7 @@ def page_parts(page: Page) -> Iterator[str]:
         "css": Markup,
         "anchor": anchor,
     }
-    return environment.get_template("page.html.jinja").generate(
-        page=page,
-        dark=plotting.DARK | figures.DARK,
-        library=pack((HERE / "vendor" / "plotly-basic.min.js").read_bytes()),
-        style=Markup((HERE / "page.css").read_text(encoding="utf-8")),  # noqa: S704 - our own file
-        script=Markup((HERE / "page.js").read_text(encoding="utf-8")),  # noqa: S704 - our own file
-    )
+    return environment.get_template("page.html.jinja")
 
 
 def script_json(value: Any) -> Markup:
