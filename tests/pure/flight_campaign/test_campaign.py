@@ -131,6 +131,9 @@ def test_share_of_diverged_flights_has_confidence_interval() -> None:
     share, low, high = Tally(flights=100).share(0)
     assert (share, low) == (0.0, 0.0)
     assert high == approx(1.0 - 0.025 ** (1 / 100), rel=1e-9)
+    # 7 of 50 by scipy.stats.binomtest, and all of 50
+    assert Tally(flights=50).share(7)[1:] == approx((0.05819170033997342, 0.26739600249700846))
+    assert Tally(flights=50).share(50) == (1.0, approx(0.025 ** (1 / 50)), 1.0)
 
 
 def test_a_score_counts_errors_in_their_units() -> None:

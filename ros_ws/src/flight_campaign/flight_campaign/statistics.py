@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import betaincinv
 
 from flight_core.fields import Field
 from flight_core.parameters import Config, require
@@ -199,12 +200,12 @@ class Tally(Config):
     def share(self, count: int) -> tuple[float, float, float]:
         """Return a count of flights as a share, with its 95 % confidence interval, 0 to 1.
 
-        The interval is that of Clopper and Pearson.
+        The interval is that of Clopper and Pearson, by quantiles of the beta distribution.
         """
-        from scipy.stats import binomtest  # noqa: PLC0415 - half a second, only for this
-
-        interval = binomtest(count, self.flights).proportion_ci(0.95, method="exact")
-        return count / self.flights, float(interval.low), float(interval.high)
+        others = self.flights - count
+        low = float(betaincinv(count, others + 1, 0.025)) if count else 0.0
+        high = float(betaincinv(count + 1, others, 0.975)) if others else 1.0
+        return count / self.flights, low, high
 
 
 def lost_track(diverged: FloatArray, score: FloatArray) -> NDArray[np.bool_]:
