@@ -151,9 +151,10 @@ def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
     ],
 )
 def test_bad_input_is_one_sentence_and_status_2(
-    arguments: list[str], sentence: str, tmp_path: Path
+    arguments: list[str], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    process = rise_di(*arguments, cwd=tmp_path)
+    monkeypatch.chdir(tmp_path)
+    process = said(*arguments)
     assert process.returncode == 2
     assert process.stderr.startswith(sentence)
     assert ("the section is controller perhaps" in process.stderr) == ("controler." in sentence)
@@ -161,7 +162,10 @@ def test_bad_input_is_one_sentence_and_status_2(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_flight_with_set_parameters_has_them_in_its_log(tmp_path: Path) -> None:
+def test_flight_with_set_parameters_has_them_in_its_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     settings = (
         "--set",
         "controller.k_g=2.5",
@@ -170,7 +174,7 @@ def test_flight_with_set_parameters_has_them_in_its_log(tmp_path: Path) -> None:
         "--set",
         "flight.duration=0.2",
     )
-    process = rise_di("fly", "osprey_learn", "--in-process", *settings, cwd=tmp_path)
+    process = said("fly", "osprey_learn", "--in-process", *settings)
     assert process.returncode == 0, process.stderr
     scenario = recorded_scenario(tmp_path / "runs" / "latest")
     expected = find_scenario("osprey_learn").rise_di().learn
@@ -180,11 +184,12 @@ def test_flight_with_set_parameters_has_them_in_its_log(tmp_path: Path) -> None:
 
 
 def test_scenario_file_may_lie_anywhere_and_wrong_sign_ends_flight_when_it_diverges(
-    tmp_path: Path, osprey_gust: Scenario
+    tmp_path: Path, osprey_gust: Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     text = osprey_gust.path.read_text()
     (tmp_path / "mine.yaml").write_text(text.replace("D: [1, 1, 1, 1]", "D: [-1, 1, 1, 1]"))
-    process = rise_di("fly", "mine.yaml", "--in-process", cwd=tmp_path)
+    process = said("fly", "mine.yaml", "--in-process")
     assert process.returncode == 3
     assert "outcome: diverged at t = " in process.stdout
     assert (tmp_path / "runs" / "latest").resolve().name.endswith("-mine")
@@ -395,7 +400,7 @@ def test_help_is_found_by_each_usual_word(words: str, same: str) -> None:
 
 
 def test_quiet_flight_prints_its_headline_alone(tmp_path: Path) -> None:
-    words = ("fly", "osprey_gust", "--in-process", "--duration", "4", "-q")
+    words = ("fly", "osprey_gust", "--in-process", "--duration", "1", "-q")
     process = rise_di(*words, cwd=tmp_path)
     assert process.stdout == "completed\n", process.stderr
     assert process.stderr == ""
