@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.signal import cont2discrete, lfilter, ss2tf
 
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
@@ -216,6 +215,8 @@ def _simulated(
     grid = np.arange(0.0, t[-1] + 2.0 * STEP, STEP)
     u = np.diff(np.interp(grid - delay, t_u, impulse)) / STEP
     A = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]])
+    from scipy.signal import cont2discrete, lfilter, ss2tf  # noqa: PLC0415 - half a second
+
     plant = (
         A,
         np.array([[0.0], [0.0], [1.0 / lag]]),
