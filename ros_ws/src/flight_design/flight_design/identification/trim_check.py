@@ -57,8 +57,9 @@ def doubted(found: Identification, steady: Identification) -> Identification:
 
         deviation^2 + (error of the entry - its error in `steady`)^2
 
-    A part is refused if the best known effect on one of its outputs differs by more than
-    MOST_APART. A part that was refused for another reason keeps it.
+    An entry that `steady` does not have is nominal there: its error is 0. A part is refused if the
+    best known effect on one of its outputs differs by more than MOST_APART. A part that was refused
+    for another reason keeps it.
     """
     errors = {entry.name: entry.error for entry in steady.entries}
     return found._replace(parts=tuple(_doubted(part, errors) for part in found.parts))
@@ -68,7 +69,7 @@ def _doubted(part: Part, steady: Mapping[str, float]) -> Part:
     """Widen the deviations of a part, whose entries have other errors in the `steady` model."""
     entries, by_trim = [], []
     for entry in part.entries:
-        apart = abs(entry.error - steady.get(entry.name, entry.error))
+        apart = abs(entry.error - steady.get(entry.name, 0.0))
         by_trim.append(apart)
         entries.append(entry._replace(deviation=math.hypot(entry.deviation, apart)))
     return part._replace(
@@ -82,13 +83,14 @@ def _reason_against_trim(part: Part, steady: Mapping[str, float]) -> Refusal | N
     """Refuse a part whose best known effects follow the slow changes of trim."""
 
     def apart(effect: Entry) -> float:
-        return abs(effect.error - steady.get(effect.name, effect.error))
+        return abs(effect.error - steady.get(effect.name, 0.0))
 
     worst = max(best_known(part.entries, part.outputs), key=apart)
     if apart(worst) <= MOST_APART:
         return None
+    without = steady.get(worst.name, 0.0)
     return Refusal(
         f"trim: found {worst.name} changed by {100 * worst.error:+.0f} % with the slow changes of "
-        f"trim in the log, and by {100 * steady[worst.name]:+.0f} % without them, expected at most "
+        f"trim in the log, and by {100 * without:+.0f} % without them, expected at most "
         f"{100 * MOST_APART:.2g} % apart: take the doublets alone, by --from and --until"
     )
