@@ -8,7 +8,6 @@ Each is a shell of its own, to its last command.
 import re
 import signal
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -114,16 +113,21 @@ def test_shells_of_page_run_to_the_last_command(
         q, reference = (abs(tape[topic]["q"]) for topic in ("y", "y_m"))
         return len(q), max(q), max(reference)
 
+    looked = 0
+
     def follows() -> bool:
         # y_m rises for a second. In a log that ends on the rise y is still behind, and in one that
         # ends before it the noise of q is all there is: so y_m has to have reached its command
-        if sum(file.stat().st_size for file in log.glob("*.mcap")) < FIRST_CHUNKS:
+        nonlocal looked
+        size = sum(file.stat().st_size for file in log.glob("*.mcap"))
+        # each look reads the whole log
+        if size < looked + FIRST_CHUNKS:
             return False
+        looked = size
         samples, q, reference = largest()
         return samples > SAMPLES and reference > 0.9 * COMMAND and q > 0.7 * reference
 
-    # each look reads the whole log
-    until(follows, "a log with a command that y follows", each=lambda: time.sleep(0.5))
+    until(follows, "a log with a command that y follows")
     recorder.send_signal(signal.SIGINT)
     assert recorder.wait(timeout=60) == 0
     assert "incompatible QoS" not in texts()  # of the first subscription of the recorder
