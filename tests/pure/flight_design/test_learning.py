@@ -22,13 +22,16 @@ from tests.conftest import invoke, refusing
 
 import rise_di
 from aircraft_sim.airframes.airframe import Airframe, load_airframe
-from flight_analysis.closed_loop.learning_loop import Entry, LearnerResult
+from flight_analysis.closed_loop.learning_loop import GUARANTEE, Entry, LearnerResult
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.linear_loop.loop_margins import linear_loop, loop_margins
+from flight_analysis.report.html import write_page
+from flight_analysis.report.model_spans import errors_by_model
+from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_bringup.fly import fly_in_process
 from flight_core.modes import Mode
 from flight_core.outcome import COMPLETED, Refusal
@@ -45,12 +48,18 @@ from flight_design.identification.model_refusals import reason_against_airframe
 from flight_design.learning import learner as design_learner
 from flight_design.learning import part_checks
 from flight_design.learning.change_test import Change
-from flight_design.learning.designs import Goal, by_law_of_start, goal
-from flight_design.learning.learner import Known, Learner
+from flight_design.learning.designs import Goal, Known, by_law_of_start, goal
+from flight_design.learning.learner import Learner
 from flight_design.learning.scenario_learner import learn_again, learner, with_last_model
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
-from rise_di_controller.law.linear_loop import LinearPlant, LoopTiming, is_stable, linear_law
+from rise_di_controller.law.linear_loop import (
+    LinearPlant,
+    LoopTiming,
+    closed_loop,
+    is_stable,
+    linear_law,
+)
 from rise_di_controller.learning.learned_channels import (
     acting_inputs,
     authority,
@@ -211,6 +220,54 @@ def test_log_teaches_what_flight_taught_and_model_starts_next_flight(
         r"model of"
     ):
         learner(scenario(learn={"prior": {"file": "navion_lateral"}}))
+
+
+def test_log_has_the_guarantee_of_the_model_that_flies(flown: Flown) -> None:
+    """Corners of the box at its size are stable, by the exact loop of each aircraft."""
+    run, _, made = flown
+    tape = read_run(run).tape
+    rows = tape["learned"]
+    assert rows["proposed"].tolist() == [0.0, 1.0]
+    assert [rows[name][0] for name in GUARANTEE] == [0.0, 0.0, 0.0]  # nothing was proposed
+    digest, deviations, loop = (rows[name][1] for name in GUARANTEE)
+    assert digest == tape["internals"]["parameters"][-1]
+    assert deviations > 2.0
+    model = made.model
+    assert model is not None
+    controller = scenario().rise_di()
+    for change in parameter_changes(run, "/controller", RiseDiConfig.model_fields):
+        controller = vary(controller, change)  # type: ignore[assignment]
+    assert controller.digest() == digest
+    drawn = np.random.default_rng(5).choice([-1.0, 1.0], (300, 26))
+    part = {
+        name: value for known in made._known.values() for name, value in known.deviation.items()
+    }
+    assert len(part) == drawn.shape[1]
+    A, B = (np.repeat(each()[None], 300, axis=0) for each in (model.matrix_a, model.matrix_b))
+    columns = {"A": list(model.states), "B": list(model.inputs)}
+    for (name, deviation), signs in zip(part.items(), drawn.T, strict=True):
+        row, column = name[2:-1].split(", ")
+        matrix = A if name[0] == "A" else B
+        place = model.index(row), columns[name[0]].index(column)
+        matrix[:, *place] *= 1.0 + deviations * deviation * signs
+    linear = linear_loop(controller, model, A, B)
+    z = np.linalg.eigvals(closed_loop(linear.plant, linear.law, linear.loop, np.zeros(4)))
+    assert np.abs(z).max() < 1.0 + 1e-6
+    span = errors_by_model(tape)[-1]
+    assert span.stable == deviations
+    assert int(span.loop, 16) == loop
+
+
+def test_page_says_within_which_deviations_the_last_model_is_stable(
+    flown: Flown, tmp_path: Path
+) -> None:
+    run = read_run(flown.run)
+    flight = RecordedFlight("learns", scenario(), run.tape, summarise(run.tape, scenario()))
+    write_page(tmp_path / "page.html", [flight])
+    page = " ".join((tmp_path / "page.html").read_text().split())
+    deviations = run.tape["learned"]["guarantee.deviations"][-1]
+    assert f"within {int(10.0 * deviations) / 10.0:.1f} of their stated deviations" in page
+    assert "stable within (deviations)" in page
 
 
 def test_log_teaches_with_other_settings(flown: Flown) -> None:

@@ -138,7 +138,8 @@ PROPOSAL = Topic(
 )  # fmt: skip
 LEARNED = Topic(
     "learned", VECTOR, "learner -> log",
-    "`proposed` (1 or 0), `value.*` and `deviation.*` of each learned entry of A and B, SI",
+    "`proposed` (1 or 0), `value.*` and `deviation.*` of each learned entry of A and B, SI, "
+    "`parameters` that are proposed, [`guarantee.*`](learning.md#the-guarantee-of-a-model)",
     only_with="learner",
 )  # fmt: skip
 LEARNING = Topic(

@@ -21,11 +21,26 @@ from rise_di_controller.learning.proposals import (
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 
+class ModelGuarantee(NamedTuple):
+    """What is proved of the loop of proposed parameters around the learned model."""
+
+    # Number of stated deviations of each entry, from the model, within which every aircraft is
+    # stable; 0 if nothing is proved.
+    deviations: float
+    loop: str  # digest of the loop, in hexadecimal digits
+
+
+NO_GUARANTEE = ModelGuarantee(0.0, "0")
+
+
 class LearnerResult(NamedTuple):
     """The result of an identification in flight: parameters to fly, or why there are none."""
 
     controller: RiseDiConfig | None
     sentence: str | None  # None if no identification was due
+    # Computes the guarantee of a learned model, which takes about half a second. A learner may call
+    # it after its proposal has been sent. None if there is no model, or no guarantee is wanted.
+    guarantee: Callable[[], ModelGuarantee] | None = None
 
 
 class Learner(Protocol):
@@ -82,26 +97,42 @@ class Learned(NamedTuple):
     """The channels of the topic `learned`.
 
     The first channel is `proposed`. The values of the entries of A and B in the rows of the outputs
-    follow, then their standard deviations.
+    follow, then their standard deviations, and then the digest of the proposed parameters with its
+    guarantee.
     """
 
     names: tuple[str, ...]
     values: FloatArray
 
 
-def learned_sample(
-    entries: Iterable[Entry], outputs: tuple[str, ...], *, proposed: bool
-) -> Learned:
-    """Return the sample of `learned` for what an identification found.
+GUARANTEE = ("parameters", "guarantee.deviations", "guarantee.loop")
+"""The channels of `learned` on the guarantee of a proposal: the digest of the proposed parameters,
+the number of stated deviations, and the first LOOP_DIGITS digits of the loop's digest."""
 
-    `proposed` says whether the identification became a proposal.
+LOOP_DIGITS = 12
+"""Hexadecimal digits of a loop's digest in the log, as in the name of a certificate: a number of 48
+bits, which a channel holds exactly."""
+
+
+def learned_sample(
+    entries: Iterable[Entry], outputs: tuple[str, ...], proposal: LearnerResult
+) -> Learned:
+    """Return the sample of `learned` for what an identification found, and for its proposal.
+
+    This computes the guarantee of the proposal. The last three channels are 0 if nothing was
+    proposed.
     """
     output_entries = [entry for entry in entries if entry.row in outputs]
-    channels = {f"value.{entry.name}": entry.value for entry in output_entries}
+    channels = {"proposed": float(proposal.controller is not None)}
+    channels |= {f"value.{entry.name}": entry.value for entry in output_entries}
     channels |= {
         f"deviation.{entry.name}": abs(entry.unit) * entry.deviation for entry in output_entries
     }
-    return Learned(("proposed", *channels), np.array([float(proposed), *channels.values()]))
+    digest = 0 if proposal.controller is None else proposal.controller.digest()
+    promise = NO_GUARANTEE if proposal.guarantee is None else proposal.guarantee()
+    kept = (digest, promise.deviations, int(promise.loop[:LOOP_DIGITS], 16))
+    channels |= dict(zip(GUARANTEE, map(float, kept), strict=True))
+    return Learned(tuple(channels), np.array(list(channels.values())))
 
 
 class Identifications:
@@ -114,7 +145,10 @@ class Identifications:
         self._names: tuple[str, ...] = ()
 
     def next(self, proposal: LearnerResult) -> Learned | None:
-        """Return the sample of a proposal's identification, or None if there was none."""
+        """Return the sample of a proposal's identification, or None if there was none.
+
+        This computes the guarantee of the proposal, so it comes after the proposal has been sent.
+        """
         identification = getattr(self._learner, "identification", None)
         if identification is None or identification is self._last:
             return None
@@ -122,11 +156,7 @@ class Identifications:
         entries = {entry.name: entry for entry in identification.entries if entry.nominal}
         # A topic must keep its channels, so the entries of the first identification stay.
         self._names = self._names or tuple(entries)
-        return learned_sample(
-            (entries[name] for name in self._names),
-            self._outputs,
-            proposed=proposal.controller is not None,
-        )
+        return learned_sample((entries[name] for name in self._names), self._outputs, proposal)
 
 
 def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown: int) -> Proposal:

@@ -25,6 +25,7 @@ from flight_analysis.report.margin_figures import (
 )
 from flight_analysis.report.page import Card, Step
 from flight_analysis.report.summary import RecordedFlight
+from flight_analysis.report.summary_rows import stated_deviations
 
 
 def claims(flight: RecordedFlight, scenario: Scenario, flown: FlownLoops) -> list[Card]:
@@ -174,6 +175,16 @@ def _learned_card(flight: RecordedFlight) -> Card:
         sentences.append(
             f"Rms error under the law of the start, and under the last model: {', '.join(changes)}."
             " Commands and wind of the two differ."
+        )
+    stable = learned[-1]["stable"]
+    if stable is not None:
+        within = (
+            "every aircraft whose entries are within "
+            f"{stated_deviations(stable)} of their stated deviations is stable"
+        )
+        sentences.append(
+            f"With the last model, {within if stable else 'no aircraft is proved stable'}, as long "
+            f"as no limit acts (loop {learned[-1]['loop']})."
         )
     return Card(title="Learned models", sentences=sentences, words=("law of the start",))
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flight_analysis.closed_loop.learning_loop import GUARANTEE, LOOP_DIGITS
 from flight_analysis.metrics import best_error, error_metrics
 from flight_core.modes import Mode
 from flight_core.tape import Tape
@@ -29,6 +30,29 @@ class ModelSpan(NamedTuple):
     start: float  # s
     stop: float  # s
     rms: dict[str, float]  # rms of `best_error` by channel
+    # number of stated deviations of the learned model within which every aircraft is proved stable;
+    # None if these parameters were not learned, or if the log has no guarantee
+    stable: float | None = None
+    loop: str = ""  # name of the loop of that guarantee, the first digits of its digest
+
+
+class KeptGuarantee(NamedTuple):
+    """The guarantee of a proposal, as the log has it."""
+
+    stable: float  # stated deviations
+    loop: str
+
+
+def guarantees(tape: Tape) -> dict[int, KeptGuarantee]:
+    """Return the guarantees of the learner's proposals, by the digest of their parameters."""
+    if "learned" not in tape or GUARANTEE[-1] not in tape["learned"].names:
+        return {}
+    columns = (tape["learned"][name].tolist() for name in GUARANTEE)
+    return {
+        int(digest): KeptGuarantee(stable, f"{int(loop):0{LOOP_DIGITS}x}")
+        for digest, stable, loop in zip(*columns, strict=True)
+        if loop
+    }
 
 
 def model_names(first: Sequence[float], proposals: Sequence[float]) -> list[str]:
@@ -85,10 +109,12 @@ def errors_by_model(tape: Tape) -> list[ModelSpan]:
     spans = []
     names = parameter_spans(tape)
     digests = list(dict.fromkeys(span.digest for span in names))
+    kept = guarantees(tape)
     for span in names:
         stop = float(t[-1]) if span is names[-1] else span.stop
         in_span = (t >= span.start) & (t < stop) & is_engaged
         rms = {name: error_metrics(error[name][in_span]).rms for name in error.names}
+        promise = kept.get(span.digest)
         if in_span.any():
             spans.append(
                 ModelSpan(
@@ -97,6 +123,8 @@ def errors_by_model(tape: Tape) -> list[ModelSpan]:
                     start=span.start,
                     stop=stop,
                     rms=rms,
+                    stable=None if promise is None else promise.stable,
+                    loop="" if promise is None else promise.loop,
                 )
             )
     return spans

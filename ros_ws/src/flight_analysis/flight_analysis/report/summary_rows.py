@@ -5,6 +5,7 @@
 Each metric has its place in the summary, a heading, a unit and a number of digits.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -152,15 +153,24 @@ def model_rows(
 ) -> tuple[list[str], list[list[str]]]:
     """Return the headings and rows of "models" in a summary.
 
-    A row has the model, the times at which it flew, and the rms of the errors.
+    A row has the model, the times at which it flew, and the rms of the errors. If the log has the
+    guarantee of a learned model, a column has the deviations within which every aircraft is stable.
     """
     channels = list(models[0]["rms"]) if models else []
     headings = ["from (s)", "to (s)", *(f"{name} ({units[name].unit})" for name in channels)]
+    has_guarantee = any(span["stable"] is not None for span in models)
     rows = []
     for span in models:
         errors = (format_value(span["rms"][name], units[name].factor) for name in channels)
-        rows.append([span["name"], f"{span['start']:.1f}", f"{span['stop']:.1f}", *errors])
-    return headings, rows
+        stable = "" if span["stable"] is None else stated_deviations(span["stable"])
+        row = [span["name"], f"{span['start']:.1f}", f"{span['stop']:.1f}", *errors]
+        rows.append([*row, stable] if has_guarantee else row)
+    return [*headings, "stable within (deviations)"] if has_guarantee else headings, rows
+
+
+def stated_deviations(number: float) -> str:
+    """Return a number of deviations, within which something is proved, rounded down."""
+    return f"{math.floor(10.0 * number + 1e-9) / 10.0:.1f}"
 
 
 def table_rows(

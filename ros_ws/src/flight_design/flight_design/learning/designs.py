@@ -3,15 +3,19 @@
 """Derive from a learner's models what a design needs: margins to keep, and deviations of B."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 
 from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.uncertainty import Spread
+from flight_analysis.closed_loop.learning_loop import ModelGuarantee
 from flight_analysis.linear_loop.delay_margin import delay_margin
+from flight_analysis.linear_loop.guarantee import quick_stable
 from flight_analysis.linear_loop.input_margins import input_margins
-from flight_analysis.linear_loop.loop_margins import linear_loop
+from flight_analysis.linear_loop.loop_margins import linear_loop, with_box
 from flight_core.vectors import FloatArray
 from flight_design.gains.observer_search import RESOLUTION, SelectedObserver
 from flight_design.gains.requirement import OBSERVER_REQUIREMENT, Requirement
@@ -27,6 +31,10 @@ DELAY_LEFT = 0.01
 # loop of the file, and 2 % more error. A weight of 0 was no better than 0.5.
 ACTIVITY = 0.5
 SPEED = "V"  # the output whose observer needs the observers of the other outputs
+# Number of stated deviations of each entry that the box of a learned model has, and the largest
+# number up to which a guarantee is sought.
+DEVIATIONS = 2.0
+MOST_DEVIATIONS = 4.0
 ROUNDED = 1.001  # factor on the required margins of a loop, so that it has them despite rounding
 
 
@@ -37,6 +45,21 @@ class Goal(NamedTuple):
     needed: Requirement
     beside: SelectedObserver | None = None  # the design for the file, from which the search begins
     is_free: Sequence[bool] | None = None  # (m,) channels whose gains may change; if None, all may
+
+
+Design = Callable[[RiseDiConfig, Airframe, Goal], SelectedObserver]
+"""Designs the feedforward and the observer for a model. Raises ParameterError."""
+
+DesignOfFile = Callable[[RiseDiConfig], SelectedObserver]
+"""Designs for the rough model as one that errs. Raises ParameterError."""
+
+
+class Known(NamedTuple):
+    """What is known about a part of the aircraft whose learned model flies."""
+
+    deviation: Mapping[str, float]  # relative deviation of each entry, by name
+    latest: Mapping[str, float]  # delay of each input plus two standard deviations, s
+    delays: tuple[float, ...]  # delay of each input, s
 
 
 def margin_of(controller: RiseDiConfig) -> float:
@@ -199,3 +222,23 @@ def with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> R
     return designed.model_copy(
         update={"feedforward": model.model_copy(update={"deviation": values})}
     )
+
+
+def model_guarantee(
+    controller: RiseDiConfig, model: Airframe, known: Collection[Known], unlearned: float
+) -> ModelGuarantee:
+    """Compute within how many stated deviations of a learned model every aircraft is stable.
+
+    The box has DEVIATIONS standard deviations of each entry. An entry that was not learned has the
+    relative deviation `unlearned`. The loop is that of the parameters in `controller`, without
+    their limits, with every u late by the longest delay in `known`, or by the delay that the
+    controller was told if this is longer.
+    """
+    deviation = chain.from_iterable(part.deviation.items() for part in known)
+    entries = {name.replace(", ", ","): DEVIATIONS * value for name, value in deviation}
+    linear = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
+    delay = max([linear.loop.delay, *chain.from_iterable(part.delays for part in known)])
+    linear = linear._replace(loop=linear.loop._replace(delay=delay))
+    linear = with_box(linear, model, controller, DEVIATIONS * unlearned, 0, Spread(entries))
+    size = quick_stable(linear, MOST_DEVIATIONS / DEVIATIONS)
+    return ModelGuarantee(DEVIATIONS * size, linear.digest)

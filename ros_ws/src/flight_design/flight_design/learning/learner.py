@@ -8,7 +8,8 @@ refused. The controller checks the parameters again when it loads them, and may 
 """
 
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from itertools import chain
 from typing import NamedTuple
 
@@ -33,10 +34,13 @@ from flight_design.identification.model_identification import (
 )
 from flight_design.learning.change_test import ANGLE, RECORD, Change, change_test
 from flight_design.learning.designs import (
-    Goal,
+    Design,
+    DesignOfFile,
+    Known,
     by_law_of_start,
     goal,
     is_late,
+    model_guarantee,
     price,
     with_deviations,
     with_flown_channels,
@@ -84,22 +88,8 @@ RETRY = 10.0
 # Gain of log-likelihood that finds a change after a fallback. Dead surfaces had 46 to 656.
 SURE_GAIN = 40.0
 
-Design = Callable[[RiseDiConfig, Airframe, Goal], SelectedObserver]
-"""Designs the feedforward and the observer for a model. Raises ParameterError."""
-
-DesignOfFile = Callable[[RiseDiConfig], SelectedObserver]
-"""Designs for the rough model as one that errs. Raises ParameterError."""
-
 PartName = tuple[str, ...]
 """The outputs of a part of the aircraft that does not couple with the rest."""
-
-
-class Known(NamedTuple):
-    """What is known about a part of the aircraft whose learned model flies."""
-
-    deviation: Mapping[str, float]  # relative deviation of each entry, by name
-    latest: Mapping[str, float]  # delay of each input plus two standard deviations, s
-    delays: tuple[float, ...]  # delay of each input, s
 
 
 class Verdict(NamedTuple):
@@ -268,7 +258,12 @@ class Learner:
         price_text = self._adopt(verdict.model, verdict.known, self._dead)
         refused = [f"refused: {refusal}" for refusal in verdict.refusals]
         told = sentences(*left_out, *verdict.sentences, price_text, *refused)
-        return LearnerResult(self._last, told)
+        promise = None
+        if not self._quick:
+            unlearned = max(self._believed.error, self._believed.effect)
+            known = tuple(self._known.values())
+            promise = partial(model_guarantee, self._last, self._model, known, unlearned)
+        return LearnerResult(self._last, told, promise)
 
     def _damaged(self, changes: Sequence[Change], end_ns: int) -> LearnerResult:
         """Decide on parts that have changed; a part with a dead input flies without it at once.

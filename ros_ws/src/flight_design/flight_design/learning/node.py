@@ -8,12 +8,18 @@ The search runs in a thread of low priority. In real time the loop does not wait
 import os
 import threading
 import traceback
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from flight_analysis.closed_loop.learning_loop import Identifications, LearnerResult, as_received
+from flight_analysis.closed_loop.learning_loop import (
+    Identifications,
+    Learned,
+    LearnerResult,
+    as_received,
+)
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
@@ -37,7 +43,8 @@ NICE = 10  # nice value of a search in real time, which must not delay the loop
 class LearnerNode(FlightNode[LearnerConfig]):
     """Takes y and u of each tick from `internals`, and publishes the proposals that are due.
 
-    While a search runs, the samples wait in the queue of the subscription. So the record of a
+    A search is followed by the proof of its guarantee, which the proposal does not wait for. While
+    either runs, the samples wait in the queue of the subscription. So the record of a
     search does not change, and in lockstep the proposals equal those of the loop in one process. In
     real time a search begins with the newest sample. If several identifications became due during a
     search, only the last of them is made.
@@ -68,14 +75,17 @@ class LearnerNode(FlightNode[LearnerConfig]):
             qos=LOCKSTEP if lockstep else RECORD_FOREIGN,
         )
         self._publish, self._publish_learned = self.advertise(PROPOSAL), self.advertise(LEARNED)
+        # the search of a proposal, or after it the proof of its guarantee
         self._search: threading.Thread | None = None
+        self._is_sent = True  # whether the proposal of the last search has been published
         self._proposal = LearnerResult(None, None)
+        self._found: Learned | None = None
         self._end_ns = 0
         self._flown = 0
         self._given_up: tuple[str, ...] = ()
-        self._begin()
+        self._begin_record()
 
-    def _begin(self) -> None:
+    def _begin_record(self) -> None:
         """Begin a new record, which is empty."""
         self._learner, self._updates = self._new_learner(), Updates(self._settings)
         self._identifications = Identifications(self._learner, self._start.outputs)
@@ -99,28 +109,18 @@ class LearnerNode(FlightNode[LearnerConfig]):
         return max_age_ns, max_age_ns + nanoseconds(self._start.hold + self._start.ramp)
 
     def _advance(self, now_ns: int) -> bool:
-        """Publish the proposal of a finished search, and take samples until the next search begins.
+        """Publish what a finished search or proof found, and take samples until the next search.
 
-        Return whether there was a sample or a proposal.
+        Return whether there was a sample, a proposal or a proof.
         """
         advanced = False
         if self._search is not None and not self._search.is_alive():
             self._search = None
-            proposal = as_received(self._proposal, self._start, self._end_ns, self._flown)
-            values = {"start": proposal.start, "flown": proposal.flown, **proposal.change}
-            report = Report(
-                self._end_ns,
-                self.instance,
-                proposal.sentence or "",
-                values,
-                warns=not proposal.change,
-            )
-            self._publish(reports.encode(report, "proposal"))
-            if (found := self._identifications.next(self._proposal)) is not None:
-                self._publish_learned(self.encoder(found.names).encode(self._end_ns, found.values))
-            if proposal.sentence is not None:
-                self._said = f"{'proposes' if proposal.change else 'no model:'} {proposal.sentence}"
-                self.get_logger().info(self._said)
+            if self._is_sent:
+                self._publish_found()
+            else:
+                self._send_proposal()
+                self._begin(self._prove)
             advanced = True
         while self._search is None and self._internals.poll(now_ns, 1):
             advanced = True
@@ -129,20 +129,47 @@ class LearnerNode(FlightNode[LearnerConfig]):
         self._begin_search()
         return advanced
 
+    def _send_proposal(self) -> None:
+        """Publish the proposal of a finished search."""
+        self._is_sent = True
+        proposal = as_received(self._proposal, self._start, self._end_ns, self._flown)
+        values = {"start": proposal.start, "flown": proposal.flown, **proposal.change}
+        report = Report(
+            self._end_ns,
+            self.instance,
+            proposal.sentence or "",
+            values,
+            warns=not proposal.change,
+        )
+        self._publish(reports.encode(report, "proposal"))
+        if proposal.sentence is not None:
+            self._said = f"{'proposes' if proposal.change else 'no model:'} {proposal.sentence}"
+            self.get_logger().info(self._said)
+
+    def _publish_found(self) -> None:
+        """Publish what was identified, with the guarantee of its proposal, if there is any."""
+        if self._found is not None:
+            encoder = self.encoder(self._found.names)
+            self._publish_learned(encoder.encode(self._end_ns, self._found.values))
+
     def _begin_search(self) -> None:
         """Begin a search on the record so far, if one is due."""
         if self._is_due and self._search is None:
-            self._is_due = False
-            # A daemon thread does not delay the end of the node.
-            self._search = threading.Thread(target=self._propose, daemon=True)
-            self._search.start()
+            self._is_due = self._is_sent = False
+            self._begin(self._propose)
+
+    def _begin(self, work: Callable[[], None]) -> None:
+        """Begin a search or a proof in a thread of its own."""
+        # A daemon thread does not delay the end of the node.
+        self._search = threading.Thread(target=work, daemon=True)
+        self._search.start()
 
     def _take(self, sample: StampedVector, now_ns: int) -> None:
         mode, age, flown = sample.value[:3].tolist()
         y, u, given_up = np.split(sample.value[3:], 3)
         if mode == Mode.INACTIVE:  # the next engagement begins with the law of the start
             if self._has_record:
-                self._begin()
+                self._begin_record()
             return
         self._end_ns = sample.stamp_ns + round(age * NANOSECONDS)
         if mode == Mode.ENGAGED:
@@ -164,6 +191,16 @@ class LearnerNode(FlightNode[LearnerConfig]):
             self._proposal = LearnerResult(
                 None, f"the identification failed: {' '.join(str(error).split())}"
             )
+
+    def _prove(self) -> None:
+        """Prove the guarantee of the proposal, beside what was identified."""
+        if not self.parameters.lockstep:
+            os.nice(NICE)
+        self._found = None
+        try:
+            self._found = self._identifications.next(self._proposal)
+        except Exception:  # the flight continues without the guarantee
+            self.get_logger().error(f"unexpected exception: {traceback.format_exc()}")
 
     def close(self) -> None:
         """Complete the searches that are due, in lockstep.
