@@ -176,7 +176,7 @@ def _learned_card(flight: RecordedFlight) -> Card:
             f"Rms error under the law of the start, and under the last model: {', '.join(changes)}."
             " Commands and wind of the two differ."
         )
-    stable = learned[-1]["stable"]
+    stable = learned[-1].get("stable")
     if stable is not None:
         within = (
             "every aircraft whose entries are within "

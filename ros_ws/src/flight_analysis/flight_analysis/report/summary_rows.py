@@ -158,11 +158,13 @@ def model_rows(
     """
     channels = list(models[0]["rms"]) if models else []
     headings = ["from (s)", "to (s)", *(f"{name} ({units[name].unit})" for name in channels)]
-    has_guarantee = any(span["stable"] is not None for span in models)
+    # the summary of an earlier version has no guarantees
+    guarantees = [span.get("stable") for span in models]
+    has_guarantee = any(within is not None for within in guarantees)
     rows = []
-    for span in models:
+    for span, within in zip(models, guarantees, strict=True):
         errors = (format_value(span["rms"][name], units[name].factor) for name in channels)
-        stable = "" if span["stable"] is None else stated_deviations(span["stable"])
+        stable = "" if within is None else stated_deviations(within)
         row = [span["name"], f"{span['start']:.1f}", f"{span['stop']:.1f}", *errors]
         rows.append([*row, stable] if has_guarantee else row)
     return [*headings, "stable within (deviations)"] if has_guarantee else headings, rows
