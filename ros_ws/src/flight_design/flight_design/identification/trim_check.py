@@ -19,6 +19,7 @@ from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.outcome import Refusal
 from flight_design.identification.innovation_filters import FlightData
 from flight_design.identification.model_identification import Identification, Part
+from flight_design.identification.model_quality import NoBetter
 from flight_design.identification.model_refusals import best_known
 
 SLOW = 3.0  # s, time constant of the high-pass, several times as long as a doublet
@@ -59,7 +60,8 @@ def doubted(found: Identification, steady: Identification) -> Identification:
 
     An entry that `steady` does not have is nominal there: its error is 0. A part is refused if the
     best known effect on one of its outputs differs by more than MOST_APART. A part that was refused
-    for another reason keeps it.
+    for another reason keeps it, unless it was refused as no better and explains the log better all
+    the same, since such a part may be used.
     """
     errors = {entry.name: entry.error for entry in steady.entries}
     return found._replace(parts=tuple(_doubted(part, errors) for part in found.parts))
@@ -72,11 +74,11 @@ def _doubted(part: Part, steady: Mapping[str, float]) -> Part:
         apart = abs(entry.error - steady.get(entry.name, 0.0))
         by_trim.append(apart)
         entries.append(entry._replace(deviation=math.hypot(entry.deviation, apart)))
-    return part._replace(
-        entries=tuple(entries),
-        refusal=part.refusal or _reason_against_trim(part, steady),
-        by_trim=tuple(by_trim),
-    )
+    refusal = part.refusal
+    is_likelier = part.after.log_likelihood > part.before.log_likelihood
+    if refusal is None or (isinstance(refusal, NoBetter) and is_likelier):
+        refusal = _reason_against_trim(part, steady) or refusal
+    return part._replace(entries=tuple(entries), refusal=refusal, by_trim=tuple(by_trim))
 
 
 def _reason_against_trim(part: Part, steady: Mapping[str, float]) -> Refusal | None:
