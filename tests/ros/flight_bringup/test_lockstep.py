@@ -83,20 +83,9 @@ def payloads(run: Path) -> dict[str, list[bytes]]:
     return {topic: [data for _, data in sorted(messages)] for topic, messages in by_topic.items()}
 
 
-BURSTS = """
-import time
-while True:
-    end = time.monotonic() + 0.01
-    while time.monotonic() < end:
-        pass
-    time.sleep(0.01)
-"""
-
-
 @contextmanager
 def both_cores_busy() -> Iterator[None]:
-    """Each core computes for 10 ms of 20 ms, and so delays each node in turn."""
-    processes = [subprocess.Popen([sys.executable, "-c", BURSTS]) for _ in range(2)]
+    processes = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
     try:
         yield
     finally:
