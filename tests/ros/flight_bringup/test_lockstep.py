@@ -159,7 +159,7 @@ def nodes(start: Start, scenario: Path, run: str) -> dict[str, Process]:
 
 
 FIRST_CHUNKS = 100_000  # bytes of a log
-LOG_SIZE = 500_000  # bytes; by then the liveliness monitor of every node is active
+LOG_SIZE = 1_000_000  # bytes; by then the liveliness monitor of every node is active
 
 
 def test_other_nodes_end_within_three_seconds_of_kill_and_name_it(
