@@ -6,6 +6,7 @@ It imports, identifies, selects gains, compares, bounds and exports, as the comm
 names do.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -186,8 +187,7 @@ class Tune:
         path = folder / "airframe.yaml"
         write_text("--write", path, model_yaml(identification, self.log.name))
         recorded = of_log.recorded
-        noise = measured_noise(recorded.y, np.ones(recorded.y.shape[1]))
-        flight = _on_airframe(scenario, path, noise)
+        flight = _on_airframe(scenario, path, recorded)
         selectors = Selectors(
             airframe=airframe,
             flight=flight,
@@ -424,10 +424,14 @@ def _box(identification: Identification, airframe: Airframe) -> dict[str, float]
     return box
 
 
-def _on_airframe(scenario: Scenario, airframe: Path, noise: FloatArray) -> Scenario:
-    """Return the scenario on the identified airframe.
+def _on_airframe(scenario: Scenario, airframe: Path, recorded: FlightData) -> Scenario:
+    """Return the scenario on the identified airframe, with the noise of the gyro in the log.
 
-    The sensors have the noise of the gyro in the log, rad/s rms.
+    The samples of the sensors may come at another rate than those of `recorded`. White noise has
+    the same density at both rates if its variance is proportional to the rate. The density counts,
+    because the loop passes slow noise alone.
     """
+    noise = measured_noise(recorded.y, np.ones(recorded.y.shape[1]))
+    noise = noise * math.sqrt(scenario.aircraft.rate * recorded.period)
     changes = {"airframe": str(airframe.resolve()), "sensors": {"noise": noise.tolist()}}
     return scenario.vary(aircraft=changes)
