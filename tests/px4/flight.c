@@ -11,15 +11,17 @@
 
 #include "rise_di_rates.h"
 
-#define STATES 5
+#define STATES 6
 #define STEP 1e-4        /* s, of the integration of the airplane */
 #define END_STOP 0.261799 /* rad, at a torque of 1 */
 
-static const double A[STATES][STATES] = {{-22.4219, 0.817805, 0, 0, 0},
-                                         {-512.964, -19.2404, 0, 0, 0},
-                                         {0, 0, -6.92682, -0.0754134, -0.817189},
-                                         {0, 0, -605.518, -67.1245, 24.2746},
-                                         {0, 0, 422.374, 4.78212, -18.1151}};
+/* alpha, q, beta, p, r, and the bank: along a banked wing gravity moves beta */
+static const double A[STATES][STATES] = {{-22.4219, 0.817805, 0, 0, 0, 0},
+                                         {-512.964, -19.2404, 0, 0, 0, 0},
+                                         {0, 0, -6.92682, -0.0754134, -0.817189, 9.81 / 11.5},
+                                         {0, 0, -605.518, -67.1245, 24.2746, 0},
+                                         {0, 0, 422.374, 4.78212, -18.1151, 0},
+                                         {0, 0, 0, 1, 0, 0}};
 static const double B[STATES][3] = {{5.57133, 0, 0}, {533.904, 0, 0}, {0, 0.345125, -5.65739}, {0, 1219.92, -543.938}, {0, -42.0821, 510.508}};
 static double x[STATES];
 static float integral[3];

@@ -3,8 +3,8 @@
 """Doublets of the scenarios for PX4's airplane, beside a rate controller of PX4's form.
 
 The aircraft has the bank too: gravity along a banked wing moves the sideslip, beta_dot += g/V0 phi,
-which the airframe of the rates, and so the feedforward, does not know. Calm air, noise of the gyro
-of PX4's simulator.
+which the airframe of the rates does not know, but the feedforward of rates.yaml does. The air is
+calm, and the gyro has the noise of PX4's simulator.
 """
 
 import csv
@@ -117,10 +117,10 @@ def errors(airframe: Path) -> dict[str, dict[str, Rows]]:
 def test_no_axis_is_much_worse_than_by_px4(errors: dict[str, dict[str, Rows]]) -> None:
     """Of nine figures the yaw rate beside roll doublets is the hardest: sideslip by gravity.
 
-    With the gains of (22), where r is the slowest, it was 43 mrad/s, twice that of PX4's form.
+    With a feedforward that did not know the bank it was 25 mrad/s, 1.2 times that of PX4's form.
     """
     law, px4 = errors["law"], errors["px4"]
-    assert law["p"][2] < 1.25 * px4["p"][2]
+    assert law["p"][2] < 0.5 * px4["p"][2]
     for axis, name in enumerate(AXES):
         # its own doublet; of q nearly all is the noise of the gyro, of which the law hands on more
         assert law[name][axis] < 1.15 * px4[name][axis]

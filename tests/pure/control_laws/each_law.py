@@ -14,7 +14,7 @@ from tests.pure.flight_analysis.test_replay import BUSY
 
 from aircraft_sim.airframes.airframe import load_airframe
 from flight_core.vectors import FloatArray, StampedVector
-from flight_design.gains.gain_selection import with_feedforward
+from flight_design.gains.feedforward_model import with_feedforward
 from flight_design.gains.observer_gains import gains_by_rule
 from flight_design.gains.observer_selection import model_for, with_aircraft_observer
 from rise_di_controller.guard import guard

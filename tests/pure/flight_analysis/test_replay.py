@@ -35,7 +35,7 @@ from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
-from flight_design.gains.gain_selection import with_feedforward
+from flight_design.gains.feedforward_model import with_feedforward
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.stored_messages import PARAMETER_EVENT, parameter_changes
 from flight_log.tape_reader import read_run

@@ -25,7 +25,7 @@ from flight_campaign.batch import batch, batch_allocation, batch_matrices, batch
 from flight_campaign.batch.batch_loop import FleetResult
 from flight_campaign.batch.campaign_course import build_course
 from flight_core.vectors import Array, FloatArray
-from flight_design.gains.gain_selection import with_feedforward
+from flight_design.gains.feedforward_model import with_feedforward
 from rise_di_controller.extensions.allocation import allocate, allocation
 from rise_di_controller.law.control_law import ControlLaw, Measurements
 from rise_di_controller.law.saturation import Limits

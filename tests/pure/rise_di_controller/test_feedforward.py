@@ -12,15 +12,16 @@ import numpy as np
 import pytest
 from pytest import approx
 from tests.closed_loop import PROTOTYPE_SERVO, error
-from tests.conftest import refusing
+from tests.conftest import REPOSITORY, refusing
 
 from aircraft_sim.airframes.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.integrators import rk4
 from flight_core.modes import Mode
 from flight_core.vectors import FloatArray, StampedVector
-from flight_design.gains.gain_selection import with_feedforward
+from flight_design.gains.feedforward_model import with_feedforward
 from flight_design.gains.ideal_control import manoeuvre, study_airframe
 from rise_di_controller.extensions import feedforward
 from rise_di_controller.extensions.feedforward import Nominal, nominal_model
@@ -316,3 +317,26 @@ def test_feedforward_reduces_error_of_nominal_osprey_with_servos() -> None:
         float(np.sqrt(np.mean(e**2, axis=0)) @ [100.0, 10.0, 50.0, 100.0]) for e in errors
     )
     assert with_it < 0.55 * error_without
+
+
+def test_states_that_an_airframe_lacks_stay_in_the_feedforward() -> None:
+    """The bank angle of PX4's rates, which their airframe does without."""
+    scenario = find_scenario(str(REPOSITORY / "examples/px4_airplane/rates.yaml"))
+    law = scenario.rise_di()
+    former = law.feedforward
+    assert former is not None
+    assert former.states == ("alpha", "q", "beta", "p", "r", "phi")
+    airframe = load_airframe(str(REPOSITORY / "examples/px4_airplane/rates_airframe.yaml"))
+    heavy = airframe.with_matrices(
+        0.5 * airframe.matrix_a(), 0.5 * airframe.matrix_b(), np.ones((5, 2))
+    )
+    new = with_feedforward(law, heavy).feedforward
+    assert new is not None
+    assert new.states == former.states
+    A, B = np.reshape(new.A, (6, 6)), np.reshape(new.B, (6, 3))
+    before = np.reshape(former.A, (6, 6))
+    assert A[:5, :5] == approx(0.5 * before[:5, :5])
+    assert np.array_equal(A[5], before[5])
+    assert np.array_equal(A[:, 5], before[:, 5])
+    assert B[:5] == approx(0.5 * np.reshape(former.B, (6, 3))[:5])
+    assert not B[5].any()

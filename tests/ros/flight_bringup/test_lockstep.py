@@ -29,7 +29,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
 from flight_core.outcome import COMPLETED, STATUS_LOST_CONTACT, STATUS_SHORTFALL
 from flight_core.parameters import flatten, nest
-from flight_design.gains.gain_selection import with_feedforward
+from flight_design.gains.feedforward_model import with_feedforward
 from flight_log.tape_reader import read_run
 
 TOPICS = ("/y", "/y_m", "/u", "/internals", "/truth")

@@ -21,8 +21,8 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import period_ns
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
+from flight_design.gains.feedforward_model import with_feedforward
 from flight_design.gains.gain_design import check_gains, select_gains
-from flight_design.gains.gain_selection import with_feedforward
 from flight_design.identification.own_loop import OwnLoop
 from rise_di_controller.rise_di_config import RiseDiConfig
 

@@ -16,8 +16,8 @@ from flight_campaign.comparison.tuning import Benchmark, as_gains
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains.extended_state import integrator_model
+from flight_design.gains.feedforward_model import with_feedforward
 from flight_design.gains.gain_conditions import MIN_K, split_gain
-from flight_design.gains.gain_selection import with_feedforward
 from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.extensions.model_sections import FeedforwardConfig, ObserverConfig
 from rise_di_controller.law.law import MIN_GAIN

@@ -31,7 +31,7 @@ from flight_campaign.batch.campaign_course import Course, build_course, require_
 from flight_campaign.statistics import score_units
 from flight_core.vectors import Array, FloatArray
 from flight_design.gains.extended_state import integrator_model
-from flight_design.gains.gain_selection import with_feedforward
+from flight_design.gains.feedforward_model import with_feedforward
 from flight_design.gains.nominal import activity_units, airframe_model
 from flight_design.gains.requirement import REQUIREMENT, Requirement, least_fractions
 from flight_design.gains.tuned_gains import TuningResult

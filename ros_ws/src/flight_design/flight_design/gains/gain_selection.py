@@ -19,7 +19,6 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.linear_loop.loop_margins import (
     LinearLoop,
@@ -35,6 +34,7 @@ from flight_core.parameters import LARGEST, require
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_conditions
 from flight_design.gains.channel_signs import signs_of_pairing
+from flight_design.gains.feedforward_model import with_feedforward
 from flight_design.gains.gain_conditions import Bounds, GainCondition, GainSet
 from flight_design.gains.ideal_control import ChannelPairing, Study
 from flight_design.gains.lyapunov import KnownPlant, decay_matrix
@@ -47,7 +47,6 @@ from flight_design.gains.requirement import (
     margin_conditions,
     within_requirement,
 )
-from rise_di_controller.extensions.model_sections import FeedforwardConfig
 from rise_di_controller.law.decomposition import DecompositionError, signs
 from rise_di_controller.law.law import Sign
 from rise_di_controller.law.linear_loop import LoopTiming, is_stable
@@ -356,33 +355,6 @@ def _controller(
             base_inputs, channels.inputs
         ).model_dump()
     return RiseDiConfig.validate_mapping(values, "controller")
-
-
-def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
-    """Return the same controller with the airframe as the nominal model of its feedforward.
-
-    The lead is lag + delay + half a period of the controller. Raises ParameterError if the airframe
-    cannot be the model, for example because it has a zero in the right half plane.
-    """
-    for name in controller.outputs:
-        require(
-            name in airframe.states,
-            "feedforward",
-            f"the output {name}, a row of C",
-            "outputs that are states of its model",
-        )
-    _, columns = law_order(airframe, controller)
-    gravity = airframe.matrix_gravity()
-    model = FeedforwardConfig(
-        states=tuple(airframe.states),
-        A=tuple(airframe.matrix_a().ravel().tolist()),
-        B=tuple(airframe.matrix_b()[:, columns].ravel().tolist()),
-        gravity=tuple(gravity.ravel().tolist()) if gravity.any() else None,
-        lead=tuple(lag + controller.delay + 0.5 / controller.rate for lag in controller.lag),
-    )
-    return type(controller).validate_mapping(
-        controller.model_dump() | {"feedforward": model.model_dump()}, "controller"
-    )
 
 
 def assess_scenario(

@@ -40,7 +40,7 @@ from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains.airframe_properties import fastest_zero
 from flight_design.gains.extended_state import extended_state_weights, integrator_model
-from flight_design.gains.gain_selection import with_feedforward
+from flight_design.gains.feedforward_model import with_feedforward
 from flight_design.gains.linear_error import Air, discrete_gust
 from flight_design.gains.nominal import activity_units, airframe_model
 from flight_design.gains.observer_gains import ObserverGains
@@ -264,7 +264,9 @@ class _AircraftDesigns(NamedTuple):
         rows, columns = law_order(airframe, controller)
         Omega = airframe.matrix_c()[rows] @ airframe.matrix_b()[:, columns]
         require_same_signs(Omega, controller.D, f"airframe {airframe.name}")
-        bare = controller.model_copy(update={"observer": None, "schedule": None})
+        # The states of an observer begin with those of the feedforward, which are the airframe's.
+        without = {"observer": None, "schedule": None, "feedforward": None}
+        bare = controller.model_copy(update=without)
         states = tuple(airframe.states)
         names = Names(states, controller.inputs, controller.outputs, tuple(airframe.gusts))
         model = model_for(airframe, controller, noise)

@@ -19,6 +19,7 @@ from flight_analysis.linear_loop.loop_margins import (
 from flight_core.outcome import Refusal
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, gain_yaml, ideal_control
+from flight_design.gains.feedforward_model import with_feedforward
 from flight_design.gains.first_scenario import (
     Channel,
     FirstCommands,
@@ -107,7 +108,7 @@ def flying_scenario(
     if reference.coordinated_turn is not None:
         turning = identified._replace(channels=_without_sideslip(channels, identified.pairing))
     model = turning.airframe("identified in flight, without sideslip")
-    controller = gain_selection.with_feedforward(controller, model)
+    controller = with_feedforward(controller, model)
     heading = [
         f"The aircraft behind the map {channel_map.name}, with gains from its identified response.",
         gain_yaml.margins_sentence(controller, margins),
