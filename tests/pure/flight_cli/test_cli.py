@@ -21,7 +21,7 @@ import typer
 from tests.conftest import REPOSITORY, invoke
 
 from flight_analysis.closed_loop.replay import recorded_scenario
-from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_cli import cli
 from flight_cli.cli import COMMANDS, VERBS, application
@@ -107,6 +107,14 @@ def test_summary_holds_what_was_flown(flown: tuple[Path, subprocess.CompletedPro
     assert summary["errors"]["q"]["gust"] == {"rms": None, "max": None}  # the gusts come later
     assert 0 < summary["errors"]["q"]["calm"]["rms"] < 1e-3
     assert (summary["ticks"]["ticks"], summary["ticks"]["without_new_y"]) == (401, 0)
+
+
+def test_log_has_the_scenario_that_flew(
+    flown: tuple[Path, subprocess.CompletedProcess[str]],
+) -> None:
+    """With the duration of the command, so that it can be flown again beside its log."""
+    run = flown[0] / "runs" / "latest"
+    assert scenario_yaml(recorded_scenario(run)) == scenario_yaml(find_scenario("osprey_gust", 4.0))
 
 
 def test_report_is_one_page_that_needs_no_network(

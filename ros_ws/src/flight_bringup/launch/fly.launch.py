@@ -19,13 +19,9 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.scenario_library import (
-    as_flown,
-    find_scenario,
-    save_scenario,
-    with_parameters,
-)
+from flight_analysis.closed_loop.scenario_library import find_scenario, with_parameters
 from flight_analysis.report.run_folder import new_run
+from flight_bringup.fly import as_file
 from flight_bringup.graph import (
     AIRCRAFT,
     CONTROLLER,
@@ -119,10 +115,7 @@ def _fly(context: LaunchContext) -> list[Action]:
     if is_simulated:
         return by_rise_di(flight, argument(context, "scenario"))
     flight.run = run = new_run(scenario, Path(argument(context, "runs")))
-    if further:
-        scenario = save_scenario(scenario, run / f"{scenario.name}.yaml")
-    else:
-        scenario = as_flown(scenario, run, flight.namespace)
+    scenario = as_file(scenario, run, flight.namespace)
     first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
     then = tuple(spec for spec in second_stage(scenario) if spec not in others)
 

@@ -14,12 +14,7 @@ from rich.console import Console
 
 from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops, opposite_signs
-from flight_analysis.closed_loop.scenario_library import (
-    as_flown,
-    find_scenario,
-    save_scenario,
-    with_route,
-)
+from flight_analysis.closed_loop.scenario_library import find_scenario, with_route
 from flight_analysis.report.run_folder import (
     UnwrittenReportError,
     new_run,
@@ -28,7 +23,7 @@ from flight_analysis.report.run_folder import (
     write_report,
 )
 from flight_bringup.fleet import Fleet, is_fleet, new_runs
-from flight_bringup.fly import fly_in_process, fly_over_topics
+from flight_bringup.fly import as_file, fly_in_process, fly_over_topics
 from flight_bringup.graph import (
     Autopilot,
     absolute_namespace,
@@ -174,10 +169,7 @@ class Fly(RouteWords):
         learn = _learner(scenario)
         run = new_run(scenario, self.runs)
         self.context.call_on_close(partial(remove_empty, run))
-        if self.route or self.fence or self.settings or self.learn:
-            scenario = save_scenario(scenario, run / f"{scenario.name}.yaml")
-        else:
-            scenario = as_flown(scenario, run, namespace)
+        scenario = as_file(scenario, run, namespace)
         self._watch(run)
         by_clock = self.use_sim_time or (scenario.flight.use_sim_time and not stepping)
         is_quiet = self.as_json or self.quiet
