@@ -21,7 +21,7 @@ from pathlib import Path
 
 
 def _homes() -> Iterator[tuple[str, tuple[str | None, str]]]:
-    """Yield each name of the interface in __init__.pyi, with its module and its name in there."""
+    """Yield each name that __init__.pyi imports, with the module that has it and its name there."""
     stub = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
     for statement in ast.parse(stub).body:
         if isinstance(statement, ast.ImportFrom):

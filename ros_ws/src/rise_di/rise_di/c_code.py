@@ -222,9 +222,10 @@ def _sha256(text: str) -> str:
 
 
 def _certified(scenario: Scenario, constants: Path) -> tuple[str, str] | None:
-    """Return the certificate of the guarantee kept for a scenario's loop, and its statement.
+    """Return the certificate of a loop's guarantee, and what it guarantees as a line of text.
 
-    Returns None if there is no guarantee.
+    The guarantee is the one that was kept for the loop of the scenario. `constants` is the file of
+    the C constants, whose text goes into the certificate. Returns None if there is no guarantee.
     """
     if scenario.aircraft.is_jsbsim or is_literal(scenario.controller):
         return None
@@ -267,8 +268,9 @@ def _units(scenario: Scenario, controller: RiseDiConfig) -> Units:
 
 
 def _logged(run: FilePath | RecordedRun, controller: RiseDiConfig, title: str) -> Material:
-    """Return the parameters and ticks of a recorded flight, and in how many ticks u is equal.
+    """Return the parameters and the ticks of a recorded flight.
 
+    The line for the report says in how many ticks Python computes the u of the log to the bit.
     Raises ParameterError if the flight had other parameters.
     """
     sets, recording, equal = run_recording(run if isinstance(run, RecordedRun) else read_run(run))
@@ -279,7 +281,7 @@ def _logged(run: FilePath | RecordedRun, controller: RiseDiConfig, title: str) -
 
 
 def _flights(scenario: Scenario, drawn: int, seed: int, samples: int) -> Material:
-    """Return flights of a scenario and drawn inputs, with changes of the parameters."""
+    """Return simulated flights of a scenario and random inputs, with several parameter sets."""
     sets = parameter_sets(exportable(scenario.controller))
     return Material(sets, _recordings(scenario, sets, drawn, seed, samples), "")
 
@@ -287,10 +289,12 @@ def _flights(scenario: Scenario, drawn: int, seed: int, samples: int) -> Materia
 def _recordings(
     scenario: Scenario, sets: Sequence[RiseDiConfig], drawn: int, seed: int, samples: int
 ) -> Iterator[Recording]:
-    """Yield recordings of flights, and of drawn commands, calls, standstills and single steps.
+    """Yield the recordings that a proof compares: simulated flights, and random inputs.
 
-    `drawn` is the number of steps, and there are a tenth as many calls. If it is 0, only flights
-    and commands are recorded. The steps are divided into recordings that fit into memory.
+    The random inputs are commands of the reference model, calls of the controller, samples that
+    stand still, and single steps of the law. `drawn` is the number of single steps, and there are a
+    tenth as many calls. If it is 0, only flights and commands are recorded. The steps are divided
+    into recordings that fit into memory.
     """
     yield from flight_recordings(scenario, sets, samples)
     yield drawn_commands(scenario.reference_model, max(drawn // 10, 1000), seed)

@@ -104,10 +104,10 @@ sample at a tick do not depend on whether the samples before this tick were meas
 
 
 def _is_newest_last(scenario: Scenario) -> bool:
-    """Return whether the last sample of a tick is the newest y in every tick.
+    """Return whether only the last sample of y before each tick has to be measured.
 
-    In this case, earlier samples need not be measured. If the aircraft has any key outside BY_TICK,
-    the result is False, and each sample is measured.
+    This is so if the section of the aircraft sets only keys in BY_TICK, and if the controller has
+    no vanes. Otherwise each sample must be measured.
     """
     aircraft = scenario.aircraft
     return not unknown_keys(aircraft, BY_TICK) and not scenario.controller.vanes

@@ -31,9 +31,11 @@ from flight_design.gains.effectors import lags_by_input
 from flight_design.gains.first_scenario import LICENCE
 from flight_design.gains.gain_design import select_gains
 
-SIZES = (1.0, 0.5, 0.25, 0.125)  # of the commands; the first that avoids the stops is used
+# factors on the commands, which are tried in this order until u stays clear of the end stops
+SIZES = (1.0, 0.5, 0.25, 0.125)
 CLEAR = 0.9  # largest fraction of an end stop that u may reach
-ANGLE_OF_GUST = {"lateral": "sideslip", "vertical": "angle of attack"}  # gust over V0
+# the angle that a gust on an axis causes, which is the speed of the gust divided by V0
+ANGLE_OF_GUST = {"lateral": "sideslip", "vertical": "angle of attack"}
 SAMPLES = 20  # number of uncertain airframes for the bounds of the theorem
 
 
@@ -234,9 +236,10 @@ def _stop_shares(flight: Scenario, tape: Tape) -> dict[str, float]:
 def _shortfall(flight: Scenario, tape: Tape, hardest: str) -> Refusal:
     """Return what is wrong with the flight of a scenario, as a sentence.
 
-    The sentence names the input at a stop, and whether commands or gusts require its travel. It
-    also names the state or gust with the largest share of this travel, and the share. The input
-    that holds y is u = -Omega^+ C (A x + f), where f includes the gusts.
+    The sentence names the input `hardest`, which is at its stop, and says whether the commands or
+    the gusts require its travel. It also names the state or gust that requires the most of this
+    travel, and how much. For this, u is the input that keeps y constant, u = -Omega^+ C (A x + f),
+    where f includes the gusts.
     """
     airframe = flight.aircraft.load()[0]
     calm = simulate(flight.vary(aircraft={"gusts": {}}))

@@ -298,12 +298,13 @@ def as_control(
     """Return the engaged law as a discrete system of python-control.
 
     The inputs are `y_NAME` and `y_m_NAME`, and the outputs `u_NAME`. The system has limits and
-    anti-windup. Its state is that of the law, then u and y_m of the last tick, and 0 is the
-    engagement in trim. With an allocation the outputs are the effectors, and the effectors are also
-    the last values of the state.
+    anti-windup. Its state has the state of the law, then u and y_m of the last tick. All states are
+    0 right after an engagement in trim. With an allocation the outputs are the effectors, and the
+    effectors are also the last values of the state.
 
     If `linear`, the result is the law near e = 0 without limits, for Bode plots and margins. It is
-    a StateSpace from `y_NAME`, and the effectors are T u.
+    a StateSpace from `y_NAME` to `u_NAME`. With an allocation it has the effectors T u as outputs,
+    where T is the matrix of the allocation.
 
     Args:
         controller: Parameters of the controller, or a mapping as in a scenario.

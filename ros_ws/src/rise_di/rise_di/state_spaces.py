@@ -20,10 +20,12 @@ class LinearSystems(NamedTuple):
 
     Attributes:
         plant: The nominal aircraft from `u_NAME` to `y_NAME`, SI. It has the lags and the delay
-            that the controller was told, and is exact between the ticks.
+            that the controller was told. It is the exact discretisation for a u that is held from
+            tick to tick.
         law: The law near e = 0 at y_m = 0, from `y_NAME` to `u_NAME`.
-        loop: The closed loop from `d_NAME`, which is added to u, and `n_NAME`, which is added to
-            the measured y, to `y_NAME` and to the u of the law, `u_NAME`.
+        loop: The closed loop. Its inputs are `d_NAME`, a disturbance that is added to u, and
+            `n_NAME`, a noise that is added to the measured y. Its outputs are y without the noise,
+            `y_NAME`, and u of the law without the disturbance, `u_NAME`.
     """
 
     plant: "control.StateSpace"
