@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute live commands u_m up to their age limit, and the ending if the publisher is lost.
 
-The ending is the sequence of commands that follow the last u_m. Zero rates would keep the present
-bank, so the ending first levels the wings, beginning with the attitude in u_m.
+The ending is the sequence of commands that follow the last u_m. Commands of zero rates alone would
+keep the present bank, so the ending first levels the wings. It knows bank and pitch by dead
+reckoning from the attitude that guidance sent with u_m.
 """
 
 from typing import NamedTuple
@@ -32,7 +33,7 @@ class LiveParams(NamedTuple):
 
 
 class Live(NamedTuple):
-    """The last u_m, and the present attitude, which follows by dead reckoning from that in u_m."""
+    """The last u_m, and the present attitude by dead reckoning from the attitude sent with u_m."""
 
     t_ns: int  # flight time at the stamp of u_m
     u_m: FloatArray  # (m,)

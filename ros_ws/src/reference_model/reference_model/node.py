@@ -34,8 +34,8 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     The commands are those of the scenario's profile until the first u_m is received.
 
     In lockstep the node publishes y_m up to the instant of the clock, and computes the next y_m
-    ahead. If `u_m_rate` is set, the node first waits for u_m. There must be exactly one u_m at each
-    instant of this rate. It has no channels if there is no command.
+    ahead. If `u_m_rate` is set, the node first waits for u_m. There must be exactly one message of
+    u_m at each instant of this rate. A message without channels means that there is no command.
     """
 
     def __init__(self) -> None:
@@ -138,7 +138,8 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     def _commands_known(self) -> bool:
         """Return whether the next y_m can be computed in lockstep.
 
-        If a u_m is due one period earlier, it must have arrived, and is taken.
+        It can if no u_m is due at the instant one period before this y_m. If a u_m is due then, it
+        must have arrived, and this method takes it.
         """
         t_ns = (self._number - 1) * self.period_ns()
         if not self._u_m_ns or t_ns < 0 or t_ns % self._u_m_ns:

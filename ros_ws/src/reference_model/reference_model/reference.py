@@ -70,9 +70,9 @@ class Reference:
     def sample(self, number: int) -> FloatArray:
         """Compute y_m at sample `number`, shape (m,), in steps of a period.
 
-        The law tracks the last sample until the new sample comes, so over skipped samples the dead
-        reckoning uses the last rates. If a step raises an exception or gives a value that is not
-        finite, the state stays and the last y_m is repeated.
+        If samples were skipped, the law has meanwhile tracked the y_m before them. Therefore the
+        dead reckoning over the skipped samples uses the rates in that y_m. If a step raises an
+        exception or gives a value that is not finite, the state stays and the last y_m is repeated.
         """
         tracked: FloatArray = model.output(self._x_m, self._model)
         while self._number < number:
