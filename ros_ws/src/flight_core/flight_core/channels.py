@@ -44,7 +44,8 @@ surface still has 0.44 at two thirds of the trim speed."""
 def reason_against_inputs(names: Sequence[str], effects: Sequence[float]) -> Refusal | None:
     """Return a sentence on the inputs whose measured effect is below LEAST_EFFECT.
 
-    `effects` is a sample of the topic with this name. Returns None if there is no such input.
+    `effects` are the values of a sample of the topic `effects`, one for each of the inputs `names`.
+    Each is a fraction of the input's effect at trim. Returns None if there is no such input.
     """
     stuck = [
         f"{name} does not answer the probe: it has at most {100.0 * effect:.0f} % of its effect"

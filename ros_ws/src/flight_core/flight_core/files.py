@@ -61,12 +61,12 @@ LEADING_ZERO = re.compile(r"[-+]?0[0-9]+")
 
 
 class _Loader(Composer, yaml.CSafeLoader):
-    """Reads numbers as YAML 1.2 does, and rejects duplicate keys.
+    """Reads numbers as YAML 1.2 does, and rejects duplicate keys and very large texts.
 
-    PyYAML would keep the last of several equal keys. It also rejects aliases that expand to more
-    than MAX_YAML_NODES values. libyaml parses the text, nine times as fast as Python. The nodes of
-    the text are composed in Python, because libyaml's binding exhausts the stack if they are nested
-    deeply.
+    PyYAML would keep the last of several equal keys. A text is too large if its aliases expand it
+    to more than MAX_YAML_NODES values. libyaml parses the text, nine times as fast as Python. The
+    nodes of the text are composed in Python, because libyaml's binding exhausts the stack if they
+    are nested deeply.
     """
 
     def __init__(self, stream: str) -> None:

@@ -138,7 +138,7 @@ class Config:
         try:
             if check:
                 parameters._check()
-        except ValueError as error:  # `require` gave the rest of the key, and the sentence
+        except ValueError as error:  # its message begins with the key inside this set
             problems.others.append(f"{key}.{error}")
             return None
         return parameters

@@ -136,7 +136,7 @@ class LockstepLock(PublisherLock):
         """Raise ChannelError, reason "sender", if the message's number is not the next one."""
         expected = self._sequence + 1
         if self.publisher is None:
-            self._sequence = 0  # until now it can be the number of a refused message
+            self._sequence = 0  # forget the number of an earlier message, which may be refused
         elif self._sequence and sequence not in {0, expected}:
             raise ChannelError(
                 SENDER,

@@ -142,8 +142,8 @@ class Recording(NamedTuple):
     left_out: int = 0  # number of messages after the step
     # number of messages that the publisher's numbering shows as lost, or None without numbers
     lost: int | None = None
-    # The last stamp before each pause in which nothing was received, either. Such a pause is no
-    # step of the clock.
+    # The last stamp before each pause that the stamps and the times of reception both show. Such a
+    # pause is no step of the clock.
     pauses_ns: tuple[int, ...] = ()
 
 

@@ -45,7 +45,9 @@ LENGTH = (0, 1, 0, 0)
 SPEED = (0, 1, -1, 0)
 ANGULAR_RATE = (1, 0, -1, 0)
 
-SIZES = {SPEED: 1.0, LENGTH: 1.0}  # m/s and m, the "sizes" in which weights measure states
+# Typical size of a state by its dimension, m/s and m. The weights of a design compare states after
+# they are divided by their sizes.
+SIZES = {SPEED: 1.0, LENGTH: 1.0}
 ANGLE_SIZE = 0.1  # size of an angle, rad, of a rate, rad/s, and of a value without a dimension
 
 BASE_UNITS: Mapping[str, Quantity] = MappingProxyType(
