@@ -117,7 +117,10 @@ class Contest(NamedTuple):
             tuned_gains.save(self.path, tunings, list(gain_tuning.OBJECTIVES), command)
 
     def benchmark(self, *seed: int) -> Benchmark:
-        """Build winds and aircraft. A seed replaces the seed of the turbulence for the tuning."""
+        """Build the winds and the aircraft.
+
+        For the tuning, the turbulence has a fixed seed. `seed` replaces it.
+        """
         build = gain_tuning.build_benchmark(self.scenario, *seed)
         return registered_laws.with_courses(build, self.controllers)
 

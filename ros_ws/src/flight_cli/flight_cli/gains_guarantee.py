@@ -78,9 +78,10 @@ def proved(
 ) -> Guarantee:
     """Return the guarantee of a loop, and keep it for the pages of its flights.
 
-    If the box leaves out the entries that are 0 in the file, the guarantee also says how far they
-    may deviate while the others are exact. `report` is told each step. Raises ParameterError before
-    the proof if the aircraft has no linear loop.
+    The box holds the entries of A and B that may deviate. If it leaves out the entries that are 0
+    in the file, the guarantee also says how far these may deviate while all others are exact.
+    `report` is told each step. Raises ParameterError before the proof if the aircraft has no linear
+    loop.
     """
     loop = answer.loop_with_box()
     require_linear(loop)
@@ -133,10 +134,11 @@ def _require_worst(folder: Path | None, airframe: str, scenario: str) -> None:
 def write_unstable(
     folder: Path | None, promise: Guarantee, airframe: str, scenario: str
 ) -> list[str]:
-    """Write the first unstable aircraft, and one that is FARTHER off, if a folder is given.
+    """Write the unstable aircraft nearest to the nominal one, if a folder is given.
 
-    Each is written as an airframe and a scenario that flies it. Returns a sentence about each, on
-    how far off it is, and whether this is inside `--uncertainty`.
+    A second aircraft has the deviations of the first times FARTHER. Each is written as an airframe
+    and a scenario that flies it. Returns a sentence about each aircraft, on how far off it is, and
+    whether this is inside `--uncertainty`.
     """
     if folder is None:
         return []

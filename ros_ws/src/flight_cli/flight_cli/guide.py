@@ -68,7 +68,7 @@ class Guide(RouteWords):
             points = self._points(command)
         elif not is_service:
             values = dict(map(_parse, self.commands))
-        # `values` has a name only once. Without values there is one word or file, and nothing else.
+        # Each name may be given once. A service or a route file must be the only word.
         once = len(self.commands) == len(values or "1")
         require(once, "guide", "a command twice, or two", "each once")
         require_ros_environment()

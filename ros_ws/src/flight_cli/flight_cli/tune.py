@@ -218,8 +218,9 @@ class Tune:
     ) -> tuple[Scenario, float]:
         """Return the scenario with the delay of the log, and the delay of the gyro's filter.
 
-        For PX4 the delay follows from the gyro's rate and filters, and for ArduPlane from the
-        filter. If the log does not have it, it is the delay of the scenario.
+        For PX4 both delays follow from the rate and the filters of the gyro. For ArduPlane the
+        scenario stays as it is, and the second delay follows from the cut-off of the filter. If the
+        log does not have the cut-off, the second delay is that of the controller.
         """
         controller = scenario.rise_di()
         if autopilot != "px4":
@@ -260,8 +261,8 @@ def _lags(scenario: Scenario, nominal: Airframe) -> FloatArray:
 def _with_lead(controller: RiseDiConfig) -> RiseDiConfig:
     """Let the feedforward lead by the lag of the servos and half a period.
 
-    The module compares y with the y_m of the same instant, so the lead must not have the delay of
-    the gyro's filter.
+    The module compares y with the y_m of the same instant. Therefore the lead must not contain the
+    delay of the gyro's filter.
     """
     if controller.feedforward is None:
         return controller
@@ -385,10 +386,10 @@ def _kept_model(part: Part) -> str:
 def _uncertainty(identification: Identification) -> float:
     """Return the uncertainty of A and B that the margins must cover, from LEAST to MOST.
 
-    For each output the effect that is known best counts. The result is twice the largest standard
-    deviation of these effects, as a fraction of the identified value. The uncertainty of the delay
-    does not count: if the delay is wrong, A and B are wrong as well, and compensate it, so that the
-    loop is still that of the log.
+    Of the effects on each output, only the one with the smallest relative deviation counts. The
+    result is twice the largest standard deviation of these effects, as a fraction of the identified
+    value. The uncertainty of the delay does not count. If the delay is wrong, A and B are wrong in
+    a way that compensates it, so that the loop is still that of the log.
     """
     relative = [
         effect.deviation * abs(effect.nominal / effect.value)
@@ -401,8 +402,8 @@ def _uncertainty(identification: Identification) -> float:
 def _box(identification: Identification, airframe: Airframe) -> dict[str, float]:
     """Return the uncertainty of each entry by name, as a fraction of its value in the airframe.
 
-    It is twice the standard deviation. If a part stays nominal, it is at least the change of the
-    entry that the identification found.
+    The uncertainty is twice the standard deviation. In a part that stays nominal, it is at least
+    the difference between the identified and the nominal value.
     """
     A, B = airframe.matrix_a(), airframe.matrix_b()
     inputs = list(airframe.inputs)

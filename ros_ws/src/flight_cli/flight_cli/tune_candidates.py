@@ -30,8 +30,8 @@ CALM, GUSTS = "calm", "gusts"
 TURBULENCE: Mapping[str, float] = MappingProxyType({"altitude": 5.0, "wind": 5.0})
 """Turbulence of a wind of 5 m/s near the ground, which has 0.5 m/s rms along the vertical axis."""
 ROLLING = {"amplitude": 0.7, "frequency": 5.0}
-"""A rotation of the air about the roll axis, rad/s and rad/s, with 0.5 rad/s rms and a time of 0.2
-s."""
+"""A rotation of the air about the roll axis as a sine: its amplitude, rad/s, and its frequency,
+rad/s. The rms is 0.5 rad/s, and 1 / frequency is 0.2 s."""
 SAMPLES = 60  # number of uncertain aircraft
 DELAY_MARGIN = 0.01  # with the observer, s, as in examples/px4_airplane/rates_observer.yaml
 FORMER = "as in the scenario"
@@ -51,8 +51,8 @@ class Candidate(NamedTuple):
     def score(self) -> float:
         """The geometric mean of the rms errors of the outputs, rad/s.
 
-        The rms error of an output is taken over all airs together. A relative change of it counts
-        the same in each output. An air counts by the size of its errors.
+        The rms error of an output is taken over all airs together, so an air with larger errors
+        counts more. In the geometric mean, an equal relative change counts the same in each output.
         """
         in_all = np.sqrt(np.mean(np.square(list(self.rms.values())), axis=0))
         return float(np.exp(np.mean(np.log(in_all))))
