@@ -38,8 +38,9 @@ WINDOW = 8
 PEERS = 100  # largest number of nodes that are kept, because names can be forged
 FORGET_NS = 5 * NANOSECONDS  # a node that is silent for this time is forgotten
 DIFFERS = 0.005
-"""s. Half a period of a controller at 100 Hz, and several times the error of the estimate on a
-local network. A larger offset is told: it is in every age, and of a clock ahead it delays u."""
+"""Offset of a clock above which a warning is logged, s. It is half a period of a controller at
+100 Hz, and several times the error of the estimate on a local network. An offset falsifies every
+age, and stamps of a clock that is ahead delay u."""
 # Channels of `clocks` beside the names of nodes. Those names begin with a slash.
 HOST = "host"  # a number for the boot of the host; 0 is unknown
 AHEAD = "ahead"  # clock of the node minus the monotonic clock, s

@@ -46,9 +46,9 @@ PEER_TIMEOUT_NS = 30 * NANOSECONDS
 SERVICE_POLL_PERIOD = 0.1
 
 LATE_REQUEST_PAUSE = 10
-"""Time without requests after one that delayed a tick, over its duration. The middleware blocks for
-0.1 s before a reply whose reader does not match (rmw_fastrtps, `wait_for_subscription`), so that a
-client could take all of the time."""
+"""Pause of the service after a request that delayed a tick, as a multiple of the time that the
+request took. The middleware blocks for 0.1 s before a reply whose reader does not match
+(rmw_fastrtps, `wait_for_subscription`). Without the pause, a client could take all of the time."""
 
 LONGEST_PAUSE_NS = NANOSECONDS
 
@@ -57,9 +57,10 @@ REPORT_TIME_NS = NANOSECONDS // 2  # the reports of each second are spread over 
 STATUS_UNEXPECTED = 1  # exit status after an unexpected exception
 
 TEARDOWN_TIME = 0.8
-"""s, at most, of the middleware at the end of a node, which needs 0.2 s. Fast DDS 2.14 can wait for
-ever there, with the interpreter held, where other participants end at the same time
-(eProsima/Fast-DDS, issue 6513). The other nodes then notice the end by the lease, 2 s."""
+"""Longest time in which the middleware may shut down at the end of a node, s. It needs 0.2 s. If
+other participants end at the same time, Fast DDS 2.14 can wait for ever while it holds the
+interpreter (eProsima/Fast-DDS, issue 6513). The process is then ended, and the other nodes notice
+this when the lease of 2 s expires."""
 
 START_POLL_PERIOD = 0.005  # s, time between two polls of a node that waits for t = 0
 

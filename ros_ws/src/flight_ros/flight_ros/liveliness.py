@@ -18,8 +18,8 @@ from flight_ros.rclpy_private import take_messages
 from flight_ros.topics import LIVELINESS, NODES
 
 SHUTDOWN_GRACE_NS = 600_000_000
-"""Time for the report of a peer to arrive that shuts down because it lost a role. A peer that ends
-for another reason sends no report."""
+"""Time to wait for the report of a peer that has shut down. A peer sends a report if it shuts down
+because it lost a role, and none if it ends for another reason."""
 
 REPORT_TIMEOUT = Duration(seconds=0.2)
 """Longest wait until all peers have a report, after which the node ends. The lost peer never

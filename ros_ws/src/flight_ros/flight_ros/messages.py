@@ -35,8 +35,8 @@ LENGTH_PLACE = STAMP_PLACE + STAMP.size  # offset of the length of header.frame_
 COUNT = struct.Struct("<I")  # length of a sequence or a string, which precedes its elements
 FRAME_ID_PLACE = LENGTH_PLACE + COUNT.size
 MAX_SIZE = 16_384
-"""Bytes of a message of named vectors. `internals` of four channels with an observer, the longest
-of a flight, has 1,844."""
+"""Largest size of a message of named vectors, bytes. The longest message of a flight, `internals`
+of four channels with an observer, has 1,844."""
 
 NO_CHANNELS: FloatArray = np.zeros(0)
 

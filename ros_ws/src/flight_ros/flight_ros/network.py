@@ -14,8 +14,9 @@ from flight_ros.transport import LOOPBACK_PROFILE
 
 PEER_RANGE = 20  # largest number of participants that discovery finds on each host
 ANNOUNCEMENT_NS = 500_000_000
-"""A participant announces itself to each of the PEER_RANGE places of each host. At the 0.1 s of the
-loopback profile five nodes would send 1000 packets a second to each host."""
+"""Period in which a participant announces itself, ns. It sends an announcement to each of the
+PEER_RANGE ports of each host. With the period of the loopback profile, 0.1 s, five nodes would send
+1000 packets a second to each host."""
 FIRST_PORT = 7400  # DDSI-RTPS 2.3
 PORTS_A_DOMAIN = 250  # section 9.6.1.1
 

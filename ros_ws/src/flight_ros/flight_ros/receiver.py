@@ -25,8 +25,9 @@ from flight_ros.topics import Topic
 # time between two log lines on refused samples of the same topic and reason
 LOG_PERIOD_NS = 2 * NANOSECONDS
 GROWTH = 2
-"""Size of a message over that of the longest valid one. A publisher may leave channels out, as a
-bridge those of a pose that are not fresh: three of seven channels have half of the bytes."""
+"""Largest permitted size of a message, divided by the size of the longest valid message so far. A
+publisher may leave channels out, so a longer message can follow. For example, a bridge leaves out
+the channels of a pose that are not fresh, and three of seven channels have half of the bytes."""
 
 RECENT = 9  # number of samples from which the median interval is taken
 # number of samples that must fit into an age limit, so that one may be late and one may be lost
