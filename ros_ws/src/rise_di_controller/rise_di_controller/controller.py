@@ -204,8 +204,8 @@ class Controller:
     def still_vanes(self) -> tuple[str, ...]:
         """Return the names of the vanes that the observer leaves out because they stand still.
 
-        At each engagement the measurement of the motion begins again at 0. Until the vane has
-        moved, or the averaging time has passed, its result from before the engagement holds.
+        At each engagement the measurement of a vane's motion begins again at 0. Until the vane has
+        moved, or the averaging time has passed, the vane counts as before the engagement.
         """
         return tuple(
             name
@@ -273,9 +273,10 @@ class Controller:
     def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
         """Buffer a sample of y, with its channels in the law's order.
 
-        A sample that no aircraft can give (see `samples`) is lost, as if it had never arrived. The
-        next sample must have a later stamp than a sample that is lost because y changed too fast.
-        If later samples confirm a jump of y, the law engages again.
+        A sample that no aircraft can give (see `samples`) is lost, as if it had never arrived. A
+        sample with a value beyond its bound leaves no trace. Any other lost sample is remembered:
+        the next sample must have a later stamp, and later samples may confirm a jump of y. If they
+        do, the law engages again.
 
         Args:
             sample: The sample, shape (m,), or (m + k,) with k vanes, SI, deviations from trim.
@@ -412,7 +413,9 @@ class Controller:
             self._oscillations.take(e, dt, None if self._first_law else self._learned)
 
     def resume(self, state: guard.ControllerState) -> None:
-        """Continue a flight that a campaign has simulated with the same parameters, from its state.
+        """Continue from the state of a flight that was simulated with the same parameters.
+
+        A campaign simulates the beginning of a flight without a controller.
 
         Args:
             state: State of the guard and of the law after the last tick.

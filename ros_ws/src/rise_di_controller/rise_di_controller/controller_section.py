@@ -73,8 +73,8 @@ class ControllerSection(NodeConfig):
         description="change of u that changes y_dot by one: 1 / abs(Omega_ii)"
     )
     lag: NonNegatives = Field(description="time constants of the actuators, s; 0 for none")
-    # Delay for y at 500 Hz, at most 2 ms old at a tick, and a u that waits 1 ms for an aircraft on
-    # the same host.
+    # The default is for topics on one host. At a tick, a y of 500 Hz is at most 2 ms old, and u
+    # then waits 1 ms for the aircraft.
     delay: NonNegative = Field(
         default=0.003,
         description="delay from y to the actuators beside sampling, s; default: topics on one host",
@@ -83,8 +83,8 @@ class ControllerSection(NodeConfig):
         default=None,
         description="largest abs(y) and abs(y_m); none: p, q, r 2000 deg/s, V 340 m/s, else 1e6",
     )
-    # Ten ticks at 100 Hz. A busy host stalls for a shorter time, and a command takes longer to
-    # rise.
+    # The default is ten ticks at 100 Hz. A busy host stalls for a shorter time than this, and a
+    # command takes longer than this to rise.
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(
         default=0.1, description="age above which y or y_m is stale, s"
     )
@@ -250,9 +250,9 @@ class ControllerSection(NodeConfig):
     def _flown_nominal(self) -> Nominal | None:
         """Return the nominal model with which the feedforward follows y_m.
 
-        With an observer whose `part` is 0, the feedforward adds no input. The model is then kept
-        for its states if there is a learner, which needs them. Without a learner the result is
-        None.
+        If the `part` of the observer is 0, feedforward and observer do not act yet. A learner still
+        needs the states of the model, so with a learner the result is the model without an effect
+        on u. Without a learner it is None.
         """
         nominal = self.nominal()
         if nominal is None or self.observer is None or self.observer.part > 0.0:

@@ -134,8 +134,8 @@ class LearnConfig(Config):
         """Return the delay margin that a learned model must keep, s.
 
         It is the configured margin. If none is configured, it is the smaller of LEAST_MARGIN and
-        `margin`, the delay margin at the start. More than LEAST_MARGIN is not required, because the
-        first loop can have less margin around the real aircraft than around the model in the file.
+        `margin`, the delay margin of the loop at the start. That margin holds around the model in
+        the file. Around the real aircraft it can be smaller, so a learned model need not have it.
         """
         return min(margin, LEAST_MARGIN) if self.margin is None else self.margin
 
@@ -178,7 +178,7 @@ class RiseDiConfig(ControllerConfig):
     sign: Literal["auto", "literal", "implicit", "soft"] = Field(
         default="auto", description="how the sign of (21) is sampled; auto: implicit or soft"
     )
-    # Three times the width at which the loop of the sign and the lags is at the limit of stability.
+    # At a width of one total lag, the loop of the sign and the lags is at the limit of stability.
     softening: Positive | Positives = Field(
         default=3.0,
         description="width of the softened sign in total lags; stable above 1, 3 is usual",

@@ -31,7 +31,8 @@ HALVINGS = 5
 stops, the first input gets 99 % of what a linear program finds for it if there are 5 bisections,
 and 92 % if there are 3."""
 
-SMALL = 1e-9  # below this diagonal entry of `exchange`, no other effector can replace one
+# Least diagonal entry of `exchange` of an effector for which other effectors can stand in.
+SMALL = 1e-9
 
 
 class Allocation(NamedTuple):
@@ -67,9 +68,10 @@ def allocate(
 
     If no limit acts, the results are exactly T v and v.
 
-    If T v is beyond an end stop, `exchange w` passes what this effector cannot give on to the other
-    effectors. This is done for one stop after the other. If it is not enough, the inputs of the law
-    are added in the order of priority, each as far as the stops allow:
+    If T v moves an effector beyond its end stop, the other effectors take over the part that this
+    effector cannot give. For this a motion `exchange w` is added to u, which does not change v. It
+    is chosen for one effector after the other (`_exchanged`). If no such u is inside the stops, the
+    inputs of the law are added one by one in the order of priority:
 
         u += s (T_i v_i + exchange w)
 
@@ -128,9 +130,9 @@ def _towards(
 ) -> FloatArray:
     """Move u by each of the moves in turn, as far as the limits allow.
 
-    `start` lies inside the limits `low` and `high`. HALVINGS bisections find the fraction of a move
-    that can be reached with the help of `exchange`. From there u goes on in a straight line, as far
-    as the limits allow.
+    `start` lies inside the limits `low` and `high`. HALVINGS bisections find the largest fraction
+    of a move after which `_exchanged` still finds a u inside the limits. From this u the motion
+    goes on in a straight line, as far as the limits allow.
     """
     u = start
     for move in moves:
@@ -162,7 +164,12 @@ def _towards(
 def _exchanged(
     u: FloatArray, low: FloatArray, high: FloatArray, exchange: FloatArray
 ) -> FloatArray:
-    """Return a u with the same effect that lies inside the limits, if the sweeps find one."""
+    """Return a u with the same effect on v, as far inside the limits as the sweeps bring it.
+
+    A sweep visits each effector. If an effector is beyond a limit, it moves back by RELAXATION
+    times its excess, and the others move so that v stays. After SWEEPS sweeps, u may still be
+    outside.
+    """
     columns = exchange.T.tolist()
     ends = list(enumerate(zip(low.tolist(), high.tolist(), strict=True)))
     values_of_u = u.tolist()

@@ -38,7 +38,8 @@ class Nominal(NamedTuple):
     C: Array  # (m, n), selects the outputs
     gravity: Array  # (n, n), f(x) = gravity @ sin(x)
     inverse: Array  # inverse of Omega = C B, (m, m)
-    path: Array  # I - B Omega^-1 C, (n, n): the part of a drift that the ideal input leaves
+    # I - B Omega^-1 C, (n, n), which takes A x + f(x) to what remains of it under the ideal input
+    path: Array
     path_A: Array  # (n, n), path A
     path_gravity: Array  # (n, n), path gravity
     # time from a tick until the input acts, s, (m,): half a period of hold, delay and actuator lag
@@ -93,8 +94,8 @@ def with_new_model(
 ) -> FeedforwardState:
     """Return the state with which a new model continues the same motion.
 
-    If there is an old state, x and u_0 stay, and u is computed with the new model. The contribution
-    of the feedforward continues at u - u_0. y_m_dot and dt belong to the last tick.
+    If there is an old state with as many states, x and u_0 stay, and u is computed with the new
+    model, so that the feedforward goes on with u - u_0. y_m_dot and dt belong to the last tick.
     """
     start = initial_state(y_m, nominal)
     if state is not None and state.x.shape == start.x.shape:

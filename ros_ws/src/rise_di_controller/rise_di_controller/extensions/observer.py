@@ -236,9 +236,10 @@ def _at_engagement(
 
 @lru_cache(maxsize=64)
 def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
-    """Extend a control law so that it starts from the trim u_trim + u_o.
+    """Extend a control law by an observer, which moves the trim of the law from u_trim by u_o.
 
-    The observer also takes the readings of the vanes, and u after saturation as an anti-windup.
+    With `vanes`, the observer also uses the readings of the vanes. It predicts z with u after
+    saturation, so that its disturbance estimates do not wind up:
 
         u_o by `correct`
         u   = law(y, y_m) from the trim u_trim + u_o

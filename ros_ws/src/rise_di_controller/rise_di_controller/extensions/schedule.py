@@ -62,12 +62,13 @@ def over_speed(
     airspeed: FloatArray,
     model: Callable[[FloatArray, FloatArray], Any],
 ) -> OverSpeed:
-    """Interpolate a model between three airspeeds by trim + d (slope + d curvature).
+    """Interpolate a model over the airspeed, as trim + d (slope + d curvature), d = V / V0 - 1.
 
-    The stacked matrices equal `values` at the trim speed and at the two `ratios` to it, the first
-    below 1 and the second above 1. Matrices that turn y_dot into u, such as F of an observer or the
-    inverse of Omega, are divided by the factor of input_scale in `values`. `model` builds the model
-    from the matrices and these factors, (m,).
+    `values` are the matrices of the model, stacked, at the trim speed, at a lower and at a higher
+    airspeed. `ratios` are these two airspeeds divided by the trim speed. In `values`, matrices that
+    turn y_dot into u, such as F of an observer or the inverse of Omega, are divided by the factor
+    of input_scale at their airspeed. `model` builds the model from stacked matrices and the factors
+    of input_scale, (m,).
     """
     trim, slow, fast = values
     least, most = (ratio - 1.0 for ratio in ratios)

@@ -23,12 +23,12 @@ from flight_core.vectors import FloatArray
 
 RATES = frozenset({"p", "q", "r"})
 EFFECT = 0.02  # default amplitude of a body rate, rad/s; ArduPlane has 0.006 rms noise
-GAP = 4  # distance of two sines in 1 / window; disturbances are measured in between
+GAP = 4  # distance of two sines in frequency, 1 / window; disturbances are measured in between
 BIN_NS = NANOSECONDS // 20  # length of the bins over which y and u are averaged
 TESTS = 12  # tests in a window
 FILLED = 0.8  # fraction of the bins of a window that a test needs
 DRIFT = 3  # degree of the polynomial for motions slower than the window, as in a turn
-LEAST_SINE = 0.05  # least fraction of a sine that must remain in u, which a limit reduces
+LEAST_SINE = 0.05  # least fraction of a sine that must be left in u after its limits
 LARGEST = 4.0  # highest frequency of a sine, Hz, with five bins a period
 
 

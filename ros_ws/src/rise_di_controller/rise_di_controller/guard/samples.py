@@ -96,7 +96,8 @@ class SampleState(NamedTuple):
     # same stamp is refused, so that a wrong sample that is sent three times does not count as three
     # that agree.
     far: StampedVector
-    agreeing: int  # number of lost samples in a row, up to `far`, that agree with each other
+    # number of lost samples in a row that agree each with the one before; the last of them is `far`
+    agreeing: int
     stillness: Stillness
 
 
@@ -167,14 +168,15 @@ def step(
 
     The possible change grows with the time since the last sample that was taken, so no sensor is
     locked out for ever. After lost samples, `largest` takes the whole change instead of the change
-    per period, because y may be so noisy.
+    per period. The reason is that these samples may have been lost because y is noisy, and the
+    changes of noise do not grow with time.
 
     The samples within the first FIRST_NS are always NEAR. A gyro may start with wrong values.
     During this time `largest` therefore takes at most `reach` of a near change, and nothing of a
     larger change.
 
-    A sample is FROZEN if every value has been the same for STILL samples and periods, after MOVING
-    samples that changed.
+    A sample is FROZEN if at least MOVING samples in a row each had other values than the sample
+    before, and every value has since been the same for STILL samples and for as many periods.
     """
     stillness = _next_stillness(state.stillness, sample, state.last, limits)
     state = state._replace(stillness=stillness)

@@ -114,7 +114,7 @@ def without_limits(
 
 
 def fields(state: Any) -> dict[str, Array]:
-    """Return the arrays of a law's state by name, beginning with a law that it extends."""
+    """Return the arrays of a law's state by name. If it extends a law, that law's come first."""
     values: dict[str, Array] = {}
     for name, value in state._asdict().items():
         values |= fields(value) if hasattr(value, "_asdict") else {name: value}

@@ -23,11 +23,12 @@ def with_channels_of(
 ) -> RiseDiConfig:
     """Give a designed controller the gains of `start` in the channels `bare`, without checks.
 
-    These channels get no feedforward and no observer.
+    The channels `bare` get no feedforward and no observer.
 
-    The K of equation (22) cannot be below that of the last channel. Such a K is replaced by the
-    last channel's K together with a smaller input scale, which gives the same loop. The inputs
-    `dead` have no effect, and get the least input scale, so that the law does not move them.
+    By equation (22), the K of a channel cannot be below that of the last channel. If the K in
+    `start` is below it, the channel gets the K of the last channel and a smaller input scale, which
+    gives the same loop. The inputs `dead` have no effect, and get the least input scale, so that
+    the law does not move them.
     """
     law = start.law_params()
     design = designed.law_params()

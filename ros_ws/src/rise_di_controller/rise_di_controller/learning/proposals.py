@@ -46,8 +46,8 @@ DESIGNED = frozenset(
 --observer` designs them at every speed."""
 
 OPTIONAL = ("feedforward.inputs", "feedforward.gravity", "feedforward.deviation")
-"""Parameters that a design may lack. A part that was not learned had no feedforward, and gets one
-with its model."""
+"""Parameters that a design may lack. For example, `feedforward.inputs` names the inputs with a
+feedforward, and a design in which all inputs have one lacks it."""
 
 
 class EventKind(StrEnum):
@@ -500,8 +500,9 @@ def _speeds(parameters: RiseDiConfig) -> str:
 def design_changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
     """Return the values of all DESIGNED parameters of a new set, by dotted name.
 
-    The value is None for each parameter that the new set lacks, but that the old set has or the
-    parameters in force may have.
+    A value of None removes a parameter. It is given for the parameters of the old set that the new
+    set lacks. It is also given for those in OPTIONAL that the new set lacks, because the parameters
+    in force may have them.
     """
     before = _designed_values(old)
     after = _designed_values(new)
