@@ -39,9 +39,11 @@ def test_divergence_is_three_times_the_error_before(
 def test_running_mean_square_reaches_that_of_a_constant_error() -> None:
     state = divergence.Errors(np.zeros(1), np.zeros(1))
     for _ in range(100):
-        state = divergence.step(state, np.array([0.3]), 0.01, first_law=True)
+        state = divergence.step(state, np.array([0.3]), 0.01, has_learned_model=False)
     assert state.now == pytest.approx(0.09 * (1.0 - np.exp(-1.0)))
-    assert divergence.step(state, np.array([9.0]), 0.01, first_law=False).largest == state.now
+    assert (
+        divergence.step(state, np.array([9.0]), 0.01, has_learned_model=True).largest == state.now
+    )
 
 
 def noise(frequency: float, damping: float) -> FloatArray:

@@ -108,9 +108,9 @@ class Controller:
         self.period_ns = self._guard.period_ns
         self._number = 0  # number of the last sample of `internals`
         self._effects = self._effect_test(parameters)
-        self._first = self._parameters = parameters
+        self._at_start = self._parameters = parameters
         self._given_up = parameters.given_up()
-        self._first_law = True
+        self._has_learned_model = False
         self._learned = _with_feedforward(parameters)
         zero = np.zeros(len(parameters.outputs))
         self._errors = divergence.Errors(zero, zero)
@@ -155,7 +155,7 @@ class Controller:
 
         Only the proposals of a learner change them.
         """
-        return not self._first_law
+        return self._has_learned_model
 
     def restart(self) -> None:
         """Engage the law again with the next fresh y and y_m, starting from the present u.
@@ -198,7 +198,7 @@ class Controller:
         if not np.array_equal(new.parameters.probe_gain(), before.probe_gain()):
             self._effects = self._effect_test(new.parameters)
         self._given_up = new.parameters.given_up()
-        self._first_law = self._has_first_model(new.parameters)
+        self._has_learned_model = not self._has_models_of_start(new.parameters)
         self._learned = _with_feedforward(new.parameters)
 
     def still_vanes(self) -> tuple[str, ...]:
@@ -243,7 +243,7 @@ class Controller:
 
     def diverging(self) -> tuple[str, ...]:
         """Return the outputs that diverge under a model learned in flight."""
-        if self._first_law:
+        if not self._has_learned_model:
             return ()
         diverging = divergence.diverging(self._errors, self._least, self._learned)
         return tuple(
@@ -255,10 +255,9 @@ class Controller:
     def oscillations(self) -> dict[str, float]:
         """Return the period, s, of each output that oscillates under a model learned in flight.
 
-        An output counts only if it oscillates more than under the law with which the flight
-        started.
+        An output counts only if it oscillates more than under the law of the start.
         """
-        if self._first_law or not self._oscillations.periods.any():
+        if not self._has_learned_model or not self._oscillations.periods.any():
             return {}
         periods = zip(
             self._parameters.outputs,
@@ -267,8 +266,8 @@ class Controller:
         )
         return {name: period for name, period in periods if period}
 
-    def _has_first_model(self, parameters: ControllerConfig) -> bool:
-        return parameters.models() == self._first.models()
+    def _has_models_of_start(self, parameters: ControllerConfig) -> bool:
+        return parameters.models() == self._at_start.models()
 
     def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
         """Buffer a sample of y, with its channels in the law's order.
@@ -408,9 +407,11 @@ class Controller:
             e: y - y_m, shape (m,), SI.
             dt: Length of the tick, s.
         """
-        self._errors = divergence.step(self._errors, e, dt, first_law=self._first_law)
+        self._errors = divergence.step(
+            self._errors, e, dt, has_learned_model=self._has_learned_model
+        )
         if self._learns:
-            self._oscillations.take(e, dt, None if self._first_law else self._learned)
+            self._oscillations.take(e, dt, self._learned if self._has_learned_model else None)
 
     def resume(self, state: guard.ControllerState) -> None:
         """Continue from the state of a flight that was simulated with the same parameters.

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Test whether a law with a learned model diverges or oscillates.
 
-The error is compared with the error under the first law, which is the law with which the flight
-started.
+The error is compared with the error under the law of the start, which is the law with which the
+flight started.
 """
 
 from collections import deque
@@ -17,8 +17,8 @@ from flight_core.vectors import FloatArray
 # Time constant of the mean square of e, s, which is a few periods of the slowest oscillation that
 # servos allow.
 MEMORY = 1.0
-# An output diverges above this multiple of its largest rms error under the first law. Later gusts
-# can be twice as strong.
+# An output diverges above this multiple of its largest rms error under the law of the start. Later
+# gusts can be twice as strong.
 FACTOR = 3.0
 LEAST = {"V": 1.0}  # rms error of V that does not yet count as a divergence, m/s
 # The same limit for every other output, rad/s. It is five times the rms error of the law alone in
@@ -33,8 +33,8 @@ TEST = 50  # number of averaged values between two tests for an oscillation, 1 s
 # Correlation of e with e a period later. It is 0.9 in a limit cycle, and at most 0.5 in turbulence
 # and gusts.
 LIKENESS = 0.7
-# Factor on the largest rms error over a WINDOW under the first law. If the error has grown by less,
-# the first law is not clearly better.
+# Factor on the largest rms error over a WINDOW under the law of the start. If the error has grown
+# by less, the law of the start is not clearly better.
 GROWN = 1.5
 HARMLESS = 0.2  # fraction of LEAST or LEAST_RATE below which an oscillation does not count
 
@@ -42,7 +42,7 @@ HARMLESS = 0.2  # fraction of LEAST or LEAST_RATE below which an oscillation doe
 class Errors(NamedTuple):
     """Mean squares of e = y - y_m, each with the shape (m,).
 
-    `now` is the running mean, and `largest` is its largest value under the first law.
+    `now` is the running mean, and `largest` is its largest value under the law of the start.
     """
 
     now: FloatArray
@@ -54,13 +54,13 @@ def least(outputs: tuple[str, ...]) -> FloatArray:
     return np.array([LEAST.get(name, LEAST_RATE) for name in outputs]) ** 2
 
 
-def step(errors: Errors, e: FloatArray, dt: float, *, first_law: bool) -> Errors:
+def step(errors: Errors, e: FloatArray, dt: float, *, has_learned_model: bool) -> Errors:
     """Update by a tick: now += (1 - exp(-dt / MEMORY)) (e^2 - now).
 
-    `largest` changes only while the first law flies.
+    `largest` changes only while the law of the start flies.
     """
     now = errors.now - np.expm1(-dt / MEMORY) * (e**2 - errors.now)
-    return Errors(now, np.maximum(errors.largest, now) if first_law else errors.largest)
+    return Errors(now, errors.largest if has_learned_model else np.maximum(errors.largest, now))
 
 
 def diverging(
@@ -68,11 +68,11 @@ def diverging(
 ) -> NDArray[np.bool_]:
     """Return which outputs, (m,), diverge under a learned model.
 
-    An output diverges if its rms error is above FACTOR times its largest under the first law, and
-    above `least`.
+    An output diverges if its rms error is above FACTOR times its largest under the law of the
+    start, and above `least`.
 
     Only outputs with a learned model count, as `is_learned` (m,) says, because the others still fly
-    the first law.
+    the law of the start.
     """
     return is_learned & (errors.now > np.maximum(FACTOR**2 * errors.largest, least))
 
@@ -80,7 +80,7 @@ def diverging(
 class Oscillations:
     """The error e over the last WINDOW, and the outputs in which it oscillates.
 
-    An output counts only if it oscillates more than under the first law.
+    An output counts only if it oscillates more than under the law of the start.
 
     In a limit cycle, e resembles e a period earlier over the whole window. Under wind and single
     commands it does not.
@@ -97,16 +97,16 @@ class Oscillations:
         self._count = 0
         self._time = 0.0
         self._means = 0
-        self._first_law = True
+        self._has_learned_model = False
 
     def take(self, e: FloatArray, dt: float, is_learned: NDArray[np.bool_] | None) -> None:
         """Record a tick, and test once a second.
 
-        `is_learned` is the mask of the outputs with a learned model, (m,), or None under the first
-        law.
+        `is_learned` is the mask of the outputs with a learned model, (m,), or None under the law of
+        the start.
         """
-        if (is_learned is None) is not self._first_law:
-            self._first_law = is_learned is None
+        if (is_learned is not None) is not self._has_learned_model:
+            self._has_learned_model = is_learned is not None
             self._record.clear()
             self.periods = 0.0 * self.periods
         self._sum = self._sum + e

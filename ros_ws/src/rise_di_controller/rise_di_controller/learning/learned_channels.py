@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Combine channels with a learned model and channels that fly the first law.
+"""Combine channels with a learned model and channels that fly the law of the start.
 
-The first law is the law with which the flight started.
+The law of the start is the law with which the flight started.
 """
 
 from collections.abc import Collection, Sequence
@@ -107,7 +107,7 @@ def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
     s_i is the standard deviation of Omega_ii divided by abs(Omega_ii). For a small s_i the factor
     subtracts two deviations, and for any s_i it stays above 0. If there are models at other speeds,
     the least value over the speeds counts. The result is 0 for an input without effect. It is
-    UNKNOWN if the input has no limit, or if the output flies the first law.
+    UNKNOWN if the input has no limit, or if the output flies the law of the start.
     """
     m = len(parameters.outputs)
     model = parameters.feedforward
@@ -136,7 +136,7 @@ def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
 def with_fallback(
     start: RiseDiConfig, parameters: RiseDiConfig, bare: Sequence[bool]
 ) -> RiseDiConfig:
-    """Return the parameters with which further channels, `bare`, fall back to the first law.
+    """Return the parameters with which the channels `bare` also fly the law of the start.
 
     If no channel keeps a model, the result is `start` itself.
     """
@@ -161,9 +161,10 @@ def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
 def without_models(
     start: RiseDiConfig, parameters: RiseDiConfig, outputs: Collection[str]
 ) -> RiseDiConfig:
-    """Return the parameters with which some outputs give up their model and fly the first law.
+    """Return the parameters with which some outputs give up their model.
 
-    These outputs keep the first law until the engagement ends, and are added to `learn.without`.
+    These outputs fly the law of the start until the engagement ends, and are added to
+    `learn.without`.
     """
     fallen = with_fallback(start, parameters, [name in outputs for name in start.outputs])
     assert start.learn is not None  # noqa: S101 - a controller that learns

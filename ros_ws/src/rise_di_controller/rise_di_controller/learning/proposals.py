@@ -56,8 +56,8 @@ class EventKind(StrEnum):
     FLIES = "flies"  # the controller has taken a proposal
     REFUSED = "refused"  # a proposal fails a check of the controller
     NO_MODEL = "no model"  # the learner has refused what it identified
-    FALLBACK = "fallback"  # all or some parts of the model fall back to the first law
-    # the law was deactivated, and begins again with its first parameters
+    FALLBACK = "fallback"  # all or some parts of the model fall back to the law of the start
+    # the law was deactivated, and begins again with the parameters of the start
     RESTART = "restart"
 
 
@@ -65,7 +65,7 @@ class Proposal(NamedTuple):
     """What a learner found in its window, as the controller receives it."""
 
     stamp_ns: int  # the end of the window, which is the instant of its last tick
-    start: int  # digest of the first parameters, with which the learner was started
+    start: int  # digest of the parameters at the start of the flight, which the learner has
     flown: int  # digest of the parameters that flew at the end of the window
     # all parameters of DESIGNED by dotted name, None for one that is removed; empty if no model is
     # proposed
@@ -218,9 +218,9 @@ class Learning:
     def step(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
         """Certify, let due proposals act, and fall back if the law diverges.
 
-        A deactivated law begins again with its first parameters, because its model may have been
-        the reason to deactivate it. Returns the parameters that the controller has taken, or None
-        if it keeps the present ones.
+        A deactivated law begins again with the parameters of the start, because its model may have
+        been the reason to deactivate it. Returns the parameters that the controller has taken, or
+        None if it keeps the present ones.
         """
         if controller.mode is Mode.INACTIVE:
             return self._begin_again(controller, now_ns)
@@ -244,7 +244,7 @@ class Learning:
         """Fall back to the parameters of the start in all parts, because some of them diverge.
 
         A fallback counts only for the parts that diverge. A part with FALLBACKS fallbacks keeps
-        the first law until the engagement ends.
+        the law of the start until the engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -269,9 +269,9 @@ class Learning:
     def _end_oscillations(
         self, periods: Mapping[str, float], controller: Controller, now_ns: int
     ) -> RiseDiConfig:
-        """Fall back to the first law in the parts of the model whose outputs oscillate.
+        """Fall back to the law of the start in the parts of the model whose outputs oscillate.
 
-        These parts keep the first law until the engagement ends.
+        These parts keep the law of the start until the engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -295,7 +295,10 @@ class Learning:
         return fallen
 
     def _begin_again(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
-        """Forget all proposals and fallbacks, and return the first parameters if a model flew."""
+        """Forget all proposals and fallbacks.
+
+        Returns the parameters of the start if a model flew, else None.
+        """
         self._updates = Updates(self._settings)
         self._certificate = None
         self._last_ns = None
