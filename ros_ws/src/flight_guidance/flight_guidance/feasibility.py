@@ -44,8 +44,8 @@ class Performance(NamedTuple):
 def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
     """Return the airspeed on the leg to each waypoint, m/s.
 
-    It is the airspeed of the waypoint. A waypoint without an airspeed has that of the previous leg,
-    and on the first leg it has `first`.
+    If a waypoint names no airspeed, the airspeed of the previous leg goes on, and on the first leg
+    it is `first`.
     """
     leg_speeds = []
     for waypoint in waypoints:
@@ -74,14 +74,15 @@ def flyable(
     """Plan the legs of a route with fillets of `radius`, m, and path following with `period`, s.
 
     If a leg is too short for the fillets, one of its waypoints is left out. The route must still
-    pass this waypoint within `radius` or within 1 s of flight. A change of altitude may exceed the
-    climb or sink along the straight part of its leg with a tailwind. It is then flown on a circle:
-    a climb at the start of the leg, and a descent at its end.
+    pass this waypoint within `radius` or within 1 s of flight. A change of altitude may be larger
+    than the aircraft can fly along the straight part of its leg in a tailwind. It is then flown on
+    a circle: a climb at the start of the leg, and a descent at its end.
 
     Raises ParameterError for a waypoint that is not finite or beyond LARGEST, for an altitude or a
     speed out of bounds, and for a speed of at most HEADWIND times the wind. It is also raised for a
-    period below the rule, a radius below (V + W)^2 / (g tan(0.8 phi_max)), and a leg that is too
-    short for the fillets. phi_max is the largest bank at V for the stall speed.
+    `period` below `lateral.least_period`, for a `radius` below `lateral.least_radius`, and for a
+    leg that is too short for the fillets. Both limits depend on the largest bank at the speed of
+    the leg, which keeps a margin to the stall (`protection.bank_limit`).
     """
     require_bounds(waypoints, can)
     leg_speeds = speeds(waypoints, can.speed)
@@ -111,8 +112,9 @@ def as_route(
 ) -> Route:
     """Make a Route from legs through waypoints; `speed`, m/s, holds if no waypoint names one.
 
-    A fillet counts as a part of the way to the next waypoint. A leg starts at the previous
-    waypoint. In an orbit the altitude changes at its waypoint.
+    A fillet counts as a part of the way to the next waypoint. A leg starts at the altitude and the
+    airspeed of the previous waypoint. An orbit round a waypoint starts at the altitude of this
+    waypoint, and ends at the altitude at which the aircraft flies on.
     """
     leg_speeds = speeds(waypoints, speed)
     numbers = path.leads(legs)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Run guidance without ROS: `modes.step` with its state, the last samples and the program.
+"""Run guidance without ROS: `modes.step` with its state, the last samples, and timed commands.
 
 The node and the simulation in one process use the same class `Guidance`.
 """

@@ -269,8 +269,10 @@ def begun_again(
 ) -> GuidanceState:
     """Return the state `holding`, with the fields CARRIED and `further` taken from `state`.
 
-    `state` is the earlier state. Until the age limit of u_m, the reference model still flies its
-    u_m.
+    `holding` is a state that holds the measured values, and `state` is the last state, if any. If
+    this step has to hold, or if there is no last state, the result is `holding` itself. The result
+    also keeps u_m of the last state up to the age limit of u_m, because the reference model flies
+    this u_m until then.
     """
     if state is None or inputs.begin is Begin.HOLD:
         return holding

@@ -74,7 +74,8 @@ TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # th
 MAX_TARGETS = 16
 MAX_ROUTE_SIZE = 65_536  # bytes, for 900 waypoints: decoding takes 0.14 ms per waypoint
 CONTROLLER = "controller"  # the node of `internals` and `authority`
-# periods without a sample after which `authority` is void: one sample may be late, and one lost
+# Number of periods without a sample after which the last `authority` is void. One sample may be
+# late, and one may be lost.
 FEWEST_AUTHORITIES = 3
 ODOMETRY_PERIOD_NS = NANOSECONDS // 10
 PATH_PERIOD_NS = NANOSECONDS
@@ -287,7 +288,11 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return nanoseconds(self.parameters.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Return the ages above which y or pose, and internals, have timed out, ns."""
+        """Return the ages of the last sample above which another publisher can take over, ns.
+
+        They hold for y, pose and internals. The first age is for the same node in a new process,
+        and the second age is for a different node.
+        """
         return self._max_age_ns(), self._max_age_ns() + nanoseconds(self.parameters.hold)
 
     def _take_target(self, sample: NamedSample, now_ns: int) -> None:
@@ -324,7 +329,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     def _receive_authority(self) -> Receiver[StampedVector] | None:
         """Make the receiver of `authority`, or return None in a flight without a learner.
 
-        There only an unexpected publisher would send it.
+        Without a learner the controller sends no `authority`, so a message would be from an
+        unexpected publisher.
         """
         rate = self.parameters.authority_rate
         self._authority_period_ns = period_ns(rate, "authority_rate") if rate else 0
@@ -501,9 +507,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
 def _service(
     answer: Callable[[Any], bool | str], called: Callable[[], None]
 ) -> Callable[[Any, Any], Any]:
-    """Make a service callback that answers True, or a sentence of refusal.
+    """Make the callback of a service from a function that returns True or a sentence of refusal.
 
-    Each call of the service first calls `called`.
+    Each call of the service calls the function `called` first.
     """
 
     def callback(request: Any, response: Any) -> Any:

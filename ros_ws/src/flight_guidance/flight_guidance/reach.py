@@ -15,7 +15,8 @@ from flight_core.units import GRAVITY
 
 CLIMB = 0.7
 SINK = 0.5
-"""Fractions of the throttle's authority for a climb and for a sink. The rest holds the airspeed."""
+"""CLIMB and SINK are the fractions of the throttle's authority that a climb and a sink may use. The
+rest holds the airspeed."""
 
 REVERSALS = 9.3
 """Least period of path following, divided by bank / roll rate. A reversal of the bank takes
@@ -37,14 +38,15 @@ MEMORY = 10.0
 
 ASKED = 2.0
 """Evidence a above which the test decides, divided by the square of the largest roll rate, s. A
-command of the largest roll rate gives it in about this time. Without an aileron the osprey is by
-then 40 deg off its commanded bank, or 7 deg for a time of MEMORY. A turn of the osprey onto a
-course needs less command."""
+constant command of the largest roll rate gives this evidence in about this time. Without an aileron
+the osprey is by then 40 deg off its commanded bank. If it stays 7 deg off, the evidence comes after
+a time of MEMORY. A turn of the osprey onto a course gives less evidence."""
 
 IGNORED = 0.3
-"""Largest fraction of a command that counts as ignored. In strong turbulence the osprey, the c172p
-and the 737 of JSBSim follow at least 0.8 of it, at least 0.75 if the aileron has 0.3 of its effect,
-and at most 0.05 without an aileron."""
+"""A command counts as ignored if p follows less than this fraction of it. The figures for the
+osprey, and for the c172p and the 737 of JSBSim, in strong turbulence: they follow at least 0.8 of a
+command. With 0.3 of the aileron's effect they follow at least 0.75, and without an aileron at most
+0.05."""
 
 FOLLOWED = 0.7
 """Least fraction of a command that counts as followed again. `attitude.yaw_for_bank` alone
@@ -78,9 +80,10 @@ class RollTest(NamedTuple):
     ignored: bool = False
 
     def after(self, dt: float, command: float, p: float, largest: float) -> "RollTest":
-        """Return the test after a step of a command, at most `largest`, and a measured p, rad/s.
+        """Return the test after a further step of dt, s, with a command and a measured p, rad/s.
 
-        If the evidence a is at most ASKED largest^2, the verdict stays.
+        `largest` is the largest command, rad/s. Whether the command counts as ignored changes only
+        if the evidence a is above ASKED largest^2.
         """
         memory = math.exp(-dt / MEMORY)
         asked = memory * self.asked + dt * command**2

@@ -3,10 +3,10 @@
 """Enforce a fence, which has zones to stay in and zones to keep out of, by the last safe turn.
 
 Each step predicts the turns at the largest bank to the right and to the left. A turn lasts until
-the course points along the way home. Once the better of the two turns comes nearer to the fence
-than MARGIN of flight, the aircraft flies this turn, and then home. An aircraft outside first flies
-the shortest way back inside, and then home. Functions take Python floats, or arrays with an element
-for each aircraft of a fleet.
+the course points along the way home. The better turn is the one that stays farther from the fence.
+As soon as even this turn would come nearer to the fence than the distance flown in the time MARGIN,
+the aircraft flies it, and then home. An aircraft outside first flies the shortest way back inside,
+and then home. Functions take Python floats, or arrays with an element for each aircraft of a fleet.
 """
 
 import math
@@ -84,9 +84,12 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
         phi' = p_max after the lag, to the largest bank;  chi' = share g tan(phi) / V;
             [n, e]' = V [cos, sin](chi) + W
 
-    The turn ends when the course is HOMEWARD short of the bearing home, and at the latest after
-    nearly a full turn at a rate of LEAST_TURN or more. It is integrated by the trapezoidal rule
-    over POINTS. The lesser clearance over the SHARES counts.
+    A turn begins with the `lag`. The bank then changes at p_max to the largest bank. `share` is one
+    of SHARES, the fractions of the turn of this bank that the aircraft really flies, and the least
+    clearance over all of them counts. A turn ends when the course is only HOMEWARD away from the
+    bearing of the way home. It also ends after the time of nearly a full turn at the largest bank,
+    where a bank below LEAST_TURN counts as LEAST_TURN. The path is integrated by the trapezoidal
+    rule at POINTS instants.
     """
     xp = array_namespace(motion.phi)
     axes = (1,) * np.ndim(motion.phi)
@@ -123,11 +126,12 @@ COURSES = 24
 
 
 def room_at_home(fence: Fence, motion: Motion, wind: float) -> float:
-    """Compute the least clearance of the better turn from home onto the orbit, m.
+    """Compute how near to the fence the turn from home onto the orbit may come, m.
 
-    The result is the least value over COURSES courses and COURSES directions of a wind of `wind`,
-    m/s. `motion` is that of the aircraft at home. An aircraft may come over home on any course, and
-    its turn onto the orbit may lead outside of the orbit by up to twice the radius of the turn.
+    An aircraft may come over home on any course, and its turn onto the orbit may lead outside of
+    the orbit by up to twice the radius of the turn. It flies the better of the turns to the right
+    and to the left. The result is the least clearance over COURSES courses and COURSES directions
+    of a wind of `wind`, m/s. `motion` is that of the aircraft at home.
     """
     angles = np.linspace(0.0, 2.0 * math.pi, COURSES, endpoint=False)
     from_sides = angles if wind else angles[:1]
@@ -176,11 +180,13 @@ class Escape(NamedTuple):
 def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
     """Choose the action of the fence after a step; `action` is that of the previous step.
 
-    A turn begins when the better of the two turns comes nearer to the fence than MARGIN of flight.
-    It ends when the course is HOMEWARD short of the bearing home, or later if the way home is not
-    free yet. On the way home, a turn begins only if it keeps a larger clearance than this way. The
-    clearances of turn and way must also be below MARGIN of flight and below the present clearance.
-    Outside the fence no turn begins, and the aircraft flies back until it is MARGIN inside.
+    Let margin be the distance flown in the time MARGIN. A turn begins when even the better of the
+    two turns would come nearer to the fence than margin. It ends when the course is only HOMEWARD
+    away from the bearing of the way home, or later if the way home is not free yet.
+
+    On the way home the aircraft turns only if the better turn keeps a larger clearance than the way
+    does. Besides, the clearance of this turn must be below margin and below the present clearance.
+    Outside the fence no turn begins, and the aircraft flies back until it is inside by margin.
     """
     if isinstance(motion.phi, float):
         north, east, phi = map(np.float64, (motion.north, motion.east, motion.phi))

@@ -4,8 +4,8 @@
 
 A map of square cells stores the ways. It is made once for a fence. The map has the shortest ways
 over cells that stay inside the fence and, where possible, leave room for a turn. Each cell has an
-aim, which is the place on its way that is about `Fence.radius` ahead. An aircraft comes home if it
-always flies the course to the aim of the cell in which it is.
+aim: the place that an aircraft on this way reaches after a distance of about `Fence.radius`. An
+aircraft comes home if it always flies straight towards the aim of the cell in which it is.
 """
 
 import math
@@ -102,13 +102,14 @@ def ways(fence: Fence) -> Ways:
     """Make the map of a fence.
 
     A cell is open if the clearance at its centre exceeds half a cell. A way leads from an open cell
-    to another if their circles of clearance overlap, because the line between them is then inside.
-    A metre of a way costs `radius / clearance`, but at least 1.
+    to a neighbour if the circles round their centres, with their clearances as radii, overlap. The
+    line between the centres is then inside the fence. The way home is the cheapest one. A metre of
+    a way costs 1, or `radius / clearance` where the clearance is smaller than the radius.
 
-    The aim of an open cell is on the way home, about a radius ahead. If there is no way home, the
-    aim is on a way to the cell with the largest clearance nearby, where the aircraft holds. In a
-    closed cell inside the fence, the way leads away from the border. The aim of a cell outside is
-    the nearest cell with a way home.
+    The aim of an open cell is the place on its way home after a distance of about the radius. If
+    there is no way home, the way leads to the cell with the largest clearance nearby, where the
+    aircraft holds. In a closed cell inside the fence, the way leads away from the border. The aim
+    of a cell outside is the nearest cell with a way home.
     """
     north, east, cell = _cells(fence)
     room = clearance(fence.zones, north, east)
@@ -185,7 +186,10 @@ def _neighbours(values: FloatArray, fill: float) -> list[FloatArray]:
 
 
 def _uphill(values: FloatArray) -> NDArray[np.intp]:
-    """Return for each cell the neighbour towards which the values rise, at a peak the cell."""
+    """Return for each cell the neighbour in the direction in which the values rise the most.
+
+    For a cell at which the values are level, such as a peak, it is the cell itself.
+    """
     slopes = np.gradient(values)
     steepness = np.maximum(np.hypot(*slopes), 1e-6)
     last = np.array(values.shape).reshape(2, 1, 1) - 1
@@ -241,7 +245,8 @@ def _is_straight(
 ) -> NDArray[np.bool_]:
     """Return whether the line from each cell onto the orbit round home is free.
 
-    The line must have a clearance of a cell. If its ends have less, it must have their clearance.
+    The line is free if its clearance is everywhere at least the side of a cell. If an end of the
+    line has a smaller clearance, the rest of the line must have at least the clearance of this end.
     """
     to_north, to_east = onto_orbit(fence, north, east)
     at_end = clearance(fence.zones, to_north, to_east)

@@ -136,11 +136,12 @@ def follow(
 ) -> Scalar:
     """Compute the bank that follows a path, rad, before protection.
 
-    `entry` is the curvature of the next leg at its start, 1/m. Because the bank lags, this
-    curvature replaces that of the present leg early, as soon as `is_entered` is true for the
-    position that the aircraft will have after a mean lag. For a change d of the bank, the mean lag
-    is abs(d) / (2 p_max) of the ramp, plus 1 / (2 k_phi) of the bank loop, plus `turn_lag` of the
-    turn behind the bank.
+    `entry` is the curvature of the next leg at its start, 1/m. Because the bank lags its command,
+    this curvature must replace that of the present leg before the aircraft reaches the next leg. It
+    does so as soon as `is_entered` is true for the position that the aircraft will have after the
+    mean lag. For a change d of the bank, the mean lag is the sum of three times: abs(d) / (2 p_max)
+    for the ramp of the bank, 1 / (2 k_phi) for the loop of the bank, and `turn_lag` for the turn
+    behind the bank.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)

@@ -181,7 +181,7 @@ def _wanted_rates(
     rates = body_rates(
         phi_c, theta_c, state.phi, state.theta, r, 0.0 if flat else beta, speed, attitude
     )
-    # The sideslip is intended here.
+    # A commanded yaw rate without a bank is meant to cause sideslip, so beta is not fed back above.
     if flat:
         rates = rates._replace(r=rates.r + state.target.r)
     if state.mode is GuidanceMode.POSE_LOST:

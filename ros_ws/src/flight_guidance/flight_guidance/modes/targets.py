@@ -23,12 +23,13 @@ from flight_guidance.steering.path import Route
 def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams:
     """Lower the limits in the parameters to those of a model that was learned in flight.
 
-    The rules hold for an airplane; the limits of a multicopter stay. By the rules of the
-    parameters, climb and sink follow from the authority of the throttle, and the roll rate follows
-    from that of the aileron. The bank is limited so that its reversals fit into the period of path
-    following, and orbits have the radius for this bank. If the aileron has no effect, or p ignores
-    its command, the largest bank is YAWED_BANK. If the throttle has no effect, there is no climb,
-    and the limit of the sink stays, because the pitch then controls the airspeed at its floor.
+    The limits of a multicopter stay. For an airplane, the same rules hold as for parameters that a
+    file leaves out: climb and sink follow from the authority of the throttle, and the roll rate
+    follows from that of the aileron. The bank is limited so that its reversals fit into the period
+    of path following, and orbits have the radius for this bank. If the aileron has no effect, or p
+    ignores its command, the largest bank is YAWED_BANK. If the throttle has no effect, there is no
+    climb, and the limit of the sink stays, because the pitch then controls the airspeed at its
+    floor.
     """
     if authority == Authority() or params.multicopter is not None:
         return params

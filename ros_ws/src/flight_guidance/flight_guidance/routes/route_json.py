@@ -26,9 +26,9 @@ def parsed_json(content: bytes, key: str) -> Any:
 
 
 def _whole(digits: str) -> int | float:
-    """Read a whole number, as a float if it has more digits than a float holds.
+    """Read a whole number of JSON: as an int up to 15 digits, and as a float beyond.
 
-    The result is infinite if the number is beyond the range of a float.
+    A float of that many digits is rounded. It is infinite if the number is too large for a float.
     """
     return int(digits) if len(digits) < 16 else float(digits)
 
@@ -95,9 +95,10 @@ def read_lines(content: bytes, key: str) -> list[list[Place]]:
 
 
 def _ring(rings: list[Any]) -> list[list[Any]]:
-    """Return the members that are lists, such as the rings of a Polygon.
+    """Return the rings of a Polygon, which are the members that are lists.
 
-    The outer ring is a route if it is the only line. Further rings are holes.
+    The first ring is the outer border, which is a route if the file has no other line. Further
+    rings are holes.
     """
     return [ring for ring in rings if isinstance(ring, list)]
 

@@ -151,7 +151,8 @@ def least_period(speed: float, bank: float, roll_rate: float) -> float:
 def largest_wind(speed: float, wind: float, bank: float) -> float:
     """Compute the wind in which the circle of `least_radius` for `wind` needs the largest bank.
 
-    The result is (V + W) sqrt(tan(b) / tan(0.8 b)) - V, m/s.
+    The result is (V + W) sqrt(tan(b) / tan(0.8 b)) - V, m/s, for the `speed` V and `wind` W, m/s,
+    and the largest `bank` b, rad.
     """
     return (speed + wind) * math.sqrt(math.tan(bank) / math.tan(0.8 * bank)) - speed
 

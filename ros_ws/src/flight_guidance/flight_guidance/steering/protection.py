@@ -77,13 +77,13 @@ def climb_range(
 ) -> tuple[Scalar, Scalar]:
     """Compute the least and the largest climb rate, m/s, for an airspeed error V_c - V, m/s.
 
-    The error, called shortfall, arises when a throttle at its stop cannot hold V:
+    If a throttle at its stop cannot hold V, the error grows, and the climb or sink is reduced:
 
-        -sink clip(2 + shortfall / d, 0, 1),  climb clip(2 - shortfall / d, 0, 1),
-            d = max(0.05 V0, g climb / (0.4 V0))
+        least   = -sink clip(2 + shortfall / d, 0, 1),   d = max(0.05 V0, g sink / (0.4 V0))
+        largest = climb clip(2 - shortfall / d, 0, 1),   d = max(0.05 V0, g climb / (0.4 V0))
 
-    `speed` is V0, m/s. With V_dot = -g climb / V, the second term of d limits the bandwidth with
-    which the climb controls V to 0.4 rad/s.
+    `shortfall` is the error, and `speed` is V0, m/s. With V_dot = -g climb / V, the second term of
+    d limits the bandwidth with which the climb controls V to 0.4 rad/s.
     """
     margins = (max(SHORTFALL * speed, GRAVITY * rate / (0.4 * speed)) for rate in (sink, climb))
     ratios = (sign * shortfall / d for sign, d in zip((-1.0, 1.0), margins, strict=True))

@@ -11,8 +11,8 @@ from flight_core.vectors import Scalar, array_namespace
 from flight_guidance.steering.protection import forward
 
 STALL_ANGLE = 0.3
-"""Angle of attack from zero lift to the stall, C_Lmax / C_Lalpha, rad. By lifting-line theory a
-clean wing of aspect ratio 7 has 1.45 and 4.9 1/rad."""
+"""Angle of attack from zero lift to the stall, C_Lmax / C_Lalpha, rad. For a clean wing of aspect
+ratio 7, C_Lmax is 1.45, and by lifting-line theory C_Lalpha is 4.9 1/rad."""
 
 
 CLIMB_BANDWIDTH = 0.4
