@@ -76,7 +76,7 @@ MAX_ROUTE_SIZE = 65_536  # bytes, for 900 waypoints: decoding takes 0.14 ms per 
 CONTROLLER = "controller"  # the node of `internals` and `authority`
 # Number of periods without a sample after which the last `authority` is void. One sample may be
 # late, and one may be lost.
-FEWEST_AUTHORITIES = 3
+AUTHORITY_TIMEOUT_PERIODS = 3
 ODOMETRY_PERIOD_NS = NANOSECONDS // 10
 PATH_PERIOD_NS = NANOSECONDS
 PATH_LENGTH = 120  # number of poses of the flown path, one per second
@@ -107,15 +107,19 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         super().__init__("guidance", GuidanceConfig)
         self._guidance = Guidance(self.parameters)
         outputs = self.parameters.outputs
-        self._y = self._receive(Y, Decoder(outputs).decode, self._guidance.take_y)
-        self._named = NamedDecoder()
-        self._pose = self._receive(POSE, self._decode_pose, self._guidance.take_pose)
+        self._y_receiver = self._receive(Y, Decoder(outputs).decode, self._guidance.take_y)
+        self._named_decoder = NamedDecoder()
+        self._pose_receiver = self._receive(POSE, self._decode_pose, self._guidance.take_pose)
         # An operator uses the system clock, so there is no age limit with simulated time. Without
         # simulated time, a target that was sent before guidance stopped is void, because the
         # operator knows of the stop.
         max_age_ns = None if self.parameters.lockstep or self.simulated else self._max_age_ns
-        self._target = self.receive(
-            TARGET, self._named.decode, self._take_target, max_age_ns=max_age_ns, qos=NEWEST_SAMPLES
+        self._target_receiver = self.receive(
+            TARGET,
+            self._named_decoder.decode,
+            self._take_target,
+            max_age_ns=max_age_ns,
+            qos=NEWEST_SAMPLES,
         )
         self._route_subscription = self.subscribe(ROUTE, STATE)  # only the newest route
         self._publish_u_m, self._publish_log = self.advertise(U_M), self.advertise(GUIDANCE)
@@ -123,37 +127,45 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._log_encoder = self.encoder(self._guidance.names)
         self._mode = GuidanceMode.OFF
         self._wait_reason: Refusal | None = None
-        self._authority = self._receive_authority()
-        self._authorities = deque[StampedVector]()
+        self._authority_receiver = self._make_authority_receiver()
+        self._waiting_authority = deque[StampedVector]()
         # stamp of the last `authority`; -1 if none has come, or if the last one is void
-        self._authority_ns = -1
-        self._has_authority = True
+        self._authority_stamp_ns = -1
+        self._has_awaited_authority = True
         if self.parameters.lockstep:
-            y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
-            inputs = y_period_ns, self.period_ns(), self._y.receive, self._pose.receive
-            self._inputs = LockstepInputs(*inputs, self._receives_authority)
+            self._lockstep_inputs = LockstepInputs(
+                y_period_ns=period_ns(self.parameters.y_rate, "y_rate"),
+                period_ns=self.period_ns(),
+                receive_y=self._y_receiver.receive,
+                receive_other=self._pose_receiver.receive,
+                is_ready=self._has_authority_for,
+            )
             self._empty_encoder = self.encoder(())
         else:
             self._controller_mode = Mode.WAITING
             self._guidance.pause(paused=True, forget=False)
-            self._internals = self._receive(INTERNALS, Decoder(["mode"]).decode, self._take_mode)
+            self._internals_receiver = self._receive(
+                INTERNALS, Decoder(["mode"]).decode, self._take_mode
+            )
         self._advertise_views()
         self._advertise_services()
 
     def _advertise_views(self) -> None:
         """Advertise the topics of maps and 3-D views."""
-        self._odometry, self._imu, self._fix, self._wind = map(
-            self._view, (ODOMETRY, IMU, FIX, WIND)
-        )
-        self._path, self._markers = (self._view(topic, PATH_PERIOD_NS) for topic in (PATH, MARKERS))
+        self._odometry_publisher = self._view_publisher(ODOMETRY)
+        self._imu_publisher = self._view_publisher(IMU)
+        self._fix_publisher = self._view_publisher(FIX)
+        self._wind_publisher = self._view_publisher(WIND)
+        self._path_publisher = self._view_publisher(PATH, PATH_PERIOD_NS)
+        self._markers_publisher = self._view_publisher(MARKERS, PATH_PERIOD_NS)
         # REP 105: with several aircraft, each body frame has a prefix, and the aircraft share the
         # map
         self._body = f"{self.get_namespace()}/{BODY}".lstrip("/")
         if TFMessage is None:
-            self._broadcast = None
+            self._publish_transforms = None
         else:
-            self._broadcast = self.create_publisher(TFMessage, "/tf", TRANSFORMS).publish
-        if self._broadcast is None:
+            self._publish_transforms = self.create_publisher(TFMessage, "/tf", TRANSFORMS).publish
+        if self._publish_transforms is None:
             self.get_logger().info("no transforms on /tf: the package tf2_msgs is not installed")
         self._path_poses: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
 
@@ -181,10 +193,10 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self._guidance.period_ns
 
     def inputs(self) -> Sequence[PolledSubscription]:
-        return self._y.subscription, self._pose.subscription
+        return self._y_receiver.subscription, self._pose_receiver.subscription
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        for receiver in (self._internals, self._y, self._pose):
+        for receiver in (self._internals_receiver, self._y_receiver, self._pose_receiver):
             receiver.poll(now_ns)
         self._poll_authority(now_ns)
         if (output := self._step(now_ns, tick.number * self.period_ns())) is not None:
@@ -192,13 +204,13 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
 
     def advance(self) -> bool:
         advanced = False
-        for now_ns, due, y, poses in self._inputs.complete():
+        for now_ns, due, y, poses in self._lockstep_inputs.complete():
             if y is not None:
-                self._y.accept(y, now_ns)
+                self._y_receiver.accept(y, now_ns)
             for pose in poses:
                 # A pose without channels means that this instant has no pose.
                 if pose.value.size:
-                    self._pose.accept(pose, now_ns)
+                    self._pose_receiver.accept(pose, now_ns)
             if due and (output := self._step(now_ns, now_ns)) is not None:
                 self._publish(output, now_ns)
             elif due:
@@ -207,32 +219,32 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return advanced
 
     def awaited_topic(self) -> str:
-        if self._authority is not None and not self._has_authority:
-            return self._authority.name
-        return (self._pose if self._inputs.has_y else self._y).name
+        if self._authority_receiver is not None and not self._has_awaited_authority:
+            return self._authority_receiver.name
+        return (self._pose_receiver if self._lockstep_inputs.has_y else self._y_receiver).name
 
-    def _receives_authority(self, now_ns: int) -> bool:
+    def _has_authority_for(self, now_ns: int) -> bool:
         """In lockstep, return whether the last `authority` that a step needs has arrived.
 
         A controller that learns sends `authority` in equal periods.
         """
-        if self._authority is None or not now_ns:
+        if self._authority_receiver is None or not now_ns:
             return True
-        self._authority.poll(now_ns)
+        self._authority_receiver.poll(now_ns)
         period = self._authority_period_ns
         last_ns = (now_ns - 1) // period * period
-        self._has_authority = self._authority_ns >= last_ns
-        return self._has_authority
+        self._has_awaited_authority = self._authority_stamp_ns >= last_ns
+        return self._has_awaited_authority
 
     def _step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
         # An `authority` with the stamp of this step may arrive before or after the step. So in
         # lockstep it acts from the next step on.
-        while self._authorities and (
-            self._authorities[0].stamp_ns < now_ns or not self.parameters.lockstep
+        while self._waiting_authority and (
+            self._waiting_authority[0].stamp_ns < now_ns or not self.parameters.lockstep
         ):
-            value = self._authorities.popleft().value.tolist()
+            value = self._waiting_authority.popleft().value.tolist()
             self._guidance.take_authority(dict(zip(AUTHORITY_CHANNELS, value, strict=True)))
-        self._target.poll(now_ns, MAX_TARGETS)
+        self._target_receiver.poll(now_ns, MAX_TARGETS)
         self._take_routes()
         output = self._guidance.step(now_ns, t_ns)
         reason = self._guidance.reason_to_wait(now_ns)
@@ -256,10 +268,10 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         step = self.period_ns()
         if now_ns % ODOMETRY_PERIOD_NS < step:
             odometry = self._odometry_of(now_ns)
-            self._odometry.publish(odometry)
+            self._odometry_publisher.publish(odometry)
             self._publish_sensors(odometry)
-            if self._broadcast is not None:
-                self._broadcast(TFMessage(transforms=[_transform(odometry)]))
+            if self._publish_transforms is not None:
+                self._publish_transforms(TFMessage(transforms=[_transform(odometry)]))
             if now_ns % PATH_PERIOD_NS < step:
                 self._publish_path(odometry)
 
@@ -276,7 +288,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
 
     def _decode_pose(self, raw: bytes) -> StampedVector:
         """Decode a pose in the order of `channels.POSE`; it may lack the sideslip."""
-        sample = self._named.decode(raw)
+        sample = self._named_decoder.decode(raw)
         if self.parameters.lockstep and not sample.channels:
             return StampedVector(sample.stamp_ns, np.array(()), sample.sender)
         values = {"beta": 0.0} | sample.channels
@@ -326,7 +338,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
                 self._guidance.take_route(route)
                 self._guidance.keep_link()
 
-    def _receive_authority(self) -> Receiver[StampedVector] | None:
+    def _make_authority_receiver(self) -> Receiver[StampedVector] | None:
         """Make the receiver of `authority`, or return None in a flight without a learner.
 
         Without a learner the controller sends no `authority`, so a message would be from an
@@ -346,32 +358,33 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             qos=LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES,
         )
 
-    def _controller(self) -> str | None:
+    def _controller_name(self) -> str | None:
         """Return the name of the controller that flies; None before its first sample."""
         # In lockstep a sender's name has no process.
         if self.parameters.lockstep:
             return f"{self.get_namespace().rstrip('/')}/{CONTROLLER}"
-        return None if self._internals.lock is None else self._internals.lock.publisher
+        lock = self._internals_receiver.lock
+        return None if lock is None else lock.publisher
 
     def _poll_authority(self, now_ns: int) -> None:
         """In real time, take the `authority` that has arrived.
 
-        The last sample is void after FEWEST_AUTHORITIES periods plus the age limit.
+        The last sample is void after AUTHORITY_TIMEOUT_PERIODS periods plus the age limit.
         """
-        if self._authority is None:
+        if self._authority_receiver is None:
             return
-        self._authority.poll(now_ns)
-        longest_ns = FEWEST_AUTHORITIES * self._authority_period_ns + self._max_age_ns()
-        if 0 <= self._authority_ns < now_ns - longest_ns:
-            self._authority_ns = -1
-            self._authorities.clear()
+        self._authority_receiver.poll(now_ns)
+        longest_ns = AUTHORITY_TIMEOUT_PERIODS * self._authority_period_ns + self._max_age_ns()
+        if 0 <= self._authority_stamp_ns < now_ns - longest_ns:
+            self._authority_stamp_ns = -1
+            self._waiting_authority.clear()
             self._guidance.take_authority(dict.fromkeys(AUTHORITY_CHANNELS, channels.UNKNOWN))
             self.get_logger().warning(
                 f"{AUTHORITY.name}: none for {seconds(longest_ns):.2g} s: its limits are void"
             )
 
     def _take_authority(self, sample: StampedVector, now_ns: int) -> None:
-        controller = self._controller()
+        controller = self._controller_name()
         if controller is None:
             # Nothing flies yet, and the next sample will have the same content.
             return
@@ -381,8 +394,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
                 "bounds",
                 "authority: found a value below 0, expected what an input can do either way",
             )
-        self._authorities.append(sample)
-        self._authority_ns = sample.stamp_ns
+        self._waiting_authority.append(sample)
+        self._authority_stamp_ns = sample.stamp_ns
 
     def _take_mode(self, sample: StampedVector, now_ns: int) -> None:
         """Take the mode of the controller: guidance flies while it is ENGAGED.
@@ -432,8 +445,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             setattr(message.twist.twist.angular, key, value)
         return message
 
-    def _view(self, topic: Topic, period_ns: int = ODOMETRY_PERIOD_NS) -> Any:
-        """Create the publisher of a topic for maps and 3-D views."""
+    def _view_publisher(self, topic: Topic, period_ns: int = ODOMETRY_PERIOD_NS) -> Any:
+        """Create the publisher of a topic for maps and 3-D views, with its period, ns."""
         return self.create_publisher(topic.type, topic.name, publisher_qos(period_ns))
 
     def _publish_sensors(self, odometry: Odometry) -> None:
@@ -448,11 +461,11 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         imu.header.frame_id = self._body
         # -1 means no estimate, by the definition of the message
         imu.linear_acceleration_covariance[0] = -1.0
-        self._imu.publish(imu)
+        self._imu_publisher.publish(imu)
         wind = Vector3Stamped(header=odometry.header)
         if (state := self._guidance.state) is not None:
             wind.vector.y, wind.vector.x = state.wind
-            self._wind.publish(wind)
+            self._wind_publisher.publish(wind)
         if self.parameters.origin is None:
             return
         latitude, longitude, height = self.parameters.origin
@@ -465,12 +478,12 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         fix.header.stamp = odometry.header.stamp
         fix.header.frame_id = self._body
         fix.status.status = NavSatStatus.STATUS_FIX
-        self._fix.publish(fix)
+        self._fix_publisher.publish(fix)
 
     def _publish_path(self, odometry: Odometry) -> None:
         self._path_poses.append(PoseStamped(header=odometry.header, pose=odometry.pose.pose))
         path_message = Path(header=odometry.header, poses=list(self._path_poses))
-        self._path.publish(path_message)
+        self._path_publisher.publish(path_message)
         if (route := self._guidance.route) is None:
             return
         marker = Marker(ns="route", type=Marker.LINE_STRIP, action=Marker.ADD)
@@ -483,7 +496,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             points = path.outline(leg, start)
             marker.points += [Point(x=east, y=north, z=altitude) for north, east in points]
             start = points[-1]
-        self._markers.publish(MarkerArray(markers=[marker]))
+        self._markers_publisher.publish(MarkerArray(markers=[marker]))
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         ages = {} if self.parameters.lockstep else self._guidance.ages(self.now_ns())
@@ -505,15 +518,15 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
 
 
 def _service(
-    answer: Callable[[Any], bool | str], called: Callable[[], None]
+    answer: Callable[[Any], bool | str], before: Callable[[], None]
 ) -> Callable[[Any, Any], Any]:
     """Make the callback of a service from a function that returns True or a sentence of refusal.
 
-    Each call of the service calls the function `called` first.
+    Each call of the service calls the function `before` first.
     """
 
     def callback(request: Any, response: Any) -> Any:
-        called()
+        before()
         result = answer(request)
         response.success = result is True
         response.message = "" if result is True else str(result)
