@@ -65,7 +65,7 @@ class AirframeFacts(NamedTuple):
     Omega: FloatArray  # (m, m) C B
     minors: FloatArray  # (m,) leading minors of Omega
     D: FloatArray | None  # (m,) diagonal of D, None if a minor is (nearly) zero
-    coupling: float | None  # (m,) signs on the diagonal of D; None if a minor is (nearly) zero
+    coupling: float | None  # `coupling` of Omega; None if a minor is (nearly) zero
     outputs: tuple[str, ...]
     inputs: tuple[str, ...]
     # the change that makes D = I, as `search` finds it; None if none of the orders that were tried
@@ -178,12 +178,12 @@ def library() -> list[AirframeFacts]:
 
 
 def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:
-    """Find the invariant zeros, the finite s at which a pencil loses rank, in 1/s, by real part.
+    """Find the invariant zeros, 1/s, in the order of their real parts.
 
-    The pencil is that of Rosenbrock, [[A - s I, B], [C, 0]]. The shapes are A (n, n), B (n, m), C
-    (m, n). There are n - m zeros if C B is nonsingular. The zeros are the poles of the zero
-    dynamics, which is the motion of the aircraft while y = 0. Source: H. H. Rosenbrock,
-    "State-Space and Multivariable Theory", 1970.
+    They are the finite s at which Rosenbrock's pencil [[A - s I, B], [C, 0]] loses rank. The shapes
+    are A (n, n), B (n, m), C (m, n). There are n - m zeros if C B is nonsingular. The zeros are the
+    poles of the zero dynamics, which is the motion of the aircraft while y = 0. Source: H. H.
+    Rosenbrock, "State-Space and Multivariable Theory", 1970.
     """
     n, m = B.shape
     pencil = np.block([[A, B], [C, np.zeros((m, m))]])
@@ -239,9 +239,9 @@ def marginal_sentence(facts: Sequence[AirframeFacts]) -> str | None:
 
 
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
-    """Say in which half plane the zeros lie, in 1/s, shape (n - m,), for (5)-(9).
+    """Say in which half plane the zeros, (n - m,), 1/s, lie. They belong to (5)-(9).
 
-    A zero whose real part is at most ZERO_REAL_PART counts as on the imaginary axis.
+    A zero counts as on the imaginary axis if its real part is at most ZERO_REAL_PART in magnitude.
     """
     rightmost = float(np.max(zeros.real, initial=-np.inf))
     if rightmost > ZERO_REAL_PART:

@@ -54,8 +54,8 @@ MAX_LAMBDA_TO_BANDWIDTH = 0.5
 the crossover."""
 
 MAX_BETA_TO_RATE_LIMIT = 0.7
-"""Upper bound of beta_i / rate limit of the actuator. At 1 the `osprey`'s yaw rate had a limit
-cycle, at 2/3 it had none."""
+"""Upper bound of beta_i divided by the rate limit of the actuator. At a ratio of 1 the `osprey`'s
+yaw rate had a limit cycle, and at 2/3 it had none."""
 
 BOUND_TOLERANCE = 1e-5  # relative tolerance of a bound, because files hold gains with six digits
 

@@ -64,12 +64,12 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 OBSERVER_LAWS = ("rise_observer", "pi_observer")
 OBJECTIVE = "gust_turbulence"
-"""Objective whose tuned gains are taken, those with the least cost. Of the laws searched, PI is
-RISE-DI with an integral in place of the sign."""
+"""Objective of the tuned gains at which the search begins. Of the two laws that have such gains,
+pi_observer is rise_observer with an integral in place of the sign."""
 SLOWER = 1.8
-"""Gains of a search are used only below this factor on the total lag of a channel. On the `osprey`,
-searched with 38 ms in q, the gains have the margins with 55 ms but not with 65 and 75 ms. From 75
-ms on, the gains of the rule have the margins."""
+"""Tuned gains are used only if the total lag of each channel is less than this multiple of the lag
+with which they were found. On the `osprey` they were found with a lag of 38 ms in q. They have the
+margins with 55 ms, but not with 65 and 75 ms. From 75 ms on, the gains of the rule have them."""
 BY_RULE = "gains by a rule from the lags, a start"
 STABLE = Requirement(phase=1e-3, gain=1.001, sensitivity=1e3, damping=1e-3, worst_phase=0.0)
 """What gains from a file need: only a stable loop."""
@@ -122,7 +122,7 @@ def select_gains(
             None for those of the scenario.
         delay: Pure delay in s; None for that of the scenario.
         inputs: Input of each output, in the airframe's order: a list, or a text with commas. If
-            empty, the pairing is the scenario's, otherwise the airframe's.
+            empty, the scenario has the pairs, or the airframe if their channels differ.
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
@@ -132,14 +132,14 @@ def select_gains(
         margin: Least delay margin that the nominal loop with the observer must have, s.
         speeds: Two fractions of the trim speed, one below 1 and one above. The observer then has
             models of these speeds and a schedule. If empty, it holds only at the trim speed.
-        weights: File of gains and weights from which the search for the margins begins
-            (`observer_gains.read_gains`); with `accept` they are taken as they are. None for those
-            that a search for the scenario found, or that a rule gives.
+        weights: File of gains and weights at which the search for the margins begins
+            (`observer_gains.read_gains`). With `accept` they are taken as they are. If None, the
+            search begins at tuned gains of the scenario, or else at gains by a rule.
         phase_margin: Least phase margin of the nominal loop behind servos, deg; with the observer
             it is 35 deg. The gain margin must be 6 dB, the sensitivity at most 2, the damping 0.4.
         accept: Whether a `phase_margin` below 40 deg is accepted.
-        mixing: "diagonal", one input per output, or "full": an allocation u = T v distributes the
-            inputs v by the pseudo-inverse of C B, as always with more inputs than outputs.
+        mixing: "diagonal" for one input per output. "full", or more inputs than outputs, for an
+            allocation u = T v of the law's inputs v by the pseudo-inverse of C B.
         progress: Called with a sentence before each step of the search for the observer.
 
     Returns:
@@ -246,9 +246,9 @@ def check_gains(
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
         entries: Deviations by entry, {"A[q,alpha]": 0.6}, and by lag, {"1/lag[elevator]": 0.3}.
-        zeros: Largest value that a zero entry of A or B may take, as a part of its row.
-        as_told: Whether lags and delay are those of the controller. Set it for an aircraft of your
-            own, for which the one in the scenario stands in.
+        zeros: Bound of the entries of A and B that are 0 in the file, as a part of their row.
+        as_told: Whether lags and delay are those that the controller was told. Set it if the
+            aircraft of the scenario only stands in for your own.
 
     Returns:
         The controller, the conditions and the margins.

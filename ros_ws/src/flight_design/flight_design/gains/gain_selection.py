@@ -71,8 +71,8 @@ DEFAULT_CROSSOVER_LAG_PRODUCT = 0.23  # rad, for an output that is not in CROSSO
 SOFTENING = 2.75  # width of the softened sign at the start of the search, in total lags
 
 BETA_TO_SLEW = 1.25
-"""beta / largest slew of the ideal control. The law needs at least 1; more than 1.5 gained nothing
-on the `osprey`."""
+"""beta divided by the largest slew of the ideal control. The law needs at least 1. More than 1.5
+gained nothing on the `osprey`."""
 
 # limits of the controller, one per input; they are reordered with the inputs
 INPUT_LIMITS = ("lower", "upper", "slew")
@@ -135,7 +135,7 @@ class GainAssessment(NamedTuple, Generic[Controller]):
         return () if self.margins is None else self.margins.channel_delay
 
     def loop_with_box(self) -> LinearLoop:
-        """Return the linear loop with the study's box of A and B, or refuse the literal sign."""
+        """Return the loop with its box, or raise ParameterError for the literal sign."""
         return loop_with_box(self.study, self.controller)
 
     @property
@@ -163,7 +163,7 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
 
 def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
-    """Return the linear loop of a controller around a study's aircraft, with a box of A and B."""
+    """Return the linear loop of a controller, with the deviations of a study as its box."""
     timing = study.timing_of(controller)
     loop = linear_loop(controller, study.airframe, study.A, study.B, timing)
     airframe = study.airframe if study.effected is None else study.effected.airframe
@@ -202,7 +202,7 @@ def gain_sets(study: Study, setting: LoopSetting) -> Selection:
 
     The set by Theorem 1 has the literal sign. In both sets the fastest channel comes first, so the
     last has the smallest K. Inputs are scaled by 1 / abs(Omega_ii), and D follows from the minors.
-    The theorem's set is `theorem_gains` with Lambda = 1 / s, for which the smallest k_g suffices.
+    The theorem's set is `theorem_gains` with a Lambda of 1 (1/s), which needs the smallest k_g.
     The other set is `engineering_gains` with the nominal slew. Behind servos, `within_requirement`
     searches for the integral gains and bandwidths with the least error. The margins must meet the
     requirement on the nominal airframe and on every sample. `omega` is the largest abs(Omega_ii) of

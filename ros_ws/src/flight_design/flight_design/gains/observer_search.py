@@ -62,7 +62,8 @@ from rise_di_controller.rise_di_config import RiseDiConfig, SpeedConfig
 
 MOVES = Moves(mending=((1,),), cheaper=((-1,), (1,)), begin=4, is_joint=True)
 SLOWER = Moves(mending=((1,),), cheaper=((-1,),), is_joint=True)
-"""Moves of the relaxation of a channel: both ways, or only where the margins need it."""
+"""Moves of the relaxation of a channel. MOVES may lower the cost by more or by less relaxation.
+SLOWER relaxes only where the margins need it."""
 
 # s, resolution of the delay margin; the rounding of gains in a file changes the margin by less
 RESOLUTION = 3e-4

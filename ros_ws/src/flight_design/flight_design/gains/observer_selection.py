@@ -370,9 +370,10 @@ def with_extended_state_observer(
 
     The gains of the law stay, unless the margin needs slower gains. The model of the feedforward is
     y_dot = Omega u, and the model of the observer is y_dot = diag(Omega) u. If the observer had all
-    of Omega, the elevator would correct V, and turn the aircraft. Omega, (m, m), is in the law's
-    order. `noise`, (m,), is the noise of the outputs, rms per sample. `size`, (m,), holds the units
-    of the outputs, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer` does.
+    of Omega, it would use the elevator to correct V, and this would pitch the aircraft. Omega, (m,
+    m), is in the law's order. `noise`, (m,), is the noise of the outputs, rms per sample. `size`,
+    (m,), holds the units of the outputs, 1 m/s or 0.1 rad/s. Raises ParameterError as
+    `with_aircraft_observer` does.
     """
     m = len(controller.outputs)
     require_same_signs(Omega, controller.D, "Omega")

@@ -58,9 +58,9 @@ FURTHER_STARTS = (
 )
 CHEAPER = ((-1, 0), (0, -1), (1, -1), (2, -1), (-3, 1))
 MOVES = Moves(mending=(*CHEAPER, (-1, 1), (1, 0), (0, 1)), cheaper=CHEAPER)
-"""Moves of the two exponents of a channel, a of the integral and b of the bandwidth. The error
-after a slow disturbance grows with slower lower^2, so only moves with a + 2 b <= 0 can lower the
-cost."""
+"""Moves of the two exponents of a channel: a is that of `slower`, and b is that of `lower`. The
+error after a slow disturbance is proportional to slower lower^2, so only moves with a + 2 b <= 0
+can lower the cost."""
 
 NO_ERROR = 1e-12  # SI: an error below it costs nothing
 # step by which the nominal phase margin is raised while the worst aircraft has too little
@@ -296,8 +296,8 @@ class _Loops(Generic[Controller]):
         for place in places:
             candidate, margins = self._measured[place]
             phase, gain, damping = fractions(margins, requirement)
-            # Each channel integrates, so it has a crossover. A channel without one has it below the
-            # frequencies that were evaluated.
+            # Each channel integrates, so its loop has a crossover. If none was found, it lies below
+            # the frequencies that were evaluated, and the margin is unknown.
             is_certain = margins.stable & np.isfinite(margins.phase)
             fraction = np.where(is_certain, np.minimum(phase, gain), 0.0)
             goals = np.append(fraction, damping if margins.stable else 0.0)

@@ -57,7 +57,8 @@ EXCITATIONS: Mapping[str, Excitation] = {
     # The climb is an integral: slow commands move it more than its noise.
     "climb": Excitation(width=0.8, period=10.0, lowest=0.1, highest=1.5),
 }
-"""Excitations by the motion that the input causes. Any other input turns the aircraft."""
+"""Excitations by the motion that the input causes. All other inputs cause a rotation, and have the
+excitation `Excitation()`."""
 PAUSE = 1.5  # s, pause between the excitations of two inputs
 
 # Ratio of the controller's age limit to the largest age limit of the bridge. It is above 1, so that
@@ -190,7 +191,9 @@ def experiment(
     )
 
 
-WHOLE = 0.95  # share of the planned duration; reports of engagement are less than 5 % late
+# Share of the planned duration from which an engagement counts as complete. The reports of its
+# beginning and end are late by less than the rest.
+WHOLE = 0.95
 
 
 def reason_against_experiment(engagements: Sequence[Engagement], duration: float) -> Refusal | None:

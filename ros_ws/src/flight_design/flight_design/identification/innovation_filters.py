@@ -75,8 +75,8 @@ class FlightData(NamedTuple):
 def coarser(recorded: FlightData, factor: int) -> FlightData:
     """Average a flight over `factor` periods.
 
-    Each y is the mean over `factor` periods. Each u is the mean from the middle of these periods to
-    the middle of the next ones, because a u is held from one sample of y to the next.
+    Each y is the mean over `factor` periods, and stands for the middle of these periods. A u acts
+    from one sample of y to the next, so each u is the mean from this middle to the next middle.
     """
     count = len(recorded.t) // factor
     leads = [
@@ -190,7 +190,10 @@ class FilterBank(NamedTuple):
     period: float  # s
 
     def by_level(self) -> "FilterBank":
-        """Return a bank with the first model of this bank once for each level of the wind."""
+        """Return a bank of filters of the first model, one for each level of the wind.
+
+        In this bank the levels of the wind are along the axis of the models.
+        """
         levels = self.L.shape[1]
         Phi, Gamma = (
             np.repeat(matrix[:1], levels, axis=0)
@@ -440,9 +443,10 @@ def filter_bank(
         alpha_dot -= shear_1 q_g,  q_dot -= shear_2 A[q, q] q_g
 
     A frozen field of wind has the shear (0, -1). The specification gives q_g the opposite sign, and
-    in other models of the air the slope also moves alpha. The noises are the `levels` of LEVELS
-    times `strength`, (N, G). `drift` is as in `observer_design.Weights`. If the models are `near`
-    the first one, their gains are computed from its gains, exact to first order.
+    in other models of the air the slope also moves alpha. The noises of the wind are the rows
+    `levels` of LEVELS, multiplied by `strength`, (N, G). `drift` is as in
+    `observer_design.Weights`. If the models are `near` the first one, their gains are computed from
+    its gains, exact to first order.
     """
     air = FilterAir(names, speed, span, shear)
     m = model.B.shape[-1]

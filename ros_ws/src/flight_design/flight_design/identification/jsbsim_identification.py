@@ -93,8 +93,8 @@ A first flight has the same.
 
 # The manoeuvre, by one rule for all aircraft
 
-# rad, bandwidth of V times the lag of its loop. It costs 26 degrees of phase: an engine is more
-# than a lag.
+# rad, bandwidth of V times the lag of its loop. It costs 26 degrees of phase. It is not larger,
+# because an engine responds more slowly than the lag of the loop says.
 FASTEST_V = 0.46
 LIGHT_SIGMA = 1.52  # m/s, light turbulence at high altitude, 5 ft/s, MIL-F-8785C 3.7.2
 

@@ -53,7 +53,7 @@ CHANGE = 3.0
 # level of the wind.
 UNEXPLAINED = 5.0
 FEW = 0.25  # gusts in a smaller share of the spans do not count, because gusts are no white noise
-# number of spans that do not count after a span that does not, while the estimates recover
+# number of spans that are left out after a span that was left out, while the estimates recover
 RECOVERY = 2
 SPAN = 1.0  # s, length of a span, within which the level of the wind is constant
 # Every third span is held out, so that each command and gust is in both sets of samples. Commands
@@ -128,7 +128,10 @@ class Unknown(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """Largest factor of an entry on its nominal value, up or down: MAX_FACTOR at PRIOR."""
+        """Largest factor by which an entry may exceed its nominal value, or fall short of it.
+
+        It is MAX_FACTOR for prior deviations of PRIOR, and grows with the larger of the deviations.
+        """
         roughness = max(self.error, self.effect, PRIOR) / PRIOR
         return float(MAX_FACTOR**roughness)
 
@@ -534,8 +537,9 @@ class Likelihood:
     def _counted(self, theta: FloatArray, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return the mask of the samples that count in the fit, (T,).
 
-        A span does not count if no level of the wind explains it. Gusts do not count if their share
-        of the spans is below FEW. The RECOVERY spans after such a span do not count either.
+        A span does not count if no level of the wind explains it. A span with a gust does not count
+        if less than the share FEW of all spans have gusts. After a span that does not count, the
+        next RECOVERY spans do not count either.
         """
         _, (e,), _ = self.passed(theta, levels)
         square = np.array(

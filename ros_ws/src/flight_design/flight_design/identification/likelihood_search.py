@@ -122,8 +122,9 @@ class Search(Likelihood):
     def fit_alike(self, used: NDArray[np.bool_], flown: FloatArray | None = None) -> Fit | None:
         """Find the minimum of `fit` from one start, with the same level of the wind in every span.
 
-        The start is in moderate turbulence, at the model that has `flown`, or at the nominal model
-        if there is none. Returns None if fewer than ALIKE of the spans have the same level.
+        The start is in moderate turbulence, at the model in flight, whose theta is `flown`. If
+        there is none, it is at the nominal model. Returns None if less than the share ALIKE of the
+        spans have the same level.
         """
         coarse = self.coarse
         begin = self._within(np.zeros(len(self.prior)) if flown is None else flown)

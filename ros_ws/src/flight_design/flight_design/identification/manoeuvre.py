@@ -16,7 +16,8 @@ from flight_core.tape import Tape
 
 RATE = 200.0  # Hz, of y and y_m
 HEIGHTS = {"q": 0.05, "V": 2.0, "p": 0.15, "r": 0.05}
-"""Units of the outputs in the coupling; also the largest errors of a flight in calm air, SI."""
+"""Heights of the outputs in the manoeuvre, SI. In these units the outputs are paired with the
+inputs. An aircraft flies if its errors in calm air are below them."""
 # speed of the gust, m/s, downwards, and its length in m to the peak, 100 ft; FAR/CS 25.341 has 30
 # to 350 ft
 GUST_SPEED = 5.0
@@ -42,7 +43,8 @@ def moderate_turbulence(altitude: float) -> dict[str, Any]:
 
 
 LEAST_SHARE = 0.01
-"""Share of the ticks: 0.6 s of a flight of a minute, more than the start of a step takes."""
+"""Share of the ticks from which an input counts as at its limit. It is 0.6 s of a flight of a
+minute, which is longer than the beginning of a step."""
 
 
 class ManoeuvreResult(NamedTuple):

@@ -14,10 +14,10 @@ from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.likelihood import MAX_ERROR, MAX_FACTOR, PRIOR, largest_error
 
 # Largest relative standard deviation of the best known effect on each output. Two such deviations
-# are a fifth of the loop gain.
+# change the loop gain by a fifth.
 MAX_DEVIATION = 0.1
-# Largest part of this deviation that an uncertain delay of u may cause. With it the guarantee has
-# to cover 30 % of the loop gain.
+# Largest relative deviation of a best known effect that an uncertain delay of u may cause. For two
+# such deviations the guarantee must cover a loop gain that is 30 % off.
 MAX_BY_TIMING = 0.15
 
 
@@ -114,9 +114,10 @@ def reason_against_signs(
 
 
 def in_time(entries: Iterable[Entry], by_timing: Iterable[float]) -> list[Entry]:
-    """Return the entries with the deviations that they would have if the delay of u were known.
+    """Return the entries with deviations from which the part by one cause is taken out.
 
-    `by_timing` is the part of each deviation that comes from the delay, or from another cause.
+    `by_timing` is this part of each deviation. For an uncertain delay of u, the result has the
+    deviations that the entries would have if the delay were known.
     """
     return [
         entry._replace(deviation=float(np.sqrt(max(entry.deviation**2 - late**2, 0.0))))

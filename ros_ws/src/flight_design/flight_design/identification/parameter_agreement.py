@@ -48,7 +48,8 @@ CALIBRATE = (
     "change `range`, `scale` and `offset` of the rows of `inputs` and `trims`, or "
     "calibrate the transmitter and fly again"
 )
-MENDS = {  # remedies by a part of the parameter's name; none reverses what the pilot's stick does
+# Remedies by a part of the parameter's name. None of them reverses the pilot's stick.
+MENDS = {
     "REVERSED": "change `positive` of the row of `inputs`, and not the parameter",
     "TRIM": "calibrate the transmitter with its trims in the middle and fly again",
     "MIN": CALIBRATE,

@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compare the models that a log shows with and without its slow changes of trim.
 
-A climb or another airspeed has another trim. A linear model takes the inputs that hold it for
-inputs that have little effect, and its innovations stay white, because most of the log is quiet. In
-a log that began with the climb, the damping of pitch came out 50 stated deviations off. A linear
-aircraft has one model, whichever slow part of the log is left out; if two of them differ, their
-difference is an error that neither of them states.
+A climb or another airspeed has another trim. A linear model does not know this, and takes the
+inputs that hold the new trim for inputs that have little effect. Its innovations stay white,
+because most of the log is quiet. In a log that began with the climb, the damping of pitch came out
+50 stated deviations off.
+
+A linear aircraft has the same model with and without the slow changes of the log. If the two models
+differ, the difference is an error that the stated deviations of neither model include.
 """
 
 import math
@@ -34,9 +36,9 @@ def without_trim(recorded: FlightData) -> FlightData:
         y' = F(z) y,  u' = F(z) u,  F(z) = (1 + a)/2 (1 - 1/z)/(1 - a/z),  a = exp(-period / SLOW)
 
     F commutes with a linear aircraft, so the model from u' to y' is the model from u to y. F begins
-    at rest at the mean of the first 2 SLOW, which is close to the trim there: the first sample may
-    lie within a doublet. To filter across lost samples of y, a line joins their neighbours. The
-    samples stay lost.
+    at rest at the mean of the first 2 SLOW, which is close to the trim at the beginning. The first
+    sample itself may lie within a doublet. Across lost samples of y, a straight line is filtered,
+    and the samples stay lost in the result.
     """
     a = math.exp(-recorded.period / SLOW)
     numerator = (1.0 + a) / 2.0 * np.array([1.0, -1.0])
@@ -58,10 +60,11 @@ def doubted(found: Identification, steady: Identification) -> Identification:
 
         deviation^2 + (error of the entry - its error in `steady`)^2
 
-    An entry that `steady` does not have is nominal there: its error is 0. A part is refused if the
-    best known effect on one of its outputs differs by more than MOST_APART. A part that was refused
-    for another reason keeps it, unless it was refused as no better and explains the log better all
-    the same, since such a part may be used.
+    `steady` is the model of `without_trim`. An entry that it lacks is nominal in it, so its error
+    is 0. A part is refused if the best known effect on one of its outputs differs by more than
+    MOST_APART. A part that is already refused for another reason keeps this reason. The exception
+    is a part that is refused as no better than the nominal model, but has the higher likelihood:
+    such a part may be used, so it is tested too.
     """
     errors = {entry.name: entry.error for entry in steady.entries}
     return found._replace(parts=tuple(_doubted(part, errors) for part in found.parts))

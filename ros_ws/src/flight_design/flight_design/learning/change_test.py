@@ -52,10 +52,10 @@ REVERSED = -2.0  # least relative change of an effect: the input acts the other 
 DEAD = -1.0  # relative change of an effect that is lost
 MOST = 2.0  # largest relative change of an effect
 NONE = MAX_DEVIATION  # share of an effect that counts as none: it is known no better than that
-# Share of a reversed effect that counts as none. No surface reverses in flight, but a surface that
-# is jammed off centre pushes steadily against the u that shall balance it. Jammed at 5 deg, beside
-# a u at its stop of 30 deg, it looks like an effect of -17 %. The deviation of the effect would be
-# no limit here, because it falls to 1 %.
+# A reversed effect of at most this share counts as none. No surface reverses in flight, but a
+# surface that is jammed off centre pushes steadily against the u that is to balance it. If it is
+# jammed at 5 deg while u is at its stop of 30 deg, it looks like an effect of -17 %. This effect
+# has a stated deviation of only 1 %, so a limit in deviations would not help.
 OFF_CENTRE = 0.25
 # Difference of log-likelihood up to which an input without effect explains the flight as well as
 # the best loss does.
@@ -191,8 +191,9 @@ class Effects(Search):
     def most_probable(self, lower: float = REVERSED) -> Least:
         """Find the least J under the condition kappa >= `lower`.
 
-        The flown model takes a loss of effect for gusts. So the search has several starts: the
-        winds that fit this model, the same wind in every span, and a dead input if its J is CLOSE.
+        With the winds that fit the flown model, a loss of effect may pass for gusts. Therefore the
+        search has several starts: these winds, the same wind in every span, and each input dead.
+        A start with a dead input counts only if its J exceeds the least J by less than CLOSE.
         """
         same = self.least(lower=lower, levels=np.full(len(self._spans), TURBULENT))
         best = least_of(self.least(lower=lower), self.least(same.theta, lower))

@@ -51,7 +51,8 @@ Design = Callable[[RiseDiConfig, Airframe, Goal], SelectedObserver]
 """Designs the feedforward and the observer for a model. Raises ParameterError."""
 
 DesignOfFile = Callable[[RiseDiConfig], SelectedObserver]
-"""Designs for the rough model as one that errs. Raises ParameterError."""
+"""Designs the feedforward and the observer for the rough model, and allows for its errors. Raises
+ParameterError."""
 
 
 class Known(NamedTuple):
@@ -162,11 +163,11 @@ def by_law_of_start(
 ) -> set[str]:
     """Return the outputs that fly by the law of the start, given the dead input of each part.
 
-    A part whose dead input is "" has been given up. If the design for the file flies, a part with a
-    dead input leaves the output of this input to the law, and V too. In flights without an
-    elevator, the observer of V erred four times as much as the law. The other outputs of the part
-    keep the design, because their inputs work. Without a rudder, the error of p was then half of
-    that under the law.
+    All outputs of a part that has been given up fly by the law. So do all outputs of a part with a
+    dead input, unless the design for the file flies. In that case only the output of the dead input
+    flies by the law, and V if it is in the part. In flights without an elevator, the observer of V
+    erred four times as much as the law. The other outputs keep the design, because their inputs
+    work. In flights without a rudder, the error of p was half of that under the law.
     """
     own = dict(zip(start.inputs, start.outputs, strict=True))
     return {

@@ -100,8 +100,8 @@ class FlightRecord:
     def fell_back(self, after_ns: int, proposals: Collection[int]) -> bool:
         """Return whether the law fell back after an instant.
 
-        It fell back if other parameters began to fly that are no proposal. `proposals` has the
-        digests of the proposals.
+        This is so if the parameters changed, and the new parameters are no proposal. `proposals`
+        has the digests of the proposals.
         """
         flown = [sample.flown for sample in self._after(after_ns)]
         return any(new != old and new not in proposals for old, new in pairwise(flown))

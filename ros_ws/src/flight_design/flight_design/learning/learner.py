@@ -78,7 +78,8 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 # number of entries that may lie at a bound: the right model may have one, wrong models have 2 to 6
 AT_BOUND = 1
-# s, shortest record: it has two of the six held-out seconds that `identify` needs
+# s, shortest record that is identified. It has two held-out seconds, of the six that `identify log`
+# requires.
 SHORTEST = 20.0 * TRANSIENT
 # s from a fallback to the next identification, whose record then shows the parameters that fly
 # after the fallback
@@ -149,7 +150,8 @@ class Learner:
         self._window_ns = nanoseconds(settings.window)
         self._latency_ns = nanoseconds(settings.latency)
         self._planned = deque(map(nanoseconds, settings.updates))
-        self._tolerance_ns = nanoseconds(settings.check / 2.0)  # for planned times, as y may be old
+        # how much earlier than planned an identification may begin, because y may be old
+        self._tolerance_ns = nanoseconds(settings.check / 2.0)
         self._first_ns: int | None = None
         self._prior = airframe  # prior of the next identification
         self._model = airframe  # the model that flies
@@ -578,7 +580,11 @@ class Learner:
         latest: Mapping[str, float],
         dead: Collection[str],
     ) -> str | None:
-        """Say what `learn.margin` costs compared with the file's; None if a margin is missing."""
+        """Say what `learn.margin` costs, compared with the margins that the goal without it has.
+
+        Returns None if `learn.margin` is not set, if the rough model does not fly, or if there is
+        no design to compare with.
+        """
         start = self._controller
         settings = start.learn
         if settings is None or settings.margin is None or self._design_of_rough is None:

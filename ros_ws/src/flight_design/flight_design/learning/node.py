@@ -43,11 +43,11 @@ NICE = 10  # nice value of a search in real time, which must not delay the loop
 class LearnerNode(FlightNode[LearnerConfig]):
     """Takes y and u of each tick from `internals`, and publishes the proposals that are due.
 
-    A search is followed by the proof of its guarantee, which the proposal does not wait for. While
-    either runs, the samples wait in the queue of the subscription. So the record of a
-    search does not change, and in lockstep the proposals equal those of the loop in one process. In
-    real time a search begins with the newest sample. If several identifications became due during a
-    search, only the last of them is made.
+    After a search, the guarantee of its proposal is proved. The proposal does not wait for this.
+    While a search or a proof runs, the samples wait in the queue of the subscription, so the record
+    of a search does not change. In lockstep the proposals therefore equal those of the loop in one
+    process. In real time a search begins with the newest sample. If several identifications became
+    due during a search, only the last of them is made.
     """
 
     def __init__(self) -> None:
@@ -193,7 +193,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
             )
 
     def _prove(self) -> None:
-        """Prove the guarantee of the proposal, beside what was identified."""
+        """Prove the guarantee of the proposal, and note it with what was identified."""
         if not self.parameters.lockstep:
             os.nice(NICE)
         self._found = None

@@ -165,7 +165,10 @@ def effect_sentence(part: Part) -> str:
 
 
 def without_effect(dead: Mapping[tuple[str, ...], str], by_law: Collection[str]) -> list[str]:
-    """Say which parts fly without an input, and which outputs fly `by_law` of the start."""
+    """Say which parts fly without an input, and which of their outputs fly the law of the start.
+
+    `by_law` has the outputs that fly this law.
+    """
     told = []
     for part, name in dead.items():
         outputs = [output for output in part if output in by_law]
