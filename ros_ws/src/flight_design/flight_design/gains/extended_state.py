@@ -7,6 +7,7 @@ knows only the sign and the size of the integrator's gain.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,28 +16,41 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.extensions.model_sections import FeedforwardConfig
 from rise_di_controller.params import ControllerConfig
 
-EXTENDED_STATE_PRODUCTS: Mapping[str, tuple[float, ...]] = {
-    "q": (0.183, 0.0077, 0.665, 0.256),
-    "p": (0.603, 0.0102, 1.02, 0.098),
-    "r": (0.714, 0.0242, 0.098, 0.161),
-    "V": (1.31, 0.0242, 0.184, 0.667),
+
+@dataclass(frozen=True, kw_only=True)
+class WeightProducts:
+    """The `ExtendedStateWeights` of an output, made independent of the total lag T of its loop."""
+
+    effort: float  # effort / T
+    drift: float  # drift T
+    rate_drift: float  # rate_drift T
+    decay: float  # decay T
+
+
+WEIGHT_PRODUCTS: Mapping[str, WeightProducts] = {
+    "q": WeightProducts(effort=0.183, drift=0.0077, rate_drift=0.665, decay=0.256),
+    "p": WeightProducts(effort=0.603, drift=0.0102, rate_drift=1.02, decay=0.098),
+    "r": WeightProducts(effort=0.714, drift=0.0242, rate_drift=0.098, decay=0.161),
+    "V": WeightProducts(effort=1.31, drift=0.0242, rate_drift=0.184, decay=0.667),
 }
-"""effort / T, drift T, rate_drift T and decay T with the total lag T, by output. A search on the
-`osprey` found them for T = 0.035 s, and 0.115 s in V, with the cost of gusts and turbulence
-together; no other aircraft took part."""
+"""The products by output. A search on the `osprey` found them for T = 0.035 s, and 0.115 s in V,
+with the cost of gusts and turbulence together. No other aircraft took part."""
 
-
-# products for an output that is not in EXTENDED_STATE_PRODUCTS
-DEFAULT_PRODUCTS = EXTENDED_STATE_PRODUCTS["p"]
+OF_OTHERS = WEIGHT_PRODUCTS["p"]  # products of an output that is not in WEIGHT_PRODUCTS
 
 
 def extended_state_weights(outputs: tuple[str, ...], T: FloatArray) -> ExtendedStateWeights:
-    """Choose the weights of an extended-state observer by EXTENDED_STATE_PRODUCTS.
+    """Choose the weights of an extended-state observer by WEIGHT_PRODUCTS.
 
     T holds the total lags of the loop, (m,), s.
     """
-    products = np.array([EXTENDED_STATE_PRODUCTS.get(name, DEFAULT_PRODUCTS) for name in outputs]).T
-    return ExtendedStateWeights(products[0] * T, *(products[1:] / T))
+    products = [WEIGHT_PRODUCTS.get(name, OF_OTHERS) for name in outputs]
+    return ExtendedStateWeights(
+        effort=np.array([of_output.effort for of_output in products]) * T,
+        drift=np.array([of_output.drift for of_output in products]) / T,
+        rate_drift=np.array([of_output.rate_drift for of_output in products]) / T,
+        decay=np.array([of_output.decay for of_output in products]) / T,
+    )
 
 
 def integrator_model(controller: ControllerConfig, Omega: FloatArray) -> FeedforwardConfig:
