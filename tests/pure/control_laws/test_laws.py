@@ -190,7 +190,7 @@ def test_only_gains_change_in_flight() -> None:
         assert not controller(name).tunable() & {"law", "outputs", "D", "rate", "learn"}
         models = {"feedforward", "observer"} if controller(name).law == "rise_di" else set()
         assert not controller(name).tunable() & {"feedforward", "observer"}
-        assert controller(name).learned() == models
+        assert controller(name).changed_by_node() == models
 
 
 def test_another_law_or_observer_refused_in_flight() -> None:

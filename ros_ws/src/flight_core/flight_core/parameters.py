@@ -250,8 +250,8 @@ class NodeConfig(Config):
         return frozenset()
 
     @classmethod
-    def learned(cls) -> frozenset[str]:
-        """Return the parameters that only the node itself can change in flight."""
+    def changed_by_node(cls) -> frozenset[str]:
+        """Return the groups of parameters that only the node itself can change in flight."""
         return frozenset()
 
 

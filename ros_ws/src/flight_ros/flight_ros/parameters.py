@@ -23,7 +23,7 @@ from flight_core.text import bounded
 
 P = TypeVar("P", bound=NodeConfig)
 AT_RESTART = "a change at a restart only"
-"""Change that is expected of a parameter in `learned`, which in flight only the node changes."""
+"""What is expected of a change by an operator to a parameter of `changed_by_node`."""
 
 
 def read_parameters(node: Node, schema: type[P]) -> P:
@@ -45,19 +45,19 @@ def read_parameters(node: Node, schema: type[P]) -> P:
             f"{node.get_name()}: found no parameters, expected {expected}: {error}"
         ) from None
     tunable = parameters.tunable()
-    own = parameters.learned()
+    by_node = parameters.changed_by_node()
     descriptions = {
         name: field.description or "" for name, field in type(parameters).model_fields.items()
     }
     for name, value in flatten(parameters.model_dump()):
         group = name.split(".")[0]
-        is_read_only = group not in tunable | own and name not in tunable
+        is_read_only = group not in tunable | by_node and name not in tunable
         # with dynamic_typing, the set validates the types, and accepts an integer as a float
         descriptor = ParameterDescriptor(
             description=descriptions.get(group, ""),
             read_only=is_read_only,
             dynamic_typing=True,
-            additional_constraints=AT_RESTART if group in own else "",
+            additional_constraints=AT_RESTART if group in by_node else "",
         )
         if node.has_parameter(name):
             node.set_descriptor(name, descriptor)
@@ -130,13 +130,14 @@ def _require_no_octal(arguments: Sequence[str]) -> None:
 def changed(node: Node, parameters: P, changes: list[Parameter]) -> P:
     """Change some parameters of a set, and validate it as a whole.
 
-    Raises ParameterError for an invalid set. It is also raised for a parameter that `learned`
-    names, because such a parameter can change only at a restart.
+    Raises ParameterError for an invalid set. It is also raised for a parameter that only the node
+    itself changes in flight (`changed_by_node`). A user can change such a parameter only at a
+    restart.
     """
     for change in changes:
-        is_own = change.name.split(".")[0] in parameters.learned()
+        is_for_node_only = change.name.split(".")[0] in parameters.changed_by_node()
         name = f"{node.get_name()}.{change.name}"
-        require(not is_own, name, short_repr(change.value), AT_RESTART)
+        require(not is_for_node_only, name, short_repr(change.value), AT_RESTART)
     values = {
         change.name: _as_list(change.value)
         for change in changes

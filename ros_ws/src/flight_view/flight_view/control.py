@@ -361,7 +361,8 @@ class Control:
 
     def _read(self) -> None:
         base = self._controller()
-        self._values = self._link.parameters("controller", sorted(base.tunable() | base.learned()))
+        names = sorted(base.tunable() | base.changed_by_node())
+        self._values = self._link.parameters("controller", names)
         self._digest = self._with(self._values).digest()
 
     def _with(self, values: Mapping[str, Any]) -> ControllerConfig:

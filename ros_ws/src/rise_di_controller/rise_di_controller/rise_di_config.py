@@ -218,7 +218,7 @@ class RiseDiConfig(ControllerConfig):
         return (super().tunable() | {"input_scale"}) - {"learn"}
 
     @classmethod
-    def learned(cls) -> frozenset[str]:
+    def changed_by_node(cls) -> frozenset[str]:
         """Return the models, which only proposals of a learner may change.
 
         A change by an operator would bypass the certification.
