@@ -159,22 +159,24 @@ def goal(
 
 
 def by_law_of_start(
-    start: RiseDiConfig, dead: Mapping[tuple[str, ...], str], *, has_file: bool
+    start: RiseDiConfig, left: Mapping[tuple[str, ...], str | None], *, has_file: bool
 ) -> set[str]:
-    """Return the outputs that fly by the law of the start, given the dead input of each part.
+    """Return the outputs that fly by the law of the start.
 
-    All outputs of a part that has been given up fly by the law. So do all outputs of a part with a
-    dead input, unless the design for the file flies. In that case only the output of the dead input
-    flies by the law, and V if it is in the part. In flights without an elevator, the observer of V
-    erred four times as much as the law. The other outputs keep the design, because their inputs
-    work. In flights without a rudder, the error of p was half of that under the law.
+    `left` has the parts that are left to this law, each with its dead input. The dead input is None
+    if the controller gave up the model of the part. All outputs of such a part fly by the law. So
+    do all outputs of a part with a dead input, unless the design for the file flies. In that case
+    only the output of the dead input flies by the law, and V if it is in the part. In flights
+    without an elevator, the observer of V erred four times as much as the law. The other outputs
+    keep the design, because their inputs work. In flights without a rudder, the error of p was half
+    of that under the law.
     """
-    own = dict(zip(start.inputs, start.outputs, strict=True))
+    driven = dict(zip(start.inputs, start.outputs, strict=True))
     return {
         output
-        for part, name in dead.items()
+        for part, dead in left.items()
         for output in part
-        if not (has_file and name) or output in {own.get(name), SPEED}
+        if dead is None or not has_file or output in {driven.get(dead), SPEED}
     }
 
 
@@ -183,19 +185,19 @@ def with_flown_channels(
     designed: RiseDiConfig,
     model: Airframe,
     flying: Collection[str],
-    dead: Mapping[tuple[str, ...], str],
+    left: Mapping[tuple[str, ...], str | None],
 ) -> RiseDiConfig:
     """Let the outputs `flying` fly a design, and all other outputs the law of the start.
 
-    The inputs that are dead are held at a constant value. If a part has been given up or has a dead
-    input, the margin in the controller is set to that of its loop.
+    `left` is that of `by_law_of_start`. Its dead inputs are held at a constant value. If any part
+    is left to the law, the margin in the controller is set to that of its loop.
     """
     bare = [output not in flying for output in start.outputs]
     mixed = with_channels_of(
-        start, designed, bare, [name in dead.values() for name in start.inputs]
+        start, designed, bare, [name in left.values() for name in start.inputs]
     )
-    has_own = bool(dead) and mixed.observer is not None
-    return with_own_margin(mixed, model, margin_of(start)) if has_own else mixed
+    has_other_margin = bool(left) and mixed.observer is not None
+    return with_own_margin(mixed, model, margin_of(start)) if has_other_margin else mixed
 
 
 def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> RiseDiConfig:

@@ -158,9 +158,9 @@ class Learner:
         self._tried = airframe  # the model that the next identification tests
         self._tried_ns = -nanoseconds(RETRY)  # end of the record of the last identification
         self._known: dict[PartName, Known] = {}
-        # Parts that fly the law of the start for good, with their dead input each, or with "" if
-        # the outputs are those of `learn.without`.
-        self._dead: dict[PartName, str] = {}
+        # Parts that fly the law of the start for good, each with its dead input, or with None if
+        # the outputs are those of `learn.without`, which the controller has given up.
+        self._dead: dict[PartName, str | None] = {}
         self._start = controller  # with the `learn.without` of the parameters in flight
         # Inputs that had no effect in the last test. In a single test a gust can hide an effect.
         self._suspected: dict[PartName, str] = {}
@@ -283,7 +283,7 @@ class Learner:
             return LearnerResult(None, "; ".join(weaker_parts))
         known = {part: value for part, value in self._known.items() if part not in dead}
         try:
-            price_text = self._adopt(self._model, known, self._dead | dead)
+            price_text = self._adopt(self._model, known, {**self._dead, **dead})
         except ParameterError as error:
             # Report the loss, although no controller without the input can be proposed.
             self._changed |= set(dead)
@@ -348,7 +348,7 @@ class Learner:
         )
 
     def _adopt(
-        self, model: Airframe, known: dict[PartName, Known], dead: dict[PartName, str]
+        self, model: Airframe, known: dict[PartName, Known], dead: dict[PartName, str | None]
     ) -> str | None:
         """Design for a model, note it as proposed, and say what `learn.margin` costs.
 
@@ -410,7 +410,7 @@ class Learner:
         self._start = without_models(self._controller, self._controller, outputs)
         if outputs:
             part = outputs_without(self._start)
-            self._dead[part] = ""
+            self._dead[part] = None
             self._known = {
                 names: known for names, known in self._known.items() if not is_within(names, part)
             }
@@ -527,12 +527,12 @@ class Learner:
                 found.append(change)
         return found
 
-    def _by_law(self, dead: Mapping[PartName, str]) -> set[str]:
+    def _by_law(self, dead: Mapping[PartName, str | None]) -> set[str]:
         """Return the outputs that fly by the law of the start, given the dead inputs."""
         return by_law_of_start(self._controller, dead, has_file=self._design_of_rough is not None)
 
     def _designed(
-        self, model: Airframe, known: Mapping[PartName, Known], dead: Mapping[PartName, str]
+        self, model: Airframe, known: Mapping[PartName, Known], dead: Mapping[PartName, str | None]
     ) -> tuple[RiseDiConfig, str | None]:
         """Design the controller for a model, and say what `learn.margin` costs.
 

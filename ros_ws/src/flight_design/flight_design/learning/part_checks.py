@@ -164,16 +164,18 @@ def effect_sentence(part: Part) -> str:
     return text if all(entry.nominal for entry in part.entries) else f"{text}, with coupling"
 
 
-def without_effect(dead: Mapping[tuple[str, ...], str], by_law: Collection[str]) -> list[str]:
+def without_effect(
+    left: Mapping[tuple[str, ...], str | None], by_law: Collection[str]
+) -> list[str]:
     """Say which parts fly without an input, and which of their outputs fly the law of the start.
 
-    `by_law` has the outputs that fly this law.
+    `left` is that of `designs.by_law_of_start`, and `by_law` has the outputs that fly this law.
     """
     told = []
-    for part, name in dead.items():
+    for part, dead in left.items():
         outputs = [output for output in part if output in by_law]
         which = "" if len(outputs) == len(part) else f"{' and '.join(outputs)} "
-        if name:
+        if dead is not None:
             flown = f"{' and '.join(part)} without it, {which}by the law of the start"
-            told.append(f"{name} has no effect: {flown}")
+            told.append(f"{dead} has no effect: {flown}")
     return told
