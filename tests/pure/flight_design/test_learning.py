@@ -366,7 +366,7 @@ def test_identification_is_due_where_last_proposal_does_not_fly(
     for k in range(1001, 1500):
         made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
     # other parameters fly: the proposal was refused, or the controller fell back
-    assert made.propose(0).sentence == "each part flies the law of the start from before on"
+    assert made.propose(0).sentence == "each part already flies the law of the start"
     identified.assert_called_once()
 
 
@@ -501,7 +501,7 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
     refused = made.propose(0)
     assert refused.controller is None
     assert str(refused.sentence).startswith(
-        "q and V: found no model with coupling, expected one, as that which flies; p and r"
+        "q and V: found no model with coupling, expected one, like the model that flies; p and r"
     )
     # the search begins at the model that flies too
     assert [call.kwargs["flown"] for call in identified.call_args_list] == [None, made.model]

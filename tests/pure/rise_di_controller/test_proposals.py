@@ -209,7 +209,7 @@ def test_proposal_for_other_parameters_or_beside_changed_ones_is_refused() -> No
     flight.receive(start=1)
     flight.receive(flown=1)
     assert "found a proposal for the parameters 1, expected" in flight.sentences[0]
-    assert "found a proposal beside the parameters 1, expected" in flight.sentences[1]
+    assert "found a proposal made with the parameters 1, expected" in flight.sentences[1]
 
 
 def test_proposal_that_loses_the_race_during_its_certificate_is_refused() -> None:

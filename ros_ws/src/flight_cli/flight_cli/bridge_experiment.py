@@ -386,9 +386,8 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
         say(
             console,
             f"{', '.join(uncertain)}: no certain model without a zero above {FASTEST_ZERO:g} "
-            "1/s, so that the law has"
-            f" {uncertain[0]}_dot = Omega u from the step response: no damping in its "
-            "feedforward, and the integral by bandwidth alone.",
+            f"1/s. The law takes {uncertain[0]}_dot = Omega u from the step response. Its "
+            "feedforward then has no damping, and its integral follows from the bandwidth alone.",
         )
 
 

@@ -119,7 +119,7 @@ class Campaign:
         "the limit, or only the two limits."
     )
     score: list[str] | None = rare_option(
-        "Unit that the score divides the rms error of an output by, SI, as in q=0.02; once for "
+        "Unit by which the score divides the rms error of an output, SI, as in q=0.02; once for "
         "each output."
     )
     seed: int = option("Seed of the aircraft.", default=1, min=0)

@@ -77,7 +77,7 @@ class Check:
     )
     namespace: str | None = log_namespace()
     definitions: list[Path] | None = option(
-        "Check the rows of the map instead, against the sources of a message package of one "
+        "Check the rows of the map against this folder, the sources of a message package of one "
         f"release, or {INSTALLED} for this host; may be repeated, one column each."
     )
     as_json: bool = json_option()

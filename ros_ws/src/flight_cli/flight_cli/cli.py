@@ -93,7 +93,7 @@ VERBS = MappingProxyType(
         "gains": {
             "select": "Select gains by Theorem 1 and by the engineering procedure.",
             "check": "Check the gains of a scenario, of any law: margins and conditions.",
-            "guarantee": "Bound what holds for every aircraft within --uncertainty.",
+            "guarantee": "Prove what holds for every aircraft within --uncertainty.",
         },
         "identify": {
             "jsbsim": "Linearise an aircraft of JSBSim, and write a scenario that flies it.",

@@ -81,8 +81,8 @@ OF_AIRCRAFT = (
 class Fly(RouteWords):
     """Fly a scenario or a fleet over ROS 2 topics.
 
-    The flight is in real time, with a process for each node. If this host has too little to give
-    for that, the flight is in lockstep with one process for each aircraft, and a sentence says so.
+    The flight is in real time, with a process for each node. If this host has too few resources for
+    this, the flight is in lockstep with one process for each aircraft, and a sentence says so.
 
     Exit status: 0 completed or landed; 2 bad input; 3 ended early or never flew; 4 completed or
     landed, but short of something that the outcome names with its figure: the errors, the law
@@ -105,7 +105,7 @@ class Fly(RouteWords):
         default=False,
     )
     real_time: bool = option(
-        "Fly in real time even if this host has too little to give for it.", default=False
+        "Fly in real time even if this host has too few resources for it.", default=False
     )
     composed: bool = rare_option(
         "Fly with all nodes in one process. It takes a third of the processor time, but a busy "

@@ -142,7 +142,7 @@ class _Gains:
 
 @dataclass(frozen=True, kw_only=True)
 class Select(_Gains):
-    """Select gains by Theorem 1 and by the engineering procedure, with every condition on both.
+    """Select gains by Theorem 1 and by the engineering procedure, and check all conditions on them.
 
     The loop has the rate, the lags and the delay of the scenario, unless options say otherwise.
     Exit status: 0, or 2 bad input.
@@ -180,8 +180,8 @@ class Select(_Gains):
         "schedule between them."
     )
     weights: Path | None = rare_option(
-        "With --observer: file of gains and weights in place of those that a search or a rule "
-        "finds; with accept they are taken as they are."
+        "With --observer: file of gains and weights in place of those of a search or a rule. With "
+        "--accept they are taken as they are."
     )
     phase_margin: float = rare_option(
         "Least phase margin of the loop with its servos, deg; 35 or less with the observer.",
@@ -251,7 +251,7 @@ class Check(_Gains):
         "'1/lag[elevator]=0.3'; may be repeated."
     )
     zeros: float = option(
-        "Part of its row that each entry of A and B may be that is 0 in the file, as in 0.1.",
+        "Bound of the entries of A and B that are 0 in the file, as a part of their row: 0.1.",
         default=0.0,
     )
 
@@ -277,21 +277,21 @@ class Check(_Gains):
 
 @dataclass(frozen=True, kw_only=True)
 class Guarantee(Check):
-    """Bound what holds for every aircraft within --uncertainty, beside what `gains check` shows.
+    """Show what `gains check` shows, and prove what holds for every aircraft within --uncertainty.
 
     Exit status: 0; 1 if the loop does not pass `gains check`, or if an aircraft within
     --uncertainty may be unstable; 2 bad input.
     """
 
     worst: Path | None = option(
-        "Folder for the first unstable aircraft and one 1.2 times as far off."
+        "Folder for the unstable aircraft that deviates least, and one 1.2 times as far off."
     )
     late: float = option(
         "Largest time by which u is late, s. It may differ at each tick and in each input.",
         default=0.0,
     )
     saturation: str | None = option(
-        "Input whose limits may be anywhere: bound what holds with them, by --certificate."
+        "Input with limits of any size: find what holds with them, and write it to --certificate."
     )
     certificate: Path | None = option(
         "File for the proof (JSON), which examples/check_certificate.py checks "

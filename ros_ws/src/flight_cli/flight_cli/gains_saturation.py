@@ -48,7 +48,7 @@ def write_limit_certificate(
     """
     if path is None:
         return []
-    require(promise is not None, "--certificate", "no box without oscillation", "a guarantee")
+    require(promise is not None, "--certificate", "no guarantee for any box", "one")
     assert promise is not None  # noqa: S101 - for mypy
     frame = airframe_to_check(airframe, scenario_to_check(scenario))
     sources = certificate_sources(frame, scenario)

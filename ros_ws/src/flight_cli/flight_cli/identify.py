@@ -76,7 +76,7 @@ def _accept_option() -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Jsbsim:
-    """Linearise an aircraft of JSBSim, select its gains, fly it, and write a scenario that does.
+    """Linearise an aircraft of JSBSim, select its gains, fly it, and write a scenario of it.
 
     Exit status: 0, 2 bad input, 3 the aircraft does not trim or does not fly.
     """
@@ -290,7 +290,9 @@ class Bridge:
     speed: float | None = option(
         "True airspeed in trim, m/s, if the map has the airspeed. Leave it out for a hover."
     )
-    run: Path | None = option("Log of the experiment, or one of rise-di import, read in its place.")
+    run: Path | None = option(
+        "Log of an experiment, or of rise-di import, to read instead of flying."
+    )
     amplitude: float = rare_option(
         "Amplitude of the excitation as a fraction of each input's limit.", default=AMPLITUDE
     )

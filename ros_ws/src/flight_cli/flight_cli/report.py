@@ -48,7 +48,7 @@ class Report:
     file is kept as *.damaged, an intact log stays as it is, and metadata.yaml of another program is
     never replaced.
 
-    Exit status: that of the flight, as docs/outcomes.md has it, or of several the gravest; 2 bad
+    Exit status: that of the flight (see docs/outcomes.md), or the gravest of several flights; 2 bad
     input.
     """
 

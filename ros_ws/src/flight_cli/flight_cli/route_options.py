@@ -24,7 +24,7 @@ class RouteWords:
         metavar="LAT,LON",
     )
     altitude: float | None = rare_option(
-        "Altitude of a route that has none, or of the ground or home from which it counts, m.",
+        "Altitude of a route that has none, or of the ground or home above which it is given, m.",
     )
     simplify: float = rare_option(
         "Leave out positions that are within this distance of the line through the others, m.",

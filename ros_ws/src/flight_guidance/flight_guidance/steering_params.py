@@ -119,7 +119,7 @@ class SteeringConfig(NodeConfig):
         default=None, description="time constant of the estimated angle of attack, s"
     )
     sideslip_gain: NonNegative | None = Field(
-        default=None, description="k_beta, 1/s, with beta in `pose`"
+        default=None, description="k_beta, yaw rate per sideslip, 1/s, with beta in `pose`"
     )
     period: Positive | None = Field(default=None, description="period of path following, s")
     damping: Annotated[float, Field(ge=0.5, le=1.0)] = Field(

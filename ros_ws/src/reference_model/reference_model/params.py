@@ -253,8 +253,10 @@ class ReferenceModelConfig(NodeConfig):
     recorded: dict[str, Recorded] = Field(
         default={}, description="recorded commands by channel, for example of a stick"
     )
-    coordinated_turn: CoordinatedTurn | None = Field(default=None, description="turn coordination")
-    live: LiveCommands = Field(default=LiveCommands(), description="live commands u_m")
+    coordinated_turn: CoordinatedTurn | None = Field(
+        default=None, description="yaw rate in a coordinated turn"
+    )
+    live: LiveCommands = Field(default=LiveCommands(), description="limits of live commands u_m")
     u_m_rate: float = Field(
         default=0.0, ge=0, le=1000, description="rate of u_m in lockstep, Hz; 0 for no u_m"
     )

@@ -48,7 +48,7 @@ class SpeedConfig(Config):
     Values are in SI units, matrices row by row as in those sections.
     """
 
-    ratio: Positive = Field(description="this airspeed over the trim speed")
+    ratio: Positive = Field(description="this airspeed divided by the trim speed")
     A: Numbers = Field(description="A of the feedforward")
     B: Numbers = Field(description="B of the feedforward")
     gravity: Numbers | None = Field(default=None, description="gravity of the feedforward")
@@ -65,7 +65,7 @@ class ScheduleConfig(Config):
     time: Positive = Field(default=1.0, description="time constant at which input_scale follows, s")
     slow: SpeedConfig | None = Field(
         default=None,
-        description="models below the trim speed, with an observer; interpolated in between",
+        description="models below the trim speed, with an observer; between, they are interpolated",
     )
     fast: SpeedConfig | None = Field(
         default=None, description="models above the trim speed, with an observer"
@@ -82,12 +82,11 @@ class PriorConfig(Config):
 
     file: str | None = Field(
         default=None,
-        description="its airframe file, written by `rise-di learn`; none: that of the airframe",
+        description="airframe file of the model, as of `rise-di learn`; none: that of the aircraft",
     )
     off: Annotated[float, Field(ge=0.05, le=1.0)] | None = Field(
         default=None,
-        description="standard deviation of its entries over their values; none: 0.29, which is "
-        "+-50 %",
+        description="relative standard deviation of the entries; none: 0.29, for +-50 %",
     )
     sketch: bool = Field(
         default=False,
@@ -118,8 +117,8 @@ class LearnConfig(Config):
     prior: PriorConfig | None = Field(default=None, description="the rough model")
     margin: Annotated[float, Field(ge=0, le=0.5)] | None = Field(
         default=None,
-        description="least delay margin of a learned model, s; none: what the loop of the file "
-        "keeps around it",
+        description="least delay margin of a learned model, s; none: as the loop of the file has "
+        "around the model",
     )
     without: tuple[str, ...] | None = Field(
         default=None,

@@ -254,7 +254,7 @@ class Learner:
         # after a lost proposal, the next proposal has to leave out the dead inputs again
         leaves_out_again = lost and any(self._dead.values())
         if verdict.model is self._model and not leaves_out_again:
-            nothing = Refusal("each part flies the law of the start from before on")
+            nothing = Refusal("each part already flies the law of the start")
             return LearnerResult(None, str(joined(verdict.refusals) or nothing))
         left_out = without_effect(self._dead, self._by_law(self._dead)) if lost else []
         price_text = self._adopt(verdict.model, verdict.known, self._dead)

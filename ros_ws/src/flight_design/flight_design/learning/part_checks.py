@@ -92,7 +92,7 @@ def reason_against_first_model(part: Part, name: str, *, flies: bool) -> Refusal
         return None
     return Refusal(
         f"{' and '.join(part.outputs)}: found an advantage over the airframe {name} of "
-        f"{part.advantage:.2g} standard deviations in the seconds since the model before, "
+        f"{part.advantage:.2g} standard deviations in the seconds since the previous model, "
         f"expected more than {limit:g}"
     )
 
@@ -120,8 +120,8 @@ def reason_against_part_alone(part: Part, known: Iterable[tuple[str, ...]]) -> R
     if not any(is_within(part.outputs, outputs) for outputs in known if outputs != part.outputs):
         return None
     return Refusal(
-        f"{' and '.join(part.outputs)}: found no model with coupling, expected one, as that "
-        "which flies"
+        f"{' and '.join(part.outputs)}: found no model with coupling, expected one, like the model "
+        "that flies"
     )
 
 

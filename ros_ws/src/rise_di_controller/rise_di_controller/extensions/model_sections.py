@@ -169,11 +169,12 @@ class ObserverConfig(Config):
         description="names of the estimates: first the states of the feedforward, as x.alpha"
     )
     Phi: Numbers = Field(description="estimates one period later without input")
-    Gamma: Numbers = Field(description="effect on them of u held over the period")
+    Gamma: Numbers = Field(description="effect of u, held over the period, on the estimates")
     L: Numbers = Field(description="correction of the estimates by the errors of the outputs")
     F: Numbers = Field(description="u_o = -F z, one row per input, one column per estimate")
     part: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.6, description="bound of u_o over the limits of u; 0: neither u_o nor u_ff"
+        default=0.6,
+        description="bound of u_o, as a fraction of u's limits; 0: neither u_o nor u_ff",
     )
     within: Positive = Field(
         default=0.1, description="least time in which u_o goes from 0 to its bound, s"
@@ -237,7 +238,7 @@ class AllocationConfig(Config):
     slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s")
     priority: Names | None = Field(
         default=None,
-        description="inputs, the one that keeps its effect longest first; none: in order",
+        description="inputs by priority, the first keeps its effect longest; none: in order",
     )
 
     def ordered(self, inputs: Sequence[str], order: Sequence[str]) -> "AllocationConfig":

@@ -416,7 +416,7 @@ class Learning:
         if self._fallback is not None and self._fallback.outlived_by(proposal, controller.digest):
             return None
         return Refusal(
-            f"found a proposal beside the parameters {proposal.flown}, expected "
+            f"found a proposal made with the parameters {proposal.flown}, expected "
             f"{controller.digest}: they changed meanwhile"
         )
 
