@@ -70,8 +70,8 @@ class BridgeExperiment:
     """An experiment on the aircraft behind a channel map, which is flown or read from its log.
 
     The files that fly the aircraft are written to `folder`. If the log was imported, the gains
-    allow for `link_delay`, s, in addition to the delay in the log. If it is None, the delay of the
-    map is taken.
+    allow for `link_delay`, s, in addition to the delay in the log. If `link_delay` is None, it is
+    that of the map.
     """
 
     map_name: str

@@ -84,6 +84,7 @@ class Play:
     def _sendable(self, playback: Playback, *, every: bool) -> dict[str, str]:
         """Return the message types of the topics that can be sent, and warn of the others.
 
+        If `every`, the user named no topic, and topics that cannot be sent are left out.
         Raises ParameterError if no topic can be sent.
         """
         from flight_bringup.player import unsendable  # noqa: PLC0415 - as above

@@ -60,8 +60,8 @@ def set_keys(parameters: Config) -> Iterator[SetKey]:
     """Yield the keys whose value is not their default.
 
     If the default is the empty list, a list of zeros counts as the default, too, because both mean
-    none. If a section is left out by default, but is given with nothing but defaults, the section
-    itself is a key.
+    none. Some sections are absent by default. If such a section is given, but all of its keys have
+    their defaults, the section itself is the key.
     """
     return _set_keys(parameters, "", "")
 

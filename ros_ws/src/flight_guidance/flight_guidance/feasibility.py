@@ -112,6 +112,8 @@ def as_route(
 ) -> Route:
     """Make a Route from legs through waypoints; `speed`, m/s, holds if no waypoint names one.
 
+    If `slopes`, the altitude changes along a line, and otherwise in a step at its start.
+
     A fillet counts as a part of the way to the next waypoint. A leg starts at the altitude and the
     airspeed of the previous waypoint. An orbit round a waypoint starts at the altitude of this
     waypoint, and ends at the altitude at which the aircraft flies on.

@@ -389,7 +389,10 @@ class Guidance:
             return self._last_goes_on(now_ns, sentence(error), is_said=is_said)
 
     def _last_goes_on(self, now_ns: int, cause: str, *, is_said: bool) -> GuidanceOutput | None:
-        """Return the output after a failed step: the last u_m, or None beyond the age limit."""
+        """Return the output after a failed step: the last u_m, or None beyond the age limit.
+
+        `cause` is a sentence on the error, and becomes a notice if `is_said`.
+        """
         state = self._state
         pose = self._pose
         y = self._y

@@ -101,7 +101,7 @@ class TargetChannels(NamedTuple):
     together: Mapping[Lateral, tuple[str, ...]]  # channels of a mode that must come in one message
 
     def known(self) -> tuple[str, ...]:
-        """Return all these channels, in the order of TARGETS."""
+        """Return all channels of Target that the aircraft takes, in the order of TARGETS."""
         names = {*self.lateral, *self.vertical, *self.further}
         return tuple(name for name in TARGETS if name in names)
 

@@ -140,9 +140,9 @@ class ZoneConfig(Config):
 
 
 class HomeConfig(Config):
-    """The place to which the aircraft flies at a fence and by `guidance/home`.
+    """The place to which the aircraft flies when the fence acts, or by the service `guidance/home`.
 
-    It also flies there after a loss of pose (`after_loss`) or of the operator's link
+    It also flies there after the loss of the pose (`after_loss`) or of the operator's link
     (`link_timeout`).
     """
 

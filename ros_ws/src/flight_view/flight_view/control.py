@@ -392,7 +392,10 @@ class Control:
     def _apply(
         self, request: Mapping[str, Any], values: Mapping[str, Any], *, undo: bool
     ) -> Refusal | None:
-        """Set new values, or refuse if the parameters differ from those shown on the page."""
+        """Set new values, or refuse if the parameters differ from those shown on the page.
+
+        If `undo`, the earlier values are kept, so that this change can be undone.
+        """
         self._require_simulated()
         self._read()
         if request.get("digest") != f"{self._digest:012x}":

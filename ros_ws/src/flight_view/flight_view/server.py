@@ -250,7 +250,9 @@ def answer(
 ) -> bytes:
     """Encode the data that a browser lacks, as a head and the columns of each topic in the head.
 
-    `fleet` is the number that stands for the places of all aircraft, or 0 without a fleet.
+    `fleet` is the number that stands for the places of all aircraft, or 0 without a fleet. `ghost`
+    says whether there is a second flight for comparison, and `control` whether the page has
+    control.
 
     The head has the length of its JSON as uint32, and then the JSON. It is little endian, and ends
     at a multiple of 8 bytes. A topic with `count` rows has as columns the flight time in s as

@@ -135,7 +135,7 @@ class GainAssessment(NamedTuple, Generic[Controller]):
         return () if self.margins is None else self.margins.channel_delay
 
     def loop_with_box(self) -> LinearLoop:
-        """Return the loop with its box, or raise ParameterError for the literal sign."""
+        """Return the `loop_with_box` of the study. Raises ParameterError for the literal sign."""
         return loop_with_box(self.study, self.controller)
 
     @property

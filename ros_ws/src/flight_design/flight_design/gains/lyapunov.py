@@ -186,11 +186,13 @@ def lemma_2(plant: KnownPlant, signals: Evidence, params: LawParams) -> float:
 
     P >= 0 then follows from (29), (30).
 
-        zeta_i = max_t abs(N_d,i) + sum_(j>i) abs(U_ij) beta_j  lower bound of beta_i in (29), (30)
-        gamma_2,i = Lambda_i (beta_i / zeta_i - 1)  the largest that (29), (30) allow
+        zeta_i = max_t abs(N_d,i) + sum_(j>i) abs(U_ij) beta_j
+        gamma_2,i = Lambda_i (beta_i / zeta_i - 1)
         gamma_1,i = max_t (integral abs(e_dot_i) - gamma_2,i integral abs(e_i) - abs(e_i))
-            the smallest for (40)
         zeta_b = sum_i beta_i abs(e_i(0)) + gamma_1,i zeta_i
+
+    zeta_i is the lower bound of beta_i in (29), (30). gamma_2,i is the largest value that (29),
+    (30) allow, and gamma_1,i is the smallest value with which (40) holds.
 
     Raises ValueError, which names the channel, if beta_i < zeta_i, because no gamma_2 >= 0 meets
     (29), (30) then.

@@ -39,11 +39,14 @@ class ObserverGains(NamedTuple):
 def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> ObserverGains:
     """Derive gains from the lags of the loop, at which a search can start.
 
-    The numbers were found on the `osprey`. The gains and weights scale with the total lag T:
+    The numbers were found on the `osprey`. Gains and weights follow from the total lag T of each
+    channel:
 
-        effort = 0.38 T,  drift = 0.4 0.035 s / T,  loose = 0.0036,  K = 0.026 / T,  Lambda = K / 4
-        wind: 0.12 of Dryden's noise sqrt(2 V0 / L) sigma, with 17 times its time L / V0
-        beta = K / T, and a softened sign of 3 T: eps is 3 units of y / s times T
+        effort = 0.38 T,  drift = 0.4 (0.035 s) / T,  loose = 0.0036
+        K = 0.026 / T,  Lambda = K / 4,  beta = K / T,  softening = 3
+
+    With these, the softened sign has the half-width eps = 3 units of y. The noise of the wind is
+    0.12 of Dryden's, sqrt(2 V0 / L) sigma, and its time constant is 17 times Dryden's, L / V0.
 
     `axes` are the axes of the wind in the order of the model's columns, and `speed` is V0, m/s.
     """

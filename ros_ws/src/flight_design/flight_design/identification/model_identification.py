@@ -141,7 +141,7 @@ class _Study(NamedTuple):
     channels: ChannelPairing
     bound_count: int  # number of entries that may lie at a bound
     searches_again: bool
-    timing: float | None  # s, deviation of the delay; if None, the model counts as right
+    timing: float | None  # s, deviation of the delay; if None, no doubt is added (`with_doubt`)
     step: Callable[[], None]
 
     def search(self, model: NominalModel, block: Block, *, coupled: bool = False) -> Search:
@@ -240,7 +240,11 @@ class _Study(NamedTuple):
         *,
         quick: bool,
     ) -> tuple[Fit, Part]:
-        """Find the most probable theta of a block, and return the fit with the model."""
+        """Find the most probable theta of a block, and return the fit with the model.
+
+        If `quick`, `Search.fit_alike` is tried first, and its fit is taken if its model may be
+        used.
+        """
         also = None if flown is None else search.model_errors(flown)
         quick_fit = search.fit_alike(used, also) if quick else None
         if quick_fit is not None:
@@ -361,7 +365,10 @@ def identify_model(
 def _counter(
     progress: Callable[..., None], parts: int, *, starts_at_flown: bool
 ) -> Callable[[], None]:
-    """Return a function that counts the search steps of the parts and tells `progress`."""
+    """Return a function that counts the search steps of the parts and tells `progress`.
+
+    `starts_at_flown` says whether the model in flight is one more start.
+    """
     starts = len(STARTS) + len(SIGNS) + starts_at_flown
     total = parts * (starts * START_STEPS + REFINED * STEPS)
     total += (parts > 1) * (START_STEPS + STEPS)

@@ -51,9 +51,9 @@ def module_flight(log: VehicleLog, controller: ControllerConfig) -> ModuleFlight
 
     A stretch is a series of ticks without a gap after an engagement. Python starts a stretch with
     the u of its first tick. In `internals`, e and u come from the log, and the states of the law
-    come from Python. At low airspeed a torque of 1 limits u, which counts as a change of the
-    parameters. Raises ParameterError if the log has no ticks or other parameters, or if the module
-    computes in single precision.
+    come from Python. At low airspeed the largest torque, 1, limits u more than the parameters do.
+    The limits of u then count as changed parameters. Raises ParameterError if the log has no ticks
+    or other parameters, or if the module computes in single precision.
     """
     require(STATUS in log.tables, "the log", f"no {STATUS}", EXPECTED)
     table = log.tables[STATUS]

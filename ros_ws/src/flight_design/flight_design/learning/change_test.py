@@ -66,7 +66,7 @@ class Change(NamedTuple):
     """The result of the test of one part of the aircraft, which does not couple with the rest."""
 
     outputs: tuple[str, ...]
-    gain: float  # gain of log-likelihood if effects may be lost by more than LOSS
+    gain: float  # log-likelihood that is gained if effects may fall by more than LOSS
     # most probable effect of each input, as a share of its effect in the model
     left: Mapping[str, float]
     dead: str  # the input that has no effect any more; empty if there is none

@@ -165,11 +165,11 @@ def by_law_of_start(
 
     `left` has the parts that are left to this law, each with its dead input. The dead input is None
     if the controller gave up the model of the part. All outputs of such a part fly by the law. So
-    do all outputs of a part with a dead input, unless the design for the file flies. In that case
-    only the output of the dead input flies by the law, and V if it is in the part. In flights
-    without an elevator, the observer of V erred four times as much as the law. The other outputs
-    keep the design, because their inputs work. In flights without a rudder, the error of p was half
-    of that under the law.
+    do all outputs of a part with a dead input, unless the design for the file flies (`has_file`).
+    In that case only the output of the dead input flies by the law, and V if it is in the part. In
+    flights without an elevator, the observer of V erred four times as much as the law. The other
+    outputs keep the design, because their inputs work. In flights without a rudder, the error of p
+    was half of that under the law.
     """
     driven = dict(zip(start.inputs, start.outputs, strict=True))
     return {

@@ -78,8 +78,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 # number of entries that may lie at a bound: the right model may have one, wrong models have 2 to 6
 AT_BOUND = 1
-# s, shortest record that is identified. It has two held-out seconds, of the six that `identify log`
-# requires.
+# s, shortest record: it has two held-out seconds, and `identify log` requires six
 SHORTEST = 20.0 * TRANSIENT
 # s from a fallback to the next identification, whose record then shows the parameters that fly
 # after the fallback
@@ -293,7 +292,7 @@ class Learner:
         return LearnerResult(self._last, told)
 
     def _verdict(self, identified: Identification, *, lost: bool) -> Verdict:
-        """Decide which parts fly by their new models after an identification."""
+        """Decide which parts fly new models; `lost` if the last proposal does not fly."""
         known = dict(self._known)
         model = self._model
         told = list[str]()
@@ -350,9 +349,9 @@ class Learner:
     def _adopt(
         self, model: Airframe, known: dict[PartName, Known], dead: dict[PartName, str | None]
     ) -> str | None:
-        """Design for a model, note it as proposed, and say what `learn.margin` costs.
+        """Design a controller, and note it as the last proposal. Raises ParameterError.
 
-        Raises ParameterError if there is no design.
+        Returns a sentence on what `learn.margin` costs, if anything.
         """
         proposed, price_text = self._designed(model, known, dead)
         new = [part for part, value in known.items() if value is not self._known.get(part)]
@@ -418,8 +417,8 @@ class Learner:
     def _is_due(self, end_ns: int, *, lost: bool) -> bool:
         """Return whether an identification is due: at `learn.updates`, then once in every window.
 
-        If the last proposal does not fly, or if a part has changed, an identification is also due
-        RETRY after the last one. Within AFTER_FALLBACK of a fallback this is not so.
+        If the last proposal does not fly (`lost`), or if a part has changed, an identification is
+        also due RETRY after the last one. Within AFTER_FALLBACK of a fallback this is not so.
         """
         is_planned = False
         elapsed_ns = -1 if self._first_ns is None else end_ns - self._first_ns
@@ -580,11 +579,7 @@ class Learner:
         latest: Mapping[str, float],
         dead: Collection[str],
     ) -> str | None:
-        """Say what `learn.margin` costs, compared with the margins that the goal without it has.
-
-        Returns None if `learn.margin` is not set, if the rough model does not fly, or if there is
-        no design to compare with.
-        """
+        """Say what `learn.margin` costs, or return None if there is no design to compare with."""
         start = self._controller
         settings = start.learn
         if settings is None or settings.margin is None or self._design_of_rough is None:

@@ -224,7 +224,10 @@ def correct(state: Any, measurements: Measurements, dt: Array, params: ObserverP
 def _at_engagement(
     law_state: Any, measurements: Measurements, params: ObserverParams, *, vanes: bool
 ) -> Any:
-    """Return the state at engagement, with u_o = 0 and estimates from the first e."""
+    """Return the state at engagement, with u_o = 0 and estimates from the first e.
+
+    With `vanes`, the state has the motion of the vanes as well.
+    """
     e = measurements.y - measurements.y_m
     zero = array_namespace(e).zeros_like(e)
     state = ObserverState(law_state, initial_estimates(e, params), zero, zero[:1])

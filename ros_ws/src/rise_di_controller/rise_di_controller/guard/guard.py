@@ -133,7 +133,7 @@ class TickInputs(NamedTuple):
     Computing the tick again from these inputs gives the same u to the last bit.
     """
 
-    stamp_ns: int  # stamp of u: that of its y, or continued with the clock without a y
+    stamp_ns: int  # stamp of u, which is that of its y; without a y it goes on with the clock
     y: FloatArray
     y_m: FloatArray  # interpolated to the stamp of y
     y_m_offset: float  # stamp of the newest y_m minus stamp of y, s
@@ -293,7 +293,7 @@ def tick(
 
 
 def _going_on(state: ControllerState, now_ns: int) -> int:
-    """Return the stamp of a u without a y, ns, which is that of the last u plus the time since."""
+    """Return the stamp of a u without a y, ns: that of the last u, plus the time since then."""
     return state.stamp_ns + max(now_ns - state.tick_ns, 0)
 
 

@@ -104,7 +104,7 @@ class SampleState(NamedTuple):
 def sample_limits(
     names: Sequence[str], authority: FloatArray, largest: Sequence[float] | None, period_ns: int
 ) -> SampleLimits:
-    """Return the limits of outputs by name.
+    """Return the limits within which the samples of the outputs `names` must be.
 
     `authority` is the y_dot that full inputs give, (m,), units of y / s. `largest` holds the bounds
     from the parameters. If it is None, plausible bounds are used.

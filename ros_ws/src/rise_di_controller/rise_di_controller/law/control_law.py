@@ -114,7 +114,10 @@ def without_limits(
 
 
 def fields(state: Any) -> dict[str, Array]:
-    """Return the arrays of a law's state by name. If it extends a law, that law's come first."""
+    """Return the arrays of a law's state by name.
+
+    If the law extends another law, the arrays of the extended law come first.
+    """
     values: dict[str, Array] = {}
     for name, value in state._asdict().items():
         values |= fields(value) if hasattr(value, "_asdict") else {name: value}
