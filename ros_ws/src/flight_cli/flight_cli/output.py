@@ -53,7 +53,7 @@ def has_desktop() -> bool:
 
 
 def show_outcome(console: Console, outcome: Mapping[str, Any]) -> None:
-    """Print the headline of an outcome, followed by the details that it lacks."""
+    """Print the headline of an outcome, and then the details that are not in the headline."""
     style = {0: "bold", STATUS_HOST: "bold yellow"}.get(outcome["status"], "bold red")
     say(console, f"outcome: {outcome['sentence']}", style=style)
     for detail in outcome["details"]:

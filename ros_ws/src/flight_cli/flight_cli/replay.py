@@ -153,10 +153,11 @@ class Shown(NamedTuple):
 
 
 def _claims_of(run: RecordedRun) -> tuple[Guarantee | None, tuple[str, ...]]:
-    """Return the guarantee of a flight's loop, and sentences on how its aircraft differs.
+    """Return the guarantee of a flight's loop, and sentences on its aircraft.
 
-    The guarantee is None if none was computed, if there is no linear model, if the parameters
-    changed in flight, or if it does not hold for the aircraft that flew.
+    The sentences say how the aircraft differs from what the controller was told. The guarantee is
+    None if none was computed, if there is no linear model, if the parameters changed in flight, or
+    if it does not hold for the aircraft that flew.
     """
     if len({span.digest for span in parameter_spans(run.tape)}) > 1:
         return None, ()

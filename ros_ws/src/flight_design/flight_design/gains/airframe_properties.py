@@ -239,7 +239,7 @@ def marginal_sentence(facts: Sequence[AirframeFacts]) -> str | None:
 
 
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
-    """Say in which half plane the zeros, (n - m,), 1/s, lie. They belong to (5)-(9).
+    """Say in which half plane the zeros of the zero dynamics (5)-(9) lie, (n - m,), 1/s.
 
     A zero counts as on the imaginary axis if its real part is at most ZERO_REAL_PART in magnitude.
     """

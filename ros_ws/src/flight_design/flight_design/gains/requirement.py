@@ -82,7 +82,7 @@ class Requirement(NamedTuple):
     # rad, least phase margin over the samples of uncertain aircraft
     worst_phase: float = math.radians(30.0)
     # rad, least phase margin that a search over the corners of the uncertainty finds. Shipped loops
-    # that have 30 deg by samples have at least this much there.
+    # whose samples have 30 deg have at least this much at the corners.
     searched_phase: float = math.radians(28.0)
 
     @property

@@ -78,10 +78,10 @@ def is_file_better(part: Part) -> bool:
 def reason_against_first_model(part: Part, name: str, *, flies: bool) -> Refusal | None:
     """Refuse the first model of a part until it has proved itself against the airframe `name`.
 
-    The model was chosen by the record, so only later samples count. If the airframe `flies`, as
-    that of a file, the model needs an advantage over it that two equally good models show with a
-    probability of at most 5 %. If it does not fly, as a sketch, the model is refused only if its
-    disadvantage is that large.
+    The model was chosen by the record, so only later samples count. Let a difference be clear if
+    two equally good models show it with a probability of at most 5 %. If the airframe `flies`, as
+    one from a file does, the model must be clearly better than the airframe. If the airframe does
+    not fly, as a sketch does not, the model is refused only if it is clearly worse.
     """
     limit = LIKELIER if flies else -LIKELIER
     if part.advantage == 0.0:

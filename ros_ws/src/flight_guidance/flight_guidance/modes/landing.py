@@ -170,7 +170,8 @@ class Lander:
     def _along_line(self, pose: Mapping[str, float], drift: float) -> dict[str, float]:
         """Return the commands that turn the nose along the line and lower the upwind wing.
 
-        `drift` is the speed across the line, m/s, positive to the right. The law is
+        `drift` is the speed across the line, m/s, and e the distance from it, m, both positive to
+        the right. The law is
 
         r = k (course - psi),  g tan(phi) = -w^2 e - 2 zeta w drift,  w = 2 pi / P
         """
