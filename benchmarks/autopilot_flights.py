@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fly autopilots in software, and take the figures of a flight of the stack beside one."""
+"""Start autopilots in software, let the stack fly them, and take the figures of a flight."""
 
 import json
 import subprocess
@@ -23,12 +23,15 @@ if TYPE_CHECKING:
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER = REPOSITORY / "build" / "autopilots"
 EXAMPLE = REPOSITORY / "examples" / "arduplane" / "scenario.yaml"
-DELAYS = np.arange(0.0, 1.0, 0.01)  # s by which y may be behind y_m
+DELAYS = np.arange(0.0, 1.0, 0.01)  # delays of y behind y_m that `behind` tries, s
 
 
 @contextmanager
 def arduplane(servo: float, place: Path = FOLDER / "arduplane") -> Iterator["ArduPlane"]:
-    """Start an ArduPlane in flight, with servos of this speed."""
+    """Yield an ArduPlane in flight.
+
+    `servo` is its parameter SIM_SERVO_SPEED, and `place` the folder of its files.
+    """
     from tests.sitl.kit import ArduPlane  # noqa: PLC0415 - after the kit's place is known
 
     with flying(ArduPlane(place), SIM_SERVO_SPEED=servo) as plane:
@@ -46,7 +49,7 @@ def px4() -> Iterator["Px4"]:
 
 @contextmanager
 def flying(autopilot: Any, **parameters: float) -> Iterator[Any]:
-    """Yield an autopilot that is in flight."""
+    """Start an autopilot with these parameters, take off, and yield it; stop it at the end."""
     try:
         autopilot.up(**parameters)
         autopilot.take_off()
@@ -64,8 +67,8 @@ def on_the_ground(*arguments: str) -> subprocess.CompletedProcess[str]:
 def tracking(autopilot: "Autopilot") -> dict[str, Any]:
     """Return the figures of the last flight.
 
-    They are the errors while commanded, how far y is behind y_m, the part of the time with u at a
-    limit, and whether the flight replays.
+    They are its engagements, its outcome, the rms errors while y_m is commanded, the delay of y
+    behind y_m, the part of the time with u at a limit, and whether the flight replays.
     """
     summary = autopilot.summary()
     log = read_run(autopilot.run)
@@ -87,7 +90,10 @@ def tracking(autopilot: "Autopilot") -> dict[str, Any]:
 
 
 def behind(tape: Tape, name: str, engaged: Engagement) -> float:
-    """Return the delay of y behind y_m with the smallest error, s."""
+    """Return which of DELAYS of y_m leaves the smallest variance of y - y_m, s.
+
+    It covers an engagement without its first second.
+    """
     y = tape["y"]
     y_m = tape["y_m"]
     t = np.arange(

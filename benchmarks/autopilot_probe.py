@@ -24,17 +24,18 @@ if TYPE_CHECKING:
 
 SERVOS = {"elevator": 2, "aileron": 1, "rudder": 4}
 REPEATS = 3
-HEALTHY_FOR = 15.0  # s engaged before a surface sticks: two windows
-LONGEST = 30.0  # s, in which a stuck surface is found or not
-QUIET = 600.0  # s engaged without a fault, of each kind
-TURN = 45.0  # s between two turns under guidance
-SPEED = 23.9  # m/s
+HEALTHY_FOR = 15.0  # time engaged before a surface sticks, s: two windows of the probe
+LONGEST = 30.0  # time within which the probe has to find a stuck surface, s
+QUIET = 600.0  # time engaged without a fault in each of KINDS, s
+TURN = 45.0  # time from one turn under guidance to the next, s
+SPEED = 23.9  # airspeed that guidance holds, m/s
 KINDS = {"calm": (0.0, 0.0, False), "guided": (0.0, 0.0, True), "wind": (8.0, 0.5, True)}
-"""Flights without a fault: SIM_WIND_SPD, SIM_WIND_TURB, whether guidance turns and climbs."""
+"""Flights without a fault: SIM_WIND_SPD, SIM_WIND_TURB, and whether guidance turns and climbs; if
+not, guidance holds."""
 
 
 def probe() -> dict[str, Any]:
-    """Stick each surface in trim in calm air, then fly minutes of calm, guided and windy flight."""
+    """Let each surface stick in level flight in calm air, then fly all KINDS without a fault."""
     from tests.sitl.kit import OVERRIDE_TIME, ArduPlane  # noqa: PLC0415 - after the kit's place is known
 
     plane = ArduPlane(FOLDER / "probe")
@@ -49,9 +50,9 @@ def probe() -> dict[str, Any]:
 
 
 def probed(plane: "ArduPlane", program: Mapping[str, Any]) -> Path:
-    """Return the scenario of the example with a probe, under guidance.
+    """Write the scenario of the example with a probe, under guidance; return its file.
 
-    Guidance holds, or follows a program.
+    Guidance follows the program, or holds if the program is empty.
     """
     from tests.sitl.kit import guided_scenario  # noqa: PLC0415 - as above
 
@@ -65,9 +66,9 @@ def probed(plane: "ArduPlane", program: Mapping[str, Any]) -> Path:
 
 
 def stuck(plane: "ArduPlane", channel_map: str, surface: str) -> float:
-    """Return the time from when a surface sticks to the release that names it, s.
+    """Let a surface stick; return the time until the controller releases because of it, s.
 
-    It is infinite if there is another release, or none.
+    The time is infinite if a release has another reason, or if there is no release.
     """
     number = SERVOS[surface]
     ends = {f"SERVO{number}_MIN": -1.0, f"SERVO{number}_MAX": 1.0, f"SERVO{number}_TRIM": 0.0}
@@ -91,9 +92,10 @@ def stuck(plane: "ArduPlane", channel_map: str, surface: str) -> float:
 
 
 def unfailed(plane: "ArduPlane", channel_map: str, name: str) -> dict[str, Any]:
-    """Return the minutes that were engaged without a fault.
+    """Fly one of KINDS without a fault, and return its figures.
 
-    Also returns the least effect that any test told, and whether the ticks replay.
+    They are the seconds engaged, the false alarms, the number of tests of the probe, the least
+    effect of each surface in any test, and whether the flight replays.
     """
     speed, turbulence, turns = KINDS[name]
     plane.say("param", "SIM_WIND_SPD", f"{speed:g}")

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Experiment on signs with ArduPlane.
+"""Experiment on the signs of ArduPlane's inputs.
 
-The figures say whether `rise-di check` finds each sign, and each flipped one.
+The figures say whether `rise-di check` finds each sign, and whether it finds each sign that is
+flipped on purpose.
 """
 
 import time
@@ -26,21 +27,23 @@ from flight_log.engagements import Engagement
 from flight_log.tape_reader import read_run
 
 PERIODS = {"elevator": 12.0, "thrust": 4.0, "aileron": 1.5, "rudder": 1.5}
-"""s, of the multisines of the experiments on signs. With 4 s of the elevator 2 of 12 were unsure of
-it at SIM_WIND_TURB 0.5."""
-STRONGER_ELEVATOR = 2.0  # `rise-di check` asked for 1.7 times the amplitude at SIM_WIND_TURB 1
-# SIM_WIND_TURB of the experiments on signs; 2 moves q by 0.4 rad/s
+"""Period of the multisine of each input, s. With 4 s for the elevator, 2 of 12 experiments were
+unsure of its sign at SIM_WIND_TURB 0.5."""
+# factor on the elevator's amplitude: at SIM_WIND_TURB 1 `rise-di check` asked for a factor 1.7
+STRONGER_ELEVATOR = 2.0
+# SIM_WIND_TURB of the experiments, in turn; a value of 2 would move q by 0.4 rad/s
 TURBULENCE = (0.25, 0.5, 0.25, 0.5, 1.0)
-EXCITED = 35.0  # s, of an experiment on signs at least
-EXPERIMENT = 80.0  # s, of one on signs at most: 39 s engaged, and back to level flight
-MODERATE = 0.5  # SIM_WIND_TURB up to which one experiment has to show every sign
+EXCITED = 35.0  # shortest engagement that is judged, s
+EXPERIMENT = 80.0  # longest time of an experiment, s: 39 s engaged, and back to level flight
+MODERATE = 0.5  # SIM_WIND_TURB up to which a single experiment has to show every sign
 
 
 def signs(experiments: int = 25) -> dict[str, Any]:
-    """Fly short experiments, open loop, and collect what `rise-di check` says of each.
+    """Fly short open-loop experiments, and collect what `rise-di check` says of each.
 
-    Each is in different turbulence, and earlier ones are kept. The simulator draws its turbulence
-    from one stream of random numbers without a seed, so each experiment has another part of it.
+    The experiments take the values of TURBULENCE in turn. The results of earlier runs are kept. The
+    simulator draws its turbulence from one stream of random numbers without a seed, so no two
+    experiments meet the same turbulence.
     """
     with arduplane(0.03) as plane:
         channel_map = plane.patient_map("ardupilot")
@@ -87,11 +90,12 @@ def signs(experiments: int = 25) -> dict[str, Any]:
 def signs_of_logs(
     runs: Sequence[Path], wind_of: Callable[[int, Engagement], float]
 ) -> dict[str, Any]:
-    """Return the stored experiments on signs, and those from logs.
+    """Return the stored experiments on signs, and those of the given runs.
 
-    `wind_of` is the turbulence of an engagement. An engagement shorter than EXCITED was ended by
-    the bridge or with the flight, so it is counted but not judged. Those of a run in strong
-    turbulence are also judged together, as `rise-di check` judges a log with several.
+    `wind_of` returns the turbulence of an engagement from its number in the run. An engagement
+    shorter than EXCITED was ended by the bridge or with the flight, so it is counted but not
+    judged. The engagements of a run in turbulence above MODERATE are also judged together, as
+    `rise-di check` judges a log with several engagements.
     """
     earlier = stored("signs")
     channel_map = load_map("ardupilot")
@@ -118,9 +122,9 @@ def signs_of_logs(
 def judged(
     channel_map: ChannelMap, tape: Tape, engagements: Sequence[Engagement]
 ) -> dict[str, Any]:
-    """Return what `rise-di check` says of every sign, and of each sign flipped alone.
+    """Return what `rise-di check` says of every sign as flown, and with each sign flipped alone.
 
-    To flip a sign, its column of the recorded u gets the other sign.
+    To flip the sign of an input, its column of the recorded u is multiplied by -1.
     """
     pairing, expected = channel_pairs(channel_map)
     columns = [list(channel_map.inputs).index(name) for name in pairing.inputs]
@@ -157,17 +161,17 @@ def judged(
 
 
 def shows_all(experiment: dict[str, Any]) -> bool:
-    """Return whether every sign is found, and is right."""
+    """Return whether `rise-di check` finds every sign as flown, and calls it right."""
     return set(experiment["as flown"].values()) == {"right"}
 
 
 def finds_each(experiment: dict[str, Any]) -> bool:
-    """Return whether each single sign that is flipped is found."""
+    """Return whether `rise-di check` calls each flipped sign wrong."""
     return all(verdicts[name] == "wrong" for name, verdicts in experiment["flipped"].items())
 
 
 def counted(result: dict[str, Any]) -> dict[str, Any]:
-    """Count the experiments on signs by their result."""
+    """Return how many experiments have each result."""
     experiments = result["experiments"]
     moderate = [each for each in experiments if each["turbulence"] <= MODERATE]
     return {

@@ -8,15 +8,17 @@ The figures are of gains, engagements, signs, pose and releases.
     python -m benchmarks.autopilots --sitl KIT --only signs
         # one measurement; the others keep their figures
 
-The kit is that of `make test-sitl`: docs/autopilots.md. build/autopilots/ has the results and the
-runs.
+KIT is the folder of the kit of `make test-sitl` (docs/autopilots.md). build/autopilots/ has the
+results and the runs.
 
-Age limits of y and u are 1 s, for the host. The identified gains fly the scenario that `identify`
-writes: pulses of 50 mrad/s in q and 150 mrad/s in p in coordinated turns, a step of at most 2 m/s
-in V. The errors of PX4's airplane are those of y, with the low-pass of the map; the true errors are
-by the rates of the simulator. The time of a release begins with the release in the bridge's log,
-the time of any event beside a release with the event. The sticks act by RC_CHANNELS in the
-autopilot's log, each 0.1 s; PX4's own law by nav_state.
+The age limits of y and u are 1 s, because a busy host stops the autopilot for half a second. The
+identified gains fly the scenario that `identify` writes: pulses of 50 mrad/s in q and 150 mrad/s in
+p in coordinated turns, and a step of at most 2 m/s in V. The errors of PX4's airplane are those of
+y, which the map filters with a low-pass; its true errors use the rates of the simulator.
+
+The time of a release begins with the release in the bridge's log. The time of another event, such
+as a killed bridge, begins with the event. RC_CHANNELS in the autopilot's log, each 0.1 s, shows
+when the sticks act again, and nav_state shows when PX4's own law flies again.
 """
 
 import json
@@ -65,15 +67,17 @@ if TYPE_CHECKING:
 
 PX4_MAP = REPOSITORY / "examples" / "px4_airplane" / "map.yaml"
 ENGAGEMENTS = 20
-WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints count
-# s: engaged under guidance, each turn, and from its command until it counts as held
+WINDOW = (-0.3, 1.0)  # begin and end of the time in which steps count, s from an engagement
+# s: time engaged under guidance, from one turn to the next, and from a turn's command until the
+# errors count
 GUIDED, EACH, SETTLED = (300.0, 60.0, 45.0)
-# s beyond the identified delay; SIM_WIND_TURB; flights
+# delay margin beyond the identified delay, s; SIM_WIND_TURB; flights with and without the observer
 OBSERVER_MARGIN, OBSERVED_TURBULENCE, OBSERVED_PAIRS = (0.025, 0.5, 2)
-# m/s, equivalent, 15 % above the kit's AIRSPEED_CRUISE of 22; % of the throttle
+# the faster cruise: equivalent airspeed, m/s, 15 % above the kit's AIRSPEED_CRUISE of 22, and the
+# range of the throttle in which its level flight engages, %
 FASTER = 25.3
 FASTER_THROTTLE = (30.0, 85.0)
-TRUE = 1.049  # of true over equivalent airspeed at the kit's place
+TRUE = 1.049  # ratio of true to equivalent airspeed at the kit's place
 WINDS = {"calm": (0.0, 0.0), "SIM_WIND_SPD 8, SIM_WIND_TURB 0.5": (8.0, 0.5)}
 HELD = {"heading": "rad", "altitude": "m", "V": "m/s"}
 END = "the end of the flight"
@@ -129,10 +133,11 @@ def identified(
     speed: float,
     log: Path | None,
 ) -> dict[str, Any]:
-    """Run experiment, gains, flight and replay: the commands of docs/autopilots.md.
+    """Fly an experiment, identify gains from its log, fly them, and replay the flight.
 
-    The log is read on the ground. If there is a log of an experiment that this command flew before,
-    there is no new experiment.
+    The commands are those of docs/autopilots.md. `log` is the run of an earlier experiment of this
+    command; without it, a new experiment is flown. The gains are identified after the autopilot has
+    stopped.
     """
     results = place / "found"
     channel_map = place / f"{Path(map_name).stem}.yaml"
@@ -174,8 +179,9 @@ def identified(
 def own_log() -> dict[str, Any]:
     """Measure ArduPlane at a cruise 15 % faster, over DDS and over MAVLink, calm and in wind.
 
-    The errors come from its own log, and so does Omega. Each flight has gains of its own
-    experiment. The autopilot's DataFlash log of the experiment is imported and identified too.
+    Both ways have an experiment of their own, whose gains fly. The errors are measured in the log
+    of the stack and in the autopilot's own log. The autopilot's DataFlash log of the experiment is
+    imported, and Omega is identified from it too.
     """
     from tests.sitl.kit import OVERRIDE_TIME, ArduPlane  # noqa: PLC0415 - after the kit's place is known
 
@@ -186,7 +192,7 @@ def own_log() -> dict[str, Any]:
         with flying(
             plane, SIM_SERVO_SPEED=0.03, AIRSPEED_CRUISE=FASTER, RC_OVERRIDE_TIME=OVERRIDE_TIME
         ):
-            # of the thrust, whose trim is 0.63 to 0.75 there
+            # limit of the thrust, whose trim is 0.63 to 0.75 at this cruise
             narrower = ("    upper: 0.3\n", "    upper: 0.2\n")
             channel_map = (
                 plane.patient_map(name, narrower)
@@ -216,9 +222,9 @@ def own_log() -> dict[str, Any]:
 
 
 def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -> dict[str, Any]:
-    """Return Omega by channel from the autopilot's own log of an experiment.
+    """Identify Omega from the autopilot's own log of an experiment and from the log of the stack.
 
-    Omega from the log of the stack is beside it.
+    Returns both by input, and their relative difference.
     """
     bag = place / "imported"
     shutil.rmtree(bag, ignore_errors=True)
@@ -254,9 +260,9 @@ def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -
 
 
 def guided() -> dict[str, Any]:
-    """Measure minutes engaged under guidance by rule: turns, climbs, changes of V.
+    """Fly ArduPlane under guidance for GUIDED s: turns, climbs and changes of V.
 
-    The gains are those of the last identification.
+    All numbers of guidance are by rule. The gains are those of the last identification.
     """
     from tests.sitl.kit import ALTITUDE, guided_scenario  # noqa: PLC0415 - after the kit's place is known
 
@@ -272,9 +278,10 @@ def guided() -> dict[str, Any]:
 
 
 def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
-    """Return how well a guided flight of turns at these times holds what it is commanded.
+    """Return rms and maximum of the errors of heading, altitude and V in a guided flight.
 
-    Also returns whether it replays.
+    `starts` are the times at which its turns are commanded, s. The errors count from SETTLED s
+    after each of them until the next turn. Also returns whether the flight replays.
     """
     (one,) = json.loads((run / "summary.json").read_text())["engagements"]
     tape = read_run(run).tape
@@ -330,9 +337,9 @@ def observed() -> dict[str, Any]:
 
 
 def bumpless() -> dict[str, Any]:
-    """Measure engagements and releases in one flight.
+    """Engage and release ENGAGEMENTS times in one flight.
 
-    The figure is the largest step of a setpoint around each, as a part of its range.
+    The figures are the largest step of a setpoint around each engagement, as a part of its range.
     """
     with arduplane(0.03) as plane:
         channel_map = plane.patient_map("ardupilot")
@@ -361,7 +368,7 @@ def bumpless() -> dict[str, Any]:
 def step(sent: Signal, ranges: dict[str, float], engaged_ns: int) -> float:
     """Return the largest step of a setpoint around an engagement, as a part of its range.
 
-    Before the engagement the setpoint is the stick.
+    Before the engagement the setpoint is that of the stick.
     """
     begin, end = (engaged_ns + int(edge * NANOSECONDS) for edge in WINDOW)
     around = sent.within([(begin, end)])
@@ -369,9 +376,9 @@ def step(sent: Signal, ranges: dict[str, float], engaged_ns: int) -> float:
 
 
 def pose() -> dict[str, Any]:
-    """Compare rates and pose of the map `ardupilot` with the autopilot's log.
+    """Compare the rates and the pose that the map `ardupilot` gives with the autopilot's log.
 
-    The flight has turns and climbs.
+    ArduPlane flies turns and climbs meanwhile.
     """
     with arduplane(0.03) as plane:
         run = plane.fly(EXAMPLE, plane.patient_map("ardupilot"), 60.0)
@@ -388,7 +395,7 @@ def pose() -> dict[str, Any]:
 def releases() -> dict[str, Any]:
     """Run `make test-sitl`.
 
-    Return what failed, and the times until the pilot or PX4 flies again, s.
+    Returns what failed, and the times until the pilot or PX4's own law flies again, s.
     """
     report = FOLDER / "releases.xml"
     python = sys.executable

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measure the seconds of a Monte Carlo campaign, and their floor, on the device of this host.
+"""Measure how long a Monte Carlo campaign takes on the device of this host.
 
-Further figures are the ratios to its CPU and to the simulation in one process, the integration
-error and the memory.
+`floor` estimates the least time that it could take there. Further figures are the ratio of the
+speed to that on the host's CPU and to that of a simulation in one process, the integration error
+and the memory.
 
 python -m benchmarks.campaign  # 10,000 aircraft of osprey_servo, a minute on two cores
     # 1,000,000 on a GPU, and 10,000 on the CPU of its host
@@ -53,10 +54,10 @@ COPIED = 2**27  # numbers of 8 bytes, 1 GiB, more than any cache holds
 class Speed(NamedTuple):
     """Speed and memory of a campaign."""
 
-    compiled: float  # s, of the first chunk, flown once before, with compilation
-    took: float  # s, of the campaign, its rows written
-    memory_early: float  # MB resident, after a third of the chunks
-    memory: float  # MB at its end
+    compiled: float  # time to compile and fly the first chunk once before the campaign, s
+    took: float  # time of the campaign, with the writing of its rows, s
+    memory_early: float  # resident memory after a third of the chunks, MB
+    memory: float  # resident memory at the end of the campaign, MB
 
 
 def speed(scenario: Scenario, aircraft: int, chunk: int | None, workers: int | None) -> Speed:
@@ -75,10 +76,10 @@ def speed(scenario: Scenario, aircraft: int, chunk: int | None, workers: int | N
 
 
 def floor(scenario: Scenario, aircraft: int) -> float:
-    """Compute the least seconds of a campaign on the device.
+    """Compute a lower bound of the time of a campaign on the device, s.
 
-    Its matrices, which fit into no cache of a device, are read at each tick, at the speed of a
-    copy.
+    Each tick has to read the matrices of all aircraft, which do not fit into a cache. The bound is
+    the time to read them at the measured speed of a copy.
     """
     course = build_course(scenario)
     airframe = load_airframe(scenario.aircraft.airframe)
@@ -100,7 +101,7 @@ def floor(scenario: Scenario, aircraft: int) -> float:
 
 
 def on_cpu(scenario: str, aircraft: int) -> dict[str, Any]:
-    """Return the figures of this program on the CPU of the host of a device."""
+    """Run this program on the CPU of this host, and return its figures."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "cpu.json"
         words = ["--scenario", scenario, "--aircraft", str(aircraft), "--exact", "0"]
@@ -114,9 +115,9 @@ def on_cpu(scenario: str, aircraft: int) -> dict[str, Any]:
 
 
 def write_rows(label: str, figures: dict[str, tuple[float, str]], begun: Origin) -> None:
-    """Write the rows of a device in place of its former rows.
+    """Write rows to DEVICES, in place of all rows whose name begins with `label`.
 
-    A row is value and unit by name.
+    `figures` has value and unit of each row by its name.
     """
     DEVICES.touch()
     with DEVICES.open(newline="") as stream:

@@ -36,9 +36,10 @@ from rise_di_controller.learning.proposals import Event, EventKind
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 SCENARIO, DURATION = "osprey_learn", 64.0  # s
-LEARNED = 34.0  # s, from when on the model of a whole window of 30 s flies
-WITHIN = 1.1  # a score within 10 % of that of the true model
-CORES, MANY = 2, 1000  # of the scaled row
+# instant from which the score counts, s: from here on a model of a whole window of 30 s flies
+LEARNED = 34.0
+WITHIN = 1.1  # largest ratio to the score of the true model that counts as near it
+CORES, MANY = 2, 1000  # cores and aircraft to which one row scales the processor time
 
 
 class _Knowing:
@@ -69,14 +70,14 @@ class _Knowing:
 
 
 def knowing(scenario: Scenario) -> Learn:
-    """Return what makes a learner that knows the true model."""
+    """Return a function that makes a learner which knows the true model of the scenario."""
     return lambda start: _Knowing(scenario, start)
 
 
 def score_of(scenario: Scenario, learn: Learn) -> float:
-    """Return the score of an aircraft from LEARNED on.
+    """Fly an aircraft that learns, and return its score from LEARNED on.
 
-    It is NaN for a flight that falls back to the law of the start.
+    The score is NaN if the flight falls back to the law of the start, or restarts there.
     """
     events: list[Event] = []
     tape = simulate(scenario, learn=learn, announce=events.append)

@@ -21,7 +21,7 @@ from flight_core.vectors import FloatArray
 
 IMAGE = Path(__file__).resolve().parents[1] / "docs" / "images" / "counterexample.png"
 K, LAMBDA, BOUND = 10.0, 1.0, 1.0  # 1/s, 1/s, bound of abs(f_dot)
-SLOPE = 100.0 * K  # of f_dot over e_dot, 1/s: above K, so that e = 0 repels
+SLOPE = 100.0 * K  # slope of f_dot over e_dot, 1/s: it is above K, so that e = 0 repels
 BETAS = (2.0, 20.0, 100.0, 1000.0)
 DURATION = 1.5  # s, of the flights in the figure
 FLIGHTS = ((2.0, 1.0), (20.0, 1.0), (200.0, 1.0), (2.0, 0.0))  # beta, and whether f acts
@@ -29,10 +29,13 @@ COLOURS = ("#1f6f8b", "#c8553d", "#5a8f29", "#888888")
 
 
 class Cycle(NamedTuple):
-    """The limit cycle of a beta: half a period with e > 0; the other half is its negative."""
+    """The half period with e > 0 of the limit cycle of a beta.
+
+    In the other half period e and e_dot have the opposite sign.
+    """
 
     beta: float
-    t: FloatArray  # (N,) s, from e = 0 to e = 0
+    t: FloatArray  # (N,) s, from one crossing of e = 0 to the next
     e: FloatArray  # (N,)
     e_dot: FloatArray  # (N,)
 
@@ -51,10 +54,11 @@ class Cycle(NamedTuple):
 
     @property
     def multipliers(self) -> FloatArray:
-        """Compute the growth of a small deviation over half a period, two moduli.
+        """Compute by which two factors a small deviation d of e grows over half a period, (2,).
 
-        f is a function of time. Between the crossings d_ddot + K d_dot + K LAMBDA d = 0; at a
-        crossing d_dot jumps by -2 beta d / abs(e_dot).
+        The deviation does not change f, which is a function of time. Between the crossings of e = 0
+        it obeys d_ddot + K d_dot + K LAMBDA d = 0. At a crossing d_dot jumps by -2 beta d /
+        abs(e_dot). The factors are the moduli of the eigenvalues, in rising order.
         """
         between = expm(np.array([[0.0, 1.0], [-K * LAMBDA, -K]]) * self.t[-1])
         crossing = np.array([[1.0, 0.0], [-2.0 * self.beta / abs(self.e_dot[-1]), 1.0]])
@@ -62,9 +66,9 @@ class Cycle(NamedTuple):
 
 
 def formula(beta: float) -> float:
-    """Compute the largest abs(e) of the limit for a large beta and SLOPE.
+    """Compute the largest abs(e) of the limit cycle, which a large beta and SLOPE approach.
 
-    9 BOUND^2 / (8 K^2 beta)
+    It is 9 BOUND^2 / (8 K^2 beta).
     """
     return 9.0 * BOUND**2 / (8.0 * K**2 * beta)
 
@@ -72,8 +76,9 @@ def formula(beta: float) -> float:
 def half_period(speed: float, beta: float, acts: float = 1.0) -> Any:
     """Solve e_ddot + K e_dot + K LAMBDA e + beta sgn(e) = f_dot over half a period.
 
-    The solution goes from e = 0, e_dot = speed to the next e = 0. f_dot is BOUND sat(SLOPE e_dot /
-    BOUND), or 0 with acts = 0. By symmetry the half period with e < 0 is its negative.
+    The solution goes from e = 0, e_dot = speed to the next crossing of e = 0. f_dot is BOUND
+    sat(SLOPE e_dot / BOUND); with acts = 0 it is 0. By symmetry the half period with e < 0 has the
+    opposite sign.
     """
 
     def w_dot(_: float, w: FloatArray) -> list[float]:
@@ -84,7 +89,7 @@ def half_period(speed: float, beta: float, acts: float = 1.0) -> Any:
         return float(w[0])
 
     crossing.terminal, crossing.direction = True, -1.0  # type: ignore[attr-defined]
-    scale = speed / beta  # s, time to the peak without damping
+    scale = speed / beta  # time until the peak if nothing damped e, s
     return solve_ivp(
         w_dot,
         (0.0, 100.0 * scale),
@@ -100,9 +105,9 @@ def half_period(speed: float, beta: float, acts: float = 1.0) -> Any:
 
 
 def limit_cycle(beta: float) -> Cycle:
-    """Find the cycle: the speed at e = 0 that half a period reproduces.
+    """Find the limit cycle: half a period ends with minus the e_dot with which it begins.
 
-    It exists for beta > BOUND and SLOPE > K.
+    The cycle exists for beta > BOUND and SLOPE > K.
     """
     energy_balance = 1.5 * BOUND / K
     speed = brentq(
@@ -117,9 +122,9 @@ def limit_cycle(beta: float) -> Cycle:
 
 
 def peaks(beta: float, acts: float) -> tuple[FloatArray, FloatArray]:
-    """Return times and sizes of the peaks of abs(e) of a flight from e = 0, e_dot = 1.
+    """Return times, s, and sizes of the peaks of abs(e) of a flight from e = 0, e_dot = 1.
 
-    In the flight f is recorded.
+    `acts` says whether f acts, as for `half_period`.
     """
     t, speed, times, sizes = 0.0, 1.0, [], []
     while t < DURATION:
@@ -131,9 +136,9 @@ def peaks(beta: float, acts: float) -> tuple[FloatArray, FloatArray]:
 
 
 def plot(cycles: list[Cycle]) -> Figure:
-    """Plot two panels: peaks of abs(e) over time, with and without f, and their limit over beta.
+    """Plot the peaks of abs(e) over time, with and without f, and their limit over beta.
 
-    The formula is beside the limit.
+    The panel of the limit also has the curve of `formula`.
     """
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     over_time, over_beta = figure.subplots(1, 2)

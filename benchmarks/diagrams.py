@@ -30,13 +30,13 @@ IMPORTS = REPOSITORY / "tests" / "pure" / "imports.yaml"
 LAWS = REPOSITORY / "docs" / "evidence" / "tables" / "experiments-laws.csv"
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "rise_di", "font.size": 9.0}
 INK, QUIET, BLUE, ORANGE, RED = ("#2b3640", "#66717b", "#123c52", "#f6a85f", "#8b1f4f")
-FILLS = ("#e9f2fb", "#f5f7f8")  # of a node of the stack, and of others
+FILLS = ("#e9f2fb", "#f5f7f8")  # of the box of a node of the stack, and of another box
 
 Place = tuple[float, float]
 
 
 def save_drawing(figure: Figure, path: Path, shows: str) -> None:
-    """Write a figure as SVG, with texts as text and with what it shows as the title."""
+    """Write a figure as an SVG whose texts remain text, and whose title is `shows`."""
     with mpl.rc_context(STYLE):
         metadata = {"Title": shows, "Date": None, "Creator": None}
         figure.savefig(path, format="svg", metadata=metadata, facecolor="white")
@@ -63,7 +63,7 @@ class Arrow(NamedTuple):
 
     start: Place
     end: Place
-    label: Place = (0.0, 0.0)  # from the middle
+    label: Place = (0.0, 0.0)  # from the middle of the arrow to the label
     bend: float = 0.0
     dotted: bool = False
 

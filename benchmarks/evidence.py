@@ -4,10 +4,10 @@
 
 docs/evidence.md is the table of these files.
 
-    make evidence                              # what has no file yet
+    make evidence                              # run the measurements that have no file yet
     make evidence ARGS="--again faults"
-        # measure this again; "speed" is every name that begins so; repeatable
-    make evidence ARGS="--again long"          # up to 80 min each, by name alone
+        # run each measurement whose name begins with "faults" again; repeatable
+    make evidence ARGS="--again long-faults"   # a long one, which runs by its name alone
 
 Commands and goals are in benchmarks/evidence.yaml. build/evidence/ has the logs.
 """
@@ -44,9 +44,9 @@ MEASUREMENTS = {
 }
 COMMANDS = {name: each["command"] for name, each in MEASUREMENTS.items() if "command" in each}
 DIRTY = "-dirty"  # end of a revision with changes that are not committed
-# end of a host on which times are longer; share of its processors
+# end of the column `host` if other work used more than BUSY_SHARE of the processors
 BUSY, BUSY_SHARE = ("busy with other work", 0.1)
-BASELINE = " x baseline"  # end of a goal on a ratio
+BASELINE = " x baseline"  # end of a goal that limits the ratio to the baseline
 HEAD = """\
 # Evidence
 
@@ -106,7 +106,10 @@ def row(
     at_most: float | None = None,
     at_least: float | None = None,
 ) -> Row:
-    """Make a row from a number, from words, or from None if the host could not measure."""
+    """Make a row; its goal is `at_most` or `at_least`, if one of them is given.
+
+    The value is a number, or words, or None for what this host could not measure.
+    """
     sign, limit = ("<=", at_most) if at_least is None else (">=", at_least)
     text = (
         "not measured"
@@ -119,7 +122,7 @@ def row(
 
 
 def goals_of(name: str) -> Mapping[str, str]:
-    """Return the goals of a measurement by the pattern of the end of a figure's name."""
+    """Return the goals of a measurement. A key is a pattern of the end of a figure's name."""
     goals: Mapping[str, str] = MEASUREMENTS[name].get("goals", {})
     return goals
 
@@ -131,9 +134,10 @@ def split(name: str) -> tuple[str, str]:
 
 
 def rows(result: Any, goals: Mapping[str, str], name: str = "") -> Iterator[Row]:
-    """Return the rows of a JSON result.
+    """Yield a row for each figure of a JSON result.
 
-    The path of keys is the name, and the first goal whose pattern ends the name holds.
+    Its name joins the keys that lead to it with ": ". Its goal is the first of `goals` whose
+    pattern matches the end of the name.
     """
     if isinstance(result, dict):
         for key, value in result.items():
@@ -171,7 +175,10 @@ def compared(figure: Row, figures: Mapping[str, Row]) -> float:
 
 
 def used(figure: Row, figures: Mapping[str, Row]) -> float:
-    """Return the share of the goal that a figure uses; above 1 the goal is not met."""
+    """Return how much of its goal a figure uses: the value over the limit, above 1 if it misses.
+
+    For a goal with ">=" it is the limit over the value.
+    """
     sign, limit = figure.goal.split()[:2]
     value = compared(figure, figures)
     low, high = (value, float(limit)) if sign == "<=" else (float(limit), value)
@@ -220,7 +227,7 @@ def _line(path: Path, title: str) -> str:
         reverse=True,
     )
     met_count = sum(share <= 1.0 for share, _ in judged)
-    misses: dict[str, str] = {}  # of figures that differ by the subject alone the worst
+    misses: dict[str, str] = {}  # the worst of the figures that differ by their subject alone
     for _, figure in judged[: len(judged) - met_count]:
         value = compared(figure, figures)
         text = (
@@ -239,14 +246,15 @@ def _line(path: Path, title: str) -> str:
 
 
 def origin(command: str) -> Origin:
-    """Return the origin of figures that a command begins to measure now on this host."""
+    """Return the origin of the figures of a command that starts now on this host."""
     return Origin(command, revision(), host(), f"{datetime.now(UTC):%Y-%m-%d %H:%M UTC}")
 
 
 def revision(*paths: str) -> str:
-    """Return the commit, with DIRTY if any file but the evidence differs from it.
+    """Return the commit, with DIRTY at its end if any file but the evidence differs from it.
 
-    With `paths` it is the last commit that touched them.
+    With `paths`, return the last commit that touched them, with DIRTY if one of them differs from
+    it.
     """
     status = _git(
         "status", "--porcelain", "--", *(paths or (".", ":(exclude)docs/evidence*"))
@@ -277,9 +285,9 @@ def host() -> str:
 
 
 def measure(name: str) -> int:
-    """Run a measurement and write its rows. Returns the exit status.
+    """Run a measurement and write its rows. Returns the exit status of its program.
 
-    An exit status other than 0 is a goal that is not met.
+    An exit status other than 0 becomes a row whose goal is not met.
     """
     busy = psutil.cpu_percent(interval=2.0) / 100.0
     template = COMMANDS[name]

@@ -34,12 +34,13 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 CAMPAIGN = REPOSITORY / "tests" / "ros" / "faults"
 
 STARTS = ("exec_to_ready", "start_run", "start_waited")
-"""From the start of a killed node to its being ready, and of this time: its main thread runs, or
-waits for a processor."""
+"""Times of the start of a killed node: from its start until it is ready, and for how long of this
+time its main thread runs, and waits for a processor."""
 
-TRAFFIC = ("exec_to_traffic", "ready_to_traffic", "ready_to_caught_up")  # of a killed node
+# times of a killed node
+TRAFFIC = ("exec_to_traffic", "ready_to_traffic", "ready_to_caught_up")
 TIMES = ("reaction", "recovery", "longest_pause", "held_back", "page", *TRAFFIC, *STARTS)
-# the largest after the loss of u_m, and that when the wings have to be level
+# largest bank after the loss of u_m, and the bank when the wings have to be level again
 BANKS = ("bank_deg", "last_bank_deg")
 
 Row = dict[str, Any]
@@ -91,10 +92,10 @@ def run_campaign(options: Sequence[str], total: int | None = None) -> tuple[list
 
 
 def summarise(rows: Sequence[Row]) -> list[Row]:
-    """Return one row for each case.
+    """Return one row for each case, in the order of their first injection.
 
-    It has how many faults were injected, detected and passed, and median and worst of each time in
-    s.
+    It has how many faults were injected and passed, and the median and the worst of each time, s,
+    over those that passed.
     """
     cases: dict[str, list[Row]] = {}
     for row in rows:

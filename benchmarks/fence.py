@@ -10,9 +10,9 @@ The figures say how many leave the fence, and how far.
 The figures go to docs/evidence/guidance-fence-*.csv, with a row for each shape and wind. The osprey
 flies as a fleet, in which every entry of A and B is off by up to 30 % (`aircraft_sim.uncertainty`).
 An aircraft of JSBSim flies as it is, once. The turbulence is light (MIL-F-8785C, 1.5 m/s), and the
-steady wind is a share of V0. The aircraft starts at the origin to the north, 2 to 3 least radii
-before the fence. No number is tuned to an aircraft. Exit status 1: an aircraft left the fence, or
-was lost.
+steady wind is a share of V0. The aircraft starts at the origin and flies to the north, where the
+fence is 2 to 3 least radii away. No number is tuned to an aircraft. Exit status 1: an aircraft left
+the fence, or was lost.
 
 `--generated N` makes fences round home: triangles, slots, holes near home and polygons smaller than
 a turn, until N are accepted. An osprey begins over home and flies a course of the seed; the figures
@@ -43,9 +43,9 @@ from flight_guidance.fence.zones import Fence, Zone
 
 OSPREY = "osprey"
 AIRCRAFT = (OSPREY, "c172p", "f16", "737")
-UNCERTAINTY = 0.3  # share of the entries of A and B
+UNCERTAINTY = 0.3  # largest deviation of an entry of A or B, as a share of the entry
 
-HOME = (-1.0, 0.0)  # radii
+HOME = (-1.0, 0.0)  # north and east, least radii
 
 
 def zones_of(rows: Sequence[Mapping[str, Any]]) -> tuple[Zone, ...]:
@@ -63,12 +63,12 @@ OUTSIDE = {
     name: Fence(zones_of(fence["zones"]), tuple(fence["home"]))
     for name, fence in FENCES["outside"].items()
 }
-"""Fences by name, those of OUTSIDE with the origin outside, in least radii of the aircraft in the
-wind."""
+"""Fences by name, in least radii of the aircraft in the wind. The origin lies outside of those of
+OUTSIDE."""
 
 HOME_RADII = 1.5
-"""Largest distance from home, in radii of the orbit round home: the orbit, and half a radius to
-join it."""
+"""Distance within which an aircraft counts as home, in radii of the orbit round home: the orbit
+itself, and half a radius for an aircraft that still joins it."""
 
 WINDS: Mapping[str, tuple[float, float]] = {
     "calm": (0.0, 0.0),
@@ -76,11 +76,12 @@ WINDS: Mapping[str, tuple[float, float]] = {
     "0.3 V across": (0.0, 0.3),
     "0.3 V from ahead": (-0.3, 0.0),
 }
-"""Where the air moves to: north and east, of V0."""
+"""Velocity of the air to the north and to the east, each as a share of V0."""
 
 DURATION, GENERATED_DURATION = 8.0, 12.0
-"""Radii at V0: 3 to the fence against the wind, a turn, and the way home; 12 lead to the corners of
-most generated fences."""
+"""Durations of a flight, as the number of radii that V0 covers. DURATION suffices for 3 radii to
+the fence against the wind, a turn, and the way home. GENERATED_DURATION suffices to reach the
+corners of most generated fences."""
 
 
 class Row(NamedTuple):
@@ -90,10 +91,10 @@ class Row(NamedTuple):
     fence: str
     wind: str
     flights: int
-    outside: int  # flights
-    farthest: float  # m beyond the fence
-    lost: int  # flights
-    home: int  # flights within HOME_RADII at the end
+    outside: int  # flights that left the fence
+    farthest: float  # largest distance beyond the fence, m
+    lost: int  # flights that did not complete
+    home: int  # flights that ended within HOME_RADII of home
 
     def figures(self) -> Iterator[evidence.Row]:
         """Return the rows of evidence."""
@@ -105,7 +106,7 @@ class Row(NamedTuple):
 
 
 def of_radius(zones: tuple[Zone, ...], radius: float) -> tuple[Zone, ...]:
-    """Return zones in m."""
+    """Return zones in m from zones in radii; `radius` is in m."""
 
     def scaled(values: tuple[float, ...]) -> tuple[float, ...]:
         return tuple(radius * value for value in values)
@@ -122,9 +123,10 @@ def windy(
     home: tuple[float, float],
     radii: float = DURATION,
 ) -> tuple[Scenario, float]:
-    """Return a scenario in a wind, a share of V0, without a route, that flies to the north.
+    """Return a scenario in wind and turbulence without its route, and the least radius there, m.
 
-    Also returns the least radius, m. `home` is in radii, and so is `radii`, the duration at V0.
+    `wind` has the shares of V0 to the north and to the east, and `home` is north and east in radii.
+    The flight lasts as long as V0 takes for `radii` radii.
     """
     if scenario.guidance is None:
         raise ValueError(f"{scenario.name} has no guidance")
@@ -145,20 +147,23 @@ def windy(
 
 
 def at(place: tuple[float, float], radius: float) -> tuple[float, float]:
-    """Return a place in m."""
+    """Return a place in m from a place in radii; `radius` is in m."""
     return place[0] * radius, place[1] * radius
 
 
 class Flight(NamedTuple):
     """A flight at a fence."""
 
-    beyond: float  # m, largest distance beyond the fence
-    lost: bool
-    is_home: bool  # within HOME_RADII at the end
+    beyond: float  # largest distance beyond the fence, m
+    lost: bool  # whether the flight did not complete
+    is_home: bool  # whether it ended within HOME_RADII of home
 
 
 def fly_fleet(shape: str, wind: str, aircraft: int, seed: int) -> Row:
-    """Return the row of uncertain ospreys, which fly to the north one by one on all cores."""
+    """Fly uncertain ospreys to the north, each in a flight of its own, and return their row.
+
+    The flights run in parallel on all cores.
+    """
     scenario, radius = windy(find_scenario("osprey_route"), WINDS[wind], HOME)
     with ProcessPoolExecutor() as pool:
         underway = []
@@ -171,15 +176,15 @@ def fly_fleet(shape: str, wind: str, aircraft: int, seed: int) -> Row:
 
 
 def fly_alone(name: str, shape: str, wind: str) -> Row:
-    """Return the row of an aircraft of JSBSim, which flies to the north."""
+    """Fly an aircraft of JSBSim to the north, and return its row."""
     prepared = windy(aircraft_of(name), WINDS[wind], HOME)
     return row_of(name, shape, wind, [fly(prepared, SHAPES[shape], 0.0)])
 
 
 def fly(prepared: tuple[Scenario, float], shape: tuple[Zone, ...], course: float) -> Flight:
-    """Fly on a course, rad, inside of zones in radii; `prepared` comes from `windy`.
+    """Fly on a course, rad, inside of zones in radii.
 
-    Raises ParameterError for a fence that is refused.
+    `prepared` is what `windy` returns. Raises ParameterError for a fence that is refused.
     """
     scenario, radius = prepared
     fence = {}
@@ -203,9 +208,9 @@ def fly(prepared: tuple[Scenario, float], shape: tuple[Zone, ...], course: float
 def polygon(
     rng: np.random.Generator, corners: int, radii: tuple[float, float], centre: float = 0.0
 ) -> Zone:
-    """Return a polygon round a place at the distance `centre`, radii, from the origin.
+    """Return a polygon round a place that lies `centre` radii to the north of the origin.
 
-    Its corners are at random angles and distances, radii.
+    Its corners are at random angles round this place, at random distances within `radii`.
     """
     evenly = rng.uniform() + np.arange(corners) / corners
     angles = 2.0 * math.pi * (evenly + rng.uniform(-0.3, 0.3, corners) / corners)
@@ -215,7 +220,7 @@ def polygon(
 
 
 def generated(kind: str, rng: np.random.Generator) -> tuple[Zone, ...]:
-    """Return zones of a kind of GENERATED round the origin, in radii."""
+    """Return the zones of a random fence of a kind of GENERATED round the origin, in radii."""
     if kind == "triangle":
         return (polygon(rng, 3, (2.0, 12.0)),)
     if kind == "smaller than a turn":
@@ -236,7 +241,10 @@ GENERATED = ("triangle", "slot", "hole near home", "smaller than a turn")
 
 
 def fly_generated(accepted: int, seed: int, show: Callable[[Row], Any]) -> bool:
-    """Fly in generated fences until so many are accepted. Returns whether all stayed inside."""
+    """Fly in generated fences until `accepted` of them were not refused.
+
+    Returns whether every flight stayed inside and completed.
+    """
     rows_flown = list[Row]()
     refusals = dict.fromkeys(GENERATED, 0)
     for number, kind in enumerate(cycle(GENERATED)):

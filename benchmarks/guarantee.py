@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Print guaranteed and found limits of the deviations of A and B as CSV.
 
-The rows are scenarios that ship and the F-4C of the tutorial (f4c). An unstable aircraft is flown
-for each.
+Each row is a scenario that ships, or the F-4C of the tutorial (f4c). For a scenario of a linear
+airframe, the program also flies an aircraft beyond the limit.
 
     python -m benchmarks.guarantee osprey_servo osprey_observer f4c
     python -m benchmarks.guarantee osprey_servo --corners 20000  # corners and samples at the limit
@@ -37,10 +37,11 @@ from flight_design.gains.gain_design import select_gains
 from rise_di_controller.law.linear_loop import SPECTRAL_RADIUS_TOLERANCE, closed_loop
 
 UNCERTAINTY = 0.3
-LATE = 0.01  # s
-FARTHER = 1.2  # factor on the deviations of the first unstable aircraft, for one that diverges
-LARGEST = 0.99
-BATCH = 500  # aircraft at once: their matrices stay in the cache
+LATE = 0.01  # largest delay of u in the second guarantee, s
+# factor from the deviations of the first unstable aircraft to those of the one that flies
+FARTHER = 1.2
+LARGEST = 0.99  # largest deviation of the aircraft that flies
+BATCH = 500  # number of aircraft at once: so few that their matrices stay in the cache
 F4C = "f4c"
 PAGE = Path(__file__).parents[1] / "docs" / "tutorials" / "theorem.md"
 HEADINGS = (
@@ -61,7 +62,7 @@ HEADINGS = (
 
 
 def loop_of(name: str) -> tuple[LinearLoop, Scenario | None]:
-    """Return the loop with its box, and the scenario that flies; it is None for the F-4C."""
+    """Return the loop with its box of deviations, and the scenario, which is None for the F-4C."""
     if name == F4C:
         text = PAGE.read_text().split("cat > f4c.yaml <<'EOF'\n")[1].split("EOF")[0]
         frame = Airframe.validate_mapping(yaml.safe_load(text), F4C)
@@ -71,7 +72,10 @@ def loop_of(name: str) -> tuple[LinearLoop, Scenario | None]:
 
 
 def flight(scenario: Scenario, first: Unstable) -> str:
-    """Return the outcome of an aircraft FARTHER times as far off as the first unstable one."""
+    """Fly an aircraft with FARTHER times the deviations of the first unstable one.
+
+    Returns the outcome.
+    """
     factor = min(FARTHER, LARGEST / first.deviation)
     entries = {name: factor * part for name, part in first.entries.items()}
     frame = with_entries(load_airframe(scenario.aircraft.airframe), entries)
@@ -84,9 +88,9 @@ def flight(scenario: Scenario, first: Unstable) -> str:
 
 
 def beyond(linear: LinearLoop, stable: float, count: int) -> str:
-    """Count the unstable ones of `count` aircraft at a guaranteed limit.
+    """Return how many of `count` aircraft within a guaranteed limit are unstable.
 
-    Half of them are corners, and half are uniform samples.
+    Half of the aircraft have every deviation at the limit; those of the others are uniform samples.
     """
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
@@ -104,7 +108,10 @@ def beyond(linear: LinearLoop, stable: float, count: int) -> str:
 
 
 def row(name: str, corners: int) -> list[str]:
-    """Return the figures of a scenario."""
+    """Return the figures of a scenario in the order of HEADINGS.
+
+    `corners` is the number of aircraft that `beyond` tries, or 0.
+    """
     linear, scenario = loop_of(name)
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy

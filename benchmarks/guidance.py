@@ -9,11 +9,11 @@ The air is calm, or has turbulence of 1.5 m/s.
     .venv/bin/python -m benchmarks.guidance --route
         # another route, on aircraft that guidance was not built with
 
-The figures go to docs/evidence/guidance-*.csv, and docs/evidence.md is written from them. All
-flights are in one process. Each row is a figure with its limit; in turbulence it is the worst of
-all seeds. The
-rectangle is flown without wind and with a wind of a fifth of the airspeed across its first leg. No
-number is tuned to an aircraft. The 737 is identified first, which takes some minutes.
+The figures go to docs/evidence/guidance-*.csv, and docs/evidence.md is written from them. Each
+flight is simulated in one process. Each row is a figure with its limit; in turbulence it is the
+worst of all seeds. The rectangle is flown without wind, and with a wind of a fifth of the airspeed
+across its first leg. No number is tuned to an aircraft. The 737 is identified first, which takes
+some minutes.
 """
 
 import math
@@ -83,7 +83,8 @@ def aircraft_of(name: str) -> Scenario:
 def original_of(name: str) -> Scenario:
     """Return the scenario of an aircraft, with its own commands and gusts."""
     if name == "osprey_servo":
-        slower = {"rate": 100.0, "step": 0.005}  # as the law: four times faster than with 500 Hz
+        # y comes at the rate of the law, so that the flight takes a quarter of the time of 500 Hz
+        slower = {"rate": 100.0, "step": 0.005}
         return find_scenario(name).vary(aircraft=slower, reference_model={"rate": 100.0})
     if name in {"c172p", "f16"}:
         return find_scenario(f"jsbsim_{name}")
@@ -104,7 +105,7 @@ CONDITIONS: Mapping[str, tuple[float, float]] = {"737": (154.0, 6096.0), **OTHER
 
 
 def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure]:
-    """Return the figures of a flight."""
+    """Fly a manoeuvre, and yield its figures; a lost flight has one figure that says so."""
     guidance = scenario.guidance
     if guidance is None:
         raise ValueError(f"{scenario.name} has no guidance")
@@ -125,7 +126,7 @@ def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure
         "pose": dict(manoeuvre.pose.measured),
     }
     if manoeuvre.figures is of_switch:
-        aircraft["sensors"] = {}  # noise moves u by itself
+        aircraft["sensors"] = {}  # without noise, which moves u too
     if air.seed is not None:
         aircraft["turbulence"] = turbulence(scenario, air.seed)
     varied = scenario.vary(flight={"duration": duration}, aircraft=aircraft, guidance=section)
@@ -166,8 +167,8 @@ def trim_pitch(scenario: Scenario) -> float:
 
 
 EXEMPT = {("f16", "heading", "altitude (m)"): 40.0, ("f16", "orbit", "rms (s)"): 0.05}
-"""Limits of an aircraft whose rudder is at its stop in turns: its own yaw damper feeds r back
-without a washout."""
+"""Wider limits, by aircraft, manoeuvre and figure. The f16's own yaw damper feeds r back without a
+washout, so that its rudder is at its stop in turns."""
 
 
 class Row(NamedTuple):
@@ -180,15 +181,15 @@ class Row(NamedTuple):
 
 
 class Job(NamedTuple):
-    """One flight: a manoeuvre by its title, in the air that a row names."""
+    """One flight of a manoeuvre."""
 
-    title: str
-    shown: str
+    title: str  # of the manoeuvre
+    shown: str  # how the row names the air
     air: Air
 
 
 def jobs(manoeuvres: Mapping[str, Manoeuvre], seeds: int) -> Iterator[Job]:
-    """Return the flights of one aircraft, with those of a row beside each other."""
+    """Yield the flights of one aircraft, so that those of one row come one after another."""
     for title, manoeuvre in manoeuvres.items():
         for across in manoeuvre.winds:
             wind = f", wind {across:g} V" if across else ""
@@ -210,9 +211,9 @@ def rows(
     seeds: int,
     over: Callable[..., Iterable[list[Figure]]] = map,
 ) -> Iterator[Row]:
-    """Return all rows of an aircraft, as `over` flies them.
+    """Fly the manoeuvres of an aircraft, and yield all its rows.
 
-    `over` is `map`, or the `map` of a pool of processes.
+    `over` maps a function over the flights: it is `map`, or the `map` of a pool of processes.
     """
     several = list(jobs(manoeuvres, seeds))
     flights = zip(several, over(partial(fly, aircraft_of(name)), several), strict=True)
@@ -267,7 +268,7 @@ def main() -> None:
 
 
 def origin(options: str) -> evidence.Origin:
-    """Return the origin of figures that this program begins to measure with these options."""
+    """Return the origin of the figures of this program, which starts now with these options."""
     return evidence.origin(f"python -m benchmarks.guidance {options}")
 
 

@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Print gains, margins and errors of the aircraft of JSBSim that trim, as CSV.
 
-Each aircraft has two speeds. The gains are those that `rise-di identify` finds, and a random search
-tries to refute refusals.
+Each aircraft has two speeds. The gains are those that `rise-di identify` finds. If it refuses
+gains, a random search tries to find some, which would refute the refusal.
 
 python -m benchmarks.jsbsim_gains c172p t6texan2
 
-A refusal is a phase margin that the search for gains does not reach, of 45 deg or of
---phase-margin. FIVE of them, drawn at random, are searched by random factors on the integrals and
-the bandwidths, within wider bounds than those of the search.
+A refusal says that the search for gains does not reach a phase margin of 45 deg, or of
+--phase-margin. FIVE refusals are drawn at random. For each, random factors on the integrals and the
+bandwidths are tried, within wider bounds than those of the search.
 """
 
 import argparse
@@ -33,10 +33,10 @@ from flight_design.identification.jsbsim_identification import IdentifiedAircraf
 
 CONDITIONS = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
 FIVE = 5
-SECONDS = 10.0  # of processor time a refusal
-WIDEST = np.log([[4000.0], [200.0]])  # factors on integral and bandwidth
-FRESH = 0.3  # of the tries: anywhere; the others begin at the best one
-SPREAD = 0.4  # of a try beside the best one, in the logarithm of a factor
+SECONDS = 10.0  # processor time for the random search of one refusal
+WIDEST = np.log([[4000.0], [200.0]])  # logarithms of the largest factors on integral and bandwidth
+FRESH = 0.3  # share of the tries that are drawn anywhere; the others lie near the best one so far
+SPREAD = 0.4  # standard deviation of the step from the best try, in the logarithm of a factor
 AIRS = ("calm", "turbulence")
 HEADINGS = (
     "aircraft",
@@ -82,7 +82,7 @@ def figures(identified: IdentifiedAircraft) -> list[str]:
 
 
 def searched(selection: Selection) -> str:
-    """Return what random factors find for a refused selection in SECONDS."""
+    """Try random factors for SECONDS on a refused selection, and say what they find."""
     build = gain_candidates(selection.study, selection.setting)
     generator = np.random.default_rng(1)
     m = len(selection.chosen.outputs)

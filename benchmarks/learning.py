@@ -2,16 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure learning in the air: uncertain aircraft that learn in every air.
 
-They are compared with the law alone, with the model of the file and with the true model.
+The learner is compared with the law alone, with the model of the airframe file and with the true
+model.
 
     python -m benchmarks.learning  # every cell, 50 aircraft: at most 3 h on two idle cores
-    python -m benchmarks.learning --aircraft 6  # with fewer; run again, it flies what is missing
-    python -m benchmarks.learning --aircraft 20 --cell "rough prior"  # of one cell
+    python -m benchmarks.learning --aircraft 6  # fewer aircraft; a second run flies what is missing
+    python -m benchmarks.learning --aircraft 20 --cell "rough prior"  # one cell
 
-An aircraft learns for 64 s of osprey_learn. The model that flies then is frozen, and flies the
-commands and the two gusts of osprey_observer. The others fly the same, and so do the laws of
-`rise-di compare` with their gains for the airframe file. A row for each aircraft goes to
-build/learning.csv. The figures of the cells that were flown whole go to docs/evidence/learning.csv.
+An aircraft learns for 64 s of osprey_learn. The model that flies at the end is frozen, and flies
+the commands and the two gusts of osprey_observer. The law alone and the two models that are not
+learned fly the same, and so do the laws of `rise-di compare` with their gains for the airframe
+file. A row for each aircraft goes to build/learning.csv. The figures of the cells of which all
+aircraft have flown go to docs/evidence/learning.csv.
 If the airs of both uncertainties are among them, the picture goes to docs/images/learning.png. An
 aircraft takes 2 to 3 min of a core over all cells. For false alarms at most two aircraft fly 600 s
 without damage in each air, which takes 2 min of a core each.
@@ -41,14 +43,14 @@ IMAGE = REPOSITORY / "docs" / "images" / "learning.png"
 
 
 def count(name: str, aircraft: int) -> int:
-    """Return the number of aircraft in a cell."""
+    """Return how many aircraft a cell has if a whole cell has `aircraft` of them."""
     return min(math.ceil(CELLS[name].share * aircraft), CELLS[name].most)
 
 
 def code() -> list[str]:
     """Return the paths of the code that flies.
 
-    They are this file, and the packages of this stack that it imports.
+    They are benchmarks/learning_flights.py, and the packages of the stack that are imported now.
     """
     sources = REPOSITORY / "ros_ws" / "src"
     imported = {name.partition(".")[0] for name in sys.modules} & {
@@ -66,7 +68,7 @@ def code() -> list[str]:
 def read(path: Path) -> list[Row]:
     """Return the rows of a file of results.
 
-    There are none if the file has other columns, because an earlier version wrote it.
+    Returns none if there is no file, or if an earlier version wrote it with other columns.
     """
     if not path.exists():
         return []
@@ -108,8 +110,9 @@ def main(
 ) -> None:
     """Fly the aircraft that are missing in the results, and write the figures and the picture.
 
-    Rows that other code flew are flown again, and so are all if that code is not committed. The
-    revision of a row is the last one that touched the code that flies.
+    The revision of a row is the last commit that touched the code of `code`. A row with another
+    revision is flown again. All rows are flown again if this code has changes that are not
+    committed.
     """
     if unknown := [name for name in cell if name not in CELLS]:
         raise typer.BadParameter(
@@ -123,12 +126,12 @@ def main(
         if each.revision == flown_by and not flown_by.endswith(evidence.DIRTY)
     ]
     known = {(each.cell, each.number) for each in rows}
-    # aircraft by aircraft, so that a run that ends early has some of each cell
+    # one aircraft after another in all cells, so that a run that ends early has some of each cell
     cases: dict[tuple[int, float, str], list[str]] = {}
     for n in range(aircraft):
         for name in cell:
             if n < count(name, aircraft) and (name, n) not in known:
-                # what flies beside is the same in all cells of an uncertainty
+                # what does not learn flies the same in all these cells of an uncertainty
                 shared = "" if CELLS[name].kind == "learn" else name
                 cases.setdefault((n, CELLS[name].uncertainty, shared), []).append(name)
     with ProcessPoolExecutor(jobs) as pool:

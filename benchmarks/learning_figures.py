@@ -44,8 +44,9 @@ LABELS = {
 }
 RIVALS = ("rise", "pi", "l1", "indi", "lqg", "rise_observer")
 OBJECTIVE = "gust_turbulence"
-"""Laws of the catalogue with the gains that ship, of a search with this cost on the airframe file
-in the loop of osprey_servo. INDI measures the actuators too."""
+"""RIVALS are laws of the catalogue with the gains that ship. A search with the cost OBJECTIVE on
+the airframe file, in the loop of osprey_servo, has found these gains. INDI measures the actuators
+too."""
 
 
 def figures(rows: Sequence[Row]) -> Iterator[evidence.Row]:
@@ -70,7 +71,7 @@ def figures(rows: Sequence[Row]) -> Iterator[evidence.Row]:
 
 
 def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
-    """Return scores beside those of the others."""
+    """Yield the figures of aircraft that learn, beside those of the others."""
     yield from scores(name, chosen)
     known = [each for each in chosen if not math.isnan(each.true)]
     shares = {"learn": 0.95 if cell.uncertainty < 0.5 else 0.9, "turning": 0.75, "rough": 0.75}
@@ -107,10 +108,7 @@ def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evid
 
 
 def scores(name: str, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
-    """Return the lost flights, and the scores of the flights to the end, of each.
-
-    The scores are mean and largest.
-    """
+    """Yield the lost flights for each of LABELS, and mean and largest score of the others."""
     for key, label in LABELS.items():
         values = np.array([getattr(each, key) for each in chosen])
         flown = values[~np.isnan(values)]
@@ -124,7 +122,7 @@ def scores(name: str, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
 
 
 def damage_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
-    """Return scores from SETTLED on, and whether a dead input was found in time."""
+    """Yield scores from SETTLED on after damage, and how often a dead input was found in time."""
     yield from scores(name, chosen)
     yield row(
         f"{name}: lost with the learner and not with the law alone",
@@ -155,14 +153,17 @@ def damage_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evi
 
 
 def window_figures(name: str, label: str, values: FloatArray) -> Iterator[evidence.Row]:
-    """Return mean scores over WINDOWS of the flights to the end, from scores (N, W)."""
+    """Yield the mean score over each of WINDOWS, from scores (N, W).
+
+    A flight that was lost in any window does not count.
+    """
     if len(whole := values[np.isfinite(values).all(axis=1)]):
         for (first, end), mean in zip(WINDOWS, whole.mean(axis=0), strict=True):
             yield row(f"{name}: score from {first:g} to {end:g} s, {label}", float(mean))
 
 
 def alarm_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
-    """Count alarms without damage."""
+    """Yield the flight time without damage, and the number of false alarms in it."""
     yield row(f"{name}: flight time", ALARM_FLIGHT / 60.0 * len(chosen), "min")
     yield row(
         f"{name}: false alarms",
@@ -186,10 +187,11 @@ CELL_FIGURES = {
 
 
 def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[evidence.Row]:
-    """Return the scores of the laws of RIVALS in the flight with gusts.
+    """Yield the scores of the laws of RIVALS in the flight with gusts.
 
-    The share that loses track there with u LATE is beside them. All aircraft have the same noise.
-    Each law has its model and gains by the airframe file.
+    Each law also flies it with u late by LATE; the figure is the share of aircraft that lose track.
+    All aircraft have the same noise. The model and the gains of each law come from the airframe
+    file.
     """
     benchmark = tuning.build_benchmark(find_scenario("osprey_observer"))
     tuned = load(tuned_file(find_scenario("osprey_servo")))
@@ -217,7 +219,7 @@ def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[eviden
 def plot(rows: Sequence[Row]) -> Figure:
     """Plot the score of every aircraft in the flight with gusts, a panel for each uncertainty.
 
-    The bar is the mean.
+    A bar shows the mean of a column.
     """
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     for axis, uncertainty in zip(figure.subplots(1, 2, sharey=True), (0.3, 0.5), strict=True):
@@ -242,6 +244,6 @@ def plot(rows: Sequence[Row]) -> Figure:
             )
         axis.set_xticks(range(len(columns)), list(columns), fontsize=7)
         plain(axis, f"A and B +-{100 * uncertainty:g} %: score", lines="y")
-    # of both panels, once all points are drawn: it ends the automatic limits
+    # for both panels, once all points are drawn, because this ends the automatic limits
     axis.set_ylim(bottom=0.0)
     return figure

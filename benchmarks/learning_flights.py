@@ -39,19 +39,23 @@ from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 REPOSITORY = Path(__file__).parents[1]
-SEED = 11  # of the aircraft
-# s: when the last model flies; the fault, and what counts after it
+SEED = 11  # seed of the deviations of all aircraft
+# s: end of a flight that learns; the damage, the instant after it from which scores count, and the
+# end of a flight with damage
 LEARNED, DAMAGED, SETTLED, END = (64.0, 60.0, 75.0, 100.0)
 WINDOWS = ((0.0, 14.0), (14.0, 30.0), (30.0, DAMAGED), (DAMAGED, SETTLED), (SETTLED, END))
-"""s, of a flight with damage: before the first model, with the first ones, learned, from the damage
-on, and learned again."""
-UPDATE = 1.0  # s, of a core, for the two parts of the osprey
-LATE, MARGIN, WITHIN = 0.02, 0.03, 1.1  # s, s; a score within 10 % of that of the true model
-REPEATED = 35.0  # s, after which the commands of osprey_learn come again
-ROUGH = 0.6  # deviation of the logarithms of the entries of a rough prior
+"""Parts of a flight with damage, begin and end, s: before the first model, with the first models,
+with the learned model, right after the damage, and with the model learned after it."""
+UPDATE = 1.0  # largest mean processor time of an update of both parts of the osprey, s
+# s by which u is late in the test of stability; delay margin of the design, s; largest ratio to the
+# score of the true model that counts as near it
+LATE, MARGIN, WITHIN = 0.02, 0.03, 1.1
+REPEATED = 35.0  # time after which the commands of osprey_learn come again, s
+ROUGH = 0.6  # standard deviation of the logarithms of the factors of a rough prior
+# factor on the effect of a weak surface; size of an entry between the parts of a coupled aircraft
 WEAK, COUPLING = 0.5, 0.1
-ALARM_FLIGHT = 600.0  # s
-TRAIN = {  # m/s, m, s: a gust every 3 to 7 s
+ALARM_FLIGHT = 600.0  # duration of a flight without damage that counts false alarms, s
+TRAIN = {  # speed, m/s; length, m; start and time from one gust to the next, s
     "vertical": {"start": 1.0, "speed": 8.0, "length": 15.0, "every": 4.7},
     "lateral": {"start": 2.5, "speed": 5.0, "length": 12.0, "every": 6.1},
     "longitudinal": {"start": 4.0, "speed": 4.0, "length": 25.0, "every": 9.7},
@@ -71,16 +75,16 @@ class Cell(NamedTuple):
     """What the aircraft of a cell have in common."""
 
     kind: str  # "learn", "turning", "rough", "coupled", "untold", "weak", "dead" or "alarm"
-    air: str
-    uncertainty: float
-    share: float = 1.0  # of --aircraft
-    most: int = sys.maxsize  # aircraft
-    # keys of the aircraft, with sections, of which neither controller nor learner is told
+    air: str  # a key of AIR
+    uncertainty: float  # largest relative deviation of an entry of A or B
+    share: float = 1.0  # number of aircraft, as a share of --aircraft
+    most: int = sys.maxsize  # largest number of aircraft
+    # keys of the scenario's aircraft that differ without the controller or the learner knowing it
     untold: Mapping[str, Any] = MappingProxyType({})
 
 
 def untold(air: str, uncertainty: float = 0.3, **keys: Any) -> Cell:
-    """Return a cell in which something differs that neither controller nor learner is told."""
+    """Return a cell whose aircraft differ by `keys`, which controller and learner do not know."""
     return Cell("untold", air, uncertainty, 0.25, untold=MappingProxyType(keys))
 
 
@@ -108,14 +112,14 @@ CELLS = {
     "dead": Cell("dead", "turbulence", 0.3, 0.5),
     **{f"alarms in {air}": Cell("alarm", air, 0.3, 0.1, 2) for air in AIR},
 }
-# any cell with the airframe, the actuators and the noise of the library
+# stands for any cell with the airframe, the actuators and the noise of the library
 OSPREY = Cell("learn", "calm", 0.3)
 
 
 class Row(NamedTuple):
     """One aircraft: its scores in the flight with gusts, or after damage.
 
-    A score is NaN if it was not flown.
+    A score is NaN if its flight was not flown, and infinite if it ended early.
     """
 
     cell: str
@@ -124,33 +128,34 @@ class Row(NamedTuple):
     file: float = math.nan
     learner: float = math.nan
     true: float = math.nan
-    late_alone: int = 0  # 1: unstable with u LATE
+    late_alone: int = 0  # 1 if the linear loop is unstable with u late by LATE
     late_file: int = 0
     late_learner: int = 0
     late_true: int = 0
-    # s, delay margins on the true aircraft; -1: unstable
+    # what `margin_left` returns, s; -1 if the loop is unstable
     margin_file: float = math.nan
     margin_learner: float = math.nan
     margin_true: float = math.nan
-    first: float = math.nan  # s, when the first model flew
+    first: float = math.nan  # instant from which the first model flew, s
     models: int = 0
     refused: int = 0
-    alarms: int = 0  # of the change test
+    alarms: int = 0  # alarms of the change test
     dead: str = ""  # the input without effect
     found: str = ""  # the input found to be without effect
-    found_at: float = math.nan  # s
-    lost: int = 0  # 1: with the learner alone of the two
-    update: float = 0.0  # s of a core, mean: identification, test for a change and design
-    longest: float = 0.0  # s of a core, the same
-    replayed: int = 0
-    # JSON: the scores over WINDOWS of each, after half of elevator and aileron was lost
+    found_at: float = math.nan  # instant of this finding, s
+    lost: int = 0  # 1 if the learner lost track and the law alone did not
+    update: float = 0.0  # mean processor time of a step: identification, change test and design, s
+    longest: float = 0.0  # longest processor time of such a step, s
+    replayed: int = 0  # 1 if the flight replays
+    # JSON of a flight with weak surfaces: the scores over WINDOWS, by "alone", "file", "true" and
+    # "learner"
     windows: str = ""
     events: str = ""
-    revision: str = ""  # of the code that flew
+    revision: str = ""  # commit of the code that flew
 
 
 class Timed:
-    """A learner, and how long its steps take on one core."""
+    """A learner that measures the processor time of its proposals, s."""
 
     def __init__(self, own: Learner) -> None:
         self._own, self.steps = own, list[float]()
@@ -214,9 +219,10 @@ def evaluation(flown: Scenario) -> Scenario:
 def score(
     tape: Tape, first: float = 0.0, without: Sequence[str] = (), end: float = math.inf
 ) -> float:
-    """Sum the true rms errors of the outputs in units of a score.
+    """Return the sum of the true rms errors of the outputs, each in its unit of the score.
 
-    It is infinite for a flight that ended early.
+    It covers the instants from `first` until before `end`, s, and leaves out the outputs of
+    `without`. It is infinite for a flight that ended early.
     """
     if tape.outcome != COMPLETED:
         return math.inf
@@ -237,7 +243,7 @@ def score(
 
 @cache
 def file_design() -> RiseDiConfig | None:
-    """Return the start of OSPREY with feedforward and observer of the file."""
+    """Return the controller of the start, with feedforward and observer by the airframe file."""
     chosen = learning(OSPREY, 0, LEARNED)
     return designed(start_of(chosen), chosen, load_airframe("osprey"), uncertain=True)
 
@@ -245,9 +251,9 @@ def file_design() -> RiseDiConfig | None:
 def designed(
     start: RiseDiConfig, scenario: Scenario, model: Airframe, *, uncertain: bool = False
 ) -> RiseDiConfig | None:
-    """Return the start with feedforward and observer of a model.
+    """Return the controller `start` with feedforward and observer by a model.
 
-    It is None if no relaxation has the margins.
+    Returns None if no relaxation of the observer has the margins.
     """
     try:
         return selected_observer(start, scenario, model, MARGIN, uncertain=uncertain).controller
@@ -256,7 +262,7 @@ def designed(
 
 
 def is_unstable(controller: ControllerConfig, aircraft: Airframe) -> int:
-    """Return 1 if the linear loop of an aircraft is unstable with u LATE, else 0."""
+    """Return 1 if the linear loop of an aircraft is unstable with u late by LATE, else 0."""
     rows, columns = law_order(aircraft, controller)
     plant = LinearPlant(
         aircraft.matrix_a() + aircraft.matrix_gravity(),
@@ -273,9 +279,10 @@ def is_unstable(controller: ControllerConfig, aircraft: Airframe) -> int:
 
 
 def margin_left(controller: RiseDiConfig, chosen: Scenario) -> float:
-    """Return the delay margin of the linear loop of the true aircraft with its lags, s.
+    """Return the delay margin that the loop of the true aircraft has left, s.
 
-    It is beyond the delays of u and y, or -1 if the loop is unstable.
+    It is the delay margin of the linear loop with the true lags, less the delays of the actuators
+    and of y. It is -1 if the loop is unstable with these delays.
     """
     aircraft = chosen.aircraft
     true = aircraft.sampled_airframe()
@@ -294,7 +301,7 @@ class Learned(NamedTuple):
     """A flight that learned."""
 
     tape: Tape
-    controller: RiseDiConfig  # at its end, without the section learn
+    controller: RiseDiConfig  # the controller at the end of the flight, without the section learn
     row: Row
 
 
@@ -341,10 +348,10 @@ def start_of(chosen: Scenario) -> RiseDiConfig:
 
 @lru_cache(maxsize=4)
 def beside(uncertainty: float, number: int) -> dict[str, tuple[float, int]]:
-    """Fly what does not learn.
+    """Fly an aircraft with the law alone, with the model of the file and with the true model.
 
-    Returns the score in the flight with gusts, and whether it is unstable with u late. It is the
-    same in every air.
+    Returns the score in the flight with gusts, and 1 if the loop is unstable with u late by LATE,
+    by "alone", "file" and "true". These are the same for every air in which the learner flies.
     """
     chosen = learning(Cell("learn", "calm", uncertainty), number, LEARNED)
     flight = evaluation(chosen)
@@ -361,14 +368,17 @@ def beside(uncertainty: float, number: int) -> dict[str, tuple[float, int]]:
 def frozen(
     controller: RiseDiConfig | None, flight: Scenario, aircraft: Airframe
 ) -> tuple[float, int]:
-    """Return the score of a controller in a flight, and whether it is unstable with u late."""
+    """Return the score of a controller in a flight, and 1 if it is unstable with u late by LATE.
+
+    The score is NaN without a controller.
+    """
     if controller is None:
         return math.nan, 0
     return score(simulate(flight.vary(controller=controller))), is_unstable(controller, aircraft)
 
 
 def learn(name: str, cell: Cell, number: int) -> Row:
-    """Fly a learner, and beside it what does not learn."""
+    """Fly a learner, then its frozen model and what does not learn in the flight with gusts."""
     with TemporaryDirectory() as folder:
         chosen = learning(cell, number, LEARNED)
         others = (
@@ -419,9 +429,10 @@ def with_prior(chosen: Scenario, folder: str) -> Scenario:
 
 
 def rough(number: int) -> Airframe:
-    """Return the osprey with every entry off by a factor exp(ROUGH N), or up to 30 % for C B.
+    """Return a rough model of the osprey.
 
-    Rows of angles stay.
+    Each entry of A and B has a random factor exp(ROUGH n), with n normal of variance 1. An entry of
+    B that acts on an output directly is off by up to 30 % instead. The rows of theta and phi stay.
     """
     airframe = load_airframe("osprey")
     rng = np.random.default_rng([SEED, number])
@@ -439,9 +450,10 @@ def rough(number: int) -> Airframe:
 
 
 def coupled(number: int) -> Airframe:
-    """Return the osprey with entries between its two parts.
+    """Return the osprey with random entries of A and B that couple its two parts.
 
-    They have up to COUPLING of the largest effect on the row, in units of motion.
+    An entry of B is at most COUPLING times the largest of its row. For A the row's root sum of
+    squares takes its place, with V in m/s and the other states in 0.1 rad or 0.1 rad/s.
     """
     airframe = load_airframe("osprey")
     rng = np.random.default_rng([SEED, number, 1])
@@ -471,9 +483,10 @@ def coupled(number: int) -> Airframe:
 
 
 def damage(name: str, cell: Cell, number: int) -> Row:
-    """Fly a learner and the others when elevator and aileron lose half of their effect.
+    """Fly a learner, and what does not learn, when surfaces are damaged at DAMAGED s.
 
-    In other cells one surface loses all of it.
+    In a cell of kind "weak" elevator and aileron lose half of their effect; in one of kind "dead"
+    one surface loses all of it.
     """
     inputs = tuple(load_airframe("osprey").inputs)
     surfaces = [key for key in inputs if key != "thrust"]
@@ -510,9 +523,10 @@ def damage(name: str, cell: Cell, number: int) -> Row:
 def over_windows(
     tapes: dict[str, Tape], chosen: Scenario, aircraft: Airframe
 ) -> dict[str, list[float]]:
-    """Return scores over WINDOWS.
+    """Return the scores over WINDOWS of each flight, by its name.
 
-    Until the damage, those of the true model are with the model of the aircraft as it was.
+    Before the damage, the scores of the true model are those of a flight with the model of the
+    undamaged aircraft.
     """
     found = {
         key: [score(tape, first, (), end) for first, end in WINDOWS] for key, tape in tapes.items()

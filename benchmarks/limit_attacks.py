@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly aircraft inside or outside the box of a certificate with a limit, and count how each ends.
 
-This reads the numbers of the certificate and computes the motion by itself, without a line of the
-stack. The limits lie at random around the u at which the loop rests, and each flight starts from a
-state for which the law asks for up to 300 times as much.
+This program reads the numbers of the certificate and computes the motion without any code of the
+stack. The limits of the input lie at random around the u at which the loop rests. Each flight
+starts from a state for which the law asks for up to 300 times the width between the limits.
 
     python -m benchmarks.limit_attacks certificate.json --aircraft 2000
     python -m benchmarks.limit_attacks certificate.json --aircraft 2000 --size 0.4 --input thrust
@@ -20,20 +20,26 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 Array = NDArray[Any]
-BATCH = 250  # aircraft at once
-LONGEST, LOOKED_AT = 600.0, 20.0  # s: of a flight, and from one look at it to the next
-SETTLED = 1e-2  # part of the start by which a state that has settled still changes between looks
-DOUBLINGS = 21  # of ticks until a linear loop rests
-GONE = 1e6  # times the start at which a flight has left
-FALLEN = 0.999  # part of an earlier excess beyond the limits below which it counts as falling
-TURNS = 3  # in the last third, 200 s, of an oscillation with a period of 126 s or less
+BATCH = 250  # number of aircraft that fly at once
+# s: duration of a flight, and time from one look at it to the next
+LONGEST, LOOKED_AT = 600.0, 20.0
+# a flight has settled if its state changes less than this between looks, as a part of the start's
+SETTLED = 1e-2
+DOUBLINGS = 21  # a linear loop rests after 2^21 ticks
+GONE = 1e6  # a flight has left if its state is this many times that of the start
+# a flight falls if its later excess over the limits is below this part of its earlier excess
+FALLEN = 0.999
+# changes of the exceeded limit in the last third of a flight, 200 s: an oscillation with a period
+# of 126 s or less has at least so many
+TURNS = 3
 ENDS = ("settles", "falls", "swings more slowly", "oscillates", "leaves")
 
 
 def loop_of(file: dict[str, Any], d: Array) -> tuple[Array, Array, Array]:
-    """Return F (N, S, S), W (N, S) and K (S,): s+ = F s - W w, u = K s of the limited input.
+    """Return F (N, S, S), W (N, S) and K (S,) of s+ = F s - W w and u = K s, for each aircraft d.
 
-    s are aircraft and actuators, u of earlier ticks, and the law; w is what the limits cut off.
+    s has the states of aircraft and actuators, u of earlier ticks, and the states of the law. u is
+    the command of the limited input, and w what the limits cut off from it.
     """
     A, B, C, E, F, G, lag = (np.array(file[key], float) for key in [*"ABCEFG", "lag"])
     law = {key: np.array(value, float) for key, value in file["law"].items()}
@@ -73,7 +79,7 @@ def ends_of(file: dict[str, Any], d: Array, generator: np.random.Generator) -> A
     n = len(file["A"])
     s = np.zeros(W.shape)
     s[:, :n] = generator.normal(size=(len(d), n))
-    # without a limit the loop comes back to u = 0 from here: where it rests is taken off
+    # without the state at which it would rest, the loop comes back to u = 0 if there are no limits
     rests = F
     for _ in range(DOUBLINGS):
         rests = rests @ rests

@@ -48,7 +48,8 @@ from flight_log.bag import LOST_MESSAGES
 from flight_log.tape_reader import read_run
 
 SIDE = 6000.0  # m, of the triangle
-# of 1.5 m/s: at the altitude of the c172p; moderate at 100 m above ground (MIL-F-8785C)
+# of about 1.5 m/s: for the c172p at its altitude; for the osprey moderate at 100 m above the ground
+# (MIL-F-8785C)
 TURBULENCE = {
     "c172p": {"altitude": 1219.2, "sigma": 1.5, "seed": 1},
     "osprey": MODERATE | {"seed": 1},
@@ -60,7 +61,7 @@ IN_VIEW = """(() => {
   const place = ({node}) => node.getBoundingClientRect(), all = typeof figures === "undefined" ? [] : figures;
   const found = all.filter(one => place(one).top < innerHeight && place(one).bottom > 0);
   return found.length > 0 && found.every(one => one.drawn);
-})()"""  # goes to the first figure; whether all figures in view are drawn  # noqa: E501 - a text as it is written
+})()"""  # scrolls to the first figure; true if all figures in view are drawn  # noqa: E501 - a text as it is written
 MODES = {
     "in lockstep": ["--lockstep"],
     "in lockstep in one process": ["--lockstep", "--composed"],
@@ -76,7 +77,7 @@ def triangle(minutes: float, *, observer: bool, rate: float | None = None) -> Sc
     base = find_scenario("osprey_route" if observer else "jsbsim_c172p_route")
     if observer:
         base = replace(base, controller=find_scenario("osprey_observer").controller)
-    # above the start
+    # the triangle lies at the altitude of the start
     speed = base.aircraft.channels().speed
     altitude = base.aircraft.altitude or 0.0
     laps = math.ceil(60.0 * minutes * speed / (2.0 * SIDE))  # the fillets shorten a lap
@@ -99,10 +100,10 @@ def triangle(minutes: float, *, observer: bool, rate: float | None = None) -> Sc
 
 
 def fly(scenario: Path, runs: Path, mode: str) -> tuple[dict[str, list[int]], int]:
-    """Fly with a client of the page. Returns the memory of each process by its command.
+    """Fly with a client of the page, and return how much memory the processes need, bytes.
 
-    It is taken until the nodes end, in bytes every PERIOD. The second result is the most memory of
-    `rise-di fly` after that, while it writes the report, in bytes.
+    The first result has samples each PERIOD until the nodes end, by the command of the process. The
+    second result is the largest memory of `rise-di fly` after that, while it writes the report.
     """
     prefix = real_time() if mode == "in real time" else ()
     command = [*prefix, RISE_DI, "fly", str(scenario), *MODES[mode], "--runs", str(runs)]
@@ -146,11 +147,12 @@ def end(flight: psutil.Popen) -> None:
 def skips(
     tape: Tape, scenario: Scenario, *, real_time: bool
 ) -> dict[str, tuple[NDArray[np.int64], int]]:
-    """Return begin and end of each time without a sample in the flight, and the period, by topic.
+    """Return begin and end of each gap between the samples of a topic, and its period, ns.
 
-    All are in ns. What follows the flight is the end of the processes. In real time a late tick
-    skips instants. It is late by 0 to 1 period, so a skip ends half a period after the next stamp.
-    Each u carries the stamp of a y, and `figures_of_ticks` counts the ticks of the controller.
+    Only samples during the flight count, not those while the processes end. In real time a tick
+    that is late skips instants. It is late by 0 to 1 period, so the gap ends half a period after
+    the stamp of the next sample. u is left out in real time, because it carries the stamp of a y;
+    there `figures_of_ticks` counts the ticks of the controller.
     """
     guidance = scenario.guidance
     if guidance is None:
@@ -174,7 +176,7 @@ def missing(
 ) -> dict[str, dict[str, int]]:
     """Count the samples of each topic that the log lacks.
 
-    If host delays are known, they are also counted without those.
+    If host delays are known, the samples that they explain are left out of a second count.
     """
     skipped = skips(tape, scenario, real_time=real_time)
     return {
@@ -191,10 +193,11 @@ def missing(
 
 
 def opened(report: Path) -> dict[str, float] | None:
-    """Return the times from the address to the figures drawn in a browser, s, or None without one.
+    """Return how long a browser takes to draw the figures of a report, s.
 
-    The page draws the figures in view first, and then all others. The first time is that of a
-    reader who goes to the first figure at once, the second is that of all figures, in view or not.
+    Returns None without a browser. Both times begin when the browser opens the report. The page
+    draws the figures in view first. The first time ends when these are drawn for a reader who goes
+    to the first figure at once. The second time ends when all figures are drawn.
     """
     if CHROMIUM is None:
         return None
@@ -215,9 +218,9 @@ def figures(
 ) -> dict[str, Any]:
     """Return the figures of a flight from its run, SI.
 
-    They are the memory in bytes in the middle and at the end, and the ticks as `figures_of_ticks`
-    gives them. `delays` are those of the host, by the clock of the stamps, or None if unknown.
-    Ticks are only counted in real time: in lockstep they wait for their inputs.
+    The memory is in bytes, in the middle and at the end of the flight. `delays` are those of the
+    host, by the clock of the stamps, or None if unknown. `figures_of_ticks` counts ticks in real
+    time alone, because in lockstep they wait for their inputs.
     """
     begin = time.monotonic()
     write_report(run)

@@ -25,32 +25,33 @@ from flight_guidance.params import GuidanceConfig
 from flight_guidance.steering.lateral import least_radius
 from flight_guidance.steering.protection import FLOOR
 
-SIGMA = 1.5  # m/s, of the turbulence
-START = 5.0  # s, of the command
-BANK = math.radians(20.0)
-TURN = math.pi / 2.0
-CLIMB = 100.0
-FASTER = 0.1  # rad, rad, m, of V0
-WIND = 0.2  # of V0
+SIGMA = 1.5  # intensity of the turbulence, m/s
+START = 5.0  # instant of the command, s
+BANK = math.radians(20.0)  # commanded bank, rad
+TURN = math.pi / 2.0  # commanded change of the heading, rad
+CLIMB = 100.0  # commanded change of the altitude, m
+FASTER = 0.1  # commanded change of V, as a share of V0
+WIND = 0.2  # as a share of V0
 RECTANGLE = ((0, 0, 0), (3, 0, 0), (3, 2.5, 0), (0, 2.5, 0), (0, 0, 0))
 ROUTE = ((0, 0, 0), (3, 0, 10), (5, 2, 10), (5, 5, 0), (2.5, 6.25, 0), (2.5, 3, 0), (0, 2.375, 0))
-"""Waypoints as of `round_route`. The second route turns by 45, 45, 63, 117 and -76 deg."""
+"""Waypoints as `round_route` takes them. ROUTE turns by 45, 45, 63, 117 and -76 deg."""
 LOW = 100.0  # m
 LOW_WIND = 10.9  # m/s at 20 ft
-"""For an airframe without altitude: lateral intensity 1.5 m/s, MIL-F-8785C."""
-SWITCH_PERIOD = 5.0  # s
-FAULT = START + 10.0  # s, of a fault of pose, in a turn
+"""Altitude and wind of the turbulence for an airframe without an altitude. By MIL-F-8785C its
+lateral intensity is then 1.5 m/s."""
+SWITCH_PERIOD = 5.0  # time from one of SWITCHES to the next, s
+FAULT = START + 10.0  # instant at which a fault of pose begins, in a turn, s
 ANGLE_NOISE = math.radians(0.5)
 NOISE = dict.fromkeys(("phi", "theta", "beta"), ANGLE_NOISE) | {"psi": 2.0 * ANGLE_NOISE}
 NOISE |= dict.fromkeys(("north", "east", "altitude"), 0.5) | dict.fromkeys(
     ("v_north", "v_east", "climb"), 0.2
 )
-"""Standard deviations of a poor estimator, rad, m and m/s, white."""
+"""Standard deviations of the white noise of a poor estimator, rad, m and m/s."""
 
 
 LATE = 5.0
-"""Limit of the bank beyond its limit with a poor pose, deg. A pose 0.4 s old costs 8 deg at p_max
-where nothing predicts."""
+"""Largest permitted excess of the bank over its limit with a poor pose, deg. If nothing predicted
+the bank, a pose that is 0.4 s old would cost 8 deg at p_max."""
 
 
 class Air(NamedTuple):
@@ -58,7 +59,7 @@ class Air(NamedTuple):
 
     name: str
     seed: int | None = None
-    across: float = 0.0  # wind to the east, of V0
+    across: float = 0.0  # wind to the east, as a share of V0
 
 
 class Figure(NamedTuple):
@@ -75,16 +76,13 @@ class Figure(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """How guidance receives pose.
+    """How guidance receives pose: how it is measured, and a fault that begins at FAULT."""
 
-    It has `aircraft.pose` of the scenario, and a fault for `fault` s from FAULT on.
-    """
-
-    measured: Mapping[str, Any] = MappingProxyType({})
-    fault: float = 0.0  # s
+    measured: Mapping[str, Any] = MappingProxyType({})  # section `aircraft.pose` of the scenario
+    fault: float = 0.0  # duration of the fault, s
     off: Mapping[str, float] | None = None  # what the fault adds; None: the last pose is repeated
     stamped: bool = False  # whether the repeated pose has a new stamp
-    max_age: float = 0.2  # s, of the section
+    max_age: float = 0.2  # key `max_age` of guidance, s
 
 
 class FaultyPose(Guidance):
@@ -114,23 +112,24 @@ class FaultyPose(Guidance):
 
 
 class Manoeuvre(NamedTuple):
-    """A manoeuvre: the section of guidance, the duration, s, and the figures."""
+    """A manoeuvre."""
 
+    # returns the section of guidance, and the duration, s
     plan: Callable[[GuidanceConfig], tuple[dict[str, Any], float]]
-    # the last: whether the air is calm
+    # yields the figures of a flight; the last argument says whether the air is calm
     figures: Callable[[Tape, GuidanceConfig, bool], Iterator[Figure]]
-    winds: tuple[float, ...] = (0.0,)
+    winds: tuple[float, ...] = (0.0,)  # winds to the east, each a share of V0
     turbulent: bool = True
     pose: Pose = Pose()
 
 
 def program(**channels: float) -> dict[str, Any]:
-    """Return commands from START on."""
+    """Return the section `program` with a constant command of each channel from START on."""
     return {name: {"start": [START], "value": [value]} for name, value in channels.items()}
 
 
 def after(tape: Tape, t: float, *names: str) -> tuple[FloatArray, ...]:
-    """Return channels of `guidance` from t on."""
+    """Return channels of the topic `guidance` from the instant t, s, on."""
     keep = tape.time("guidance") >= t
     return tuple(tape["guidance"][name][keep] for name in names)
 
@@ -171,9 +170,10 @@ def of_heading(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figu
 
 
 def of_pose(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Return heading and altitude as received over the last 10 s, and the true bank then.
+    """Return errors of heading and altitude, and the true bank, over the last 10 s.
 
-    How long the wings were levelled is beside them.
+    The errors use pose as guidance receives it. Also returns how long pose was stale; guidance
+    levels the wings meanwhile.
     """
     end = tape.time("guidance")[-1] - 10.0
     psi, altitude, wanted, lateral = after(
@@ -213,7 +213,7 @@ def of_altitude(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Fig
 def of_speed(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
     """Return the overshoot of an acceleration, and what it costs in altitude.
 
-    The rms of V in turbulence is divided by that of the wind.
+    In turbulence, return the rms of V over that of the wind instead.
     """
     altitude, V = after(tape, START, "pose.altitude", "y.V")
     step = FASTER * section.speed
@@ -227,9 +227,9 @@ def of_speed(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure
 
 
 def of_route(waypoints: int, tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Return the largest cross-track error, in s of flight.
+    """Return the largest cross-track error between 30 s and the last orbit, in s of flight at V0.
 
-    It is taken from 30 s on and before the last orbit.
+    Also returns the number of legs if the flight did not reach the last orbit.
     """
     leg, xtrack = after(tape, 30.0, "leg", "xtrack")
     leg_errors = np.abs(xtrack[leg < leg.max()])
@@ -239,7 +239,7 @@ def of_route(waypoints: int, tape: Tape, section: GuidanceConfig, calm: bool) ->
 
 
 def of_orbit(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Return the rms of the cross-track error, in s of flight."""
+    """Return the rms of the cross-track error on the last lap, in s of flight at V0."""
     end = tape.time("guidance")[-1]
     yield Figure(
         "rms (s)",
@@ -249,9 +249,9 @@ def of_orbit(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure
 
 
 def of_switch(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Return the largest jump of u within 20 ms of a change of the mode.
+    """Return by how much u jumps at most within 20 ms of a change of the mode.
 
-    It is in percent of the range of each input.
+    The jump of each input is in percent of its range.
     """
     t = tape.time("u")
     u = tape["u"].values
@@ -271,9 +271,9 @@ RANGES: dict[str, float] = {}
 
 
 def of_limits(tape: Tape, section: GuidanceConfig, calm: bool, pose: Pose) -> Iterator[Figure]:
-    """Return how far the bank is beyond its limit, and the airspeed below nine tenths of the floor.
+    """Return how far the bank exceeds its limit, and how far V falls below 0.9 of its floor.
 
-    This holds for any manoeuvre.
+    Every manoeuvre has these figures.
     """
     phi = tape["truth"]["x.phi"]
     V = tape["guidance"]["y.V"]
@@ -295,9 +295,10 @@ def lap(section: GuidanceConfig) -> float:
 def round_route(
     places: Sequence[tuple[float, float, float]], section: GuidanceConfig
 ) -> tuple[dict[str, Any], float]:
-    """Return a route over places.
+    """Return a route over places, and the time to fly it, s.
 
-    North and east are in least radii, which the fillets have, and altitude is over that of trim, m.
+    A place has north and east in least radii, and its altitude over that of trim, m. The fillets
+    have the least radius.
     """
     radius = float(math.ceil(least_radius(section.speed, section.wind, section.bank)))
     north, east, altitude = np.transpose(places) * [[radius], [radius], [1.0]]
@@ -313,11 +314,11 @@ SWITCHES: tuple[dict[str, float], ...] = (
     {"phi": -0.2, "theta": 0.0},
     {"heading": 1.0, "altitude": 0.0},
 )
-"""Commands one after another; altitude and theta count from those of trim."""
+"""Commands that follow each other each SWITCH_PERIOD; altitude and theta are those above trim."""
 
 
 def turn_round(section: GuidanceConfig) -> tuple[dict[str, Any], float]:
-    """Return a turn to the right onto the heading at which psi jumps, 180 deg."""
+    """Return a turn to the right onto 180 deg, at which psi jumps, and its duration, s."""
     duration = math.pi * section.speed / (GRAVITY * math.tan(section.bank)) + 40.0
     return {
         "program": {"heading": {"start": [START, START + 5.0], "value": [TURN, math.pi]}}
@@ -340,11 +341,11 @@ POSES: Mapping[str, Pose] = {
         fault=0.02, off={"phi": 1.0, "theta": 0.3, "psi": math.pi, "altitude": 100.0, "climb": 20.0}
     ),
 }
-"""A pose worse than the true one."""
+"""Ways to receive a pose that is worse than the true one."""
 
 
 def switching(section: GuidanceConfig) -> tuple[dict[str, Any], float]:
-    """Return a change of both modes every SWITCH_PERIOD."""
+    """Return SWITCHES, which change the lateral and the vertical mode, and their duration, s."""
     steps: dict[str, dict[str, list[float]]] = {}
     for k, switch in enumerate(SWITCHES):
         for name, value in switch.items():

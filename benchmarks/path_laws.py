@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compare guidance with its path law, with L1, and with L1 and the same lead of the curvature.
+"""Compare three path laws in guidance: its own, L1, and L1 with the same lead of the curvature.
 
-The osprey flies the same routes in the same loop.
+The osprey flies the same routes in the same loop with each of them.
 
     .venv/bin/python -m benchmarks.path_laws
 
@@ -33,14 +33,14 @@ from flight_guidance.steering.lateral import PathError, PathParams, bank_for
 from flight_guidance.steering.vertical import path_angle
 
 LAWS = ("guidance", "L1", "L1 + lead")
-WINDS = (0.0, 0.2, 0.6)  # of V0, to the east
-OFFSETS = (0.3, 0.6, 0.9)  # radii to the side of the line
-WITHIN = 0.1  # s of flight at V0: what counts as captured
+WINDS = (0.0, 0.2, 0.6)  # to the east, each a share of V0
+OFFSETS = (0.3, 0.6, 0.9)  # distances of the start from the line, radii
+WITHIN = 0.1  # cross-track error at which a line counts as captured, s of flight at V0
 STEEPEST_L1 = math.sin(math.radians(45.0))
 
 
 class Cell(NamedTuple):
-    """A figure of the three laws."""
+    """A figure with its value for each of the three laws."""
 
     name: str
     unit: str
@@ -57,8 +57,8 @@ def l1(error: PathError, course: Any, ground_speed: Any, params: PathParams) -> 
     """Return the acceleration to the right of ArduPilot's L1, m/s^2.
 
     For lines it is K v^2 / L sin(nu), L = zeta P v / pi, K = 4 zeta^2. For circles it is w^2 d + 2
-    zeta w d' + v_t^2 / r, and outside at most that law towards the centre. Source: ArduPilot,
-    libraries/AP_L1_Control.
+    zeta w d' + v_t^2 / r. Outside of a circle it is at most what the law of lines gives for a
+    course to the centre. Source: ArduPilot, libraries/AP_L1_Control.
     """
     e, track, kappa = map(float, error)
     speed = float(ground_speed)
@@ -89,14 +89,14 @@ def _within(angle: float) -> float:
 def without_lead(
     error: PathError, entry: Any, entered: Any, slip: Any, pose: Any, speed: Any, params: Any
 ) -> Any:
-    """Do as `lateral_modes.follow` with L1, but without the lead and the estimate of the slip."""
+    """Do what `lateral_modes.follow` does, with L1 and without lead and estimate of the slip."""
     acceleration = l1(error, *course_and_speed(pose), params.path)
     return bank_for(acceleration, path_angle(pose["climb"], speed), lateral_modes.STEEPEST)
 
 
 @contextmanager
 def flying(law: str) -> Iterator[None]:
-    """Return guidance with one of LAWS."""
+    """Let guidance fly by one of LAWS inside the context."""
     if law == LAWS[0]:
         yield
         return
@@ -106,9 +106,10 @@ def flying(law: str) -> Iterator[None]:
 
 
 def osprey(wind: float, places: list[tuple[float, float]], start: float = 0.0) -> Scenario:
-    """Return the osprey in a steady wind, a share of V0, on a route in radii.
+    """Return the scenario of the osprey on a route in a steady wind to the east.
 
-    The start lies to the east, in radii.
+    `wind` is a share of V0. `places` are north and east of the waypoints in radii, and `start` is
+    how far to the east the aircraft starts, radii.
     """
     base = find_scenario("osprey_route").vary(
         reference_model={"rate": 100.0},
@@ -138,7 +139,11 @@ def rectangle(law: str, wind: float) -> float:
 
 
 def capture(law: str, offset: float) -> tuple[float, float]:
-    """Return the time to within WITHIN of a line from beside it, s, and the overshoot, m."""
+    """Fly from beside a line onto it; return the time and the overshoot, m.
+
+    `offset` is the distance of the start from the line, radii. The time ends when the cross-track
+    error stays below WITHIN, s.
+    """
     scenario = osprey(0.0, [(0, 0), (60, 0)], offset).vary(flight={"duration": 25.0})
     with flying(law):
         tape = simulate(scenario)
@@ -149,7 +154,7 @@ def capture(law: str, offset: float) -> tuple[float, float]:
 
 
 def cells() -> Iterator[Cell]:
-    """Return the figures, flight by flight."""
+    """Fly the captures and the rectangles, and yield their figures."""
     for offset in OFFSETS:
         captures = {law: capture(law, offset) for law in LAWS}
         title = f"capture from {offset:g} radii"

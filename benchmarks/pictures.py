@@ -30,18 +30,18 @@ from flight_log.tape_writer import write_run
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 TITLE = "Title"
-"""Key of a PNG under which it says what it shows."""
+"""Key of the text in a PNG that says what the picture shows."""
 FIGURES = "Figures"
-"""Key of its figures: JSON."""
+"""Key of the text in a PNG that has the figures of what it shows, as JSON."""
 WIDTH, HEIGHT, COLOURS = 1280, 800, 64
 SCREEN = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": False}
 DRAWN = "Number(document.body?.dataset.drawn ?? 0)"
 STATE = "document.getElementById('state')?.textContent"
 ENDED = f"{STATE} === 'ENDED'"
 TIME = "parseFloat(document.getElementById('time').textContent.slice(4))"
-# s: a roll, the vertical gust, the second leg of the route
+# s: instants that the pictures show: a roll, the vertical gust, the second leg of the route
 LIVE_AT, GHOST_AT, GUIDED_AT = (12.0, 40.6, 60.0)
-LIVE_SECONDS = 60.0  # s, of a flight faster than real time
+LIVE_SECONDS = 60.0  # duration of the live flight, which is faster than real time, s
 DEFAULT = "osprey_servo"
 ROUTE = "osprey_route"
 
@@ -69,10 +69,10 @@ def flown(scenario: Scenario, folder: Path, name: str) -> Path:
 
 
 def save(shot: str, path: Path, shows: str, figures: str = "") -> None:
-    """Write a screenshot, as base64, as a PNG of a third of its size.
+    """Write a screenshot, which is given as base64, as a PNG of a third of its size.
 
-    `figures` of what it shows are kept as text, by which a test recognises a picture of another
-    flight.
+    `figures` are those of the flight that it shows. The PNG keeps them as text, by which a test
+    recognises a picture of another flight.
     """
     picture = Image.open(BytesIO(base64.b64decode(shot))).convert("RGB")
     info = PngInfo()
@@ -90,9 +90,10 @@ def save_view(
     at: str = "",
     clicks: Sequence[str] = (),
 ) -> None:
-    """Open the live page of runs at an instant, click on elements, and save its picture.
+    """Open the live page of runs, wait until a condition holds, click on elements, save a picture.
 
-    It is saved once a condition holds, unless a failsafe says that the host was too busy.
+    `until` is the condition, in JavaScript; `at` ends the address of the page, such as with an
+    instant. No picture is saved if the page shows a failsafe, because the host was too busy then.
     """
     with (
         tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
@@ -115,7 +116,7 @@ def save_view(
 
 
 def report(path: Path, shows: str) -> None:
-    """Draw the first screen of the page of the default flight, as it is."""
+    """Draw the first screen of the report of the default flight."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
         run = flown(find_scenario(shows), Path(temporary), shows)
         errors = write_report(run).flight.summary["errors"]
@@ -145,9 +146,9 @@ def view_guided(path: Path, shows: str) -> None:
 
 
 def view_live(path: Path, shows: str) -> None:
-    """Draw the default flight over topics, in the air.
+    """Draw the default flight over topics on the live page while it flies.
 
-    It flies in lockstep, which no other work disturbs.
+    It flies in lockstep, which other work on the host does not disturb.
     """
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -161,7 +162,7 @@ def view_live(path: Path, shows: str) -> None:
 
 
 def drawing(name: str) -> Callable[[Path, str], None]:
-    """Return what writes a drawing of `benchmarks.diagrams`."""
+    """Return a function that writes a drawing of `benchmarks.diagrams` to a file."""
 
     def draw(path: Path, shows: str) -> None:
         diagrams.save_drawing(getattr(diagrams, name)(), path, shows)
@@ -170,7 +171,7 @@ def drawing(name: str) -> Callable[[Path, str], None]:
 
 
 def plotted(main: Callable[[], object]) -> Callable[[Path, str], None]:
-    """Return what runs a program that plots its own picture."""
+    """Return a function that runs a program which plots its own picture."""
 
     def draw(path: Path, shows: str) -> None:
         main()

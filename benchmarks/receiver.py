@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measure the time of a receiver for one message of y that has arrived.
+"""Measure how long a receiver takes for one message of y that has arrived.
 
-The controller takes a right message, and refuses others.
+The controller takes a right message, and the receiver refuses the others.
 
 python -m benchmarks.speed --only receiver
 """
@@ -25,15 +25,15 @@ from rise_di_controller.controller import Controller
 RIGHT = "right message, taken"
 DECODED = "message under the name of the publisher, twice as long, decoded and refused"
 AT_MOST = {DECODED: 6.0}
-"""Times of a refused message over that of a right one; 2 of those that are not here, which are not
-decoded."""
+"""Largest permitted ratio of the time of a refused message to that of a right one. For a message
+without an entry it is 2, because the receiver refuses it without decoding it."""
 REPEATS, WARM_UP = 20_000, 200
 OWN, FOREIGN = "/aircraft#1", "/foreign#2"
 TAKEOVER_NS = 10**15  # no publisher times out
 
 
 def long_message(sender: str, size: int) -> bytes:
-    """Return a message of about this many bytes, of channels that the controller does not want."""
+    """Return a message of about `size` bytes, with channels that the controller does not want."""
     count = (size - 100) // 20  # 12 bytes a name, 8 a value
     return Encoder([f"c{k:05}" for k in range(count)], sender).encode(0, np.zeros(count))
 

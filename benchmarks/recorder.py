@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure CPU time and losses of the recorder at 1 kHz on six topics.
 
-The size of its file is compared with that of rosbags' Writer.
-
 Another process publishes y, y_m, u, u_m, internals and truth, as wide and as noisy as those of the
-scenario osprey_servo. Then the same messages, in the order recorded, go through
-rosbags.rosbag2.Writer: plain, and with its chunks compressed.
+scenario osprey_servo. Then rosbags.rosbag2.Writer writes the same messages in the recorded order,
+once plain and once with compressed chunks. The size of the recorder's file is compared with those
+of this Writer.
 
     .venv/bin/python -m benchmarks.speed --only recorder
 """
@@ -79,7 +78,7 @@ def publish(rate: float, duration: float) -> None:
 def record(run: Path, rate: float, duration: float) -> tuple[dict[str, float], float]:
     """Return the publisher's counts, and the processor time of the recorder, s.
 
-    The time is from the first message to the last.
+    The processor time covers the messages from the first to the last one.
     """
     scenario = find_scenario("osprey_servo").path
     options = ("--ros-args", "--params-file", str(scenario), "-p", f"directory:={run}")
@@ -98,13 +97,16 @@ def record(run: Path, rate: float, duration: float) -> tuple[dict[str, float], f
 class Rewritten(NamedTuple):
     """The messages of a run, written again by rosbags' Writer."""
 
-    counts: Counter[str]  # by topic
-    cpu: float  # us a message
-    size: float  # bytes a message
+    counts: Counter[str]  # number of messages by topic
+    cpu: float  # processor time for each message, us
+    size: float  # size of the file for each message, bytes
 
 
 def rewrite(run: Path, folder: Path, compression: CompressionMode) -> Rewritten:
-    """Write the messages of a run on TOPICS, read before, to a bag of rosbags' Writer."""
+    """Read the messages of a run on TOPICS, then write them to a bag with rosbags' Writer.
+
+    The processor time is that of writing alone.
+    """
     names = {f"/{topic.name}" for topic in TOPICS}
     with AnyReader([run]) as reader:
         connections = [connection for connection in reader.connections if connection.topic in names]

@@ -2,16 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly routes by rule that are hard to begin, windy, steep, or cross themselves.
 
-They are flown, missed or refused.
+Each route is flown, missed or refused.
 
     .venv/bin/python -m benchmarks.routes [--only osprey_servo c172p 737 f16] [--cases behind helix]
 
-The figures go to docs/evidence/guidance-routes-*.csv, if all cases are flown. Each flight is in one
-process and has a row: the result, the largest cross-track error on the legs in seconds of flight at
-V0, its limit, and the largest error of the altitude. A leg or a circle that the aircraft joins, and
-the leg of the start, count from one radius beyond their start on, within which the start counts as
-reached. A refusal is a result, with the sentence. The wind is known as `guidance.wind`. No number
-is tuned to an aircraft. Exit status 1: an error beyond its limit, a missed leg, or a lost aircraft.
+The figures go to docs/evidence/guidance-routes-*.csv, if all cases are flown. Each flight is
+simulated in one process. Its row has the result, the largest cross-track error on the legs in
+seconds of flight at V0, the limit of this error, and the largest error of the altitude. The errors
+leave out the first radius of the leg of the start, and of each leg or circle that the aircraft
+joins, because within a radius its start counts as reached. A refusal is a result, with its
+sentence. `guidance.wind` states the wind. No number is tuned to an aircraft. Exit status 1: an
+error beyond its limit, a missed leg, or a lost aircraft.
 """
 
 import csv
@@ -39,20 +40,19 @@ from flight_guidance.steering import path
 from flight_guidance.steering.path import Arc, Line, Route
 
 CALM_LIMIT, LIMIT = 0.35, 0.5
-"""s of flight at V0: what guidance claims in calm air, and in wind or turbulence."""
+"""Cross-track error that guidance claims in calm air, and in wind or turbulence, s of flight at
+V0."""
 
 SETTLE = 20.0
-"""s on the last orbit, and beside a joining way longer than the straight one."""
+"""Time that each flight has in addition, s: for the last orbit, and because the way that joins the
+route can be longer than the straight one."""
 
 
 class Case(NamedTuple):
-    """A route, in least radii or in m, and the air.
+    """A route and the air. The aircraft starts at the origin and heads north."""
 
-    The aircraft starts at the origin and heads north.
-    """
-
-    waypoints: Callable[[float], list[Waypoint]]
-    wind: float = 0.0  # to the east, of V0
+    waypoints: Callable[[float], list[Waypoint]]  # returns the route for a least radius, m
+    wind: float = 0.0  # to the east, as a share of V0
     turbulent: bool = False
 
 
@@ -62,13 +62,16 @@ class Row(NamedTuple):
     aircraft: str
     case: str
     result: str  # "flown", "missed ...", "lost ...", or "refused: ..."
-    xtrack: float  # s
-    limit: float  # s
-    altitude: float  # m, on the legs
+    xtrack: float  # largest cross-track error on the legs, s of flight at V0
+    limit: float  # largest permitted cross-track error, s of flight at V0
+    altitude: float  # largest error of the altitude on the legs, m
 
     @property
     def figure(self) -> evidence.Row:
-        """Return the row of evidence; words that are no refusal do not meet the limit."""
+        """Return the row of evidence: the error of a flown route, or the words of the result.
+
+        A refusal has no goal. The words of a missed or a lost flight do not meet the goal.
+        """
         goal = None if self.result.startswith("refused") else self.limit
         value = self.xtrack if self.result == "flown" else self.result
         return evidence.row(
@@ -79,9 +82,10 @@ class Row(NamedTuple):
 def of_radii(
     *places: tuple[float, float], altitudes: tuple[float, ...] = ()
 ) -> Callable[[float], list[Waypoint]]:
-    """Return a route of places in radii to the north and to the east.
+    """Return a function that makes a route from a least radius, m.
 
-    Its altitudes are over that of the start in m.
+    `places` are north and east of its waypoints in radii, and `altitudes` are those above the
+    start, m.
     """
 
     def waypoints(radius: float) -> list[Waypoint]:
@@ -95,17 +99,17 @@ def of_radii(
 
 
 def far(radius: float) -> list[Waypoint]:
-    """Return a line 20 km to the side."""
+    """Return a route of one line to the north, 20 km to the east of the start."""
     return [Waypoint(0.0, 20e3, 0.0), Waypoint(6.0 * radius, 20e3, 0.0)]
 
 
 def steep(_: float) -> list[Waypoint]:
-    """Return a climb of 1000 m within 500 m."""
+    """Return a route with a leg of 500 m that climbs by 1000 m."""
     return [Waypoint(1000.0, 0.0, 0.0), Waypoint(1500.0, 0.0, 1000.0)]
 
 
 EIGHT = of_radii((0, 0), (3, 0), (6, 3), (9, 3), (9, 0), (6, 0), (3, 3), (0, 3))
-# longer, and the f16 runs out of fuel against the wind
+# on a longer route the f16 would run out of fuel against the wind
 BOX = of_radii((0, 0), (3, 0), (3, 3), (0, 3))
 CASES: Mapping[str, Case] = {
     "behind": Case(of_radii((-4, 0), (-9, 0), (-9, 5))),
@@ -122,7 +126,7 @@ CASES: Mapping[str, Case] = {
 
 
 def duration(route: Route, section: GuidanceConfig) -> float:
-    """Return the time to fly a route from the origin with the wind from ahead, s."""
+    """Return a time that suffices to fly a route from the origin against the wind, s."""
     climb, sink = section.climb_limits()
     slowest, (start, course), at = section.speed - section.wind, route.start(0), (0.0, 0.0)
     side = float(path.joining(start, course, route.radius, route.near(0), at, 0.0))
@@ -148,7 +152,7 @@ def duration(route: Route, section: GuidanceConfig) -> float:
 
 
 def fly(name: str, title: str, case: Case) -> Row:
-    """Return the result of a flight."""
+    """Fly a case with an aircraft, and return its row."""
     scenario = aircraft_of(name)
     limit = LIMIT if case.wind or case.turbulent else CALM_LIMIT
     try:
@@ -195,9 +199,9 @@ def planned(scenario: Scenario, name: str, case: Case) -> Scenario:
 
 
 def errors(tape: Tape, route: Route) -> tuple[float, float]:
-    """Return the largest cross-track error and error of the altitude, m.
+    """Return the largest cross-track error and the largest error of the altitude, m.
 
-    They are taken on the legs before the last orbit.
+    Both are those on the legs before the last orbit; the altitude is not judged on a circle.
     """
     log = tape["guidance"]
     circles = [k for k, leg in enumerate(route.legs) if isinstance(leg, Arc) and leg.loiter]

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Print what is proved with any limits of one input, by scenario and input, as CSV.
 
-Each certificate is checked by the program that a stranger would use, and written to a folder.
+Each certificate is written to a folder, and checked there by examples/check_certificate.py, which
+needs no code of the stack.
 
     python -m benchmarks.saturation FOLDER osprey_servo osprey_observer jsbsim_c172p
 """
@@ -18,7 +19,8 @@ from flight_analysis.linear_loop.certificate import limit_certificate
 from flight_analysis.linear_loop.loop_margins import scenario_loop
 from flight_analysis.linear_loop.saturation import SLOWEST, limit_guarantee
 
-SIZES = (0.3, 0.25, 0.2, 0.15, 0.11, 0.1, 0.05)  # deviations that are tried
+# relative deviations of A and B that are tried, the largest first
+SIZES = (0.3, 0.25, 0.2, 0.15, 0.11, 0.1, 0.05)
 CHECKER = Path(__file__).parents[1] / "examples" / "check_certificate.py"
 CLAIMS = {"settles": 0.0, "no periodic motion of up to 126 s": SLOWEST}
 HEADINGS = (
@@ -35,7 +37,10 @@ HEADINGS = (
 
 
 def row(folder: Path, name: str, limited: str, claim: str) -> list[str]:
-    """Return the figures of a claim of the largest of SIZES for which it is proved."""
+    """Return the figures of a claim for the largest of SIZES for which it is proved.
+
+    They are in the order of HEADINGS, with "none" if it is proved for none of SIZES.
+    """
     scenario = find_scenario(name)
     for size in SIZES:
         linear = scenario_loop(scenario, scenario.controller, 1, size)

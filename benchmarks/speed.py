@@ -78,11 +78,11 @@ class Goal:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of a table: figures by column."""
+    """A row of a table."""
 
     what: str
-    figures: Mapping[str, float]
-    floor: str = ""  # `what` of the row of its baseline; its own for a baseline, empty without one
+    figures: Mapping[str, float]  # by column
+    floor: str = ""  # `what` of the row of its baseline; a baseline names itself; "" without one
     goals: Sequence[Goal] = field(default=())
 
 
@@ -97,7 +97,7 @@ def us(values: Sequence[float] | FloatArray) -> dict[str, float]:
 
 
 class Peer:
-    """Publishes y and y_m at a rate as aircraft and reference model do.
+    """A node that publishes y and y_m at a rate, as aircraft and reference model do.
 
     It receives u and internals.
     """
@@ -156,17 +156,17 @@ class Peer:
 
 @dataclass
 class Driven:
-    """Answers of a process, by stamp of the y."""
+    """How a process answers samples of y. The key of each table is the stamp of the y, ns."""
 
     start: float = 0.0  # system time of the first u, s
-    sent: int = 0  # y
+    sent: int = 0  # number of samples of y
     received: dict[int, int] = field(default_factory=dict)  # when u was received, ns
-    age: dict[int, float] = field(default_factory=dict)  # of y at the tick, s
+    age: dict[int, float] = field(default_factory=dict)  # age of y at the tick, s
     late: dict[int, float] = field(default_factory=dict)  # lateness of the tick, s
     cpu_ns: int = 0  # processor time of the process
 
     def __add__(self, other: "Driven") -> "Driven":
-        """Return the answers of both; no two have the same stamp."""
+        """Join the answers of both; no stamp is in both of them."""
         return Driven(
             self.start or other.start,
             self.sent + other.sent,
@@ -372,7 +372,7 @@ def _ticks(
 @contextlib.contextmanager
 def full_load() -> Iterator[None]:
     """Keep every core busy with other work at ordinary priority."""
-    # Also where this program runs at real-time priority: else they would block the host.
+    # If this program has a real-time priority, its children give it up: else they block the host.
     spin = (
         "import os\nos.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))\nwhile True: pass"
     )

@@ -76,8 +76,9 @@ def executor_of(node: Node, kind: str) -> Any:
 def echo(kind: str, hz: float, *, timed: bool) -> dict[str, float]:
     """Run a subscription to y whose callback publishes each message on u.
 
-    If it is timed, the executor spins once at a fixed rate, when a message has arrived, and the
-    time to the end of the callback is measured. Otherwise the executor spins as usual.
+    With `timed`, the executor spins once at each instant of a fixed rate. If a message has arrived
+    by then, the time from the instant until it is published is measured. Without `timed` the
+    executor spins as usual.
     """
     has_ended = termination()
     took: list[int] = []
@@ -107,7 +108,7 @@ def echo(kind: str, hz: float, *, timed: bool) -> dict[str, float]:
 
 
 def polled_echo() -> dict[str, float]:
-    """Publish each message of y on u, by the stack's publisher and subscription."""
+    """Publish each message of y on u, with the publisher and the subscription of the stack."""
     has_ended = termination()
     with open_node("echo") as node:
         subscription = PolledSubscription(node, Y, LOCKSTEP, raw=True)
@@ -200,8 +201,8 @@ def ticker_node(hz: float, seconds: float) -> dict[str, Any]:
 def delay_monitor(core: int) -> dict[str, Any]:
     """Measure the host delays of one core, monotonic ns.
 
-    They are intervals in which a process of the highest priority did not run. The kernel delays it
-    or, in a virtual machine, its host (steal time).
+    Each is an interval in which this process of the highest priority could not run. The kernel
+    delayed it or, in a virtual machine, the machine below (steal time).
     """
     os.sched_setaffinity(0, {core})
     os.sched_setscheduler(
@@ -215,16 +216,16 @@ def delay_monitor(core: int) -> dict[str, Any]:
         now_ns = time.monotonic_ns()
         # a wake-up takes a twentieth to a fifth of a period
         if now_ns - last_ns > 1.5e9 * MONITOR_PERIOD:
-            # it was to sleep until then
+            # the delay begins when the sleep had to end
             delays.append((last_ns + round(MONITOR_PERIOD * NANOSECONDS), now_ns))
         last_ns = now_ns
     return {"delays": delays}
 
 
 def controller() -> dict[str, float]:
-    """Run the controller's node.
+    """Run the controller's node, and measure its ticks.
 
-    The times are from the beginning of a tick until u is published, and until its end.
+    The times are those from the beginning of a tick until u is published, and until the tick ends.
     """
     until_u: list[int] = []
     tick_times: list[int] = []

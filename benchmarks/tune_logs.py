@@ -30,9 +30,9 @@ from flight_design.identification.rates_log import SPARSE, scaled_torques
 from flight_design.identification.trim_check import doubted, without_trim
 
 ROOT = Path(__file__).parents[1]
-STEP = 5e-4  # s, of the aircraft
-APART = 3.0  # s, from a doublet to the next
-LENGTH = 72.0  # s
+STEP = 5e-4  # step of the simulation, s
+APART = 3.0  # time from one doublet to the next, s
+LENGTH = 72.0  # duration of a flight, s
 SEED = 7
 OFF = 2.5  # stated deviations
 HEADINGS = (
@@ -53,15 +53,16 @@ class Case(NamedTuple):
     still: str = ""  # output that the autopilot does not control
     silent: str = ""  # output without doublets
     every: int = 1  # periods from one logged u to the next
-    lost: float = 0.0  # share of the samples of y
-    hole: float = 0.0  # s without y
-    colour: float = 0.0  # e_k = colour e_(k-1) + white noise
-    late: float = 0.0  # s, by which u acts later than known
+    lost: float = 0.0  # share of the samples of y that the log lacks
+    hole: float = 0.0  # duration of a gap in y, s
+    colour: float = 0.0  # noise of y: e_k = colour e_(k-1) + white noise
+    late: float = 0.0  # delay of u that `rise-di tune` does not know, s
     gusts: float = 0.0  # m/s rms
-    climb: float = 0.0  # rad, trim of the elevator in the first third, which has no doublets
-    # effects of each surface on roll, pitch and yaw by PX4's CA_SV_CSk_TRQ; without: one an axis
+    climb: float = 0.0  # trim of the elevator in the first third, which has no doublets, rad
+    # effects of each surface on roll, pitch and yaw by PX4's CA_SV_CSk_TRQ; empty: each axis has a
+    # surface of its own
     surfaces: tuple[tuple[float, float, float], ...] = ()
-    plane: str = "px4_airplane"
+    plane: str = "px4_airplane"  # a key of PLANES
 
 
 CASES = (
@@ -91,14 +92,14 @@ CASES = (
 class Plane(NamedTuple):
     """An airplane and its autopilot, channels in the airframe's order."""
 
-    period: float  # s
-    size: tuple[float, ...]  # rad/s, of a doublet
-    noise: tuple[float, ...]  # rad/s
-    gains: tuple[tuple[float, ...], ...]  # FF, P, I
-    end: float  # rad, u at the torque 1
-    changes: Mapping[str, float]  # of the rows of A and B, by output
-    lag: float  # s
-    folder: str  # of examples
+    period: float  # period of the autopilot and of the log, s
+    size: tuple[float, ...]  # size of a doublet by channel, rad/s
+    noise: tuple[float, ...]  # standard deviation of the noise of y by channel, rad/s
+    gains: tuple[tuple[float, ...], ...]  # FF, P and I of the autopilot, each by channel
+    end: float  # u at the torque 1, rad
+    changes: Mapping[str, float]  # true over nominal row of A and B, by output
+    lag: float  # lag of the actuators, s
+    folder: str  # folder of its scenario in examples/
 
 
 PLANES: dict[str, Plane] = {
@@ -165,16 +166,19 @@ def true_model(nominal: Airframe, plane: Plane) -> tuple[FloatArray, FloatArray]
 
 
 class Allocation(NamedTuple):
-    """How PX4 turns the torques of the axes into servos, and what these do, shares of the stops."""
+    """How PX4 turns the torques of the axes into servos, and what the servos do.
 
-    servos: FloatArray  # (surfaces, m)
-    on_axes: FloatArray  # (m, surfaces)
+    Torques and servos are shares of their end stops.
+    """
+
+    servos: FloatArray  # servos for the torques of the axes, (surfaces, m)
+    on_axes: FloatArray  # effect of the servos on the axes, (m, surfaces)
 
 
 def allocated(case: Case, outputs: Sequence[str]) -> Allocation:
-    """Return the allocation of a case: PX4's pseudo-inverse, before the surfaces that it drives.
+    """Return the allocation of a case: PX4's pseudo-inverse, and the effects of the surfaces.
 
-    The surfaces of an axis, all at their end stops, are the end stop of the axis.
+    An axis is at its end stop if all its surfaces are at theirs.
     """
     if not case.surfaces:
         return Allocation(np.eye(len(outputs)), np.eye(len(outputs)))
@@ -227,7 +231,10 @@ def flown(case: Case, nominal: Airframe, plane: Plane) -> FlightData:
 def logged(
     case: Case, plane: Plane, y: FloatArray, u: FloatArray, rng: np.random.Generator
 ) -> FlightData:
-    """Return what a log keeps of y and u: a u that is linear between two rare samples."""
+    """Return what a log keeps of y and u.
+
+    If u is logged rarely, the u between two samples is taken as linear.
+    """
     is_lost = rng.random(len(y)) < case.lost
     begin = len(y) // 2
     is_lost[begin : begin + round(case.hole / plane.period)] = True

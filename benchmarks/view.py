@@ -53,25 +53,25 @@ from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
 
 SCENARIO = "osprey_servo"  # y, y_m and truth at 500 Hz, ticks at 100 Hz, noise
-PIECE = 60.0  # s of flight that are repeated to a long log
+PIECE = 60.0  # duration of the flight whose repetitions make a long log, s
 FLUSH_PERIOD_NS = nanoseconds(0.1)  # as the recorder
-START_S = 1_795_000_000  # s, stamps of today
-POLLS = 60.0  # Hz: the page asks again once an answer is drawn, a frame later
-# s: a page stops for so long, and is back when it is less behind than that
+START_S = 1_795_000_000  # first stamp of a long log, s: about today
+POLLS = 60.0  # rate of the client, Hz: the page asks again one frame after it got an answer
+# s: how long the process of a page stops, and the delay below which the page has recovered
 FREEZE, RECOVERED = (10.0, 0.3)
-BEGUN = 3.0  # s, until a flight has begun
-FLIGHT_SECONDS = 60.0  # of each of the flights whose ticks are compared
-TURN = 2.5  # s, with a client and without one in turns
-STARTED = 7.0  # s, for the start of the server, until its client has the flight so far
+BEGUN = 3.0  # time until a flight has begun, s
+FLIGHT_SECONDS = 60.0  # duration of each of the flights whose ticks are compared, s
+TURN = 2.5  # time with a client, then the same time without one, s
+STARTED = 7.0  # time until the server has started and its client has the flight so far, s
 
 
 # A long log
 
 
 def write_long_log(run: Path, hours: float) -> None:
-    """Repeat a flight of PIECE s with moved stamps.
+    """Write a log of `hours` that repeats a flight of PIECE s with later stamps.
 
-    A chunk is written each 0.1 s, as by the recorder.
+    A chunk is written each 0.1 s of flight, as by the recorder.
     """
     scenario = find_scenario(SCENARIO, PIECE)
     with tempfile.TemporaryDirectory() as folder:
@@ -100,7 +100,7 @@ def write_long_log(run: Path, hours: float) -> None:
 def moved(one: StoredMessage, now_ns: int) -> bytes:
     """Return the message with another stamp.
 
-    If it has a t, that stays, because in one flight only the first t counts.
+    Its channel t, if it has one, stays, because only the first t of a flight counts.
     """
     seconds, rest = divmod(now_ns, NANOSECONDS)
     return (
@@ -112,10 +112,11 @@ def moved(one: StoredMessage, now_ns: int) -> bytes:
 
 
 def open_log(hours: float) -> dict[str, Any]:
-    """Return the times in s from the start of `rise-di watch` to answers about a long log.
+    """Open a long log with `rise-di watch`, and return how long its answers take, s.
 
-    The memory of the server, in MB, is beside them. "first samples" is the first answer that has
-    some, "whole log" the first one with the state "ended".
+    "first samples" is the time from the start of the program to the first answer with samples, and
+    "whole log" that to the first answer with the state "ended". The figures also have the processor
+    time, s, and the memory of the server, MB.
     """
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
@@ -168,8 +169,8 @@ class Client(threading.Thread):
         return opened
 
     def run(self) -> None:
-        """Ask until stopped, or until the server ends; not while `asks` is off."""
-        # of this thread: in use the browser is on another host
+        """Ask until stopped, or until the server ends; pause while `asks` is off."""
+        # this thread has the lowest priority, because in use the browser runs on another host
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
         while not self._ended.wait(1.0 / POLLS):
             try:
@@ -179,7 +180,7 @@ class Client(threading.Thread):
                 break
 
     def news(self) -> dict[str, Any]:
-        """Return the head of an answer with what the client lacks; the client then knows it.
+        """Ask for what is new since the last answer, and return the head of the answer.
 
         Raises EOFError if the server has ended.
         """
@@ -196,7 +197,7 @@ class Client(threading.Thread):
         return head
 
     def ask(self, query: str = "") -> bytes:
-        """Return what a client lacks that knows so much.
+        """Return the server's answer to a client; `query` says what the client has already.
 
         Raises EOFError if the server has ended.
         """
@@ -315,9 +316,10 @@ def live(seconds: float, *, browser: bool) -> dict[str, Any]:
 
 
 def frozen(seconds: float = FREEZE) -> dict[str, Any]:
-    """Measure a page whose process stops for so long.
+    """Stop the process of a page for some seconds.
 
-    Returns the time from when it goes on until its delay is below RECOVERED again, s.
+    Returns the time from when the process goes on until the delay of the page is below RECOVERED
+    again, s.
     """
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -363,12 +365,13 @@ def start_of(address: str) -> float:
 
 
 def flights(count: int, seconds: float) -> dict[str, Any]:
-    """Compare the ticks of flights with and without a watching client, for half of the time each.
+    """Compare the ticks of flights with and without a watching client.
 
-    The figures are missed ticks, and late p99 in s. Client and server stop and go on in turns of
-    TURN. So the phases of the nodes' timers, which differ from flight to flight, are the same for
-    both, and a drift of the host cancels. "start included" also counts the start of the server,
-    whose processor time is that of any program that starts.
+    The figures are missed ticks, and the 99th percentile of the lateness of ticks, s. In each
+    flight, client and server run for TURN s, then stop for TURN s, and so on. The phases of the
+    nodes' timers differ from flight to flight. In one flight they are the same with a client and
+    without one, and a drift of the host cancels. "start included" also counts the time in which the
+    server starts; any program that starts needs such processor time.
     """
     period_ns = nanoseconds(1.0 / find_scenario(SCENARIO).controller.rate)
     tables: dict[str, list[dict[str, float]]] = {"without": [], "with": [], "start included": []}
@@ -433,9 +436,9 @@ def figures_of_ticks(
     period_ns: int,
     windows: Intervals = ((0, 2**63 - 1),),
 ) -> dict[str, float]:
-    """Return missed ticks and late p99 of the deadlines inside windows.
+    """Return missed ticks, and the 99th percentile of their lateness, for deadlines inside windows.
 
-    If host delays are known, they are also given without those.
+    If host delays are known, also returns both figures without what these delays explain.
     """
     at = internals.stamp_ns + np.rint(internals["age"] * NANOSECONDS).astype(np.int64)
     due = at - np.rint(internals["late"] * NANOSECONDS).astype(np.int64)

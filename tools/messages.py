@@ -40,7 +40,7 @@ BUILD = Path(__file__).resolve().parents[1] / "build" / "messages"
 KINDS = ("msg", "srv", "action")
 # what CMake's find_package says if a package is missing
 MISSING = re.compile(r'package configuration\s+file\s+provided\s+by\s+"(\w+)"')
-LAST_LINES = 15  # of a failed step that are shown
+LAST_LINES = 15  # lines that are shown of the output of a failed step
 
 
 class MessagesError(Exception):
@@ -73,7 +73,7 @@ def find_sources(folders: Sequence[Path]) -> dict[str, Source]:
 def in_order(package: str, sources: Mapping[str, Source]) -> list[str]:
     """Return the package and those of its dependencies that are among the sources.
 
-    Each comes after its own dependencies.
+    Each package comes after the packages on which it depends.
     """
     if package not in sources:
         raise MessagesError(
@@ -108,7 +108,11 @@ def specifications(package: str, path: Path) -> Iterator[MessageSpecification]:
 
 
 def closure(package: str, source: Path, names: Sequence[str]) -> set[str]:
-    """Return the named interfaces of a package, and those of the package that they contain."""
+    """Return the named interfaces of a package, and what they contain of the same package.
+
+    An interface that they contain is followed into its own fields. Raises MessagesError for a name
+    that the package does not have.
+    """
     files = {path.stem: path for kind in KINDS for path in (source / kind).glob(f"*.{kind}")}
     unknown = [name for name in names if name not in files]
     if unknown:
@@ -129,7 +133,10 @@ def closure(package: str, source: Path, names: Sequence[str]) -> set[str]:
 
 
 def copy_of_part(package: str, source: Path, names: Sequence[str], target: Path) -> Path:
-    """Copy a package with only the named interfaces and what they contain."""
+    """Copy a package to `target`, with the named interfaces and what they contain alone.
+
+    CMakeLists.txt of the copy does not list the others. Returns `target`.
+    """
     packages = closure(package, source, names)
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(source, target, ignore=shutil.ignore_patterns(".*"))
@@ -148,9 +155,10 @@ def copy_of_part(package: str, source: Path, names: Sequence[str], target: Path)
 
 
 def point_at_this_python(prefix: Path) -> None:
-    """Replace the headers of Python in the CMake files of the wheels.
+    """Let the CMake files of the wheels name the headers of this Python and of its numpy.
 
-    Those of the Python that built the wheels become those of this one.
+    Before, they name the headers of the Python that built the wheels. Raises MessagesError if the
+    headers of this Python are not installed.
     """
     include = sysconfig.get_path("include")
     if not Path(include, "Python.h").is_file():
@@ -167,11 +175,11 @@ def point_at_this_python(prefix: Path) -> None:
 
 
 def run(log: Path, prefix: Path, *command: str) -> None:
-    """Run a step of a build, with no packages but those of this environment.
+    """Run a step of a build, with the packages of this environment and of `prefix` alone.
 
-    Its output goes to a log.
+    Its output goes to a log. Raises MessagesError if the step fails.
     """
-    # If another ROS 2 were sourced, too, the two would mix.
+    # If the user has sourced another ROS 2, its packages would mix with those of the wheels.
     environment = {
         name: value
         for name, value in os.environ.items()

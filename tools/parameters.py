@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write docs/reference/parameters.md, which has every parameter of every node.
 
-They come from the classes that validate them.
+Names, types, bounds and meanings come from the classes that validate the parameters.
 """
 
 from collections.abc import Iterator, Mapping, Set
@@ -45,7 +45,7 @@ SHARED = {
 }
 """Keys that several nodes have, and that `rise-di fly` and the launch files set."""
 UNBOUNDED = 1e6
-"""Bounds from here on are stated once for all keys."""
+"""Smallest bound that the page states once for all keys, and not beside each key."""
 SECTIONS: Mapping[str, type[Config]] = {
     "flight": FlightConfig,
     "aircraft": AircraftConfig,
@@ -96,7 +96,8 @@ def _section(title: str, schema: type[Config], known: Set[str] = frozenset()) ->
 def _rows(schema: type[Config], prefix: str = "") -> Iterator[tuple[str, str, str]]:
     """Yield key, permitted value and meaning of each parameter of a set.
 
-    Those of a group have a dotted key, and come once for each class.
+    A parameter of a group has a dotted key. If several groups have the same class, its parameters
+    come under the first of them, and the others refer to it.
     """
     places: dict[type[Config], str] = {}
     for name, field in schema.model_fields.items():
@@ -162,7 +163,7 @@ def _type(annotation: Any) -> str:
 def _bounds(rules: Mapping[str, Any]) -> str:
     """Write the bounds of a number, without those that every number has.
 
-    If there is a smallest size, the number is positive.
+    A lower bound above 0 and up to SMALLEST is written as "> 0".
     """
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     limits = {rule: rules[rule] for rule in signs if rule in rules and abs(rules[rule]) < UNBOUNDED}

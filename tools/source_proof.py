@@ -24,7 +24,7 @@ from c_export.proof import write_code
 from flight_analysis.closed_loop.scenario_library import find_scenario
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-BOUND = 1000.0  # on abs(y) and abs(y_m), SI
+BOUND = 1000.0  # largest abs(y) and abs(y_m) that Eva follows, SI
 EXPORTS: Mapping[str, int] = MappingProxyType(
     {
         "osprey_servo": 3,
@@ -34,8 +34,8 @@ EXPORTS: Mapping[str, int] = MappingProxyType(
         str(REPOSITORY / "examples/px4_airplane/rates_observer.yaml"): 2,
     }
 )
-"""Scenarios, and how many ticks Eva follows. The first is the engagement, and from the second on
-the law steps."""
+"""Scenarios, and how many ticks Eva follows. The law engages at the first tick, and steps from the
+second one on."""
 
 SELF_TEST = "is_rounded_once() && is_nan_told()"
 """The self-test, which is left out because it makes infinity and NaN on purpose."""
@@ -101,8 +101,8 @@ ALLOCATION = [
     "allocate",
     "is_inside",
 ]
-"""Functions whose paths Eva joins, because one path for each effector at each stop would be too
-many. The bounds of the effectors do not need separate paths."""
+"""Functions whose paths Eva joins, because it would have too many with one path for each effector
+at each stop. To bound the effectors, Eva does not need separate paths."""
 
 JOINED = (
     "-eva-slevel-function", ",".join(f"{name}:0" for name in ALLOCATION),
@@ -113,7 +113,7 @@ JOINED = (
 class Result(NamedTuple):
     """What Eva says of an export."""
 
-    functions: int  # how many were analysed
+    functions: int  # number of functions that Eva analysed
     alarms: tuple[str, ...]
 
 
@@ -173,7 +173,10 @@ def _output(command: list[str], folder: Path) -> str:
 
 
 def main(scenarios: list[str]) -> int:
-    """Print a line for each scenario; return 1 for an alarm or a rule without a reason."""
+    """Print what both tools find in each scenario.
+
+    Returns 1 if there is an alarm, or a broken rule that DEVIATIONS does not have.
+    """
     tools = {name: shutil.which(name) is not None for name in ("frama-c", "cppcheck")}
     for name, package in (("frama-c", "frama-c-base of Debian"), ("cppcheck", "cppcheck")):
         if not tools[name]:

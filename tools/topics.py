@@ -39,7 +39,7 @@ POLICY_COMMENT = """ SPDX-FileCopyrightText: RISE-DI contributors
      the topics of `recorder.topics` to the recorder. Guidance publishes `/tf` where tf2_msgs is installed.
      `python -m tools.topics` writes this file, tests/ros/flight_bringup/test_policy.py compares it with the nodes. """  # noqa: E501 - a text as it is written
 
-IN_LOCKSTEP = NODES[:-1]  # all but the bridge
+IN_LOCKSTEP = NODES[:-1]  # all nodes but the bridge
 MONITOR = "monitor"
 TYPES = "~get_type_description"
 PARAMETER_SERVICES = (
@@ -132,7 +132,7 @@ def _list(profile: ElementTree.Element, kind: str, verb: str, names: list[str]) 
 def _of_maps() -> tuple[list[str], list[str], list[str]]:
     """Return the topics that the bridge sends and receives, and the services that it requests.
 
-    They are those of each map in the library and in the examples.
+    The maps of the library and of the examples name these topics and services.
     """
     files = (
         path
