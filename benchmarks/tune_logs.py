@@ -34,7 +34,6 @@ STEP = 5e-4  # step of the simulation, s
 APART = 3.0  # time from one doublet to the next, s
 LENGTH = 72.0  # duration of a flight, s
 SEED = 7
-OFF = 2.5  # stated deviations
 HEADINGS = (
     "log",
     "entry",
