@@ -90,9 +90,10 @@ def tracking(autopilot: "Autopilot") -> dict[str, Any]:
 
 
 def behind(tape: Tape, name: str, engaged: Engagement) -> float:
-    """Return which of DELAYS of y_m leaves the smallest variance of y - y_m, s.
+    """Return the delay of y behind y_m in an engagement, s.
 
-    It covers an engagement without its first second.
+    It is the one of DELAYS by which y_m has to be late so that y - y_m has the smallest variance.
+    The first second of the engagement does not count.
     """
     y = tape["y"]
     y_m = tape["y_m"]

@@ -13,10 +13,10 @@ An aircraft learns for 64 s of osprey_learn. The model that flies at the end is 
 the commands and the two gusts of osprey_observer. The law alone and the two models that are not
 learned fly the same, and so do the laws of `rise-di compare` with their gains for the airframe
 file. A row for each aircraft goes to build/learning.csv. The figures of the cells of which all
-aircraft have flown go to docs/evidence/learning.csv.
-If the airs of both uncertainties are among them, the picture goes to docs/images/learning.png. An
-aircraft takes 2 to 3 min of a core over all cells. For false alarms at most two aircraft fly 600 s
-without damage in each air, which takes 2 min of a core each.
+aircraft have flown go to docs/evidence/learning.csv. If they include all cells of turbulence, gusts
+and calm air, the picture goes to docs/images/learning.png. An aircraft takes 2 to 3 min of a core
+over all cells. For false alarms at most two aircraft fly 600 s without damage in each air, which
+takes 2 min of a core each.
 """
 
 import csv

@@ -132,8 +132,8 @@ class _Loops(NamedTuple):
 
     controller: RiseDiConfig
     relaxation: FloatArray
-    # in order of speed, the trim speed first. At each speed, the loop with all vanes in use comes
-    # first.
+    # the loops at the trim speed, then those at each of `others`. At each speed, the loop with all
+    # vanes in use comes first.
     around: list[tuple[LinearPlant, LinearLaw]]
 
 

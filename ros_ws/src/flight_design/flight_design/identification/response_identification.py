@@ -367,10 +367,10 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
 def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: Spans) -> FloatArray:
     """Return the share of each channel's variance that the excitation explains, (k,).
 
-    Without disturbances the share is 1. A channel is modelled as a sum of means of the excitation
-    over earlier windows, up to LOOP_MEMORY. The flight has FOLDS parts. Each part is predicted with
-    coefficients that were fitted to the rest. Source of the cross-validation: M. Stone, J. Royal
-    Statistical Society B 36, 1974.
+    Without disturbances the share is 1. The regressors of a channel at an instant are means of the
+    excitation over windows before this instant, up to LOOP_MEMORY. Each span is divided into FOLDS
+    parts, and each part is predicted with coefficients that were fitted to the other parts. Source
+    of the cross-validation: M. Stone, J. Royal Statistical Society B 36, 1974.
     """
     residual = np.zeros((len(RIDGES), len(names)))
     total = np.zeros(len(names))
