@@ -70,9 +70,10 @@ class Reference:
     def sample(self, number: int) -> FloatArray:
         """Compute y_m at sample `number`, shape (m,), in steps of a period.
 
-        If samples were skipped, the law has meanwhile tracked the y_m before them. Therefore the
-        dead reckoning over the skipped samples uses the rates in that y_m. If a step raises an
-        exception or gives a value that is not finite, the state stays and the last y_m is repeated.
+        Between live commands, the attitude is dead-reckoned with the rates in y_m. If samples were
+        skipped, the law has meanwhile tracked the last y_m before the gap, so the rates of this y_m
+        hold for the whole gap. If a step raises an exception or gives a value that is not finite,
+        the state stays and the last y_m is repeated.
         """
         tracked: FloatArray = model.output(self._x_m, self._model)
         while self._number < number:

@@ -201,10 +201,10 @@ class Learner:
         While the rough model flies, the first model of a part is only on trial. The next
         identification proposes it if the samples since then show its advantage over the rough one.
 
-        If the digest `flown` is not that of the last proposal after the latency, the proposal was
-        refused, or the controller fell back. An identification is then due. Outputs that the
-        controller has `given_up` are not proposed again. If no part is left to learn, a sentence
-        says so once.
+        `flown` is the digest of the parameters that fly. If it still differs from that of the last
+        proposal after the latency, the controller refused the proposal or fell back. Then an
+        identification is due. Outputs that the controller has `given_up` are not proposed again. If
+        no part is left to learn, a sentence says so once.
         """
         is_first = not self._has_proposed_rough
         self._has_proposed_rough = True
