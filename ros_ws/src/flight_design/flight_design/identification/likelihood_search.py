@@ -144,10 +144,11 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         flown: FloatArray | None,
     ) -> Fit:
-        """Return the fit at the end of a search, with the innovations of the other models.
+        """Return the fit at the end of a search.
 
-        Each of the other models gets the levels of the wind that fit it best, or the `same` level
-        in every span if this costs less.
+        The fit also has the innovations of the nominal model, and of the model `flown` if there is
+        one. For each of these two models, the wind has the level in each span that fits best, or
+        the levels `same` if they cost less.
         """
         theta = best.theta
         deviation = np.sqrt(np.diag(np.linalg.inv(best.hessian)))

@@ -47,13 +47,14 @@ class ModuleFlight(NamedTuple):
 
 
 def module_flight(log: VehicleLog, controller: ControllerConfig) -> ModuleFlight:
-    """Compute the ticks of a module again, beginning at each engagement.
+    """Compute in Python again what an exported module computed at its ticks.
 
-    A stretch is a series of ticks without a gap after an engagement. Python starts a stretch with
-    the u of its first tick. In `internals`, e and u come from the log, and the states of the law
-    come from Python. At low airspeed the largest torque, 1, limits u more than the parameters do.
-    The limits of u then count as changed parameters. Raises ParameterError if the log has no ticks
-    or other parameters, or if the module computes in single precision.
+    A stretch is the ticks from an engagement to the first gap or to the next engagement. Python
+    starts each stretch with the u of its first tick in the log. In `internals`, e and u come from
+    the log, and the states of the law come from Python. At low airspeed the largest torque, 1,
+    limits u more than the parameters do. The limits of u then count as changed parameters. Raises
+    ParameterError if the log has no ticks or other parameters, or if the module computes in single
+    precision.
     """
     require(STATUS in log.tables, "the log", f"no {STATUS}", EXPECTED)
     table = log.tables[STATUS]

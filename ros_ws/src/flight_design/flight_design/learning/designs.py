@@ -233,9 +233,9 @@ def model_guarantee(
     """Compute within how many stated deviations of a learned model every aircraft is stable.
 
     The box has DEVIATIONS standard deviations of each entry. An entry that was not learned has the
-    relative deviation `unlearned`. The loop is that of the parameters in `controller`, without
-    their limits, with every u late by the longest delay in `known`, or by the delay that the
-    controller was told if this is longer.
+    relative deviation `unlearned`. The loop has the parameters of `controller` without their
+    limits. Every u is late by the longest delay in `known`, or by the delay that the controller was
+    told if this is longer.
     """
     deviation = chain.from_iterable(part.deviation.items() for part in known)
     entries = {name.replace(", ", ","): DEVIATIONS * value for name, value in deviation}
