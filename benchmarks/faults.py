@@ -31,7 +31,7 @@ from rich.table import Table
 from flight_cli.output import COUNT_COLUMNS, progress_bar
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-CAMPAIGN = REPOSITORY / "tests" / "ros" / "faults"
+CAMPAIGN = REPOSITORY / "tests" / "ros" / "flight_bringup" / "faults"
 
 STARTS = ("exec_to_ready", "start_run", "start_waited")
 """Times of the start of a killed node: from its start until it is ready, and for how long of this
