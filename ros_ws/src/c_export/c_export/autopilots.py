@@ -20,10 +20,12 @@ from flight_core.parameters import require
 AXES: Mapping[str, int] = MappingProxyType({"p": 0, "q": 1, "r": 2})
 """Channels of y, with the number of the axis in autopilots: roll, pitch, yaw."""
 
-# Number of samples that are kept. y_m is stepped past each y, so a tick only needs the newest y and
-# two samples of y_m.
+# Number of samples of y, and of y_m, that the code keeps. Before it takes a y, the module steps the
+# reference model up to the instant of this y or past it. So a tick needs only the newest y and two
+# samples of y_m.
 SAMPLES = 8
-# Speeds in units of the trim speed. The dynamic pressure is clipped to its values at these speeds.
+# Airspeeds as fractions of the trim speed. The torque for a u follows the dynamic pressure only
+# between these airspeeds.
 SLOWEST, FASTEST = 0.6, 1.6
 
 HOOKS = """ArduPlane/Plane.h, in class Plane, beside void stabilize();
@@ -180,9 +182,9 @@ def write_module(
     and hooks.txt with two lines to add to the tree. Raises ParameterError if the scenario does not
     suit the autopilot, or if a file cannot be written.
 
-    The outputs are body rates. A u at the upper end stop of its actuator is a torque of 1 with the
-    sign of D, and in ArduPlane a deflection of 45 degrees. In PX4, the controller that stands by is
-    fw_rate_control, or mc_rate_control for a multicopter.
+    The outputs are body rates. If u is at the upper end stop of its actuator, the autopilot gets a
+    torque of 1 with the sign of D. In ArduPlane this torque is a deflection of 45 degrees. While
+    RISE-DI does not fly, PX4 flies by its fw_rate_control, or by mc_rate_control for a multicopter.
     """
     shell = SHELLS[autopilot]
     controller = exportable(scenario.controller)
@@ -213,7 +215,7 @@ def write_module(
 
 
 def _words_of_vehicle(autopilot: str, scenario: Scenario) -> Mapping[str, str]:
-    """Return the words to replace in the shell, for a multicopter, or none for a fixed wing.
+    """Return the words of the shell to replace for a multicopter; {} for a fixed wing.
 
     A fixed wing has a trim speed. A multicopter has none, and its inputs are torques about the
     axes. Raises ParameterError if the aircraft is neither.
@@ -244,7 +246,11 @@ def _with_words(text: str, words: Mapping[str, str]) -> str:
 
 
 def _axes(scenario: Scenario, suffix: str) -> str:
-    """Write rise_di_axes.h, with the axes, the torque per unit of u, and the speed for it."""
+    """Return the text of rise_di_axes.h.
+
+    The header has the axis of each output, the torque per unit of u, and the airspeed at which this
+    torque holds.
+    """
     controller = scenario.controller
     channels = scenario.aircraft.channels()
     upper = dict(zip(channels.inputs, scenario.aircraft.actuators.upper or (), strict=False))

@@ -378,7 +378,8 @@ def _initialiser(
 ) -> str:
     """Return the C initialiser of a number, or of a list in braces.
 
-    The first and the last list of a nested struct also open and close the braces of the struct.
+    The limits are a nested struct. Its braces open before the list of `lower`, which is its first
+    member, and close after that of `rate`, which is its last.
     """
     if isinstance(value, int):
         return str(value)
@@ -408,5 +409,5 @@ def _octal(character: str) -> str:
 
 
 def _comment(names: tuple[str, ...]) -> str:
-    """Return names for a comment in C. The escapes of `_strings` keep a name from ending it."""
+    """Return names for a comment in C, with the escapes of `_strings` so that none ends it."""
     return ", ".join("".join(map(_octal, name)) for name in names)

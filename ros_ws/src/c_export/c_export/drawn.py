@@ -70,7 +70,7 @@ def drawn_calls(
     for k in range(ticks):
         draw = rng.random(10)
         now_ns += _interval_ns(draw[0], draw[1], period_ns)
-        # Draw the size of the error, and the silence of both topics.
+        # Draw the size of the error, and how long both topics are silent.
         if k % 50 == 0:
             size = unit * 10.0 ** rng.uniform(-3.0, 2.5, m) * (rng.random(m) < 0.9)
         silence = int(draw[2] * 100.0) if draw[3] < 0.005 else max(silence - 1, 0)
@@ -79,7 +79,8 @@ def drawn_calls(
             if draw[4] < 0.92 and not silence:
                 late = rng.uniform(-0.1, 0.4 * draw[6])
                 first = 2 - int(3.0 * draw[5])
-                for distance in (0.3, 0.02, 0.0)[first:]:  # some too close for a slope
+                # some samples are too close together for a slope of y_m
+                for distance in (0.3, 0.02, 0.0)[first:]:
                     stamp_m_ns = now_ns - round(period_ns * (late + distance))
                     recorder.take_y_m(
                         StampedVector(stamp_m_ns, y_m * rng.uniform(0.9, 1.1)), now_ns
@@ -381,9 +382,10 @@ def _feedforward_step(
 def _effector_values(
     u: FloatArray, before: FloatArray | None, dt: FloatArray, params: Allocation | None
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Return the u that the effectors give for a demanded u, and the effectors, by column.
+    """Allocate the demanded u of many steps, one step in each column.
 
-    Without an allocation, these are u and None.
+    Returns the u that the effectors give, and the values of the effectors. Without an allocation,
+    these are the demanded u and None.
     """
     if params is None or before is None:
         return u, None

@@ -270,7 +270,7 @@ class Recorder(Controller):
 
 
 def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
-    """Return the given parameters, followed by sets with valid changes of them.
+    """Return the given parameters, and then sets in which some parameters have other valid values.
 
     The changes concern gains, limits, signs, times, the schedule, the observer and stops.
     """
@@ -315,10 +315,11 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
 def flight_recordings(
     scenario: Scenario, sets: Sequence[RiseDiConfig], samples: int = SAMPLE_BUFFER_SIZE
 ) -> Iterator[Recording]:
-    """Yield recordings of flights in one process: undisturbed, with a tenth of y lost, and faulty.
+    """Yield recordings of three flights: undisturbed, with a tenth of y lost, and with faults.
 
-    The faults are new parameters, deactivation, engagement, tight limits, and losses of y or y_m.
-    A loss ends while the failsafe holds u, while it ramps u to trim, or after this ramp.
+    The flights are simulated in one process. The faults are new parameters, deactivation,
+    engagement, tight limits, and losses of y or y_m. A loss ends while the failsafe holds u, while
+    it ramps u to trim, or after this ramp.
     """
     sensors = scenario.aircraft.sensors.model_dump() | {"dropout": 0.1}
     yield _flight("the flight", scenario, Recorder(sets, samples=samples))
@@ -400,8 +401,8 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
                 recorder.restart()
             sample = (int(log.stamp_ns[k]), groups["y"][k], groups["y_m"][k], offset_ns)
         elif log.stamp_ns[k] == recorder.state.stamp_ns:
-            # The stamp stayed the same, so the last y is older than the stamp, and the law did not
-            # engage.
+            # The controller stands by at the same stamp as before. So its last y was older than
+            # this stamp, and the law did not engage.
             sample = (int(log.stamp_ns[k]) - 1, groups["y"][k], groups["y_m"][k], 0)
         recorder.guard_tick(int(now_ns[k]), sample, active=log["mode"][k] != Mode.INACTIVE)
         equal += recorder.state.command.tobytes() == groups[command][k].tobytes()

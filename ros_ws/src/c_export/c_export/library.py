@@ -30,7 +30,7 @@ MOST = float(np.finfo(np.float64).max)  # number that stands for infinity in the
 class CController:
     """A controller in C with the methods of `rise_di_controller.controller.Controller`.
 
-    Its u has p values.
+    `p` is the number of values of u.
     """
 
     def __init__(self, library: Path, p: int) -> None:

@@ -104,7 +104,7 @@ def write_code(
 
 
 def compilers(names: Sequence[str] = ()) -> list[list[str]]:
-    """Return the commands of the C compilers, which are `names`, or COMPILERS on the PATH.
+    """Return the commands of the C compilers: `names`, or else those of COMPILERS on the PATH.
 
     Raises ParameterError if there is no compiler.
     """
@@ -171,7 +171,10 @@ class Program:
         build([*compiler, *flags, "-o", "proof", "proof.c"], folder)
 
     def take(self, sets: Sequence[RiseDiConfig]) -> None:
-        """Replace the parameter sets. The first set stays that of the exported header."""
+        """Replace the parameter sets.
+
+        The program does not use the first set, but the parameters in the exported header.
+        """
         self._sets = sets
         content = b"".join(packed(controller, float32=self._float32) for controller in sets)
         (self._folder / "sets").write_bytes(content)
