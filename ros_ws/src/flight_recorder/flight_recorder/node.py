@@ -61,7 +61,8 @@ LOOP = (Y, Y_M, U)  # every flight has these topics
 # Topics that go on in every mode of a flight while their publisher runs.
 STEADY = (Y, Y_M, U, INTERNALS, TRUTH, POSE)
 
-DRAIN_NS = 10 * NANOSECONDS  # longest wait at the end for messages that were sent before
+# longest wait at the end of a flight for messages that were sent before the end
+DRAIN_NS = 10 * NANOSECONDS
 QUIET_NS = NANOSECONDS // 5  # after this time without a message, no message is left
 
 
@@ -73,7 +74,10 @@ class _Subscribed(RecordedTopic):
 
 
 class _RecordedTopics:
-    """The recorded topics: the topics of a flight, and `names` once they have a publisher."""
+    """The topics that are recorded.
+
+    They are the topics of a flight, and those of `names`, each from its first publisher on.
+    """
 
     def __init__(self, node: Node, bag: FlightBag, names: Sequence[str]) -> None:
         self._node = node
@@ -92,7 +96,10 @@ class _RecordedTopics:
         return iter(self._topics)
 
     def among(self, topics: Sequence[Topic], *, heard: bool = False) -> list[_Subscribed]:
-        """Return the recorded topics among `topics`, and if `heard`, only those with messages."""
+        """Return those of `topics` that are recorded.
+
+        If `heard`, a topic without a message so far is left out.
+        """
         selection = (topic for topic in self._topics if topic.subscription.topic in topics)
         return [topic for topic in selection if topic.channel.messages or not heard]
 
@@ -155,9 +162,9 @@ class _RecordedTopics:
     def weaken_qos(self, topic: _Subscribed, drain: Callable[[], None]) -> None:
         """Subscribe again with a weaker QoS if publishers offer less than is requested.
 
-        If the stack also publishes the topic, a publisher with a weaker QoS does not lower the QoS,
-        and EndpointMonitor logs the mismatch. `drain` writes the received messages before the
-        subscription is removed.
+        A topic that the stack publishes keeps its QoS if at least one publisher offers it.
+        EndpointMonitor then logs the mismatch of the others. `drain` writes the received messages
+        before the subscription is removed.
         """
         subscription = topic.subscription
         offered = self._offered(topic.name, topic.channel.type.name)
@@ -186,7 +193,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def __init__(self) -> None:
         super().__init__("recorder", RecorderConfig)
         self.host = time  # host time, so that the log is also flushed in a pause of /clock
-        self._flight_time: HostTime = self.simulated or time  # for silences, without pauses
+        # time by which silences count; it stands still in a pause of /clock
+        self._flight_time: HostTime = self.simulated or time
         names = [_full_name(self, name) for name in self.parameters.topics]
         logger = self.get_logger()
         self._bag = FlightBag(
@@ -215,14 +223,15 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return [topic.subscription for topic in self._topics.among(LOOP)]
 
     def runs_in_lockstep(self) -> bool:
-        # In lockstep the recorder writes at ticks as well, for many instants at a time, and
-        # publishes its progress.
+        # Even in a lockstep flight the recorder ticks by the clock of the host. Each tick writes
+        # many instants of the flight, and publishes up to where the log is complete.
         return False
 
     def advance(self) -> bool:
-        """Write at ticks between the steps of the other nodes, if they share this process.
+        """Write the received messages if a period has passed since the last time.
 
-        This does not delay any node.
+        In a lockstep flight in one process, this is called between the steps of the other nodes.
+        Returns False, because writing is no step of the flight.
         """
         if time.monotonic_ns() - self._drained_ns > self.period_ns():
             self._write()
@@ -275,7 +284,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
             self._publish_recorded(instant(stamps[-1]))
 
     def _hear(self, topic: _Subscribed, arrivals: Sequence[ReceivedMessage]) -> None:
-        """Note times and stamp of the newest message of a topic."""
+        """Note when the newest message of a topic was sent and received, and its stamp."""
         now_ns = self._flight_time.monotonic_ns()
         topic.hear(arrivals[-1].sent_ns, now_ns)
         if topic.subscription.topic in LOOP and not self.parameters.lockstep:

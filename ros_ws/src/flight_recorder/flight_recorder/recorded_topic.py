@@ -9,7 +9,10 @@ from flight_log.bag import BagChannel
 
 @dataclass(kw_only=True)
 class RecordedTopic:
-    """A topic and its channel in the bag. Only messages of the stack name their publisher."""
+    """A topic and its channel in the bag.
+
+    Only the messages of the stack contain the name of their publisher.
+    """
 
     name: str  # full name
     is_foreign: bool

@@ -14,7 +14,7 @@ from flight_recorder.recorded_topic import RecordedTopic
 
 SILENCE_NS = 3 * NANOSECONDS  # a killed controller is back within 1 s, so this is no restart
 
-# A topic is steady after this number of messages at intervals up to this length.
+# A topic is steady once it has had so many messages at a mean interval up to this length.
 STEADY_MESSAGES = 20
 STEADY_INTERVAL_NS = NANOSECONDS // 5
 TOPIC_SILENCE_NS = NANOSECONDS
