@@ -54,11 +54,10 @@ axis. Dryden's L / V0 at 100 m and 25 m/s is 4 s vertically and 10 s along the f
 of 15 m peaks after 0.6 s."""
 
 
+# Models of a feedforward.
 NONE = "none"
-AIRCRAFT = "aircraft"
-INTEGRATORS = "integrators"
-"""Models of a feedforward, which are no model, A, B and f of the nominal aircraft, and y_dot =
-Omega u."""
+AIRCRAFT = "aircraft"  # A, B and f of the nominal aircraft
+INTEGRATORS = "integrators"  # y_dot = Omega u
 
 
 class Law(NamedTuple):
@@ -72,8 +71,8 @@ class Law(NamedTuple):
     params: Callable[[Gains, NominalModel], Any]
     tuned: tuple[str, ...]  # names of the gains
     feedforward: str = NONE  # model of the feedforward
-    # gains at which a search begins; if None, they follow from the lag of the loop and the
-    # constants above
+    # gains at which a search begins; None if they follow from the lag of the loop and the constants
+    # INITIAL_...
     initial: Gains | None = None
     linear: bool = True  # whether the law is linear near e = 0
 

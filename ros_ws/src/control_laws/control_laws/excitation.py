@@ -48,8 +48,8 @@ def signal(elapsed: Array, params: ExcitationParams) -> Array:
         sum_k part_k sin(2 pi harmonic_k (tau - 8) w / period + phase_k) in [8, 8 + period / w)
             a multisine
 
-    Each doublet and the multisine have the mean 0, so that a rate proportional to u leaves the
-    attitude unchanged in the end.
+    Each doublet and the multisine have the mean 0. If an angular rate is proportional to u, the
+    attitude is therefore the same at the end as at the beginning.
     """
     xp = array_namespace(params.amplitude)
     since = elapsed - params.begin

@@ -102,7 +102,8 @@ def mackunis_params(gains: dict[str, FloatArray], model: NominalModel) -> MacKun
     """Return the parameters for the gains of a search.
 
     The gains are K, Lambda and beta (m, N), softening (1, N) and, without a perfect y_dot, filter
-    (1, N), rad/s. With eps = beta / K softening, the sign adds K / softening to K inside eps.
+    (1, N), rad/s. eps is softening times beta / K. Inside eps, the softened sign is linear, and its
+    gain K / softening adds to K.
     """
     K = gains["K"]
     beta = gains["beta"]

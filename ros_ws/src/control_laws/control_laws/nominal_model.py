@@ -28,8 +28,8 @@ class NominalModel(NamedTuple):
     C: FloatArray  # (m, n), picks the outputs
     gravity: FloatArray  # (n, n), f(x) = gravity @ sin(x)
     wind: FloatArray  # x_dot for 1 m/s of wind along each of G axes, (n, G)
-    # rms noise of the measured outputs per sample, (m,); if an output has none, a tenth of its unit
-    # in the score
+    # rms noise of the measured outputs per sample, (m,); for an output without noise, a tenth of
+    # its unit in the score
     noise: FloatArray
     kinematic: FloatArray  # 1 for an angle that integrates rates, such as theta, else 0, (n,)
     size: FloatArray  # unit of each state in weights, (n,): 1 m/s, 0.1 rad or 0.1 rad/s

@@ -22,11 +22,10 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.extensions.observer import ObserverParams
 from rise_di_controller.law.saturation import Limits
 
-PART = 0.6
-WITHIN = 0.1
-FADE = 1.0
-"""Bound of u_o as a fraction of the limits of u, least time in which u_o goes from 0 to this bound,
-s, and time of the fade-in, s. They are the defaults of `ObserverConfig`."""
+# The defaults of `ObserverConfig`.
+PART = 0.6  # bound of u_o, as a fraction of the limits of u
+WITHIN = 0.1  # s, least time in which u_o goes from 0 to this bound
+FADE = 1.0  # s, time in which u_o fades in after an engagement
 
 
 def observer_params(

@@ -226,10 +226,11 @@ def vane_correction(
 ) -> FloatArray:
     """Compute the gains that a vane adds to L of `aircraft_correction`, (s, m + 1).
 
-    They are the gains of the observer of y and the vane, minus those of the observer of y alone.
-    The last column acts on the vane. The reading of the vane, minus the reading in the reference
-    motion, is `row` z plus white noise with the rms `noise`. `row` has the shape (s,). `weights`
-    has the weights without the vane, and then those with the vane.
+    They are the gains of an observer of y and the vane, minus those of the observer of y alone. The
+    last column acts on the reading of the vane. The observer takes the deviation of this reading
+    from its value in the reference motion. This deviation is `row` z plus white noise with the rms
+    `noise`, where `row` has the shape (s,). `weights` has the weights without the vane, and then
+    those with the vane.
     """
     without_vane = aircraft_correction(model_by_tick, model, weights[0])
     with_vane = model_by_tick._replace(H=np.vstack([model_by_tick.H, row]))

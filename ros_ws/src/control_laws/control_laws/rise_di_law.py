@@ -12,8 +12,8 @@ from rise_di_controller.law.law import LawParams
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> LawParams:
     """Return the parameters of RISE-DI for the gains of a search, in scaled inputs.
 
-    The gains are K, Lambda, beta (m, N) and either softening, (m, N) or (1, N), or omega (1, N).
-    With softening, eps = beta / K softening total_lag.
+    The gains are K, Lambda, beta (m, N) and either softening, (m, N) or (1, N), or omega (1, N). If
+    there is a softening, eps is the product of softening, beta / K and total_lag.
     """
     K = gains["K"]
     beta = gains["beta"]
