@@ -17,10 +17,11 @@ CLOCK_TOLERANCE_NS = NANOSECONDS
 class AutopilotLock:
     """Locks to the first autopilot until it is silent, and then to the next one.
 
-    Two autopilots behind the same address differ by the time since boot in their messages. This
-    time never goes back, and it advances by at most the time that passes here, although a message
-    may be late. An autopilot that starts again counts as a second sender. It stops counting as one
-    when messages of its earlier start have been missing for the same silence.
+    Two autopilots behind the same address differ by the time since boot in their messages. In the
+    messages of one autopilot this time never goes back, and it advances no faster than the clock of
+    this host, except if a message was late. An autopilot that starts again counts as a second
+    sender at first. Once the messages of its earlier run have been missing for the time of a
+    silence, the lock goes to the new run.
     """
 
     def __init__(self, silence_ns: int) -> None:
@@ -40,7 +41,7 @@ class AutopilotLock:
         return self._addresses.publisher
 
     def overran(self, duration_ns: int) -> None:
-        """Subtract a time in which the receiver did not run from the silence, ns."""
+        """Do not count a time in which the receiver did not run as silence, ns."""
         self._addresses.overran(duration_ns)
         self._starts.overran(duration_ns)
 
@@ -92,10 +93,11 @@ class AutopilotLock:
         return is_new_sender
 
     def _start(self, since_boot_ns: int, now_ns: int) -> str:
-        """Return a name that tells the present run of the autopilot from a run after a restart.
+        """Return a name for the run of the autopilot that sent a message.
 
-        If the time since boot continues that of the locked run, it is the name of this run.
-        Otherwise it is a new name, from the instant of boot.
+        A run lasts from one boot to the next. If the time since boot continues that of the locked
+        run, the result is the name of the locked run. Otherwise it is a new name, made from the
+        instant of boot.
         """
         boot_ns = now_ns - since_boot_ns
         advances = (

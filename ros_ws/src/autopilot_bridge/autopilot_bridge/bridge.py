@@ -27,8 +27,8 @@ UNBOUNDED = Refusal(
     "the loss of the transmitter cannot be seen over this link: set max_engaged in the "
     "map, or engage with --blind"
 )
-# A u that does not change counts as being at a limit of the law if it exceeds this share of the
-# map's limits. The amplitudes of experiments are smaller.
+# If a u does not change and exceeds this share of the map's limits, it counts as being at a limit
+# of the law. The amplitudes of experiments are smaller.
 LARGE = 0.5
 # time from the warning to the end of an engagement by `max_engaged`
 END_WARNING_NS = 10 * NANOSECONDS
@@ -88,8 +88,8 @@ class Bridge:
         self.conditions = Conditions(channel_map)
         self._parameters: dict[str, float] = {}
         self._phase_ns = 0  # instant at which the phase began
-        # Whether a release keeps the mode, because the pilot chose the mode or because nothing
-        # flew.
+        # Whether a release leaves the autopilot in its mode. It does if the pilot chose the mode,
+        # or if no u was sent yet.
         self._keeps_mode = True
         self._limit_ns: dict[str, int] = {}  # instants since which inputs are at a limit
         self._end_ns: int | None = None  # instant at which `max_engaged` ends the engagement
@@ -130,16 +130,17 @@ class Bridge:
         self._readings[name] = Reading(stamp_ns, value)
 
     def _u_timeouts_ns(self) -> tuple[int, int]:
-        """Return the times after which the publisher of u has timed out, ns.
+        """Return the silence of the publisher of u after which another may take over, ns.
 
-        While the bridge is engaged, any other publisher conflicts, even after a timeout, because
-        its u would jump. The timeout ends the engagement.
+        The first value is for the same node in a new process, and the second for another node.
+        While the bridge is engaged, no publisher may take over, because u would jump. A timeout of
+        u ends the engagement instead.
         """
         takeover_ns = sys.maxsize if self.phase is Phase.ENGAGED else self._max_age_ns
         return takeover_ns, takeover_ns
 
     def max_u_age_ns(self) -> int:
-        """Return the age limit of a u, ns; the age counts from its stamp, the instant of a y.
+        """Return the age limit of a u, ns. The age counts from the instant of the y in its stamp.
 
         This limit prevents the playback of a log from flying the autopilot.
         """
@@ -215,8 +216,9 @@ class Bridge:
     def _reason_against_inputs(self, now_ns: int) -> Refusal | None:
         """Say which inputs stay at a limit for longer than their rows allow.
 
-        The aircraft does not follow such an input. The limits of the law may be narrower than those
-        of the map. So a large u that does not change counts as being at a limit.
+        Then the aircraft does not answer to this input any more. The limits of the law may be
+        narrower than those of the map, so a large u that does not change also counts as being at a
+        limit.
         """
         reasons = []
         inside, small = (
@@ -342,7 +344,7 @@ class Bridge:
         return None
 
     def _reason_against_trim(self, name: str) -> Refusal | None:
-        """Refuse the trim of a captured input if the limits around it exceed its field's range."""
+        """Refuse the trim of a captured input if trim plus a limit is outside its field's range."""
         row = self.channel_map.inputs[name]
         trim = self.trim(name)
         (low, high), ends = row.range, (trim + row.lower, trim + row.upper)
@@ -531,7 +533,7 @@ class Bridge:
         return np.array([self._resting(name, row) for name, row in self.channel_map.inputs.items()])
 
     def _resting(self, name: str, row: InputRow) -> float:
-        """Return the neutral or the release value of an input."""
+        """Return the raw value of an input that does not follow u: neutral, or release value."""
         if self.phase is not Phase.NEUTRAL:
             return math.nan if row.release is None else row.release
         return self._raw(name, 0.0) if row.neutral == "trim" else row.neutral

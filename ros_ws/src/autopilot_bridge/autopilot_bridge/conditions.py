@@ -52,7 +52,10 @@ class Conditions:
         self._overrides[name] = Reading(now_ns, raw)
 
     def engage(self, now_ns: int) -> None:
-        """Store the present values of the overrides, from which `moved` overrides are measured."""
+        """Store the present values of the overrides.
+
+        An override with `moved` becomes active when its value has moved from this one.
+        """
         self._at_engagement = {
             name: reading.value
             for name, reading in self._overrides.items()
@@ -106,7 +109,7 @@ class Conditions:
         return row.is_active(reading.value, at_engagement)
 
     def _is_silent(self, name: str, now_ns: int) -> bool:
-        """Return whether an override cannot act now, because its topic is silent."""
+        """Return whether the topic of an override is silent, so that the override cannot act."""
         row = self._map.overrides[name]
         return staleness(row.topic, self._overrides.get(name), row.max_age, now_ns) is not None
 
@@ -120,9 +123,9 @@ class Conditions:
         return Refusal(f"a pilot override has no effect: {'; '.join(silent)}") if silent else None
 
     def blindness(self, *, bounded: bool) -> Refusal | None:
-        """If an engagement does not notice the loss of the transmitter, say so.
+        """Warn if an engagement does not notice the loss of the transmitter; else return None.
 
-        The sentence also says what can still release the aircraft. `bounded` says whether
+        The sentence also says what can still end the engagement. `bounded` says whether
         `max_engaged` ends the engagement.
         """
         if self.watches_transmitter and not self.blind:

@@ -38,7 +38,10 @@ VERSION = "MESSAGE_VERSION"  # the constant in definitions of PX4
 
 
 class CheckedRow(NamedTuple):
-    """A field that a row of a map reads or sets, and by release why the row does not hold."""
+    """A field that a row of a map reads or sets.
+
+    `faults` has for each release why the row does not hold, or None if it holds.
+    """
 
     key: str
     topic: str

@@ -93,7 +93,7 @@ class MovingRow(Row):
 
     @property
     def motion(self) -> tuple[str, int]:
-        """The output that a growing channel moves, a key of UNITS, and the motion's sign."""
+        """The output, a key of UNITS, that changes while the channel grows, and with which sign."""
         output, sign = MOTIONS[self.positive]
         return output, sign * self.sign
 

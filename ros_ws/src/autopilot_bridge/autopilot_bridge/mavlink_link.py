@@ -34,9 +34,9 @@ from flight_core.vectors import ChannelError
 
 DIALECT = "ardupilotmega"
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
-# MAV_COMP_ID_ONBOARD_COMPUTER4, because other companions mostly have 191. If the link were a
-# component of the ground station, such as 0 or 190, ArduPilot would not forward the heartbeats of
-# the station any more (MAVLink_routing.cpp, handle_heartbeat).
+# MAV_COMP_ID_ONBOARD_COMPUTER4, because other companions mostly have 191. With the number of a
+# ground station, such as 0 or 190, the link would keep ArduPilot from forwarding the heartbeats of
+# the real station (MAVLink_routing.cpp, handle_heartbeat).
 COMPANION = 194
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD
 ACCEPTED = 0  # MAV_RESULT
@@ -44,16 +44,16 @@ SIGNED = 1  # MAVLINK_IFLAG_SIGNED in a header
 GCS = 6  # MAV_TYPE_GCS
 ONBOARD = 18  # MAV_TYPE_ONBOARD_CONTROLLER
 INVALID = 8  # MAV_AUTOPILOT_INVALID
-# Parameters that have the systems whose RC overrides ArduPilot takes. Since 4.7 it is
-# MAV_GCS_SYSID, or the range from MAV_GCS_SYSID to MAV_GCS_SYSID_HI if the latter is not 0. Before
-# 4.7 it is SYSID_MYGCS.
+# Parameters that name the systems whose RC overrides ArduPilot takes. Since 4.7 this is the system
+# MAV_GCS_SYSID, or those from MAV_GCS_SYSID to MAV_GCS_SYSID_HI if the latter is not 0. Before 4.7
+# it is the system SYSID_MYGCS.
 STATION, LAST_STATION, OLD_STATION = "MAV_GCS_SYSID", "MAV_GCS_SYSID_HI", "SYSID_MYGCS"
 STATION_PARAMETERS = (STATION, LAST_STATION, OLD_STATION)
 STICKS = frozenset({"RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"})  # messages of a joystick
 BEAT = 1.0  # s, time between two heartbeats
 ANSWER = 1.0  # s, longest wait for an answer, after which the request is repeated
-# s without a message of the autopilot, after which all rates are requested again, and another
-# sender may take its place
+# s. If the autopilot sends nothing for so long, all rates are requested again, and another sender
+# can become the autopilot of this link.
 SILENCE = 3.0
 # s, time after which a parameter is read again, because a ground station may have set it
 READ_AGAIN = 5.0
@@ -183,7 +183,7 @@ class Link:
         self._began = time.monotonic()
         self._rates = MessageRates(config.rates, self._began)
         self._read = 0.0  # time at which the parameters were requested
-        # Time at which a ground station was last heard whose number is that of the RC overrides.
+        # Time of the last message from a ground station whose RC overrides the autopilot takes.
         self._station_heard: float | None = None
         self._sending = Lock()
         self._closed = Event()
@@ -251,7 +251,10 @@ class Link:
         return self.problem() or self._dropped_overrides() or rates
 
     def _station_numbers(self) -> range:
-        """Return the systems whose RC overrides the autopilot takes, by its parameters if known."""
+        """Return the numbers of the systems whose RC overrides the autopilot takes.
+
+        They come from its parameters, or from the map if the parameters are not known.
+        """
         first = self.parameters.get(STATION, self.parameters.get(OLD_STATION))
         if first is None:
             first = self._config.source_system

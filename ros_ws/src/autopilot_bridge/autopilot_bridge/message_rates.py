@@ -21,7 +21,7 @@ SLOW_ENDS = 2.0
 REMEMBERED = 20.0
 REPEATED = 1.0  # s, time between two requests of a slow rate
 JUDGED = 0.1  # s, time between two judgements of the rates
-PAUSE = 0.4  # s without a judgement that show that the host paused
+PAUSE = 0.4  # s; if two judgements are farther apart, the host paused
 GAPS = 3  # number of gaps between the newest messages, whose mean gives the present rate
 
 

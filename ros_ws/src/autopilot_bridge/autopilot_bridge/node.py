@@ -97,7 +97,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         # Systems of ground stations that were reported already.
         self._known_stations: set[int] = set()
         self._conflict: Refusal | None = None  # which topics have two publishers
-        # Publishers and encoders of messages over MAVLink, as named vectors.
+        # For the log: publisher and encoder of each MAVLink topic, as named vectors.
         self._recorded: dict[str, tuple[Callable[[bytes], None], Encoder]] = {}
         self._readers = self._read_topics()
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
@@ -126,7 +126,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._u_sender: str | None = None
         self._activation: Any = None  # the pending activation of the controller
         self._activation_ns = 0
-        self._awaits_controller = False  # whether the bridge engaged before it found the controller
+        self._awaits_controller = False  # whether an engaged bridge lacks the controller so far
         if self._link is not None:
             self._link.start()
         waits = f"disengaged, waiting for {self.get_name()}/engage"
@@ -243,7 +243,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._log_phase()
         if now_ns - self._report_ns >= NANOSECONDS:
             self._report(now_ns)
-        # After a longer pause, the tick was stopped half-way, and its u is old.
+        # If the host has stopped this tick half-way, the u that it took may be old.
         if self._pause_ns() <= self._longest_pause_ns:
             self._send(now_ns, self.period_ns() // 2)
         self._warn_stale_inputs(now_ns)
@@ -411,7 +411,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         ready = self._controller.service_is_ready() and self._controller_state.service_is_ready()
         before = self._u_sender
         self._u_sender = bridge.u_lock.publisher
-        # A restart can take less time than it takes to notice the loss of the service.
+        # After a quick restart, the service is back before its loss is noticed.
         restarted = bool(before) and self._u_sender != before
         if (
             ready
@@ -426,7 +426,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._activate(active=True)
 
     def _deactivate_unengaged(self, state: Future) -> None:
-        """Deactivate a controller that was already active, as it is with `ros2 run`."""
+        """Deactivate a controller that was active before an engagement, as with `ros2 run`."""
         if (
             state.result().current_state.id == State.PRIMARY_STATE_ACTIVE
             and self._bridge.phase is not Phase.ENGAGED

@@ -373,7 +373,7 @@ class ChannelMap(Config):
         return fields
 
 
-ROUNDING = 1e-6  # tolerance for limits, rounded to six digits, at the ends of a range
+ROUNDING = 1e-6  # tolerance at the ends of a range, because the limits are rounded to six digits
 
 
 def maps() -> list[str]:
