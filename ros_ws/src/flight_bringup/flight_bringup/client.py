@@ -18,8 +18,8 @@ from flight_ros.network import addresses, network_profile, own_address, ports
 from flight_ros.transport import DISCOVERY_VARIABLE
 
 EXCHANGE_PERIOD = 0.1  # s, time between two exchanges of clocks
-# s, time for which the exchange continues once every host was received, because the least delay of
-# many exchanges counts.
+# s for which the exchange continues after every host was received. The offset of a clock comes from
+# the exchange with the least delay, so it takes many of them.
 SETTLE_TIME = 1.0
 
 

@@ -34,7 +34,7 @@ from flight_guidance.routes.route_file import Origin, read_route
 if TYPE_CHECKING:
     from flight_bringup.monitor import FlightMonitor
 
-BEGIN_TIME = 0.05  # s for the nodes of an aircraft to receive t = 0 while others do
+BEGIN_TIME = 0.05  # s by which each aircraft delays t = 0, because all nodes receive t = 0 at once
 A_FLEET = "a file of a fleet (.yaml): aircraft by name"
 Degrees = Annotated[float, Field(ge=-180, le=180)]
 Overrides = dict[str, dict[str, object]]
@@ -130,7 +130,7 @@ class Fleet:
         """Return the number of DDS participants: one for the command, and one for each process."""
         scenarios = [member.scenario for member in self.members]
         if self.composed:
-            # A learner has a separate process even then.
+            # A learner has a separate process even if the other nodes share one.
             return 1 + sum(1 + scenario.learns() for scenario in scenarios)
         return 1 + sum(len(FIRST_STAGE) + len(second_stage(scenario)) for scenario in scenarios)
 

@@ -404,10 +404,10 @@ def _is_its_file(scenario: Scenario) -> bool:
 
 
 def as_file(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
-    """Return the scenario with a file that holds it: its own file, or a new one of the run.
+    """Return the scenario with a file from which nodes in the namespace read its parameters.
 
-    The nodes in the namespace read from this file the parameters of `as_flown`. Raises
-    ParameterError.
+    If the scenario is equal to its file, the file is that of `as_flown`. Otherwise it is a new file
+    in the folder of the run. Raises ParameterError.
     """
     if _is_its_file(scenario):
         return as_flown(scenario, run, namespace)

@@ -162,8 +162,8 @@ LEAD = 0.5  # s from the message of t = 0 on `start` to t = 0, within which a bu
 def start_lead(startup: float) -> float:
     """Return the time from the start of the second stage to t = 0, s.
 
-    `startup` is the time, s, that the first stage took until it was ready. The second stage gets
-    1.5 times as long, and half a second more in which the nodes discover each other.
+    `startup` is the time, s, from the start of the first stage until it was ready. The second stage
+    gets 1.5 times this time, and half a second in which the nodes discover each other.
     """
     return 0.5 + 1.5 * startup
 
@@ -177,7 +177,11 @@ def start_instant(lead: float, now: float) -> float:
 
 
 def _airframe(scenario: Scenario) -> ParameterOverrides:
-    """Return the airframe if its file lies beside the scenario, in a folder that no node knows."""
+    """Return the airframe if its path is absolute; else {}.
+
+    The path is absolute if the file lies beside the scenario, in a folder that the nodes do not
+    know.
+    """
     airframe = scenario.aircraft.airframe
     return {"airframe": airframe} if Path(airframe).is_absolute() else {}
 
@@ -327,8 +331,8 @@ def replayed_topics(
     """
     prefix = f"/{namespace.strip('/')}/".replace("//", "/")
     names = {name for node in nodes for name in topics.published_by(node.executable)}
-    # Topics with an absolute name do not belong to the nodes alone, because other nodes publish
-    # them too.
+    # Other nodes also publish on topics with an absolute name, so these topics of the log are
+    # played.
     topics_of_nodes = {prefix + name for name in names if not name.startswith("/")}
     if BRIDGE in nodes and autopilot is not None:
         setpoint_topics = (message.topic for message in autopilot.channel_map.messages.values())

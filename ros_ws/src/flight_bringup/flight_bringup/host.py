@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure whether this host can fly in real time.
 
-As many processes as will fly spin, and each says which share of a core it got. The load of the host
-is no measure of this, because it looks alike on a host that can fly and on one that cannot. The
-same holds for the time by which a sleeping process wakes late.
+For half a second, as many processes compute as the flight will have, and each reports which share
+of a core it got. Two other measures do not serve: the load of the host, and the time by which a
+sleeping process wakes late. They look alike on a host that can fly and on one that cannot.
 """
 
 import subprocess
@@ -18,7 +18,7 @@ from flight_bringup.graph import FIRST_STAGE, LEARNER, second_stage
 from flight_core.outcome import Refusal
 from flight_core.parameters import require
 
-LOOK = 0.5  # s for which the processes spin, a hundred slices of the scheduler
+LOOK = 0.5  # s for which the processes compute, about a hundred time slices of the scheduler
 
 CORES_A_NODE = 0.35
 """Cores that a node needs in a process of its own. The four nodes of osprey_servo take 1.3 on two

@@ -49,8 +49,8 @@ class DeferredInterrupt:
     """Handles signals, but interrupts only outside the blocks of `deferred`.
 
     For example, a signal waits while the log is written. With `only_in_pauses` a signal interrupts
-    only in `pause`. The reason is Python code that a module in C calls, as when rclpy makes a
-    message: an exception in such code would become an error of the module.
+    only in `pause`. The reason is that a module in C, such as rclpy while it makes a message, can
+    call Python code. An interrupt in this code would become an error of the module.
     """
 
     def __init__(self, *, only_in_pauses: bool = False) -> None:

@@ -66,9 +66,9 @@ class Player(Client):
 
         The first message is sent immediately. Each further message is sent when its time since the
         first, divided by `rate`, has passed. Deadlines are absolute on the monotonic clock, so
-        delays do not add up. `stamps_now` moves the stamps, so that the age of a message by the
-        system clock is its age in the log divided by `rate`. `progress` is called ten times a
-        second with the instant of the log, ns.
+        delays do not add up. If `stamps_now`, the stamps are moved to the present. The age of a
+        message by the system clock is then its age in the log, divided by `rate`. `progress` is
+        called ten times a second with the instant of the log, ns.
         """
         begin_ns = begin_system_ns = first_ns = clock_ns = progress_ns = 0
         for due_ns, topic, message, has_stamp in messages:

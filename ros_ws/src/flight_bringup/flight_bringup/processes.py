@@ -65,8 +65,10 @@ SEARCH_TIMEOUT = 300.0  # s for a learner in lockstep; a search takes 5 s of a c
 READY_TIMEOUT = 20.0  # s
 NO_CLOCK = "/clock: no message of a simulator"
 FIRST_Y = 20.0  # s for which a bridge waits for the first y of its autopilot
-BEFORE_END = 0.8  # share of the duration, so that a short flight ends with the bridge's reason, too
-FIRST_U = 5.0  # s, longest time from t = 0 to the first u that the aircraft takes
+# share of the duration to which a shorter flight limits FIRST_Y, so that the bridge ends first and
+# says why
+BEFORE_END = 0.8
+FIRST_U = 5.0  # s, longest time from t = 0 until the aircraft takes its first u
 LOG_TIMEOUT = 5.0  # s without a change of the log, after the duration
 POLL_PERIOD = 0.005  # s, time between two checks while nodes start
 
@@ -275,8 +277,8 @@ class FlightProcesses:
     def begin(self, start: tuple[float, float] | None = None) -> Outcome | None:
         """Set t = 0 after `match`. Returns an outcome if the flight cannot begin, else None.
 
-        `start` is the system time and the monotonic time of t = 0, s, for several flights at once.
-        By default t = 0 is LEAD from now.
+        `start` has the system time and the monotonic time of t = 0, s. It is given if several
+        flights share t = 0. By default t = 0 is LEAD from now.
         """
         leave_real_time_priority()  # the nodes have this priority
         outcome = self.match()

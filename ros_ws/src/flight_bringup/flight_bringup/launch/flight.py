@@ -33,11 +33,11 @@ SIM_TIME = "use_sim_time"
 class Flight:
     """One flight of a launch, with the arguments in its scope and its processes.
 
-    A launch file may include several flights, in groups that have ended by the time a node starts.
-    So the flight copies the launch configurations once, and uses the copy for all that it starts
-    later. The copy has its arguments, and the effects of PushRosNamespace, SetParameter and
-    SetRemap in the group. At its end a flight stops only its own processes. If the launch then has
-    nothing else to do, it ends too.
+    A launch file may include several flights, each in a group. When a node of the flight starts,
+    the scope of its group may have ended. So the flight copies the launch configurations of the
+    group once, and uses the copy for all that it starts later. The copy has the arguments of the
+    flight, and the effects of PushRosNamespace, SetParameter and SetRemap in the group. At its end
+    a flight stops only its own processes. If the launch then has nothing else to do, it ends too.
     """
 
     _of_launch: ClassVar[WeakKeyDictionary[LaunchContext, list["Flight"]]] = WeakKeyDictionary()
@@ -164,7 +164,10 @@ class _Restore(Action):
         self.configurations = configurations
 
     def execute(self, context: LaunchContext) -> None:
-        """Replace the configurations of the launch; the caller has pushed the previous ones."""
+        """Replace the configurations of the launch.
+
+        The actions of `Flight.in_scope` push the previous ones before, and pop them afterwards.
+        """
         context.launch_configurations.clear()
         context.launch_configurations.update(self.configurations)
 

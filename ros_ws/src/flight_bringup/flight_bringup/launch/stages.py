@@ -175,9 +175,9 @@ def sim_time_argument() -> DeclareLaunchArgument:
 def by_rise_di(flight: Flight, file: str, *, has_own_time: bool = False) -> list[Action]:
     """Run `rise-di fly` of a scenario or of a fleet, with the arguments of the launch.
 
-    The command flies in real time, because a launch file flies beside other nodes. A fleet that
-    `has_own_time` may fly otherwise. If the command ends with an error, because a flight was not
-    completed, the launch ends with exit status 1.
+    The command flies in real time, because a launch file flies beside other nodes. If
+    `has_own_time`, it flies in the time that the file of the fleet says. If the command ends with
+    an error, because a flight was not completed, the launch ends with exit status 1.
 
     Raises ParameterError if the scope gives parameters or names to its nodes, because they would
     not reach the nodes of the command.
@@ -291,9 +291,8 @@ def on_state(
 ) -> Action:
     """Run the actions of `then` once, when a node of this launch has reached a state.
 
-    A later state counts too. If the node has reached the state already, the actions run
-    immediately. A node may be matched before this function is called, if its inputs are nodes of
-    the user that started before it.
+    If the node has reached the state or a later one already, the actions run immediately. This
+    happens if nodes of the user publish the inputs of the node before it starts.
     """
     node = f"{flight.namespace}/{spec.executable}"
     states = [*NodeState]
@@ -400,7 +399,7 @@ class _Begin:
         self._flight = flight
         self._duration = duration
         self._waiting = dict.fromkeys(nodes)
-        self._flies = not flies  # another aircraft does not say that it has taken u
+        self._flies = not flies  # an aircraft of the user does not report that it has taken u
         self._start_ns = 0  # instant of t = 0; 0 before t = 0 is sent
         self._held_ns = -1  # stamp up to which the log holds y, y_m and u
         topic = f"{flight.namespace}/{START.name}"
@@ -453,9 +452,9 @@ def end_with_log(
 ) -> list[Action]:
     """End a flight once the log holds y, y_m and u up to the system time `end_time`, s.
 
-    The flight lasts `lead` plus `duration`, s. If the log gets no u, for example because a bridge
-    is not engaged, the flight ends after this time. If the log still grows then, the flight waits
-    for LOG_TIMEOUT more.
+    If the log lacks one of these topics, for example u while a bridge is not engaged, the flight
+    ends `lead` plus `duration` s from now. If the log is still growing then, the flight ends
+    LOG_TIMEOUT later.
     """
     last = [-math.inf]  # monotonic time of the log's last change, s
 
@@ -516,8 +515,8 @@ def _subscribe_states(flight: Flight) -> None:
             context.asyncio_loop.call_soon_threadsafe(reach, node, message.value)
 
     def reach(node: str, state: str) -> None:
-        # In the thread of the launch, so that a state that is not stored here yet comes as an
-        # event.
+        # This runs in the thread of the launch, as `on_state` does. So a state that `on_state` does
+        # not find in `flight.states` still comes as an event.
         flight.states[node] = state
         context.emit_event_sync(NodeStateEvent(node, state))
 
