@@ -46,7 +46,8 @@ DEFINITION = "campaign.json"
 CHUNKS = "chunks"
 OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # word in an error of JAX
 LOGGER = logging.getLogger(__name__)
-# number of aircraft at once that fit into memory, by definition, if a chunk did not fit
+# how many aircraft fit into memory at once, by the JSON of the definition, after a chunk did not
+# fit
 _FITTING: dict[str, int] = {}
 MARGIN_AIRCRAFT = 200  # number of first aircraft of a case whose loop is checked for stability
 
@@ -92,10 +93,10 @@ def define(
 ) -> Definition:
     """Define a campaign over a scenario.
 
-    If `wind` or `spread` is None, it comes from the scenario's `aircraft.uncertainty`. `units`
-    replaces units of the score by output, SI. If `chunk` is None, its size is one that is fast on
-    the device, or that for single flights. Raises ParameterError if a campaign cannot fly the
-    scenario.
+    If `wind` or `spread` is None, it comes from the scenario's `aircraft.uncertainty`. `units` has
+    units of the score by output, SI, which replace the usual ones. If `chunk` is None, the number
+    of aircraft in a chunk is chosen for the device, or for flights one by one. Raises
+    ParameterError if a campaign cannot fly the scenario.
     """
     if sweep is not None:
         sweep.scaled(scenario.controller, 1.0)

@@ -171,7 +171,7 @@ def _influence(campaign: MonteCarlo, case: int, tally: Tally) -> dict[str, Any]:
         ),
     )
     learn = getattr(scenario.controller, "learn", None)
-    # The learner begins with the airframe, and not with the corner.
+    # The learner knows the airframe of the scenario, not that of the corner, which flies.
     if learn is not None and (learn.prior is None or learn.prior.file is None):
         scenario = scenario.vary(
             controller={"learn": {"prior": {"file": scenario.aircraft.airframe}}}

@@ -28,8 +28,8 @@ workers."""
 AHEAD = 2  # number of queued chunks per worker, which keeps it busy without much memory
 
 Job = tuple[int, ...]
-"""Numbers by which `Work` knows what to compute, (case, chunk) in a campaign. An engine only hands
-them on."""
+"""Numbers that say what to compute, which are (case, chunk) in a campaign. An engine passes them to
+`Work` unread."""
 
 Work = Callable[[Job], Any]
 

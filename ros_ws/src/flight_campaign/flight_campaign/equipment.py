@@ -90,12 +90,12 @@ def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, floa
 def drawn(
     scenario: Scenario, spread: Spread, seed: int, first: int, count: int
 ) -> dict[str, FloatArray]:
-    """Draw lags, noise and delays of the aircraft of a seed, by entry, (count,) each.
+    """Draw lags, noise and delays of `count` aircraft, by entry, (count,) each.
 
-    The numbers of the aircraft are first, first + 1, ... A lag and a noise are multiplied by 1 + d,
-    in the same way as an entry of A. A delay is (1 + d) / 2 times the largest delay, in whole
-    periods. A value depends only on the seed and on the number of the aircraft. The entries of
-    `spread` are those of `expanded`.
+    The aircraft have the numbers first, first + 1, ... under `seed`. A lag and a noise are
+    multiplied by 1 + d, in the same way as an entry of A. A delay is (1 + d) / 2 times the largest
+    delay, in whole periods. A value depends only on the seed and on the number of the aircraft. The
+    entries of `spread` are those of `expanded`.
     """
     published_values = published(scenario)
     rate = scenario.controller.rate
@@ -115,7 +115,7 @@ def drawn(
 
 
 def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, float]:
-    """Return the values to which a deviation is relative.
+    """Return for each entry the value to which its drawn deviation is relative.
 
     These are the `published` values. For the delay it is half of the largest delay, so that the
     delay is drawn within +-100 %.
@@ -126,9 +126,9 @@ def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, fl
 def in_order(
     values: Mapping[str, Any], kind: str, names: tuple[str, ...], otherwise: tuple[float, ...]
 ) -> list[Any]:
-    """Return the values of a kind, lag or noise, in the order of the channels.
+    """Return the lags or the noise, as `kind` says, of the channels `names` in their order.
 
-    A channel without a value gets that of `otherwise`.
+    `otherwise` has the result for channels without an entry in `values`.
     """
     return [
         values.get(f"{kind}[{name}]", value) for name, value in zip(names, otherwise, strict=True)

@@ -16,8 +16,8 @@ if TYPE_CHECKING:  # it takes some tenths of a second to load
     import polars as pl
 
 KEYS = ("seed", "number", "factor", "diverged", "lost")
-"""Columns of every table. "factor" is that of the sweep, or 1 without one. The figures follow, then
-the drawn entries."""
+"""First columns of every table. "factor" is the factor of the sweep, or 1 without a sweep. The
+columns of the figures follow, and then those of the drawn entries."""
 
 
 class Chunk(NamedTuple):

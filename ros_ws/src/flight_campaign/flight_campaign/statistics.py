@@ -21,8 +21,8 @@ from flight_core.vectors import FloatArray
 
 PER_DECADE = 100
 DECADES = (-8, 6)
-"""Bins of the histograms. They are 2.3 % wide, from 1e-8 to 1e6 in SI, the range of all errors of a
-flight."""
+"""Decades of the histograms, from 1e-8 to 1e6 in SI, with PER_DECADE bins each. All errors of a
+flight lie between these limits, and a bin is 2.3 % wide."""
 
 EDGES = 10.0 ** (np.arange(DECADES[0] * PER_DECADE, DECADES[1] * PER_DECADE + 1) / PER_DECADE)
 
@@ -33,7 +33,7 @@ commands are larger."""
 SCORE_UNIT_OF = {"p": 0.020}  # rad/s, by channel, in place of the unit of its kind
 
 FIRST_MODEL = "first_model"
-"""A figure of aircraft with a learner; NaN without a model."""
+"""Name of a figure of aircraft with a learner, `LearningOutcome.first_model`."""
 
 LOSS_OF_TRACK_SCORE = 10.0  # a higher score counts as a loss of track; scores of 1 to 4 are usual
 QUANTILES = (0.5, 0.95, 0.99)
@@ -50,8 +50,8 @@ class FigureStatistics(Config):
     mean: float = 0.0
     squares: float = 0.0  # sum of (value - mean)^2
     largest: float = -1.0  # -1 as long as there is no value
-    # Counts by index in EDGES, without empty bins; index -1 is below all edges, len(EDGES) - 1
-    # above.
+    # Number of values in each bin that is not empty. The key is the index in EDGES of the lower
+    # edge of the bin. It is -1 for values below all edges, and len(EDGES) - 1 for values above.
     bins: dict[int, int] = Field(default={})
 
     @classmethod

@@ -111,10 +111,11 @@ def _rows(values: Sequence[Any]) -> Array:
 
 
 def _reduced(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
-    """Return the indices of the states in the remainder, and the aircraft reduced to them.
+    """Reduce an aircraft to what its remainder needs.
 
-    The remainder is the part of f_state that is not linear in the state. The rows of the reduced
-    aircraft are `remainder_rows`.
+    The remainder is the part of f_state that is not linear in the state. Returns the indices of the
+    states on which it depends, and the aircraft with only these states and with the rows
+    `remainder_rows`.
     """
     rows = remainder_rows(aircraft)
     coupling = aircraft.coupling
@@ -151,9 +152,10 @@ def fly(
     """Fly N aircraft through the course under one law, from trim at rest.
 
     Each tick has four parts. The first is the sensors. The second is a step of the law, its
-    engagement, or a missed sample, depending on the phase of the course. Then come the actuators
-    over the K steps to the next tick, and the aircraft. The nonlinear remainder s of the aircraft
-    at the middle of a tick is extrapolated from this tick and the previous one.
+    engagement, or a missed sample, depending on the phase of the course. The third moves the
+    actuators in K steps up to the next tick, and the fourth moves the aircraft. The nonlinear
+    remainder s is that of the middle between two ticks, extrapolated from its values at this tick
+    and at the previous one.
 
     `params` of the law have shape (m, 1) or (m, N). If all aircraft have the same parameters,
     `shared` converts those of one aircraft, (m,). `schedule` divides the ticks into compiled loops.
@@ -235,7 +237,7 @@ class FleetStepper:
         self._k += 1
 
     def restart(self, which: NDArray[np.bool_]) -> None:
-        """Put the aircraft `which`, (N,), into trim now, and start their figures again."""
+        """Put the aircraft `which`, a mask (N,), into trim now. Their figures begin anew."""
         self._state = jax.tree.map(partial(jnp.where, which), self._begin, self._state)
 
     def result(self) -> FleetResult:

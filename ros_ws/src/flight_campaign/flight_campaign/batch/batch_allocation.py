@@ -60,7 +60,7 @@ def allocate(v: Array, u_before: Array, dt: Array, params: Allocation) -> tuple[
 
 
 def _where_not(final: Array, value: Array, otherwise: Callable[[], Array]) -> Array:
-    """Return the values that are final, and those of `otherwise` for all other aircraft."""
+    """Return `value` where the mask `final` is true, and the result of `otherwise` elsewhere."""
     return jax.lax.cond(jnp.all(final), lambda: value, lambda: jnp.where(final, value, otherwise()))
 
 
@@ -72,7 +72,7 @@ def _by_priority(start: Array, v: Array, limits: _Range, params: Allocation) -> 
 
 
 def _towards(u: Array, move: Array, limits: _Range, params: Allocation) -> Array:
-    """Return u after a move as far as the limits allow; it begins at a u within the limits."""
+    """Move u, which is within the limits, by `move` or as far as the limits allow."""
     destination = _exchanged(u + move, limits, params)
     arrives = limits.has(destination)
 
@@ -106,7 +106,10 @@ def _towards(u: Array, move: Array, limits: _Range, params: Allocation) -> Array
 
 
 def _exchanged(u: Array, limits: _Range, params: Allocation) -> Array:
-    """Return a u with the same effect that is within its limits, if the sweeps find such a u."""
+    """Exchange effectors for others so that u is within its limits and has the same effect.
+
+    If the sweeps do not find such a u, the result is not within its limits.
+    """
     exchange = params.exchange
 
     def sweep(now: tuple[int, Array]) -> tuple[int, Array]:

@@ -42,22 +42,21 @@ from rise_di_controller.law.saturation import Limits, saturate
 class Vehicle:
     """The properties that all aircraft of a fleet share."""
 
-    # These are constants of the compiled loop, so that a device need not look up the places of
-    # rows.
+    # These are constants of the compiled loop, so that the device does not read indices in flight.
     outputs: tuple[int, ...]  # (m,) indices of the outputs in the state, in the law's order
     inputs: tuple[int, ...]  # (p,) indices of the effectors in the airframe's order
     remainder_states: tuple[int, ...]  # (c,) indices of the states in the nonlinear remainder
     vanes: tuple[int, ...]  # indices of the states that the vanes measure
-    # The aircraft reduced to the remainder: its f_state of x[remainder_states] gives the rows
-    # `remainder_rows`.
+    # the aircraft with only the states and rows that the remainder needs: its f_state takes
+    # x[remainder_states] and gives the rows `remainder_rows`
     remainder: Aircraft
     actuators: Actuators  # (p, 1), in the airframe's order
     limits: Limits  # (m, 1), in the law's order: limits of u in the controller
     quantum: Array | None  # (m, 1), in the law's order: steps of the quantisation of y
     dt: float  # s, a step of the integration
     allocation: Allocation | None  # None if the inputs of the law are the effectors
-    # (m, N), in the law's order: noise of each aircraft divided by that of the course, minus 1;
-    # None means 0
+    # (m, N), in the law's order: by which fraction the noise of an aircraft exceeds that of the
+    # course; None if no aircraft has other noise
     noisier: Array | None = None
 
 
@@ -75,7 +74,10 @@ class FleetResult(NamedTuple):
 
 
 def rows_of(array: Array, places: Sequence[int] | NDArray[np.int64]) -> Array:
-    """Return the rows at constant places as slices, which a GPU compiler can fuse."""
+    """Return the rows at constant places.
+
+    Each row is taken as a slice, because a GPU compiler can fuse slices with other operations.
+    """
     if not len(places):
         return array[:0]
     return jnp.stack([jax.lax.index_in_dim(array, int(k), keepdims=False) for k in places])
@@ -124,7 +126,11 @@ class LoopState(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """Inputs that stay the same in all ticks; as arguments they are not folded by the compiler."""
+    """Inputs that stay the same in all ticks.
+
+    They are arguments of the compiled loop, because the compiler would compute with constants in
+    advance.
+    """
 
     fleet: FleetMatrices  # matrices of the fleet without its blocks
     vehicle: Vehicle
@@ -179,7 +185,10 @@ def fly_run(
 def _chosen(
     constant: int | None, value: Array, branches: Sequence[Callable[..., Any]], *arguments: Any
 ) -> Any:
-    """Run the branch `constant`, or if it is None the branch with the number `value`."""
+    """Run the branch with the number `constant`, or with the number `value` if that is None.
+
+    `constant` is known when the loop is compiled, so it needs no branch on the device.
+    """
     if constant is None:
         return jax.lax.switch(value, branches, *arguments)
     return branches[constant](*arguments)
@@ -215,7 +224,8 @@ def tick(
         if allocation is None:
             law, _, u = control_law.limited(now.law, measurements, segment.dt, params, limits)
             return law, u, u
-        # As in the guard, the limits of the law account for the u that the effectors give.
+        # As in the guard, the law gets limits that say which u the effectors can give, for its
+        # anti-windup.
         _, u_free = control_law.step(now.law, measurements, segment.dt, params)
         _, reachable = allocate(
             saturate(u_free, now.u, segment.dt, limits), now.command, segment.dt, allocation
@@ -305,7 +315,7 @@ def advance(
     """Advance to the next tick with the command of the present tick."""
     blocks = timing.blocks
     u_late = timing.u_late
-    # Find the places of the states in the order of the blocks.
+    # Index of each state among the rows of all blocks, one block after the other.
     places = np.argsort([*chain.from_iterable(block.rows for block in blocks)])
     history = jnp.concatenate([command[None], now.command_before])
     if not u_late:

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Schedule the compiled loop over the ticks of a course, with branches or in known runs.
+"""Divide the ticks of a course into compiled loops, with or without branches.
 
-A GPU waits for the host at each branch. Phase and forcing are known before the flight, so each run
-of ticks can have a loop without a branch. A CPU is faster with a single loop.
+A GPU waits for the host at each branch. The phase and the forcing of each tick are known before the
+flight. So the ticks can be divided into runs, each with a loop that needs no branch. A CPU is
+faster with a single loop that has branches.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,11 +16,12 @@ import numpy as np
 from flight_campaign.batch.campaign_course import ENGAGE, Course
 
 RUN = 120
-"""Ticks of a run. A run is forced if one of its ticks is."""
+"""Largest number of ticks of a run. If forcing acts at one of its ticks, the whole run counts as
+forced."""
 
 UNROLL = 4
-"""Ticks in a step of the loop. On one H200, 250,000 flights of 60 s took 3.3 s with 1, and 1.8 s
-with 4 or 8. These compile for 3, 7 and 14 s."""
+"""Ticks in a step of the loop. On one H200, 250,000 flights of 60 s took 3.3 s with 1 tick, and 1.8
+s with 4 or 8. The compilation took 3 s with 1 tick, 7 s with 4, and 14 s with 8."""
 
 LONGEST = 20  # number of ticks of the longest pattern; a pattern is compiled tick by tick
 
@@ -58,7 +60,9 @@ def with_branches(course: Course) -> Iterator[TickRun]:
 
 
 def without_branches(course: Course) -> Iterator[TickRun]:
-    """Split a course into runs of at most RUN ticks, so that few loops are compiled and reused.
+    """Split a course into runs of at most RUN ticks.
+
+    Most runs have the same length and the same kinds of ticks, so they share a compiled loop.
 
     If the phases of a run have no short pattern, for example because of dropouts, its loop branches
     by the phase at every tick.

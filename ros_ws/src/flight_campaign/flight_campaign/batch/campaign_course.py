@@ -47,8 +47,8 @@ class Segments(NamedTuple):
     u_ff: FloatArray  # (T, m) feedforward
     error: FloatArray  # (T, m) error of the sensors in the tick's y
     noise: FloatArray  # (T, m) noise, which is a part of this error
-    # (T, K r) mean forcing over each step until the next tick: wind along `axes`, then basis' @ the
-    # other forcing
+    # (T, K r) mean forcing over each of the K steps until the next tick: first the g winds along
+    # `axes`, then the other forcing along the directions `basis`
     forcing: FloatArray
     forcing_now: FloatArray  # (T, r) forcing at the tick
     air: FloatArray  # (T, n) contribution of the wind to alpha and beta, rad
@@ -98,7 +98,8 @@ IDLE = frozenset(
     {
         # Every aircraft of a campaign has a separate draw.
         *(f"uncertainty.{key}" for key in ("A", "B", "seed", "number")),
-        # No law, command or figure depends on the place, because guided aircraft fly one by one.
+        # The place has no effect on a law, a command or a figure. Guided aircraft, for which it
+        # matters, fly one by one.
         *(f"start.{key}" for key in ("north", "east", "heading")),
         "wind",
         *(f"pose.{key}" for key in ("rate", "delay", "bias", "drift", "noise", "seed")),
@@ -370,7 +371,11 @@ class _Forcing(NamedTuple):
 def _reduced(
     wind: _Forcing, forcing_over_time: _Forcing
 ) -> tuple[NDArray[np.int64], FloatArray, tuple[FloatArray, FloatArray]]:
-    """Return `axes` and `basis` of a course, and the forcing along them over steps and at ticks."""
+    """Leave out the axes and directions along which there is never any forcing.
+
+    Returns `axes` and `basis` of a course, and the forcing along them: means over the steps, and
+    values at the ticks.
+    """
     axes = np.flatnonzero(wind.over_step.any(axis=0))
     _, sizes, rows = np.linalg.svd(forcing_over_time.over_step, full_matrices=False)
     basis = rows[sizes > 1e-12 * max(sizes[0], 1e-300)].T
@@ -382,7 +387,11 @@ def _reduced(
 
 
 def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _Forcing]:
-    """Return the wind along the G axes, m/s, and f_time without wind, n rows of x_dot."""
+    """Compute the forcing of the whole flight in two parts.
+
+    The first is the wind along the G axes, m/s. The second is f_time without the wind, with n
+    values in units of x_dot.
+    """
     no_effect = np.zeros_like(plant.aircraft.gust_direction)
     forced = plant_model.forcing(
         0, ticks * steps, plant._replace(aircraft=plant.aircraft._replace(gust_direction=no_effect))

@@ -60,7 +60,10 @@ def thread_count() -> int:
 
 
 def turn() -> AbstractContextManager[object]:
-    """Return a context in which one chunk flies while others are drawn or written."""
+    """Return a context that only one thread enters at a time, to fly a chunk.
+
+    Meanwhile other threads draw or write their chunks.
+    """
     return nullcontext() if is_cpu() else _TURN
 
 
@@ -75,7 +78,7 @@ def chunk_of_device(aircraft: int) -> int:
 
 
 def separate_devices() -> list[dict[str, str]]:
-    """Return environments that each show a process one device of this host; [] for a CPU."""
+    """Return environments for processes, so that each process sees another device; [] for a CPU."""
     devices = jax.local_devices()
     platform = devices[0].client.platform_version
     variable = next((VISIBLE[word] for word in VISIBLE if word in platform), None)

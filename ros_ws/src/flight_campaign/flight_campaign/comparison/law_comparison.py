@@ -37,7 +37,7 @@ TURBULENCE_SEED = 3  # seed of a comparison's turbulence, which differs from tha
 
 
 class Scores(NamedTuple):
-    """Scores of the uncertain aircraft of a level of uncertainty in a wind."""
+    """Scores in a wind of the uncertain aircraft that share a level of uncertainty."""
 
     mean: float  # infinite if an aircraft diverged
     worst: float
@@ -47,7 +47,7 @@ class Scores(NamedTuple):
 
 
 class Level(NamedTuple):
-    """Results of a law on the uncertain aircraft of a level, without an additional delay of u."""
+    """Results of a law on the aircraft of a level of uncertainty, without additional delay of u."""
 
     uncertainty: float
     scores: dict[str, Scores]  # scores by wind

@@ -40,9 +40,9 @@ def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:
 
 
 def registered_law(controller: ControllerConfig, name: str) -> Law:
-    """Return the law of a controller as a start for a search, which begins at its gains.
+    """Return the law of a controller, for a search that begins at the controller's gains.
 
-    The search leaves the other parameters of the controller as they are.
+    The search does not change the other parameters of the controller.
     """
     start = own_gains(controller)
     scalars = {key for key in start if not isinstance(getattr(controller, key), tuple)}

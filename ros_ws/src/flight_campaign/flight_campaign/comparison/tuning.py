@@ -40,13 +40,17 @@ from rise_di_controller.law.linear_loop import LinearPlant, LoopTiming, linear_l
 
 GUST = "gust"
 TURBULENCE = "turbulence"
-"""The winds of a benchmark: that of its scenario, and turbulence instead of it."""
+"""Names of the two winds of a benchmark: GUST is the wind of its scenario, and TURBULENCE replaces
+it."""
 
 TUNING_TURBULENCE_SEED = 40  # seed of the turbulence in a cost; a comparison has a different seed
 
 
 class Objective(NamedTuple):
-    """The flights of a cost: every aircraft without delay of u, and some with a delay."""
+    """The flights from which a cost is computed.
+
+    Every aircraft flies without delay of u, and some fly with a delay as well.
+    """
 
     title: str
     weights: dict[str, float]  # weight of each wind
@@ -75,22 +79,18 @@ OBJECTIVES = {
     ),
 }
 
-UNCERTAIN_AIRCRAFT = 12
-UNCERTAINTY = 0.4
-UNCERTAINTY_SEED = 40
-"""Number, +-fraction and seed of the uncertain aircraft. By default, campaigns and comparisons have
-other seeds."""
+UNCERTAIN_AIRCRAFT = 12  # number of uncertain aircraft in a cost
+UNCERTAINTY = 0.4  # largest relative deviation of an entry of these aircraft
+UNCERTAINTY_SEED = 40  # seed of these aircraft; by default, campaigns and comparisons have others
 
 DELAY_TICKS = 2
 """Delay of u in the late flights of a cost: 20 ms at 100 Hz. Without actuators it is one tick,
 because the lag of the loop is 15 ms."""
 
 POPULATION = 16
-GENERATIONS = 88
-GENERATIONS_PER_GAIN = 6
-INITIAL_SIGMA = 0.4
-"""A search has GENERATIONS, or GENERATIONS_PER_GAIN times its gains if that is more: from 15 gains
-on. INITIAL_SIGMA is the first standard deviation of log(gain)."""
+GENERATIONS = 88  # number of generations of a search for at most 14 gains
+GENERATIONS_PER_GAIN = 6  # number of generations for each gain, if there are more gains
+INITIAL_SIGMA = 0.4  # standard deviation of log(gain) at the start of a search
 
 # Number of parts into which the candidates of a generation are divided. The parts fly side by side.
 # In a smaller part, a flight takes more processor time.
@@ -292,9 +292,9 @@ def repeat_flights(flights: FleetMatrices, times: int) -> FleetMatrices:
 def spread_over(params: Any, single: Any, flights: int) -> Any:
     """Spread the parameters of several candidates over all of their flights.
 
-    On the last axis, each candidate is repeated `flights` times, side by side. `single` are the
-    parameters of one candidate. A parameter that has the same shape in `params` and `single` is
-    common to all candidates, and stays.
+    On the last axis, the parameters of each candidate are repeated `flights` times before those of
+    the next candidate follow. `single` has the parameters of one candidate. If a parameter has the
+    same shape in `params` and `single`, all candidates share it, and it is not repeated.
     """
 
     def spread(leaf: FloatArray, single_leaf: FloatArray) -> FloatArray:
