@@ -35,8 +35,8 @@ OUTCOME_FILE = "outcome"  # file in the folder of a run from which the recorder 
 # Name of the metadata record of a log that the stack did not fly. Its keys are "log", "kind", "map"
 # and COMPARED.
 IMPORTED = "rise_di_imported"
-# Key in IMPORTED of a sentence on what the vehicle's parameters do not tell. The sentence is empty
-# if all of them agree with the map.
+# Key in IMPORTED of the notes on how the parameters in the autopilot's log differ from the map, or
+# that they could not be compared. The text is empty if there are no notes.
 COMPARED = "parameters"
 # Name of the metadata record with the SI units of channels, for a log without a scenario.
 CHANNEL_UNITS = "rise_di_units"
@@ -149,7 +149,7 @@ class _ChunkIndexes:
 
 
 def full_names(remaps: Mapping[str, str]) -> dict[str, str]:
-    """Return the full names in the stack, by topic of a log.
+    """Invert remaps: return the full name in the stack for each topic of a log.
 
     `remaps` has the topic of the log for each name in the stack.
     """
@@ -159,7 +159,8 @@ def full_names(remaps: Mapping[str, str]) -> dict[str, str]:
 def stack_topic(channel: Channel, remaps: Mapping[str, str] = {}) -> str:
     """Return the full name that a topic of a log has in the stack.
 
-    `remaps` has names by topic of the log. They replace the names that the log contains.
+    `remaps` has such names by topic of the log. They take precedence over the name before a remap
+    that the log states.
     """
     return remaps.get(channel.topic) or channel.metadata.get(BEFORE_REMAP) or channel.topic
 

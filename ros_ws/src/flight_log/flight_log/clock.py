@@ -18,14 +18,14 @@ from flight_core.tape import LostPart, Recording, Signal
 STEP_NS = NANOSECONDS // 10  # ns, least backward step of a clock; no sample is late by this much
 # ns, least forward step of a clock, relative to the time of the recording
 LEAP_NS = NANOSECONDS // 4
-# ns. If fewer than CONFIRMED messages are older than the previous message by more than this, their
-# stamps are damaged.
+# ns. If the stamps go back by more than this for fewer than CONFIRMED messages, these stamps are
+# damaged.
 STRAY_NS = NANOSECONDS
 LATE_NS = 4 * NANOSECONDS  # ns, largest delay of a recorder's first sample on a busy host
 # Number of successive messages that confirm a step. Fewer messages come from another publisher, or
 # have a damaged stamp.
 CONFIRMED = 10
-CONFIRMED_AT_END = 3  # the same number at the end of a topic
+CONFIRMED_AT_END = 3  # number of messages that confirm a step at the end of a topic
 SINCE_EPOCH_NS = 10**15  # larger stamps count from 1970, not from the start of the flight
 
 
@@ -57,11 +57,12 @@ class StampClock:
     ) -> tuple[NDArray[np.bool_], int]:
         """Return a mask of the usable messages among the first K messages, shape (K,), and K.
 
-        K is less than the number of messages if `more` messages follow immediately and the last
-        messages neither confirm nor exclude a step. `end` is true for the last messages of the
-        topic. `steps` has the increase of the publisher's message number at each message. If this
-        number falls together with both times, this span of the log is out of order. If messages are
-        lost at a forward jump, the jump is a gap.
+        Give the messages after the first K to the next call again. There are such messages if
+        `more` messages follow immediately, and the last ones so far neither confirm nor exclude a
+        step of the clock. `end` is true for the last messages of the topic. `steps` has the
+        increase of the publisher's message number from message to message. If this number and both
+        times go back together, the log is out of order there, and the clock made no step. If a
+        forward jump of the stamps skips numbers, messages were lost, and the jump is a gap.
         """
         latest = np.maximum.accumulate(np.append(self._last_ns or 0, stamp_ns))[:-1]
         if self._step_ns:
@@ -80,7 +81,7 @@ class StampClock:
         # If nothing is received meanwhile, the publisher or the host has paused, not the clock.
         with_reception = (jumps > LEAP_NS) & (leads <= LEAP_NS) & has_time
         self._pauses_ns.update((stamps - jumps)[with_reception].tolist())
-        # These are the indices at which the messages of a new clock may begin.
+        # At these indices the clock may have made a step.
         starts = np.flatnonzero(back | forth)
         edges = [0, *starts[starts > 0].tolist(), len(stamps)]
         for first, after in pairwise(edges if len(stamps) else []):
@@ -109,7 +110,7 @@ class StampClock:
                 after_step = int(places[first])
                 keep[after_step:] = self._after_step(stamp_ns[after_step:])
                 return self._taken(stamp_ns, keep, len(stamp_ns), after_step)
-            # The previous messages are too few to be the beginning of the clock.
+            # The first clock is confirmed here. Earlier messages only stay if they fit it.
             if self._last_ns is None:
                 keep[places[:first]] &= _begins(stamps[: first + 1], offsets[: first + 1])
             self._follow(stamps[first:after], offsets[first:after])
@@ -154,8 +155,8 @@ class StampClock:
     def _after_step(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return a mask of the samples that stay after a step of the clock.
 
-        After a forward step, the samples later than the step stay. After a backward step, no sample
-        stays.
+        After a forward step, only samples with a stamp before the step are left out. After a
+        backward step, all samples are left out.
         """
         return (stamp_ns > self._step_at_ns) & (self._step_ns > 0)
 
@@ -187,7 +188,7 @@ class StampClock:
 
 
 def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which of the first N - 1 of N samples may have the clock of the last sample."""
+    """Return which of the samples before the last one may have the clock of the last one."""
     away_ns = stamp_ns[-1] - stamp_ns[:-1]
     lead_ns = offset_ns[-1] - offset_ns[:-1]
     is_near = (away_ns <= STRAY_NS) | (lead_ns <= LATE_NS)

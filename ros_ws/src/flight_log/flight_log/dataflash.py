@@ -16,7 +16,8 @@ from flight_log.vehicle_tables import Loss
 
 HEAD = b"\xa3\x95"
 FORMAT = 0x80  # identity of a packet that declares a format
-# A log counts as whole if fewer bytes than this at its end hold no packet (pymavlink, DFReader.py).
+# A log counts as whole if it ends with fewer bytes than this that hold no packet (pymavlink,
+# DFReader.py).
 TAIL = 528
 
 

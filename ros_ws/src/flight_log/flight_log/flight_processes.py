@@ -67,10 +67,10 @@ def flight_processes(
     """Return the processes by name, such as "/controller#4711", from the `spans` of publishers.
 
     A node that was restarted has several processes. `ready` has the times at which nodes were
-    ready. A process became ready at the last of the times of its node before the first sample of
-    the process. A node without samples, such as the recorder, has no process id in its name. In
-    lockstep no node has a process id. If there are nodes of the stack, every other publisher counts
-    as a process too, even `ros2 topic pub`, which has no name.
+    ready. Of the times of its node, a process has the last one that is not more than 1 s later than
+    its first sample. A node without samples, such as the recorder, has no process id in its name.
+    In lockstep no node has a process id. If there are nodes of the stack, every other publisher
+    counts as a process too, even `ros2 topic pub`, which has no name.
     """
     waiting: dict[str, list[int]] = {}
     for node, time_ns in ready:
@@ -109,9 +109,10 @@ def flight_processes(
     }
 
 
-# silence of a publisher, after which another publisher is admitted, as `aircraft.max_age`
+# If a publisher is silent for this time, the nodes admit another one. The time is that of
+# `aircraft.max_age`.
 SILENT_NS = NANOSECONDS // 5
-SILENT_PERIODS = 3  # the same silence for a slow publisher, in periods of its samples
+SILENT_PERIODS = 3  # least silence of a slow publisher that counts, in periods of its samples
 
 
 def admitted(signal: Signal) -> Signal:

@@ -123,7 +123,10 @@ def _deviation(values: np.ndarray) -> float:
 
 
 def _agree(first: MessageTable, second: MessageTable, fields: Set[str]) -> bool:
-    """Return whether two sensors' fields differ by less than UNLIKE times their deviations."""
+    """Return whether two sensors agree in each field.
+
+    The rms difference of a field may be UNLIKE times the standard deviation of the first sensor.
+    """
     for field in fields & first.fields.keys() & second.fields.keys():
         values = first.fields[field]
         difference = values - second.at(field, first.stamp_ns)

@@ -59,7 +59,8 @@ from flight_log.scan import MessageBatch
 ROUTE = "route"
 
 
-# Number of messages that are decoded together. With 1024, each table would need fresh memory.
+# Number of messages that are decoded together. With 1024, the memory of a table would not be reused
+# for the next one.
 BATCH = 512
 
 
@@ -103,7 +104,8 @@ class _Publisher:
         # number of samples with each set of channels
         self.kept: Counter[tuple[str, ...]] = Counter()
         self.messages = 0
-        # least and largest lead of a stamp over its reception; None if no reception has a time
+        # least and largest time by which a stamp is later than the reception of its message; None
+        # if the log has no times of reception
         self.leads_ns: tuple[int, int] | None = None
         self._number: int | None = None  # number of the last message by the publisher
         self._numbered = self._restarted = False
@@ -122,7 +124,7 @@ class _Publisher:
         self.batched += len(table)
 
     def lead(self, table: Table, log_ns: NDArray[np.int64]) -> None:
-        """Note by how much the stamps of messages are ahead of their reception."""
+        """Note by how much the stamps of messages are later than their reception."""
         leads_ns = stamps_of(table)[log_ns != 0] - log_ns[log_ns != 0]
         if len(leads_ns):
             least, largest = self.leads_ns or (2**62, -(2**62))
@@ -554,7 +556,7 @@ def _read_file(file: Path, log: LogContent) -> None:
         raise ParameterError(
             f"{file}: cannot be read ({error.strerror}), expected {A_RUN}"
         ) from None
-    # Note the information of this file about the whole log.
+    # Add to the notes on the whole log what this file shows.
     if first_ns < before_ns - NANOSECONDS and file.parent.name != ROSBAG2:
         log.notes.append(
             f"{file.name} begins before the end of the part before: the parts are out of order, "

@@ -30,17 +30,21 @@ SETTING = (PARAMETER, 0)
 def tables_of(
     samples: Iterable[Sample], fields: Mapping[str, set[str]]
 ) -> tuple[Instances, Parameters, str]:
-    """Return the tables of the messages, the parameters, and a sentence on what was left out.
+    """Return the tables of the messages, the parameters, and a note if parts were left out.
 
-    If the first message of a table lacks a field, the table lacks this field, too. If the clock
-    goes back by more than STEP_NS, as when an autopilot starts again, a new part begins, and only
-    the longest part counts. If fewer than AGREEING samples in a row agree with a stamp, the stamp
-    is damaged, and its sample is left out. A parameter belongs to the part of the next sample,
-    because an autopilot writes its parameters first when it starts.
+    If the clock goes back by more than STEP_NS, as when an autopilot starts again, a new part
+    begins. Only the longest part is returned, and the third result says so; else it is "". A
+    parameter belongs to the part of the next sample, because an autopilot writes its parameters
+    first when it starts.
+
+    Damaged samples are left out without a note. A stamp is damaged if fewer than AGREEING samples
+    in a row agree with it. A table with fewer than AGREEING samples is damaged if another instance
+    of its message has more. If the first message of a table lacks a field, the table lacks this
+    field, too.
     """
     parts = [list[Sample]()]
     newest_ns = 0
-    # last samples, which agree with each other but not with the current part
+    # the last samples, if they agree with each other but not with the current part
     strays: list[Sample] = []
     settings = [list[Sample]()]  # the parameters of each part
     next_settings: list[Sample] = []

@@ -89,8 +89,9 @@ JOINED_BYTES = 1 << 20
 AHEAD = 2  # number of groups of chunks that are decoded ahead
 
 MAX_CHUNK_BYTES = 64 << 20
-"""Limit for a chunk that is larger than its compressed bytes. A damaged chunk of 1 kB may claim any
-size, and hold 20 MB.
+"""Largest size of the records in a compressed chunk, bytes.
+
+Without a limit, a damaged chunk of 1 kB could claim any size, or decompress to 20 MB.
 
 Recorders close a chunk at about 1 MB, or after the message that exceeds it.
 """
@@ -240,7 +241,8 @@ class Scan:
             if isinstance(record, Statistics | ChunkIndex)
         ]
         self.known_end_ns = max(ends, default=0)
-        most = size // INDEX_ENTRY.itemsize  # the message indexes alone would take this many bytes
+        # a larger count is damaged, because its message indexes would not fit into the file
+        most = size // INDEX_ENTRY.itemsize
         self.message_counts = {
             channel: min(count, most)
             for record in index

@@ -223,8 +223,8 @@ def _tape(
     }
     recording = {name: clock for name, clock in recordings.items() if clock.found}
     leaps: list[Leap] = []
-    # The import numbers the samples that it found, so a gap is one of the log, and not a step of
-    # its clock.
+    # An imported log has no leaps, because its message numbers are those of the import. A lost
+    # message leaves no gap in them, so a gap in its stamps would look like a step of the clock.
     if IMPORTED not in log.metadata:
         signals, recording, leaps = without_leaps(signals, recording)
     start_ns = _start_ns(signals)

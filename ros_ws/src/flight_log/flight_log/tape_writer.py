@@ -23,8 +23,8 @@ from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parame
 EXPECTED = "a folder and a disk that can"
 
 DELAY_NS = NANOSECONDS
-"""Longest delay of a sample with which messages of successive parts of a flight stay in the order
-of their stamps."""
+"""Longest time by which a sample may come late, ns. Samples of the last DELAY_NS are written with
+the next part, so that the messages of the log stay in the order of their stamps."""
 
 
 def write_run(tape: Tape, directory: Path, attachments: LogAttachments) -> Path:

@@ -24,7 +24,8 @@ LEAST = MappingProxyType(
 LARGEST = 10_000  # bytes of the largest message (pyulog, core.py)
 # place of the offsets of appended parts in the message FLAGS
 APPENDED = slice(HEAD + MESSAGE.size + 16, HEAD + MESSAGE.size + 40)
-# bytes; with fewer bytes after its last message, a log counts as whole and cut inside a message
+# bytes; if fewer than this follow the last message, they count as a cut message, and the log as
+# whole
 TAIL = 528
 
 

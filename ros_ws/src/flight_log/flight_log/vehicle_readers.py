@@ -57,8 +57,8 @@ from flight_log.vehicle_tables import (
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1, common.xml
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID of a ground station and of other components
 ULOG_HEAD = 16  # bytes of magic, version and time at the beginning of a ULog
-# reads of a search that goes on byte by byte through damaged data: for each byte it reads a head
-# and a possible message, twice
+# Reads that pyulog may make for each byte of a log. It searches damaged data byte by byte. For each
+# byte it reads, twice, the head of a message and the message that may follow.
 READS_PER_BYTE = 4
 FIRMWARE = re.compile(r"(?:Ardu|APM:)(Plane|Copter|Rover|Sub)")  # in a MSG of ArduPilot
 FIRMWARES = MappingProxyType(

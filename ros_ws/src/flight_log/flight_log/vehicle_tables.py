@@ -123,11 +123,11 @@ COPTER = "multicopter"
 
 
 class Choice(NamedTuple):
-    """The user's choice of a system and of sensors in a log, and the kind of vehicle in the map."""
+    """What the user has chosen in a log: a system, sensors, and by the map the kind of vehicle."""
 
     system: int | None = None  # number of the system in a tlog; None for the system that flew
-    # Number of the sensor by message. For a message without an entry, the sensor or the part that
-    # flew counts.
+    # Number of the chosen instance, such as a sensor, by message. For any other message, the
+    # instance by which the autopilot flew is found.
     instances: Mapping[str, int] = MappingProxyType({})
     vehicle: str = PLANE
 
