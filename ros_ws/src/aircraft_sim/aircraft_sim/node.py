@@ -27,8 +27,8 @@ from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, POSE, RECORDED, TRUTH, NodeState, U, Y
 
 WINDOW = 100
-"""Largest lead of a lockstep flight over its log, in samples. It is less than publishers keep for a
-recorder that overruns."""
+"""Largest lead of a lockstep flight over its log, in samples. Publishers keep more samples than
+this for a recorder that overruns, so none is lost."""
 
 
 class AircraftNode(FlightNode[AircraftConfig]):
@@ -49,7 +49,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._applied = AppliedInput(len(self._u), held_ns, nanoseconds(self.parameters.ramp))
         self._publisher_lock = self.publisher_lock(self._timeouts_ns)
         self._timeout_logged = False
-        # ns since the last diagnostics, by the node's clock: the stamp of a u is that of its y
+        # ages of the u since the last diagnostics, ns: time from the stamp of a u, which is that of
+        # its y, to its arrival by this node's clock
         self._ages_of_u: list[int] = []
         decode = Decoder(self._simulator.inputs).decode
         self._u_receiver = self.receive(
@@ -102,7 +103,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
             self._publish_pose(self._pose_encoder.encode(start_ns + pose.stamp_ns, pose.value))
         awaited = self.parameters.lockstep and number % every(self.parameters.rate) == 0
         if awaited and not (poses and start_ns + poses[-1].stamp_ns == stamp_ns):
-            # No later pose belongs to this instant.
+            # An empty message says that no pose with the stamp of this instant will come.
             self._publish_pose(self._empty_encoder.encode(stamp_ns, NO_CHANNELS))
         self._publish_truth(self._truth_encoder.encode(stamp_ns, self._simulator.truth()))
 
@@ -189,7 +190,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
             self._ages_of_u.append(now_ns - sample.stamp_ns)
 
     def _max_u_age_ns(self) -> int:
-        """Return the age limit of u, ns; the age counts from the stamp of the y that led to it.
+        """Return the age limit of u, ns. The age counts from the stamp of the y that led to this u.
 
         The limit is needed because the middleware of a controller that was stopped sends the last u
         when the process continues.
@@ -201,9 +202,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return nanoseconds(self.parameters.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Return the times after which the publisher of u has timed out, ns.
+        """Return the silence of the publisher of u after which another may take over, ns.
 
-        Another node can take over after u has reached trim.
+        The first value is for the same node in a new process. The second, for another node, ends
+        when the failsafe has brought u to trim.
         """
         return self._max_age_ns, self._max_age_ns + nanoseconds(
             self.parameters.hold + self.parameters.ramp

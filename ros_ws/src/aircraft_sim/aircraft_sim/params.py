@@ -70,7 +70,7 @@ from flight_core.parameters import (
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray
 
-SHORTEST_STEP = 1e-5  # s; then a second of flight takes about 5 s
+SHORTEST_STEP = 1e-5  # s; with this step, simulating a second of flight takes about 5 s
 
 
 class AircraftChannels(NamedTuple):

@@ -23,7 +23,7 @@ instant, with the least k for which the rate is not higher."""
 
 
 def every(rate: float) -> int:
-    """Return the number of the aircraft's samples from pose to pose, given its rate in Hz."""
+    """Return k, if every k-th sample of an aircraft with the rate `rate`, Hz, has a pose."""
     return max(1, math.ceil(rate / RATE))
 
 

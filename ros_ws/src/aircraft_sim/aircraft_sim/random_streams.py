@@ -13,7 +13,7 @@ from flight_core.vectors import FloatArray
 
 NOISE, LOSS, DRIFT, TURBULENCE, TURBULENCE_START, AIRFRAME, VANE_LOSS, EQUIPMENT = range(8)
 ROTARY, ROTARY_START = range(8, 10)
-"""Streams, one for each use. Under the same seed they are independent of each other."""
+"""Numbers of the streams, one for each use. Under one seed, different streams are independent."""
 
 
 # The type is a string, so that np.random is loaded only if it is used.

@@ -188,7 +188,10 @@ class Simulator:
         return arrived
 
     def _advance(self, number: int, u: FloatArray) -> None:
-        """Advance the model to a sample, period by period if u has a delay."""
+        """Advance the model to a sample.
+
+        If u has a delay, another u can act in each period, so the model advances period by period.
+        """
         step = 1 if self._commands else max(number - self._number, 1)
         for k in range(self._number, number, step):
             self._commands.append(u)

@@ -24,9 +24,10 @@ POSE_STATES = ("V", "alpha", "beta", "phi", "theta", "q", "r")
 class StateSpaceModel:
     """Equation (1) with the matrices of an airframe, behind actuators.
 
-    The forcing is computed for BLOCK steps at once, which takes a tenth of the time. Heading,
-    position and altitude are no states of an airframe. They begin at 0, and each call of `advance`
-    integrates them by the trapezoidal rule. States that the airframe lacks are 0, as in trim.
+    The forcing is computed for BLOCK steps at once, in a tenth of the time that single steps take.
+    Heading, position and altitude are no states of an airframe. They begin at 0, and each call of
+    `advance` integrates them by the trapezoidal rule. States that the airframe lacks are 0, as in
+    trim.
     """
 
     def __init__(self, parameters: AircraftConfig) -> None:
@@ -160,8 +161,8 @@ class StateSpaceModel:
     def air_angles(self, t_ns: int) -> FloatArray:
         """Return alpha and beta relative to the air, deviations from trim, rad, shape (2,).
 
-        Each of them is a state minus w / V0, where w is the wind along the axis that
-        `disturbance.AIR_STATE` pairs with the angle.
+        Each angle is the state of this name, minus w / V0. w is the wind along the axis that
+        belongs to the angle in `disturbance.AIR_STATE`.
         """
         x = self._states()
         wind = self._block.wind[2 * ((t_ns - self._block_ns) // self._plant.step_ns)]

@@ -38,7 +38,10 @@ def names(airframe: Airframe) -> tuple[str, ...]:
 def values(
     state: AircraftState, wind: FloatArray, rate: FloatArray, plant: PlantParams
 ) -> FloatArray:
-    """Return the values of `truth` in the order of `names`; f and wind are those from now on.
+    """Return the values of `truth` in the order of `names`.
+
+    `f` and `gust` are the values that act in the next step, because turbulence is constant over a
+    step.
 
     `wind` (G,) and `rate` (n,) are the `dynamics.Forcing` of this instant.
     """

@@ -24,7 +24,7 @@ KINEMATIC = ("theta", "phi", "psi")
 airframes."""
 
 WindEffect = Literal["air_relative", "published"]
-"""How wind acts on x_dot of an uncertain aircraft: through the aircraft's own A, or as on the
+"""How wind acts on x_dot of an uncertain aircraft: through the A of this aircraft, or as on the
 published airframe. See `wind_factors`."""
 
 AIR_RELATIVE: WindEffect = "air_relative"
@@ -40,14 +40,14 @@ class Spread(NamedTuple):
     # largest relative deviation of an entry, by its name in `drawn_entries`
     entries: Mapping[str, float] = MappingProxyType({})
     distribution: Distribution = "uniform"
-    # largest deviation of an entry that is published as 0, as a part of its row; see `row_sizes`
+    # largest value of an entry that is published as 0, as a fraction of the value in `row_sizes`
     zeros: float = 0.0
 
 
 UNIFORM = Spread()
 
-# size of a thrust in newtons, as a part of the thrust in trim. It is a tenth of the throttle if
-# trim needs half of the throttle.
+# Size of an input that is a thrust, as a fraction of the thrust in trim. If trim needs half of the
+# throttle, this is a tenth of the throttle.
 THRUST_SIZE = 0.2
 
 
@@ -96,8 +96,8 @@ def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatAr
             1 where the published A_ij is 0 or the airframe has no state j
         published       factor_i = 1
 
-    If the published effect is minus the published column, per w / V0 or w, the resulting effect is
-    minus the column of each aircraft.
+    The published effect is that of w / V0 or of w, as the file says. If it is minus the published
+    column j, the effect for each aircraft is minus column j of its A.
     """
     nominal = airframe.matrix_a()
     factors = np.ones((len(A), len(airframe.states), len(airframe.gusts)))

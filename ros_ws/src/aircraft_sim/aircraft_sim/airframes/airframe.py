@@ -159,7 +159,7 @@ class Airframe(Config):
         ):
             quantity(unit, key)
         self._check_outputs(n, len(self.outputs))
-        # Every name in the file that stands for a state must be that of a state.
+        # Where the file must name a state, the name must be one of `states`.
         states_by_key = (
             {} if self.C else {f"outputs[{i}]": name for i, name in enumerate(self.outputs)}
         )
@@ -374,9 +374,9 @@ class Airframe(Config):
         return self.validate_mapping(self.model_dump() | values, f"airframe {self.name}")
 
     def with_rotary_gusts(self, axes: Sequence[str] = ROTARY) -> Self:
-        """Copy the airframe and add axes on which air that turns with p_g, q_g, r_g, rad/s, acts.
+        """Copy the airframe and add the axes of rotary gusts, at which the air turns, rad/s.
 
-            x_dot_i -= A_ij w_j,  i and j in p, q, r
+            x_dot_i -= A_ij w_j,  i and j in p, q, r,  w = (p_g, q_g, r_g)
 
         Forces caused by these rates are left out, because A[alpha, q] and A[beta, r] also contain
         kinematics. Effects of rotary gusts that the file already states stay as they are.

@@ -256,7 +256,8 @@ def _output(text: str, names: Sequence[str]) -> tuple[str, str, FloatArray | Non
 def _default_outputs(model: ToolModel) -> list[str]:
     """Return the outputs of q, V, p, r that elevator, thrust, aileron and rudder move.
 
-    In body axes V = u cos(alpha_0) + w sin(alpha_0), where u_dot = -W0 q gives alpha_0.
+    In body axes V = u cos(alpha_0) + w sin(alpha_0). The terms of q in u_dot and w_dot give
+    alpha_0.
     """
     outputs = []
     for name in model.inputs:
@@ -291,10 +292,10 @@ def _effect(model: ToolModel, name: str) -> str:
 
 
 def _gusts(frame: Airframe) -> dict[str, dict[str, float]]:
-    """Return the effect of wind on x_dot by axis, per w / V0.
+    """Return the effect of wind on x_dot by axis and state, for the section `gusts` of a file.
 
-    The effect is minus the column of the state that moves relative to the air. Wind has no effect
-    on angles and h.
+    The unit of the effect is that of a wind w / V0 = 1. The effect is minus the column of the state
+    that moves relative to the air. Wind has no effect on angles and h.
     """
     A = frame.matrix_a()
     names = list(frame.states)

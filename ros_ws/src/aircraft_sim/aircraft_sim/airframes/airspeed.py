@@ -36,14 +36,15 @@ EXPONENTS: Mapping[str, Mapping[str, float]] = {
     RATE: {SPEED: 1.0, INCIDENCE: 2.0, RATE: 1.0, ANGLE: 0.0},
     ANGLE: {SPEED: 0.0, INCIDENCE: 0.0, RATE: 0.0, ANGLE: 0.0},
 }
-"""Exponents of the ratio of airspeeds in the entries of A, by the kinds of row and column.
+"""Exponents of the ratio of airspeeds in an entry of A, by the kinds of its row and column.
 
 In level flight lift equals weight at any speed: alpha_dot = q - L / (m V) + g / V, where L grows
-with V^2 about the trim. A[alpha,V] is therefore -2 g / V^2. """
+with V^2 about the trim. A[alpha,V] is therefore -2 g / V^2.
+"""
 
+# Exponents for the columns of B, by the kind of the row: of a surface, and of the thrust.
 OF_SURFACE = {SPEED: 2.0, INCIDENCE: 1.0, RATE: 2.0, ANGLE: 0.0}
 OF_THRUST = {SPEED: 0.0, INCIDENCE: -1.0, RATE: 0.0, ANGLE: 0.0}
-"""The same for B, by the kind of the row."""
 
 WIND_STATE = {
     "longitudinal": SPEED,

@@ -25,7 +25,7 @@ KINDS = {
     **dict.fromkeys(("p", "q", "r"), (ANGULAR_RATE, "an angular rate, as rad/s or deg/s")),
     **dict.fromkeys(("h", "altitude"), (LENGTH, "a height, as m or ft")),
 }
-"""Dimension of the states that have a name of the field."""
+"""Dimension of a state, by the names that textbooks use, and the dimension in words."""
 OF_RATES = {
     "theta": "q r phi",
     "phi": "p q r theta phi",
@@ -33,15 +33,17 @@ OF_RATES = {
     "h": None,
     "altitude": None,
 }
-"""States whose derivative no force changes, and the named states that enter it; None if any may."""
+"""States whose derivative is pure kinematics, which no force changes, and the states that may enter
+this derivative; None if any state may."""
 
-TURNED = (0.7, 1.02)
-COUPLED = (0.6, 1.35)
+# Ranges of accepted fractions of an expected value.
+TURNED = (0.7, 1.02)  # of a value that is multiplied by the cosine of a trim angle of up to 45 deg
+COUPLED = (0.6, 1.35)  # of V0, to which the force of a rate, Z_q or Y_r, is added
+# of the change of lift with speed, where lift equals weight. Compressibility and thrust alter it.
+# Published aircraft have 0.78 to 1.02.
 LIFT = (0.3, 2.8)
-"""Accepted fractions of an expected value: cos of a trim angle up to 45 deg; V0 with the force of a
-rate, Z_q or Y_r; the change of lift = weight with speed, which compressibility and thrust alter
-(published aircraft have 0.78 to 1.02)."""
-FOREIGN = 0.02  # SI, largest accepted entry for an unrelated state in the row of an angle
+# SI, largest accepted entry in the row of an angle for a state that OF_RATES does not list
+FOREIGN = 0.02
 EXPECTED: Mapping[tuple[str, str], tuple[float, str, tuple[float, float]]] = {
     ("theta", "q"): (1.0, "", TURNED),
     ("phi", "p"): (1.0, "", TURNED),
@@ -60,8 +62,8 @@ EXPECTED: Mapping[tuple[str, str], tuple[float, str, tuple[float, float]]] = {
     ("h", "alpha"): (-1.0, "V0", COUPLED),
     ("h", "w"): (-1.0, "", TURNED),
 }
-"""Entries of A by row and column: sign, value in SI, and accepted fractions, about straight flight
-without bank."""
+"""Expected entries of A in straight flight without bank, by row and column: sign, value in SI, and
+the range of accepted fractions of this value."""
 
 EFFECTS = {
     "nose down": ("q", -1.0), "pitch down": ("q", -1.0), "nose up": ("q", 1.0),
@@ -72,18 +74,19 @@ EFFECTS = {
     "yaw left": ("r", -1.0),
     "more thrust": ("V u", 1.0), "more power": ("V u", 1.0),
 }  # fmt: skip
-"""What `positive` may say of an input: the state that it moves, and the sign."""
+"""Phrases that `positive` of an input may contain, with the state that the input then moves, and
+the sign of the motion."""
 
 CONTROLS = {
     "elevator": ("q", "alpha w", 0.06, 12.0),
     "aileron": ("p", "beta v", 0.015, 8.0),
     "rudder": ("r", "beta v", 0.015, 8.0),
 }
-"""For each input: the rate that it moves, the angle of the flow, and the accepted range of effect /
-(stiffness + damping), see `_strengths`.
+"""For each input: the rate that it moves, the angle of the flow, and a range of strengths.
 
-Published aircraft have 0.27 to 3.3, 0.04 to 0.93 and 0.04 to 1.1. If you take a column per deg for
-one per rad, it is 57 times off.
+The strength is the effect divided by stiffness plus damping, see `_strengths`. Published aircraft
+have 0.27 to 3.3 for the elevator, 0.04 to 0.93 for the aileron, and 0.04 to 1.1 for the rudder. If
+a column of B is per deg but is taken to be per rad, the strength is wrong by the factor 57.
 """
 
 

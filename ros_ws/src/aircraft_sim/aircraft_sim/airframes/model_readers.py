@@ -42,7 +42,8 @@ MOVES = {
     "thrust": ("V", "more thrust", "less thrust"),
     "throttle": ("V", "more thrust", "less thrust"),
 }
-"""Output that an input drives, and what the input does if it is positive, by the sign of B."""
+"""For each input: the output that it drives, and the effect of a positive value if the entry of B
+is positive, and if it is negative."""
 
 
 class ToolModel(NamedTuple):
@@ -382,7 +383,7 @@ BODY = {
     "Ixz": "kg*m^2",
     "density": "kg/m^3",
 }
-"""What AVL's derivatives need to know of the aircraft, with units; Ixz is 0 by default."""
+"""Values of the aircraft, with units, that AVL's file of derivatives lacks. Ixz is 0 by default."""
 DERIVATIVES = "Sref Cref Bref Alpha CLtot CDtot CLa CYb Clb Cma Cnb CYp Clp Cnp CLq Cmq CYr Clr Cnr"
 
 

@@ -25,11 +25,12 @@ AIR_STATE = {
     "pitch": "q",
     "yaw": "r",
 }
-"""State that wind w along an axis changes relative to the air: V - w, beta - w / V0, alpha - w / V0
-for small angles; p - p_g, q - q_g, r - r_g."""
+"""For each axis, the state that wind along the axis changes relative to the air. In a wind w, the
+states relative to the air are V - w and, for small angles, beta - w / V0 and alpha - w / V0. In
+rotary gusts they are p - p_g, q - q_g and r - r_g."""
 
-# s, in place of a rise time of 0, a step. t / 1e-30 saturates for every t > 0, also in float32,
-# without a division by 0.
+# s, replaces a rise time of 0, which would divide by 0. For every t > 0, t / 1e-30 is above 1 also
+# in float32, so the bias rises in a step.
 MIN_RISE = 1e-30
 
 

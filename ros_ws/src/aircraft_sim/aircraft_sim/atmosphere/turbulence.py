@@ -24,24 +24,25 @@ from aircraft_sim import random_streams
 from flight_core.vectors import Array, FloatArray
 
 FOOT = 0.3048  # m, exact
+# Heights, m. The model for low altitude holds from LOWEST to LOW, and the model for high altitude
+# from HIGH on. Source: MIL-F-8785C 3.7.3.4, 3.7.2.
 LOWEST = 10.0 * FOOT
 LOW = 1000.0 * FOOT
 HIGH = 2000.0 * FOOT
-"""m. The low model holds from LOWEST to LOW, the high one from HIGH on; MIL-F-8785C 3.7.3.4,
-3.7.2."""
 
 HIGH_LENGTH = 1750.0 * FOOT  # m, MIL-F-8785C 3.7.2.1, Dryden form
 
 MODERATE_WIND = 15.4
 MODERATE_SIGMA = 3.05
-"""m/s, of moderate turbulence: W_20 of 30 kt (MIL-F-8785C 3.7.3.4), and the intensity at high
-altitude, 10 ft/s."""
+"""Moderate turbulence, m/s: the wind W_20 of 30 kt (MIL-F-8785C 3.7.3.4) and, at high altitude, the
+intensity of 10 ft/s."""
 
 MODERATE = {"altitude": 100.0, "wind": MODERATE_WIND}  # altitude in m above the ground, wind in m/s
 
 STATES = 5  # one state of the longitudinal filter, two of the lateral, two of the vertical filter
 ROTARY_STATES = 3  # p_g divided by its intensity, and the vertical and the lateral wind behind lags
-# steps that share a generator, because its creation takes as long as hundreds of numbers
+# number of steps that share a random generator, because making one takes as long as drawing
+# hundreds of numbers
 BLOCK = 64
 
 
@@ -126,8 +127,8 @@ def filters(
         Phi_u = sigma^2 2T/pi / (1 + (T omega)^2)
         Phi_v = sigma^2 T/pi (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2,  Phi_w alike
 
-    In a step, z becomes transition z plus noise with the covariance spread spread'. With h = a dt,
-    these are as follows, where u has only the first entries:
+    In a step, z becomes transition z plus noise with the covariance spread spread'. For v and w
+    these matrices follow from h = a dt. For u they have only the first entry:
 
         transition = exp(-h) [[1, 0], [h, 1]],  spread spread' = [[g_1, g_2/2], [g_2/2, g_3/2]]
 

@@ -16,12 +16,13 @@ from flight_core.vectors import FloatArray
 
 LAYER = 12.5
 PEAK_HEIGHT = math.log(LAYER) / (LAYER - 1.0)
-"""The ratio of z* to the height e of the boundary layer, and of the height of the largest outflow
-to z*."""
+"""LAYER is the ratio of z* to the height e of the boundary layer. PEAK_HEIGHT is the ratio of the
+height of the largest outflow to z*."""
 
 PEAK = 0.319086343 * (math.exp(-PEAK_HEIGHT) - math.exp(-LAYER * PEAK_HEIGHT))
-"""Largest outflow of a microburst, divided by scale and radius: (1 - exp(-r^2)) / 2 r at 1.1209,
-times the spread at the height of the largest outflow."""
+"""Largest outflow u of a microburst, divided by l R. It is the largest value of (1 - exp(-s^2)) / 2
+s, at s = r / R = 1.1209, times exp(-z / z*) - exp(-z / e) at the height z of the largest outflow.
+"""
 
 
 class Log(NamedTuple):

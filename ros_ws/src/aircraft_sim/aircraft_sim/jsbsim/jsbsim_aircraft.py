@@ -35,10 +35,12 @@ MODEL_ELEMENT = "fdm_config"
 
 
 class Command(NamedTuple):
-    """An input, which is a normalised command of JSBSim with the unit 1."""
+    """An input of the aircraft: a command of JSBSim that is normalised from stop to stop."""
 
     property: str
-    trim_property: str | None  # property of the trim, a part of the command; JSBSim limits the sum
+    # property of the trim, which JSBSim adds to `property` before it limits the sum; None without
+    # one
+    trim_property: str | None
     lower: float  # end stops of the whole command
     upper: float
     each_engine: bool

@@ -124,7 +124,10 @@ def _first(command: Command) -> str:
 
 
 def _moves(fdm: jsbsim.FGFDMExec, paths: Iterable[tuple[str, float]], part: float) -> bool:
-    """Return whether properties change an acceleration more than it varies between equal runs."""
+    """Return whether a change of properties changes an acceleration.
+
+    The acceleration also varies between two equal runs, and must change by more than that.
+    """
     before = {path: fdm[path] for path, _ in paths}
     runs = []
     for deflection in (0.0, 0.0, part):
@@ -163,10 +166,10 @@ def sentence_without_effect(
 
 
 def hysteresis_of(model: Path | None) -> str:
-    """Return the end of a sentence about a failed trim if servos of the model have hysteresis.
+    """Return a clause, for a sentence about a failed trim, that names servos with hysteresis.
 
-    Such servos hold their output while a command changes little. Returns "" if there is no
-    hysteresis.
+    Such servos hold their output while a command changes little, so a solver may find no trim.
+    Returns "" if no servo of the model has a hysteresis.
     """
     members = {} if model is None else model_files(model).members
     if not any(b"<hysteresis_width>" in content for content in members.values()):

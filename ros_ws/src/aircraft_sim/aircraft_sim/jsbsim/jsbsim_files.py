@@ -40,7 +40,8 @@ the model itself."""
 ROOT_FOLDERS: Mapping[str, str] = MappingProxyType(
     {"engine": "engine", "thruster": "engine", "system": "systems"}
 )
-"""The folder of the root in which JSBSim looks next."""
+"""Folder of the root in which JSBSim looks for the file of an element if it is in none of FOLDERS.
+"""
 SECTIONS = frozenset(
     {
         "metrics",
@@ -53,8 +54,8 @@ SECTIONS = frozenset(
     }
     | {"flight_control", "aerodynamics", "planet"}
 )
-"""Other elements whose file JSBSim reads. Any element with an attribute `file` that is not among
-these needs no file."""
+"""Further elements for which JSBSim reads the file in their attribute `file`. In any other element,
+this attribute has no effect."""
 
 
 # largest size of a file; the largest of JSBSim's files has a third of a megabyte

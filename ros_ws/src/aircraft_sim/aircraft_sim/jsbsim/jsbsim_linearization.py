@@ -35,8 +35,8 @@ RATES = ("p", "q", "r")
 # model's tables
 MOTION = 0.01
 SIZES = (0.05, 0.1, 0.2)
-"""Steps of a command: the small ones stay linear, the large ones exceed a hysteresis or reach a
-rate limit."""
+"""Sizes of the steps of a command. Small steps stay in the linear range. Large steps exceed a
+hysteresis, or reach a rate limit."""
 MAX_STEP_FRACTION = 0.9  # upper bound of a step, as a fraction of the distance to the end stop
 SURFACE_TIME = 0.5  # s of frozen flight: long enough for flight control systems
 ENGINE_TIME = 20.0  # s of frozen flight: a turbine at altitude spools up in less time
@@ -53,7 +53,8 @@ class Linearization(NamedTuple):
     # (m,) s, lag from each input to its paired output, the longest of all sizes of steps
     lag: FloatArray
     size: FloatArray  # (m,) size of the step with the largest effect, from which B follows
-    spread: FloatArray  # (m,) smallest effect per size divided by the largest; 1 for a linear input
+    # (m,) ratio of the smallest to the largest effect per size of a step; 1 for a linear input
+    spread: FloatArray
     still: tuple[str, ...]  # sentences on steps without an effect
 
     @property
@@ -76,7 +77,8 @@ def linearize(condition: FlightCondition) -> Linearization:
         x = (V, alpha, q, theta, beta, p, r, phi),  x_dot = A x + gravity sin(x) + B u + wind w
         x_dot of V, alpha, beta: the accelerations in the axes of the flight path,
             (cos a u_dot + sin a w_dot,  (cos a w_dot - sin a u_dot) / V,  v_dot / V),  a = alpha
-        column of V, alpha, beta = -(1, V, V) wind:  air forces see the difference to the wind
+        columns of V, alpha, beta = -(1, V, V) wind, because air forces depend on the motion
+            relative to the air
         theta_dot = q,  phi_dot = p + tan(theta) r,  gravity: V_dot -= g sin(theta),
             beta_dot += g cos(theta) / V sin(phi),  for the small bank of a trim
         B_j = x_dot(t_end) / size,  lag_j = step + integral of 1 - x_dot(t) / x_dot(t_end)

@@ -55,10 +55,10 @@ MIXTURE = 0.9  # mixture of piston engines: rich
 BOTH_MAGNETOS = 3.0  # ignition of piston engines; 0 is off, 1 left, 2 right
 SETTLE = 10.0  # s of frozen flight in which running engines settle
 SPIN_UP = 30.0  # s of frozen flight in which engines settle that have just been started
+# SETTLE and SPIN_UP for a propeller that is slow to reach its speed, such as one of an electric
+# engine with a time constant of 10 s.
 SLOW_SETTLE = 80.0
 SLOW_SPIN_UP = 300.0
-"""The same for a propeller that is slow to reach its speed, such as one of an electric engine with
-a time constant of 10 s."""
 
 ATTEMPTS = (
     (SETTLE, SPIN_UP, 0.0),
@@ -66,13 +66,14 @@ ATTEMPTS = (
     (SETTLE, SPIN_UP, 1.0),
     (SLOW_SETTLE, SLOW_SPIN_UP, 1.0),
 )
-"""Settling times, s, and the fraction of the pitch trim that the elevator gives: all of it for a
-model without a trim of its own."""
+"""Attempts of the solver, in order: the settling times of running and of started engines, s, and
+the fraction of the pitch trim that the elevator provides. A model without a property for the trim
+needs 1."""
 
-# Largest multiple of TOLERANCE that an engine which has not settled leaves. A larger one has
-# another cause.
+# If accelerations of up to this multiple of TOLERANCE remain, the engine may not have settled yet.
+# Larger ones have another cause.
 NEAR = 100.0
-FAR = 1e6  # multiple of TOLERANCE in place of accelerations that are not finite
+FAR = 1e6  # multiple of TOLERANCE that replaces accelerations that are not finite
 IDLE = 0.01  # throttle below which a running engine may give no thrust
 
 # alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad).
@@ -95,8 +96,9 @@ TIMEOUT = 30.0
 NEAR_TIMEOUT = 3.0  # s of processor time for a condition near one that has no trim
 
 TrimSolution = tuple[float, ...] | None
-"""The solver's unknowns of frozen flight, scaled, then spin-up and elevator part of ATTEMPTS; None
-where JSBSim's own trim succeeds. It gives the same bits everywhere."""
+"""The scaled unknowns that the solver found, and then the spin-up time and the elevator's fraction
+from ATTEMPTS. None if the trim function of JSBSim succeeded, which gives the same bits everywhere.
+"""
 
 
 class _Log(jsbsim.FGLogger):
@@ -432,8 +434,8 @@ def _solve_accelerations(
             weighted, np.ones(len(START)), bounds=(low, high), diff_step=steps, max_nfev=40
         )
         return tuple(fit.x.tolist())
-    # The differences are a thousandth of the scales, because engines settle more accurately than
-    # that.
+    # The solver takes differences of a thousandth of SCALE. An engine that has not quite settled
+    # changes the accelerations by less than such a difference does.
     scaled, *_ = fsolve(
         accelerations, np.ones(len(START)), epsfcn=1e-6, xtol=1e-6, maxfev=100, full_output=True
     )

@@ -54,7 +54,7 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
         target  = command - clip(command, -dead_zone, dead_zone)
             dead zone: zero inside, no jump at the edge
         input   = clip(position, target - backlash, target + backlash)
-            the play operator; target without backlash; the end stop of a runaway
+            the play operator: target if there is no backlash; the end stop in a runaway
         lagged  = input - (input - position) exp(-dt / lag)  exact solution of lag p_dot = input - p
         limited = position + clip(lagged - position, -rate dt, rate dt)        rate limit
         p+      = clip(limited, lower, upper)                                  end stops
@@ -155,9 +155,10 @@ def in_force(t: Any, position: Array, params: Actuators) -> Actuators:
 def effect(t: Any, position: Array, params: Actuators) -> Array:
     """Compute the input of the aircraft at the given actuator positions, shape (m,).
 
-        t >= weak_at no_thrust + weak_effect (position - no_thrust) a part of the thrust, also of
-            the thrust in trim
+        t >= weak_at    no_thrust + weak_effect (position - no_thrust)
         else            position
+
+    A weak actuator gives a part of its thrust, and thus also only a part of the thrust in trim.
 
     `position` is the position at t, after `apply_faults`.
     """

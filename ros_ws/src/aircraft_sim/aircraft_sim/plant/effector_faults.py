@@ -30,7 +30,7 @@ class FaultKind(NamedTuple):
 
 HARD_OVER = "hard_over"
 ENDS = ("lower", "upper")
-"""Ends to which an effector can run away, as the keys of the stops."""
+"""Ends to which an effector can run away, which are also the keys of its end stops."""
 
 KINDS = {
     "stuck": FaultKind("stuck_at"),
@@ -41,8 +41,9 @@ KINDS = {
     "slow": FaultKind("slow_at", "slow_lag", 0.2),
     "loose": FaultKind("loose_at", "loose_play", 0.01),
 }
-"""The kinds of faults. If no strength is given, it is half of the effect, ten times the lag of a
-servo of the osprey in s, or a half-width of 0.57 deg or 1 % of thrust."""
+"""The kinds of faults. If a sentence states no strength, `weak` leaves half of the effect, `slow`
+has the lag 0.2 s, ten times that of a servo of the osprey, and `loose` has a half-width of 0.01,
+which is 0.57 deg, or 1 % of thrust."""
 
 STOPPED = frozenset({"stuck", "lost", "failed", HARD_OVER})
 """The kinds after which an input no longer follows u."""

@@ -144,7 +144,8 @@ def initial_state(plant: PlantParams) -> AircraftState:
 def forcing(t_ns: int, steps: int, plant: PlantParams, x: Array | None = None) -> Forcing:
     """Compute the forcing at the beginnings, middles and ends of steps that begin at t.
 
-    For n steps there are 2 n + 1 instants. The aircraft at all of them is that at t in the state x.
+    For n steps there are 2 n + 1 instants. The aircraft does not change between them. It is the
+    aircraft at t in the state x, or in trim if x is None.
     """
     halves = array_namespace(plant.aircraft.A).arange(2 * steps + 1, dtype=plant.aircraft.A.dtype)
     return dynamics.at_times(
