@@ -449,8 +449,8 @@ def settling_time(
     """Return the time, s, after which abs(e) stays in the band for `dwell` s or until the end.
 
     The time counts from t[0], and t and e have the shape (N,). It is 0 if abs(e) stays in the band
-    for the first `leaves` s, because a later excursion has another cause. It is None if abs(e) does
-    not return to the band, or if there is no sample.
+    for the first `leaves` s. If e leaves the band only later, this has another cause. It is None if
+    abs(e) does not return to the band, or if there is no sample.
     """
     if len(t) == 0:
         return None

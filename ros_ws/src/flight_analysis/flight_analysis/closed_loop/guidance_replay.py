@@ -125,8 +125,9 @@ class _Comparison:
             channels = dict(zip(self._names, row.tolist(), strict=True))
             inputs, recorded = guidance_log.restored(stamp_ns, channels, self._outputs)
             begins = previous is not None or inputs.begin is Begin.HOLD
-            # If a failed step has no sample in the log, the count of failures rises with the next
-            # step. That step did not fail, and its filters begin again.
+            # The log has the count of failed steps. If a failed step has no sample in the log, the
+            # count rises at the next step, although this step did not fail. Its filters begin
+            # again.
             failed = channels[FAILED]
             goes_on = failed > failed_before and inputs.begin is Begin.NO
             failed_before = failed

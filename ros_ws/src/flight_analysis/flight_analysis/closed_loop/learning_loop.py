@@ -24,8 +24,8 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 class ModelGuarantee(NamedTuple):
     """What is proved of the loop of proposed parameters around the learned model."""
 
-    # Number of stated deviations of each entry, from the model, within which every aircraft is
-    # stable; 0 if nothing is proved.
+    # Every aircraft is stable if each of its entries differs from the model by at most so many
+    # times the stated deviation of this entry. 0 if nothing is proved.
     deviations: float
     loop: str  # digest of the loop, in hexadecimal digits
 
@@ -96,9 +96,9 @@ class Entry(NamedTuple):
 class Learned(NamedTuple):
     """The channels of the topic `learned`.
 
-    The first channel is `proposed`. The values of the entries of A and B in the rows of the outputs
-    follow, then their standard deviations, and then the digest of the proposed parameters with its
-    guarantee.
+    The first channel is `proposed`. The next channels have the values of those entries of A and B
+    that are in the rows of the outputs, and then their standard deviations. The last channels are
+    the digest of the proposed parameters and their guarantee.
     """
 
     names: tuple[str, ...]
@@ -136,7 +136,7 @@ def learned_sample(
 
 
 class Identifications:
-    """Hands out each identification of a learner once, if the learner makes any."""
+    """Hands out each identification of a learner once. A learner need not make any."""
 
     def __init__(self, learner: Learner, outputs: tuple[str, ...]) -> None:
         self._learner = learner

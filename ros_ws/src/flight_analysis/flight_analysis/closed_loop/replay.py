@@ -386,7 +386,8 @@ def later_aircraft(run: RecordedRun, scenario: Scenario) -> tuple[AircraftConfig
     changes: dict[str, Any] = {}
     for change in parameter_changes(run.path, node, dict.fromkeys(AircraftConfig.tunable())):
         changes |= change
-        # The keys of a gust come one by one. The gust is complete with the last of them.
+        # Each key of a gust comes as a change of its own. Only with the last of them the gust is
+        # complete and valid.
         with suppress(ParameterError):
             later.append(
                 AircraftConfig.validate_mapping(scenario.aircraft.changed(changes), "aircraft")

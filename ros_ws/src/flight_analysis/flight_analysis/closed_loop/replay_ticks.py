@@ -145,7 +145,10 @@ class Ticks:
         self._copied = [names.index(name) for name in COPIED_CHANNELS]
 
     def begin(self, before: ControllerState | None = None) -> ControllerState:
-        """Return the initial state of a controller, with the u of the state `before`, if given."""
+        """Return the initial state of a controller.
+
+        If `before` is given, the initial state has the u of that state.
+        """
         state = guard.initial_state(self.m, self._allocation)
         return state if before is None else state._replace(u=before.u, effectors=before.effectors)
 
@@ -205,8 +208,8 @@ class Ticks:
         y = None
         y_m = []
         if not self.flies[k] and stamp_ns == state.stamp_ns:
-            # The stamp stayed the same, so the last y is older than the stamp and did not engage
-            # the law.
+            # The controller stands by at the same stamp as before. So its last y was older than
+            # this stamp, and did not engage the law.
             y = StampedVector(stamp_ns - 1, self._y[k])
             y_m = [StampedVector(stamp_ns - 1, self._groups["y_m"][k])]
         elif self.flies[k]:

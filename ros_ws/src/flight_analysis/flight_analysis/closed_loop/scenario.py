@@ -179,7 +179,7 @@ class Scenario:
         return isinstance(self.controller, RiseDiConfig) and self.controller.learn is not None
 
     def air(self) -> str:
-        """Return the name of the most violent motion of the air except gusts, from AIRS."""
+        """Return the most violent disturbance of the air, apart from gusts, as a name from AIRS."""
         aircraft = self.aircraft
         if aircraft.microburst is not None:
             return "microburst"

@@ -24,7 +24,7 @@ from flight_analysis.linear_loop.structured_value import (
 from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
 from flight_core.vectors import FloatArray
 
-LEVELLED = 8  # number of frequencies at which the ratios of X for a late u are sought
+LEVELLED = 8  # number of frequencies at which `_levelled` looks for the worst one
 DIGITS = 5  # significant digits of X and G in a step of a proof
 
 
@@ -112,8 +112,9 @@ def proof_of(
 def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
     """Round the scalings X and G, and return them as `t` and `g` of a step.
 
-    Rounding is safe, because any X and G prove a bound. The step needs only the X and G of the
-    means over a period, if those of the second coefficients follow from them as in `tightened_at`.
+    Rounding is safe, because any X and G prove a bound. If the X and G of the second Legendre
+    coefficients follow from those of the means over a period, as in `tightened_at`, the step has
+    only the X and G of the means.
     """
     count = len(scaling.t) if scaling.g[entries:].any() else entries
     t, g = ([float(f"{x:.{DIGITS}g}") for x in values[:count]] for values in (scaling.t, scaling.g))
@@ -131,14 +132,14 @@ def frequency_in(region: Region, highest: float) -> float:
 
 
 def _levelled(part: Channels, scale: FloatArray) -> Channels:
-    """Scale the channels of a late u so that one factor of X serves them at the worst frequency.
+    """Scale the channels of a late u so that, at the worst frequency, X is equal in all of them.
 
-    A delay can change from tick to tick. The channels of the delay must therefore have the same X
-    at all frequencies, up to a common factor.
+    A delay can change from tick to tick. So the channels of the delay must have the same X at all
+    frequencies, up to a common factor.
     """
     if not part.late:
         return part
-    # the means of the entries over a period are enough for the ratios
+    # the means over a period are enough to find the ratios of X between these channels
     k = len(part.entries)
     rows = np.r_[0:k, part.uncertain : len(scale)]
     worst, level = 0.0, np.zeros(part.late)
@@ -154,7 +155,10 @@ def _levelled(part: Channels, scale: FloatArray) -> Channels:
 
 
 def effects_of(part: Channels, M: ComplexArray, scaling: Scaling) -> FloatArray:
-    """Estimate, up to a common factor, how much the bound of M falls with each half width."""
+    """Estimate how much the bound of M falls if the half width of an entry becomes smaller.
+
+    There is a value for each entry of the part. All values have the same unknown factor.
+    """
     scale = np.exp(scaling.t)
     N = scale[:, None] * M / scale
     centre = Centre(np.ones(len(N)), scaling.g[: part.uncertain], np.eye(len(N)))

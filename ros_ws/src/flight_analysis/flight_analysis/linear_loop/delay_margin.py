@@ -13,7 +13,7 @@ MAX_DELAY_MARGIN = 0.5
 """Upper end of the search for a delay margin, s. A loop that tolerates more is slower than any loop
 of this stack."""
 
-# first step of a search that begins at the margin of a similar loop, in multiples of the resolution
+# first step of a search that begins at `near`, in multiples of the resolution
 NEAR = 4
 
 

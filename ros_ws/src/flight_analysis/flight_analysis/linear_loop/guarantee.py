@@ -33,8 +33,8 @@ WIDEST_DISK = 2.0  # a disk of 2 means a phase margin of 90 deg and any gain
 EXACT = 1.002
 CONFIRMED = 10  # number of such steps that are tried
 
-# gaps between the size that is proved and the least size that was found too large, as fractions of
-# the proved size: if the first can be proved, the finer ones are tried as well
+# Gaps between the size to prove and the least size that was found too large, as fractions of the
+# size to prove. If a proof succeeds with the first of GAPS, FINER_GAPS are tried as well.
 GAPS = (0.08, 0.16, 0.32, 0.64, 1.28, 2.56)
 FINER_GAPS = (0.04, 0.02, 0.01, 0.005)
 BOXES = 1500  # largest number of steps of a proof for the first gap
@@ -42,8 +42,9 @@ FEWER_BOXES = 300  # largest number of steps for the other gaps, and for disks
 # The proved deviations are larger than the stated ones by this fraction. It covers the coefficients
 # that are left out, and the width that a check by interval arithmetic loses.
 SLACK = 2e-3
-# The slack if a lag deviates, as a fraction of the half widths of each region. The actuator leaves
-# out more, and a slack of the whole box would move small regions by more than their half widths.
+# The slack if a lag deviates. It is larger, because the coefficients that are left out are larger
+# for an actuator. It is a fraction of the half widths of each region, because the same fraction of
+# the whole box could exceed the half widths of a small region.
 LAG_SLACK = 5e-3
 NAMED = 12  # number of digits of the digest that name a certificate
 
@@ -60,7 +61,8 @@ class Unstable(NamedTuple):
 class Zeros(NamedTuple):
     """How far the entries that are 0 in the file may deviate, if all others are exact."""
 
-    stable: float  # largest part of its row that every zero may become in a stable aircraft
+    # fraction of its row up to which each of these entries may deviate in a stable aircraft
+    stable: float
     unstable: Unstable | None  # the one that deviates least; None if none was found up to LARGEST
 
 
@@ -78,8 +80,8 @@ class Guarantee(NamedTuple):
     late: float = 0.0
     has_exact_lags: bool = True  # whether no lag of an actuator is in the box
     exact: tuple[str, ...] = ()  # nonzero entries of A and B that are not part of the box
-    # part of its row up to which each entry that is 0 in the file may deviate, while the others are
-    # within `stable`; 0 if such entries stay 0
+    # fraction of its row up to which each entry that is 0 in the file may deviate, while all other
+    # entries deviate by up to `stable`; 0 if such entries stay 0
     zeros: float = 0.0
     zeros_alone: Zeros | None = None  # how far zeros go if the others are exact, if computed
     # "entries" and "steps" of each strongly connected part of the loop, as in `proof_of`
@@ -205,7 +207,8 @@ def _exact_entries(linear: LinearLoop, box: Box) -> tuple[str, ...]:
     states = linear.states
     moved = (box.E != 0.0).astype(float) @ (box.F != 0.0)
     rows, columns = np.nonzero((linear.nominal.A != 0.0) & (moved == 0.0))
-    # actuators may follow the states, and their rows hold their lags
+    # the plant can have actuators as further states after those of the aircraft; their rows have
+    # lags and no entries of A
     places = [place for place in zip(rows, columns, strict=True) if max(place) < len(states)]
     left_out = [name for name, part in zip(box.names, box.part, strict=True) if not part]
     names = [*left_out, *(f"A[{states[i]},{states[j]}]" for i, j in places)]
@@ -275,12 +278,12 @@ def _proved(
     reserve: float = 0.0,
     show: Callable[[float], None] = lambda _: None,
 ) -> tuple[float, list[dict[str, Any]]]:
-    """Prove the largest size possible below `least`, and return this size and the proof.
+    """Find the largest size below `least` that can be proved, and return it with its proof.
 
-    The size belongs to the deviations. If `disks` is True, it belongs to the disks, and the
-    deviations cover the whole box. The size is 0 if none is proved. `least` is a size that a search
-    found too large. If `exact` is True, it may be provable, and is tried first. `show` gets each
-    size before its proof is tried.
+    The size is a factor on the deviations of the box. If `disks` is True, it is the size of the
+    disks instead, and the deviations cover the whole box. The result is 0 if no size is proved.
+    `least` is a size that a search has found too large. If `exact` is True, `least` itself may be
+    provable, and is tried first. `show` gets each size before its proof is tried.
     """
     for proved in (*(0.0,) * exact, *GAPS):
         most = FEWER_BOXES if disks or proved > GAPS[0] else BOXES
@@ -307,8 +310,8 @@ def _proof(
 ) -> list[dict[str, Any]] | None:
     """Prove each part for a size, or return None if `most` steps are not enough.
 
-    The proof covers deviations that exceed the size by the fraction SLACK. If `reserve` is not 0,
-    it covers instead, for each region, half widths that are larger by the fraction `reserve`.
+    The proof covers deviations that are larger than the size by the fraction SLACK. If `reserve` is
+    not 0, the half widths of each region are larger by the fraction `reserve` instead.
     """
     proof = []
     whole = size if reserve else (1.0 + SLACK) * size

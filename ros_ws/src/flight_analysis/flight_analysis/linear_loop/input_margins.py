@@ -42,11 +42,13 @@ SLOW = np.pi / 2.0
 more than four ticks. The gain margin and S show faster modes.
 """
 
-# An eigenvalue belongs to an integral or a constant state if its frequency times T is less, rad.
+# rad; if the frequency of an eigenvalue times T is less, it belongs to an integral or to a constant
+# state, and is no mode
 NO_MODE = 1e-6
-# An eigenvalue below this magnitude is a delayed input or rounding: its motion ends in a period.
+# If abs(z) of an eigenvalue is less, it comes from a delayed input or from rounding. Such a motion
+# ends within a period.
 VANISHED = 1e-9
-# Up to this condition of the eigenvectors, in the Frobenius norm, S is exact to 1e-9.
+# S is exact to 1e-9 up to this condition number of the eigenvectors, in the Frobenius norm.
 MOST_CONDITION = 1e6
 BATCH = 16  # aircraft computed together: larger arrays leave the cache
 # OpenBLAS starts no threads for a complex matrix with at most this many entries. Threads would only

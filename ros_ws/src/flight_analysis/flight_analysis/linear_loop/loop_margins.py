@@ -23,7 +23,7 @@ from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN, delay_margin
 from flight_analysis.linear_loop.input_margins import Margins, SlowModes, input_margins, slow_modes
 from flight_analysis.linear_loop.told import PLANNED, Comparison, Difference, FlightFacts, compare
-from flight_analysis.linear_loop.told import loop_of as loop_of  # noqa: PLC0414 - where it is looked for
+from flight_analysis.linear_loop.told import loop_of as loop_of  # noqa: PLC0414 - other modules import it from here
 from flight_analysis.linear_loop.uncertain_loop import Box, plants_at
 from flight_analysis.linear_loop.worst_case import worst_in_box
 from flight_core.arguments import as_count, as_number
@@ -75,8 +75,9 @@ class LinearLoop(NamedTuple):
     box: Box | None = None  # box of the uncertain aircraft, or None if there are none
     # how the aircraft that flies differs from what the controller was told
     differences: tuple[Difference, ...] = ()
-    # Largest deviation of A and B of the aircraft that flies from the airframe file. It can be set
-    # against a guarantee, because each entry counts in proportion to its deviation in the box.
+    # How far A and B of the aircraft that flies are from the airframe file. The deviation of each
+    # entry is divided by its deviation in the box. The largest ratio, times the largest deviation
+    # in the box, can be compared with `Guarantee.stable`.
     off: float = 0.0
 
     @property
@@ -281,10 +282,10 @@ def as_compared(linear: LinearLoop, scenario: Scenario, comparison: Comparison) 
 
 
 def _with_deviation(linear: LinearLoop, scenario: Scenario) -> LinearLoop:
-    """Return the loop with the deviation of the aircraft that the scenario draws.
+    """Return the loop with `off`, the deviation of the aircraft that the scenario draws.
 
-    The deviation is 0 if the airframe flies as in its file. It is infinite if the scenario changes
-    an entry that is exact in the box.
+    It is 0 if the airframe flies as in its file. It is infinite if the scenario changes an entry
+    that is exact in the box.
     """
     if linear.box is None or scenario.aircraft.is_jsbsim:
         return linear

@@ -41,7 +41,8 @@ from flight_analysis.linear_loop.uncertain_loop import (
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
-# abs(z) of a proof that every motion settles: integrators have a mode at 1, outside
+# abs(z) of the circle on which a proof shows that every motion settles. Integrators have a mode at
+# z = 1, which lies outside of this circle.
 SETTLING = 1.0 - 1e-5
 # Lowest frequency of a proof that nothing oscillates, rad/s
 SLOWEST = 0.05
@@ -50,21 +51,26 @@ TRIED = (1.0, 0.8, 0.65, 0.5, 0.4, 0.3, 0.2)  # parts of the box that are tried,
 LAGS = np.unique(np.geomspace(1.0, 100.0, 30).round().astype(int))  # ticks
 AIRCRAFT = 12  # random corners of the box in the linear program, and at which climbs start
 SEED = 2
-ROUNDS = 8  # linear programs at most
+ROUNDS = 8  # largest number of linear programs
 CLIMBERS = 3  # corners at which climbs start in each round
-LONGEST_CLIMB = 12  # entries that a climb turns at most
-ENOUGH = 0.5  # part of the program's room that suffices for the worst corner to end the search
-LOWEST = 1e-6  # lowest frequency of the program, as a part of pi / T
-LEAST_ROOM = 1e-3  # least Re(m S) / abs(S), as a part of `_expected`, that is worth a proof
+LONGEST_CLIMB = 12  # largest number of entries that a climb flips
+# the search for taps ends if the worst corner has this fraction of the room in the program
+ENOUGH = 0.5
+LOWEST = 1e-6  # lowest frequency of the program, as a fraction of pi / T
+# least room, Re(m S) / abs(S) as a fraction of `_expected`, that is worth a proof
+LEAST_ROOM = 1e-3
 KNEE = 3.0  # frequency below which less room is expected, rad/s
 LEAST_TAP = 1e-9
 WHOLE = 1.0 - 1e-8  # sum of the taps, so that rounding does not bring it above 1
 
-MARGIN = 0.02  # part of the bound 1 that is left for what a check between frequencies loses
+# fraction of the bound 1 that a step leaves free, because a check between frequencies loses some
+MARGIN = 0.02
 MOST = 2000  # steps of a proof
-NARROWEST = 1e-3  # a half box below this part of the box is not halved again
-STRIDE = 0.1  # part of a frequency by which the next sample of an interval is farther, at most
-TURN = 0.2  # largest angle by which the farthest tap turns between samples, rad
+# a region with less than this fraction of the half widths of the box is not halved again
+NARROWEST = 1e-3
+# largest distance from a sample of an interval to the next, as a fraction of its frequency
+STRIDE = 0.1
+TURN = 0.2  # largest angle by which z^-j of the farthest tap turns from a sample to the next, rad
 BATCH = 200  # samples on each side of a frequency, at most
 
 
@@ -302,9 +308,10 @@ def _program(
 def inequality(M: ComplexArray, m: ComplexArray | None, step: dict[str, Any]) -> ComplexArray:
     """Compute the matrices of a step that must be positive definite, at F frequencies.
 
-    They are diag(1, ..., 1, 0) - N_d* N_d - Y N - N* Y*, with M (F, q, q) and m (F,). N = diag(e^t,
-    1) M diag(e^-t, e^-s), N_d has the rows of t, and Y = diag(j g, e^-s m). If m is None, the part
-    has no limit, and the matrices lack the last row and column.
+    They are diag(1, ..., 1, 0) - N_d* N_d - Y N - N* Y*, where M has the shape (F, q, q) and m has
+    (F,). t, g and s are the scalings of the step, with N = diag(e^t, 1) M diag(e^-t, e^-s) and Y =
+    diag(j g, e^-s m). N_d has those rows of N that belong to t. If m is None, the part has no
+    limit, and the matrices lack the last row and column.
     """
     t, g = np.array(step["t"]), np.array(step["g"])
     one = M.shape[-1] - len(t)

@@ -28,14 +28,15 @@ LARGEST_G = 1e3  # limit of abs(g_i)
 LEVELS = 40  # largest number of levels in the search for X and G
 CENTRING = 6  # largest number of Newton steps at each level
 LENGTHS = tuple(0.6**k for k in range(20))  # lengths of Newton's step that are tried
-CENTRED = 0.5  # decrement of Newton's method at which a point counts as the centre
+CENTRED = 0.5  # if the decrement of a Newton step is less than this, the point counts as the centre
 FALL = 0.3  # fraction of the distance from the bound to the level that remains after a round
 STALLED = 1e-3  # the search ends if the level exceeds the bound by less than this fraction of it
 
 # Width of the narrowest interval, as a fraction of pi / T. It is less than the interval that
 # LARGEST_G allows around a frequency at which M is real.
 NARROWEST = 1e-8
-# frequency times T, rad, below which the second coefficients change the bound by less than 0.1 %
+# rad; if a frequency times T is less, the second Legendre coefficients change the bound by less
+# than 0.1 %
 MEANS_UP_TO = 0.3
 TINY = 1e-30
 # An eigenvalue of the pencil counts as on the circle if abs(log abs(z)) is less than this. If the
@@ -151,9 +152,10 @@ def tightened_at(
 ) -> tuple[float, Scaling]:
     """Bound a scaled M(w) of a part of the loop, as `tightened` does for the target 1.
 
-    At first X and G are found for the means over a period alone, and the X of the second
-    coefficients only balances rows and columns. If the resulting bound is below 1, or w is low, it
-    is returned. Otherwise X and G are found for all channels.
+    At first the search for X and G has only the channels of the means over a period. The channels
+    of the second coefficients get the X that balances their rows and columns. If the bound with
+    this X and G is below 1, or w is low, it is returned. Otherwise a second search has all
+    channels.
     """
     k = len(part.entries)
     rows = np.r_[0:k, part.uncertain : len(scaled)]

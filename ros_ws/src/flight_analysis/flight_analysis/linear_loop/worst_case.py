@@ -101,7 +101,8 @@ def _divergence(part: Channels) -> tuple[float, FloatArray]:
         best = np.where(rises, upward[rows, most], best)
         if not rises.any():
             break
-        # These are the slopes of the logarithm of the eigenvalue, up to the factor s.
+        # These are the slopes of the logarithm of the eigenvalue along each s_i, times s_i. A
+        # negative one says that s_i should change its side.
         slopes = np.linalg.pinv(X)[rows, most] * X[rows, :, most]
         corners = np.where((slopes.real < 0.0) & rises[:, None], -corners, corners)
     first = int(np.argmax(best))
@@ -255,9 +256,10 @@ def _growth(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
 
 # The least margins of a box
 
-# number of random corners at the start, in addition to those to which the nominal slopes point
+# number of random corners at the start of the walk. Others are those to which the slopes of the
+# nominal aircraft point.
 BEGUN = 16
-FOLLOWED = 2  # for each figure, the walk continues from so many corners with its least values
+FOLLOWED = 2  # number of corners with the least values of a figure from which the walk continues
 WALKED = 6  # largest number of rounds of the walk over the corners
 
 

@@ -273,8 +273,8 @@ def _late_first_u(
 def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bool) -> str | None:
     """Return what a topic lacks, as the object of "the log lacks", or None if it lacks nothing.
 
-    `late` is a tolerance, s. The first sample may come so long after the start, and the last sample
-    so long before the end. `late_u` says that the first u of the flight was late.
+    `late` is the time, s, by which the first sample may come after the start, and the last sample
+    before the end. `late_u` says that the first u of the flight was late.
     """
     facts = []
     missing = not topic.holds(topic.found + topic.unsent) or (
@@ -296,7 +296,8 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bo
         if tail > min((1.0 - WHOLE) * end, SILENCE) + late:
             facts.append(f"ends at t = {topic.last:.3f} of {end:.3f} s")
         silence = end * (1.0 - topic.share) if missing and topic.share is not None else math.inf
-        least = min(SILENCE, silence / 2.0)  # a shorter gap is named if it is most of the lack
+        # a gap is also named if it is more than half of what is missing
+        least = min(SILENCE, silence / 2.0)
         if topic.gap is not None and topic.gap_at is not None and topic.gap > least:
             facts.append(
                 f"no sample from t = {topic.gap_at:.3f} to {topic.gap_at + topic.gap:.3f} s"

@@ -30,7 +30,7 @@ from flight_core.parameters import flatten
 from flight_core.tape import Tape
 from flight_log.clock import SINCE_EPOCH_NS
 
-EQUAL_RATIO_TOLERANCE = 0.05  # metrics count as equal if their ratio is closer to 1
+EQUAL_RATIO_TOLERANCE = 0.05  # metrics count as equal if their ratio differs from 1 by less
 
 
 class ComparisonRow(NamedTuple):
@@ -40,7 +40,7 @@ class ComparisonRow(NamedTuple):
     texts: tuple[str, ...]
     ratios: tuple[float | None, ...]
     lower_is_better: bool = True
-    # whether each flight had the conditions of the first, so that its ratio is a verdict
+    # for each flight, whether it had the conditions of the first. Only then its ratio is a verdict.
     alike: tuple[bool, ...] = ()
 
     def verdict(self, flight: int) -> str:

@@ -99,7 +99,8 @@ LIMIT_VIEW_RATIO = 3.0  # a limit is in view if it is at most this many times th
 # lower and upper limit by input, SI; an input without a limit has infinite ones
 Limits = Mapping[str, tuple[float, float]]
 
-SAME_CURVE_TOLERANCE = 1e-3  # part of the largest value: closer references are one curve
+# references that differ by less than this fraction of the largest value are drawn as one curve
+SAME_CURVE_TOLERANCE = 1e-3
 
 
 def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:

@@ -124,7 +124,8 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
         # The shortfalls come first, because a flight that completed can still fall short.
         end, _, worst = sentence.partition("; ")
         headline = worst.removeprefix("worst: ") or sentence
-        # The sentence may begin with the name of an output, which stays as it is.
+        # If the sentence begins with the name of an output, such as q, its first letter stays
+        # small.
         if headline.split()[0] not in scenario.controller.outputs:
             headline = f"{headline[:1].upper()}{headline[1:]}"
         if worst:

@@ -219,8 +219,8 @@ def _next_paths(
 ) -> list[_Path]:
     """Return the paths that can follow a path, which is a possible history of the received u_m.
 
-    In each of them, another one of the u_m that may have arrived since `before_ns` is the newest.
-    In the last path, none has arrived.
+    Since `before_ns`, one or more of the next u_m may have arrived. For each of them, there is a
+    path in which it is the newest. In the last path, none has arrived.
     """
     arrived = path.taken
     while arrived < len(commands) and commands[arrived].t_ns <= before_ns + AHEAD_NS:

@@ -10,10 +10,11 @@ part of f that depends on the state. In the scenarios of the package, the error 
 to 1.3 times the error of the linear loop.
 
 Because the loop is linear, e is the sum of three errors, which the commands, the noise and the wind
-cause. These errors excuse an error of the flight, so the log must not provide too large ones. Noise
-therefore counts only up to the declared noise of the sensor, and only as far as the actuators can
-follow the law's response to it. Wind counts only as far as the travel of the actuators can counter
-it. Gravity acts along the path of y_m, so that a pitch that was not commanded is no excuse.
+cause. An error of the flight is excused if these errors explain it. So a log with unusual noise or
+wind must not make them too large. Noise therefore counts only up to the declared noise of the
+sensor, and only as far as the actuators can follow the law's response to it. Wind counts only as
+far as the travel of the actuators can counter it. Gravity acts along the path of y_m, so that a
+pitch that was not commanded is no excuse.
 """
 
 from typing import NamedTuple
@@ -152,7 +153,7 @@ def error_pair(
 
 
 def _has_feedback(controller: ControllerConfig) -> bool:
-    """Return whether u of a law depends on y. That of a law for identification does not."""
+    """Return whether u depends on y. In a law for identification it does not."""
     if is_literal(controller):
         return True
     law = linear_law(controller.tuned_law(), len(controller.outputs), 1.0 / controller.rate)

@@ -30,8 +30,9 @@ class ModelSpan(NamedTuple):
     start: float  # s
     stop: float  # s
     rms: dict[str, float]  # rms of `best_error` by channel
-    # number of stated deviations of the learned model within which every aircraft is proved stable;
-    # None if these parameters were not learned, or if the log has no guarantee
+    # Every aircraft is proved stable whose entries differ from the learned model by at most so many
+    # times their stated deviations. None if these parameters were not learned, or if the log has no
+    # guarantee.
     stable: float | None = None
     loop: str = ""  # name of the loop of that guarantee, the first digits of its digest
 
@@ -39,7 +40,7 @@ class ModelSpan(NamedTuple):
 class KeptGuarantee(NamedTuple):
     """The guarantee of a proposal, as the log has it."""
 
-    stable: float  # stated deviations
+    stable: float  # number of stated deviations, as in `ModelSpan`
     loop: str
 
 

@@ -62,8 +62,8 @@ DARK = {PAPER: "#1b1f24", INK: "#d3d9df", GRID: "#2c323a", ZERO: "#4b545e"}
 class Instants:
     """The instants at which a curve is drawn."""
 
-    # ns since the start of the flight, with a further instant at the start of each gap; two for
-    # each bin
+    # Instants of the drawn samples, ns since the start of the flight, and a further one where a gap
+    # begins. If samples are drawn in bins, each bin has two instants.
     t_ns: NDArray[np.int64]
     gaps: NDArray[np.intp]  # indices of the samples before which a NaN marks a gap
     width: int  # number of samples in a bin; 1 if each sample is drawn

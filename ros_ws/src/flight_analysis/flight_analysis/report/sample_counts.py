@@ -34,8 +34,11 @@ SENDERS = {
     **dict.fromkeys(GUIDED, "guidance"),
 }
 RATED = tuple(SENDERS)
-STEADY_RUN = 60  # number of samples that take a steady publisher about the same time
-SHORT_RUN = 6  # if a publisher leaves out 30 %, a tenth of runs of so many is whole
+# length of a run of samples; a steady publisher takes about the same time for each such run
+STEADY_RUN = 60
+# length of a short run; if a publisher leaves out 30 % of the samples, a tenth of such runs is
+# still whole
+SHORT_RUN = 6
 
 
 class TopicAccount(NamedTuple):
@@ -306,9 +309,10 @@ def ends_last(tape: Tape, name: str) -> bool:
 def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
     """Return for how many instants, from the last sample to the end, a publisher sent nothing.
 
-    The numbers of the messages must show that none was lost. Further, the topic must have a later
-    sample after the end, or the aircraft must have sent y only at other instants. Otherwise nothing
-    is proved, and the result is 0.
+    This needs a proof that the publisher did not send, or else the result is 0. The numbers of the
+    messages must show that none was lost. In addition, the topic must have a sample after the end.
+    If it is one of OF_AIRCRAFT, it suffices that the aircraft later sent y, but at no instant at
+    which a sample of the topic was due.
     """
     signal = tape.signals.get(name)
     if signal is None or tape.recording.get(name, Recording(0)).lost != 0:

@@ -10,8 +10,8 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 
-# Largest number of samples of a window, which is 82 s at 100 Hz. A flight longer than 14 min
-# therefore has no further frequencies.
+# Largest number of samples of a window, which is 82 s at 100 Hz. A longer flight than 14 min
+# therefore has no lower frequencies in its spectrum.
 MAX_WINDOW = 8192
 
 

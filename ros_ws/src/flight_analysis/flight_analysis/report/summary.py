@@ -334,7 +334,8 @@ def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
         return []
     from flight_analysis.linear_loop.loop_margins import scenario_loop  # noqa: PLC0415 - loads SciPy, which few flights need
 
-    told = FlightFacts(is_simulated=False)  # the margin comes on top of the delay in the gains
+    # the loop has the delay for which the gains are made, and the margin adds to it
+    told = FlightFacts(is_simulated=False)
     try:
         linear = scenario_loop(scenario, controller, flight=told)
     except ParameterError:  # no linear model

@@ -57,9 +57,10 @@ FACTOR = 2.0
 healthy flights have at most 1.3 times the error."""
 
 COMMAND_PART = 0.5
-"""Fraction of a command. A law that is so weak that even its linear loop does not follow is no
-success. An output counts as commanded if no other output of its kind has more than twice as large a
-command."""
+"""Fraction of a command. Largest part of the allowed error that a command causes, as a fraction of
+the command. A law is no success if it is so weak that even its linear loop does not follow the
+command. An output counts as commanded, unless the command of another output of its kind is more
+than twice as large."""
 
 END = 1.0
 """Length of the end of a flight, s. An error that grows is larger there than over WINDOW."""
@@ -200,7 +201,7 @@ def _most(unit: str) -> float:
 
 
 def _excesses(pair: ErrorPair, i: int, group: list[int], limits: _Limits) -> list[Excess]:
-    """Return the worst parts of each flown span of a flight, and of its end, for output i.
+    """Return, for output i, the worst parts of each span that the law flew, and of the end.
 
     `group` holds the outputs of the same kind, which are the airspeed or the rates.
     """
