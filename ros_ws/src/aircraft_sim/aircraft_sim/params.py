@@ -121,8 +121,8 @@ class AircraftConfig(NodeConfig):
     )
     kinematics: Literal["linear", "euler", "thrust"] = Field(
         default="linear",
-        description="attitude by A; by Euler's equations, with the loss of lift in a bank; or of a "
-        "multicopter",
+        description="how the attitude follows from the rates: linear by A, by Euler's equations "
+        "with the loss of lift in a bank, or as in a multicopter",
     )
     wind: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
         default=(0.0, 0.0), description="steady wind, m/s, towards which the air moves: north, east"

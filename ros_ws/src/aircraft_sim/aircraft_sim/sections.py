@@ -195,8 +195,12 @@ class SineConfig(Config):
 class DrawConfig(Config):
     """A random draw of A and B: entries are multiplied by 1 + d, with d drawn from a seed."""
 
-    A: float = Field(default=0.0, ge=0, lt=1, description="largest relative d of an entry of A")
-    B: float = Field(default=0.0, ge=0, lt=1, description="largest relative d of an entry of B")
+    A: float = Field(
+        default=0.0, ge=0, lt=1, description="largest relative deviation d of an entry of A"
+    )
+    B: float = Field(
+        default=0.0, ge=0, lt=1, description="largest relative deviation d of an entry of B"
+    )
     seed: int = Field(default=1, ge=0, lt=2**63, description="seed of the draw")
     number: int = Field(default=0, ge=0, lt=2**32, description="number of the draw with this seed")
 

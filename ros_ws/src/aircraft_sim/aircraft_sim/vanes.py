@@ -40,9 +40,14 @@ class VaneSensorsConfig(Config):
     channels: tuple[Literal["alpha", "beta"], ...] = Field(
         default=(), description="angles that have a vane; empty for none"
     )
-    frozen_at: Times = Field(default=(), description="instant from which each keeps its angle, s")
+    frozen_at: Times = Field(
+        default=(), description="instant from which each vane keeps its angle, s"
+    )
     dropout: float = Field(
-        default=0.0, ge=0, lt=1, description="probability that a reading repeats the one before"
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="probability that a reading is lost and the last one is repeated",
     )
 
     def _check(self) -> None:

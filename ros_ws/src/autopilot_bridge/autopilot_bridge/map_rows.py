@@ -158,8 +158,8 @@ class OutputRow(MeasuredRow, MovingRow):
     )
     low_pass: NonNegative = Field(
         default=0.0,
-        description="time constant of a first-order low-pass filter, by which y is later, s; 0 for "
-        "no filter",
+        description="time constant of a first-order low-pass filter, which delays y by this time, "
+        "s; 0 for no filter",
     )
 
 

@@ -119,7 +119,7 @@ class ExcitationConfig(ControllerConfig):
     """A controller that excites the inputs one after the other, in their order, in open loop."""
 
     amplitude: NonNegatives = Field(description="largest deviation of each input from trim")
-    width: Positives = Field(description="half the first doublet of each input, s")
+    width: Positives = Field(description="half the length of each input's first doublet, s")
     period: Positives = Field(description="period of the multisine of each input, s")
     lowest: Positives = Field(description="lowest frequency of each multisine, Hz")
     highest: Positives = Field(description="highest frequency of each multisine, Hz")

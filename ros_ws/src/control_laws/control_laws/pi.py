@@ -97,7 +97,7 @@ class PiConfig(ControllerConfig):
     """The controller under PI control."""
 
     K: Positives = Field(description="proportional gains in scaled inputs, 1/s")
-    Lambda: NonNegatives = Field(description="integral gains over proportional ones, 1/s")
+    Lambda: NonNegatives = Field(description="integral gains divided by the proportional ones, 1/s")
 
     def check_law(self) -> None:
         """Check that each parameter has a value for each channel."""

@@ -65,7 +65,9 @@ class AircraftOfFleet(Config):
     start: dict[str, Number] = Field(
         default={}, description="where it is at its t = 0: north, east, m, and heading, rad"
     )
-    delay: NonNegative = Field(default=0.0, description="its t = 0 after that of the fleet, s")
+    delay: NonNegative = Field(
+        default=0.0, description="time from t = 0 of the fleet to its t = 0, s"
+    )
     route: str | None = Field(
         default=None, description="path of a route file, flown from the start"
     )
@@ -83,8 +85,8 @@ class FleetConfig(Config):
     lockstep: bool = Field(
         default=False, description="fly as fast as the machine allows, in lockstep, each by itself"
     )
-    composed: bool = Field(default=False, description="all nodes of an aircraft in one process")
-    use_sim_time: bool = Field(default=False, description="by the /clock of a simulator")
+    composed: bool = Field(default=False, description="run all nodes of an aircraft in one process")
+    use_sim_time: bool = Field(default=False, description="fly by the /clock of a simulator")
     set: Overrides = Field(
         default={},
         description="parameters of all aircraft, by section: a shared wind, for instance",

@@ -26,6 +26,7 @@ class RecorderConfig(NodeConfig):
     )
     attach: OptionalNames = Field(default=(), description="more files to attach to the log")
     metadata_file: str = Field(
-        default="", description="YAML file of named sets of strings, the records of the log"
+        default="",
+        description="YAML file of named sets of strings, which become metadata records of the log",
     )
     scenario_file: str = Field(default="", description="scenario file to attach to the log")

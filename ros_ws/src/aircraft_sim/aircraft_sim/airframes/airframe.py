@@ -67,8 +67,8 @@ class Input(Config):
     positive: str = Field(description="effect of a positive value")
     no_thrust: Number | None = Field(
         default=None,
-        description="value without thrust, deviation from trim; absent: 0 for an angle, "
-        "otherwise unknown",
+        description="value at which the input gives no thrust, as a deviation from trim; if "
+        "absent, it is 0 for an angle and unknown for any other input",
     )
 
 
@@ -121,7 +121,7 @@ class Airframe(Config):
         description="C, one row per output, one column per state; absent if the outputs are states",
     )
     D: tuple[Numbers, ...] = Field(
-        default=(), description="feedthrough of other tools' models; 0 or absent"
+        default=(), description="feedthrough, which models of other tools have; it must be 0"
     )
     output_units: dict[Name, Unit] = Field(
         default={}, description="units of the outputs of C that are not states"
