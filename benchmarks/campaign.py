@@ -64,7 +64,8 @@ def speed(scenario: Scenario, aircraft: int, chunk: int | None, workers: int | N
     """Fly a campaign in threads of this process."""
     with TemporaryDirectory() as folder:
         campaign = MonteCarlo.begin(
-            Path(folder), define(scenario, aircraft, UNCERTAINTY, SEED, chunk)
+            Path(folder),
+            define(scenario, aircraft=aircraft, uncertainty=UNCERTAINTY, seed=SEED, chunk=chunk),
         )
         process = psutil.Process()
         before = time.perf_counter()
@@ -158,7 +159,7 @@ def integration_error(scenario: Scenario, count: int) -> tuple[float, FloatArray
     aircraft-seconds per second, and the largest relative difference of the rms of each output,
     (m,).
     """
-    definition = define(scenario, count, UNCERTAINTY, SEED, count)
+    definition = define(scenario, aircraft=count, uncertainty=UNCERTAINTY, seed=SEED, chunk=count)
     figures = fly_chunk_figures(definition.model_dump_json(), (0, 0)).figures
     outputs = scenario.controller.outputs
     worst = np.zeros(len(outputs))

@@ -98,7 +98,13 @@ def main(
 ) -> None:
     """Print and write the figures."""
     begun = origin("python -m benchmarks.campaign_learning")
-    definition = define(find_scenario(SCENARIO, DURATION), aircraft, UNCERTAINTY, SEED, aircraft)
+    definition = define(
+        find_scenario(SCENARIO, DURATION),
+        aircraft=aircraft,
+        uncertainty=UNCERTAINTY,
+        seed=SEED,
+        chunk=aircraft,
+    )
     flown = [definition.aircraft_scenario(number) for number in range(aircraft)]
     true = np.array([score_of(each, knowing(each)) for each in flown])
     make = quick_learner(flown[0])

@@ -70,7 +70,7 @@ VALUES = arrays(np.float64, st.integers(1, 60), elements=st.floats(1e-6, 1e4))
 
 
 def definition(aircraft: int = 60, chunk: int = 20, sweep: Sweep | None = None) -> Definition:
-    return define(SHORT, aircraft, 0.3, 7, chunk, sweep)
+    return define(SHORT, aircraft=aircraft, uncertainty=0.3, seed=7, chunk=chunk, sweep=sweep)
 
 
 def fly_campaign(folder: Path, of: Definition) -> MonteCarlo:
@@ -167,7 +167,15 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
     """
     units = {"V": 0.2}
     entries = {"B[V,thrust]": 0.6, "lag[thrust]": 0.2, "lag": 0.5, "noise[q]": 0.9, "delay": 0.035}
-    of = define(SHORT, 4, 0.2, 7, 4, spread=Spread(entries, "corners"), units=units)
+    of = define(
+        SHORT,
+        aircraft=4,
+        uncertainty=0.2,
+        seed=7,
+        chunk=4,
+        spread=Spread(entries, "corners"),
+        units=units,
+    )
     campaign = fly_campaign(tmp_path / "own", of)
     rows = campaign.rows().collect()
     airframe = load_airframe(SHORT.aircraft.airframe)
@@ -219,7 +227,7 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
 )
 def test_unknown_entry_and_unit_refused(options: dict[str, Any], sentence: str) -> None:
     with refusing(sentence):
-        define(SHORT, 4, 0.2, 7, 4, **options)
+        define(SHORT, aircraft=4, uncertainty=0.2, seed=7, chunk=4, **options)
 
 
 ROUTE = find_scenario("osprey_route").vary(
@@ -239,7 +247,7 @@ CORNER = ROUTE.vary(
 
 
 def test_figures_of_a_mission_are_those_of_its_flight_alone() -> None:
-    definition = define(CORNER, 2, 0.3, 7, 2)
+    definition = define(CORNER, aircraft=2, uncertainty=0.3, seed=7, chunk=2)
     chunk = single_flights.fly_chunk_singly(definition, (0, 0))
     assert not chunk.diverged.any()
     figures = {key: values[1] for key, values in chunk.figures.items()}
@@ -311,7 +319,7 @@ def test_scenario_that_campaign_cannot_fly_is_refused_before_its_folder(
     scenario: Scenario, sentence: str
 ) -> None:
     with refusing(sentence):
-        define(scenario, 2, 0.3, 7, 2)
+        define(scenario, aircraft=2, uncertainty=0.3, seed=7, chunk=2)
 
 
 def learning(duration: float, **learn: object) -> Scenario:
@@ -340,7 +348,7 @@ def proposing(*proposals: RiseDiConfig) -> Callable[[Scenario], Learn]:
 
 def flown_rows(folder: Path, scenario: Scenario, learner: Any, count: int) -> MonteCarlo:
     folder.mkdir()
-    campaign = MonteCarlo.begin(folder, define(scenario, count, 0.3, 7))
+    campaign = MonteCarlo.begin(folder, define(scenario, aircraft=count, uncertainty=0.3, seed=7))
     assert list(campaign.fly(engines.threads(1), learner)) == [count]
     return campaign
 
@@ -400,9 +408,11 @@ def test_campaign_flies_effect_of_wind_that_definition_names(tmp_path: Path) -> 
     gusty = SHORT.vary(flight={"duration": 4.0}, aircraft={"gusts": gust})
     published = gusty.vary(aircraft={"uncertainty": {"A": 0.9, "wind": "published"}})
     of = {
-        "own": define(gusty, 20, 0.5, 7, 20),
-        "published": define(gusty, 20, 0.5, 7, 20, wind="published"),
-        "scenario": define(published, 20, 0.5, 7, 20),
+        "own": define(gusty, aircraft=20, uncertainty=0.5, seed=7, chunk=20),
+        "published": define(
+            gusty, aircraft=20, uncertainty=0.5, seed=7, chunk=20, wind="published"
+        ),
+        "scenario": define(published, aircraft=20, uncertainty=0.5, seed=7, chunk=20),
     }
     tallies = {
         name: fly_campaign(tmp_path / name, campaign).tally(0) for name, campaign in of.items()
@@ -430,7 +440,9 @@ def test_same_seed_gives_same_figures_in_any_order_and_engine(tmp_path: Path) ->
     third = MonteCarlo.begin(tmp_path / "third", definition())
     list(third.fly(backwards))
     assert third.tally(0).model_dump_json() == first.tally(0).model_dump_json()
-    other = fly_campaign(tmp_path / "other", define(SHORT, 60, 0.3, 8, 20))
+    other = fly_campaign(
+        tmp_path / "other", define(SHORT, aircraft=60, uncertainty=0.3, seed=8, chunk=20)
+    )
     assert other.tally(0).figures["score"].mean != first.tally(0).figures["score"].mean
 
 
@@ -748,7 +760,9 @@ def test_chunk_beyond_memory_flies_in_halves_with_the_same_draws(
 
     Figures may differ by the order of sums, which depends on the vector width of the CPU.
     """
-    part = define(SHORT.vary(flight={"duration": 0.5}), 30, 0.3, 7, 20).model_dump_json()
+    part = define(
+        SHORT.vary(flight={"duration": 0.5}), aircraft=30, uncertainty=0.3, seed=7, chunk=20
+    ).model_dump_json()
     fits = campaign.fly_chunk_figures(part, (0, 0))
     fly_at_once = campaign._fly_at_once
 

@@ -82,6 +82,7 @@ def _permitted_units(scenario: Scenario, units: Mapping[str, float]) -> dict[str
 
 def define(
     scenario: Scenario,
+    *,
     aircraft: int,
     uncertainty: float,
     seed: int,
@@ -112,12 +113,12 @@ def define(
     airframe_spread = spread._replace(entries=equipment.matrix_entries(spread.entries))
     sampled_matrices(
         load_airframe(scenario.aircraft.airframe),
-        uncertainty,
-        uncertainty,
-        seed,
-        0,
-        1,
-        airframe_spread,
+        part_A=uncertainty,
+        part_B=uncertainty,
+        seed=seed,
+        first=0,
+        count=1,
+        spread=airframe_spread,
     )
     values = {
         "name": scenario.name,

@@ -201,14 +201,14 @@ class Campaign:
             spread = spread._replace(distribution=self.distribution)
         definition = define(
             scenario,
-            self.aircraft,
-            self.uncertainty,
-            self.seed,
-            self.chunk,
-            None if self.sweep is None else _parse_sweep(self.sweep),
-            self.wind,
-            spread,
-            None if self.score is None else named_numbers("score", self.score, "q=0.02"),
+            aircraft=self.aircraft,
+            uncertainty=self.uncertainty,
+            seed=self.seed,
+            chunk=self.chunk,
+            sweep=None if self.sweep is None else _parse_sweep(self.sweep),
+            wind=self.wind,
+            spread=spread,
+            units=None if self.score is None else named_numbers("score", self.score, "q=0.02"),
         )
         return MonteCarlo.begin(new_run(scenario, self.runs, "campaign-"), definition)
 

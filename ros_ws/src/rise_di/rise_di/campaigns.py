@@ -121,7 +121,15 @@ def fly_campaign(
         spread = spread._replace(distribution=distribution)
     units = None if score is None else as_numbers_by_name(score, "score", '{"q": 0.02}')
     definition = define(
-        source, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind, spread, units
+        source,
+        aircraft=aircraft,
+        uncertainty=uncertainty,
+        seed=seed,
+        chunk=chunk,
+        sweep=_sweep(sweep),
+        wind=wind,
+        spread=spread,
+        units=units,
     )
     quick_learner(source)  # refuses a scenario with which the aircraft could not learn
     flies = _engine(definition, workers)
