@@ -7,6 +7,7 @@ powers of the airspeed, and the trim is integrated over the airspeed.
 """
 
 from collections.abc import Mapping
+from enum import Enum, auto
 from typing import NamedTuple
 
 import numpy as np
@@ -17,24 +18,30 @@ from aircraft_sim.plant.plant import OverAirspeed
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
-SPEED = "speed"
-INCIDENCE = "incidence"
-RATE = "rate"
-ANGLE = "angle"
-STATES: Mapping[str, str] = {
-    "V": SPEED,
-    "alpha": INCIDENCE,
-    "beta": INCIDENCE,
-    **dict.fromkeys(("p", "q", "r"), RATE),
-    **dict.fromkeys(("theta", "phi", "psi"), ANGLE),
+
+class Kind(Enum):
+    """The kind of a state, on which the exponents of its entries depend."""
+
+    SPEED = auto()
+    INCIDENCE = auto()  # alpha or beta
+    RATE = auto()
+    ANGLE = auto()  # of the attitude
+
+
+STATES: Mapping[str, Kind] = {
+    "V": Kind.SPEED,
+    "alpha": Kind.INCIDENCE,
+    "beta": Kind.INCIDENCE,
+    **dict.fromkeys(("p", "q", "r"), Kind.RATE),
+    **dict.fromkeys(("theta", "phi", "psi"), Kind.ANGLE),
 }
 """Kinds of the states whose exponents are known, by name."""
 
-EXPONENTS: Mapping[str, Mapping[str, float]] = {
-    SPEED: {SPEED: 1.0, INCIDENCE: 2.0, RATE: 1.0, ANGLE: 0.0},
-    INCIDENCE: {SPEED: -2.0, INCIDENCE: 1.0, RATE: 0.0, ANGLE: -1.0},
-    RATE: {SPEED: 1.0, INCIDENCE: 2.0, RATE: 1.0, ANGLE: 0.0},
-    ANGLE: {SPEED: 0.0, INCIDENCE: 0.0, RATE: 0.0, ANGLE: 0.0},
+EXPONENTS: Mapping[Kind, Mapping[Kind, float]] = {
+    Kind.SPEED: {Kind.SPEED: 1.0, Kind.INCIDENCE: 2.0, Kind.RATE: 1.0, Kind.ANGLE: 0.0},
+    Kind.INCIDENCE: {Kind.SPEED: -2.0, Kind.INCIDENCE: 1.0, Kind.RATE: 0.0, Kind.ANGLE: -1.0},
+    Kind.RATE: {Kind.SPEED: 1.0, Kind.INCIDENCE: 2.0, Kind.RATE: 1.0, Kind.ANGLE: 0.0},
+    Kind.ANGLE: {Kind.SPEED: 0.0, Kind.INCIDENCE: 0.0, Kind.RATE: 0.0, Kind.ANGLE: 0.0},
 }
 """Exponents of the ratio of airspeeds in an entry of A, by the kinds of its row and column.
 
@@ -43,14 +50,14 @@ with V^2 about the trim. A[alpha,V] is therefore -2 g / V^2.
 """
 
 # Exponents for the columns of B, by the kind of the row: of a surface, and of the thrust.
-OF_SURFACE = {SPEED: 2.0, INCIDENCE: 1.0, RATE: 2.0, ANGLE: 0.0}
-OF_THRUST = {SPEED: 0.0, INCIDENCE: -1.0, RATE: 0.0, ANGLE: 0.0}
+OF_SURFACE = {Kind.SPEED: 2.0, Kind.INCIDENCE: 1.0, Kind.RATE: 2.0, Kind.ANGLE: 0.0}
+OF_THRUST = {Kind.SPEED: 0.0, Kind.INCIDENCE: -1.0, Kind.RATE: 0.0, Kind.ANGLE: 0.0}
 
 WIND_STATE = {
-    "longitudinal": SPEED,
-    "lateral": INCIDENCE,
-    "vertical": INCIDENCE,
-    **dict.fromkeys(ROTARY, RATE),
+    "longitudinal": Kind.SPEED,
+    "lateral": Kind.INCIDENCE,
+    "vertical": Kind.INCIDENCE,
+    **dict.fromkeys(ROTARY, Kind.RATE),
 }
 """Kind of the state in which wind along an axis acts relative to the air."""
 
@@ -93,8 +100,8 @@ def exponents(airframe: Airframe, thrust: str) -> Exponents:
     for i, row in enumerate(kinds):
         A[i] = [EXPONENTS[row][column] for column in kinds]
         B[i] = [effect[row] for effect in effects]
-        gravity[i] = EXPONENTS[row][ANGLE]
-        wind[i] = [EXPONENTS[row][kind] - float(kind == INCIDENCE) for kind in axes]
+        gravity[i] = EXPONENTS[row][Kind.ANGLE]
+        wind[i] = [EXPONENTS[row][kind] - float(kind is Kind.INCIDENCE) for kind in axes]
     return Exponents(A, B, gravity, wind)
 
 
@@ -115,7 +122,7 @@ def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
         airframe.matrix_a() * ratio**powers.A, airframe.matrix_b() * ratio**powers.B, wind
     )
     gravity = [
-        {**term.model_dump(), "gain": term.gain * ratio ** EXPONENTS[STATES[term.into]][ANGLE]}
+        {**term.model_dump(), "gain": term.gain * ratio ** EXPONENTS[STATES[term.into]][Kind.ANGLE]}
         for term in airframe.gravity
     ]
     changes = {"speed": ratio * airframe.speed, "gravity": gravity}
