@@ -391,19 +391,16 @@ class AircraftConfig(NodeConfig):
         return airframe.with_rotary_gusts() if self.has_rotary_gusts else airframe
 
     def sampled_airframe(self) -> Airframe:
-        """Return the airframe in flight at the start.
-
-        It is the named airframe, or a sample of `uncertainty` around it.
-        """
+        """Return the airframe at the start: the named one, or a sample of `uncertainty`."""
         section = self.uncertainty
         return uncertainty.sample_airframe(
             self.nominal_airframe(),
-            section.A,
-            section.B,
-            section.seed,
-            section.number,
-            section.wind,
-            section.spread(),
+            part_A=section.A,
+            part_B=section.B,
+            seed=section.seed,
+            number=section.number,
+            wind=section.wind,
+            spread=section.spread(),
         )
 
     def drifted_airframe(self) -> Airframe:
@@ -413,7 +410,12 @@ class AircraftConfig(NodeConfig):
         if section is None:
             return airframe
         return uncertainty.sample_airframe(
-            airframe, section.A, section.B, section.seed, section.number, self.uncertainty.wind
+            airframe,
+            part_A=section.A,
+            part_B=section.B,
+            seed=section.seed,
+            number=section.number,
+            wind=self.uncertainty.wind,
         )
 
     def drift_factors(self) -> Drift | None:

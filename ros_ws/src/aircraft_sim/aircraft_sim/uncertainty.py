@@ -59,7 +59,15 @@ def nominal_and_sampled(
     The first matrices are the published ones. The aircraft with the numbers 0, 1, ... of the seed
     follow. Raises as `sampled_matrices` does.
     """
-    A, B = sampled_matrices(airframe, uncertainty, uncertainty, seed, 0, samples, spread)
+    A, B = sampled_matrices(
+        airframe,
+        part_A=uncertainty,
+        part_B=uncertainty,
+        seed=seed,
+        first=0,
+        count=samples,
+        spread=spread,
+    )
     return np.concatenate([airframe.matrix_a()[None], A]), np.concatenate(
         [airframe.matrix_b()[None], B]
     )
@@ -80,7 +88,9 @@ def sample_airframe(
     The effect of wind follows from `wind_factors`, and the rest of f stays as published. Raises as
     `sampled_matrices` does.
     """
-    A, B = sampled_matrices(airframe, part_A, part_B, seed, number, 1, spread)
+    A, B = sampled_matrices(
+        airframe, part_A=part_A, part_B=part_B, seed=seed, first=number, count=1, spread=spread
+    )
     if part_A == part_B == 0.0 and not spread.entries:
         return airframe
     return airframe.with_matrices(A[0], B[0], wind_factors(airframe, A, wind)[0])

@@ -52,7 +52,15 @@ def drawn_fleet(definition: Definition, scenario: Scenario, first: int, count: i
     """Draw `count` aircraft of a campaign, beginning with number `first`."""
     part = definition.uncertainty
     airframe = scenario.aircraft.nominal_airframe()
-    A, B = sampled_matrices(airframe, part, part, definition.seed, first, count, definition.spread)
+    A, B = sampled_matrices(
+        airframe,
+        part_A=part,
+        part_B=part,
+        seed=definition.seed,
+        first=first,
+        count=count,
+        spread=definition.spread,
+    )
     directions = gust_directions(airframe, A, definition.wind)
     equipped = definition.drawn_equipment(scenario, first, count)
     return DrawnFleet(scenario=scenario, A=A, B=B, gust_directions=directions, equipment=equipped)

@@ -464,7 +464,8 @@ def box_of(
         # here the effectors are the inputs of the law, in its order
         order = [effectors.index(name) for name in controller.inputs]
         effectors, T = list(controller.inputs), T[order]
-    return Box(tuple(places), part, E, F, G, tuple(effectors), T, zeros)
+    names = tuple(places)
+    return Box(names=names, part=part, E=E, F=F, G=G, effectors=tuple(effectors), T=T, zeros=zeros)
 
 
 def _some(plant: LinearPlant, names: slice) -> LinearPlant:
