@@ -13,6 +13,7 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError
+from flight_log.playback import ScheduledMessage
 from flight_ros.client import Client
 from flight_ros.endpoints import require_no_publishers
 from flight_ros.event_loop import IDLE_POLL_PERIOD
@@ -26,9 +27,6 @@ MATCHING_TIME = 0.5  # s, time to discover the subscribers
 CLOCK_PERIOD_NS = 10_000_000  # ns of the log between two samples of `/clock`
 CLOCK_NAME = f"/{CLOCK.name}"  # the name that ROS uses for simulated time
 PROGRESS_PERIOD_NS = 100_000_000
-
-Outgoing = tuple[int, str, bytes, bool]
-"""A message: instant in the log, ns; topic; bytes; and whether these begin with a stamp."""
 
 
 class Player(Client):
@@ -56,7 +54,7 @@ class Player(Client):
 
     def play(
         self,
-        messages: Iterable[Outgoing],
+        messages: Iterable[ScheduledMessage],
         rate: float,
         *,
         stamps_now: bool,
@@ -71,7 +69,8 @@ class Player(Client):
         called ten times a second with the instant of the log, ns.
         """
         begin_ns = begin_system_ns = first_ns = clock_ns = progress_ns = 0
-        for due_ns, topic, message, has_stamp in messages:
+        for message in messages:
+            due_ns = message.due_ns
             if begin_ns == 0:
                 begin_ns = time.monotonic_ns()
                 begin_system_ns = time.time_ns()
@@ -84,10 +83,10 @@ class Player(Client):
                     progress_ns = time.monotonic_ns() + PROGRESS_PERIOD_NS
                     progress(due_ns)
             _sleep_until(begin_ns + round((due_ns - first_ns) / rate))
-            restamp = stamps_now and has_stamp
-            self._publishers[topic].publish(
-                _restamped(message, begin_system_ns, first_ns, rate) if restamp else message
-            )
+            data = message.data
+            if stamps_now and message.stamped:
+                data = _restamped(data, begin_system_ns, first_ns, rate)
+            self._publishers[message.topic].publish(data)
         for publisher in self._publishers.values():
             publisher.wait_for_all_acked(ACKNOWLEDGE_TIMEOUT)
 
