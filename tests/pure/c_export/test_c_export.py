@@ -28,6 +28,7 @@ from c_export.constants import TABLE, constants, exportable, packed
 from c_export.drawn import drawn_calls, drawn_commands, drawn_standstill, drawn_steps
 from c_export.events import (
     RETUNE,
+    GuardSample,
     Recorder,
     Recording,
     flight_recordings,
@@ -166,7 +167,7 @@ def any_numbers(sets: list[RiseDiConfig]) -> Recording:
                     start_ns + 10_000_000 * k + int(rng.integers(-2_000_000, 2_000_000)) * (k > 0)
                 )
                 # inactive at first: with u = 0 nothing has to ramp
-                recorder.guard_tick(now_ns, (now_ns, y, y_m, 0), active=k > 2)
+                recorder.guard_tick(now_ns, GuardSample(now_ns, y, y_m), active=k > 2)
             with suppress(ChannelError):
                 recorder.take_y(StampedVector(-start_ns, np.zeros(m)), start_ns + 5 * 10**8)
             recorder.tick(-start_ns)

@@ -8,6 +8,7 @@ The calls come from flights with faults, or from a log.
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -104,6 +105,16 @@ def numbered(groups: Mapping[str, int]) -> Iterator[str]:
     """Yield a name for each value of the groups, such as u[0], u[1], ..."""
     for group, count in groups.items():
         yield from (f"{group}[{i}]" for i in range(count))
+
+
+@dataclass(frozen=True)
+class GuardSample:
+    """The sample that a tick of the guard takes."""
+
+    stamp_ns: int
+    y: FloatArray
+    y_m: FloatArray  # y_m at the stamp
+    offset_ns: int = 0  # stamp of the newest y_m minus that of the sample
 
 
 class Recorder(Controller):
@@ -205,25 +216,23 @@ class Recorder(Controller):
         self._note_state(None if output is None else output.inputs)
         return output
 
-    def guard_tick(
-        self, now_ns: int, sample: tuple[int, FloatArray, FloatArray, int] | None, *, active: bool
-    ) -> None:
+    def guard_tick(self, now_ns: int, sample: GuardSample | None, *, active: bool) -> None:
         """Compute a tick of the guard with a given sample, and record it.
 
-        `sample` has a stamp, y, y_m at this stamp, and an offset. The offset is the stamp of the
-        newest y_m minus that of the sample, ns. `sample` is None if there are no samples.
+        `sample` is None if there are no samples.
         """
         y = None
         y_m = []
         if sample is None:
             self._add(GUARD_TICK, now_ns, flag=int(active))
         else:
-            stamp_ns, y_value, y_m_value, offset_ns = sample
-            self._add(GUARD_TICK, now_ns, stamp_ns, int(active) + 2, offset_ns, y_value, y_m_value)
-            y = StampedVector(stamp_ns, y_value)
-            y_m = [StampedVector(stamp_ns, y_m_value)]
+            stamp_ns, offset_ns = sample.stamp_ns, sample.offset_ns
+            flag = int(active) + 2
+            self._add(GUARD_TICK, now_ns, stamp_ns, flag, offset_ns, sample.y, sample.y_m)
+            y = StampedVector(stamp_ns, sample.y)
+            y_m = [StampedVector(stamp_ns, sample.y_m)]
             if offset_ns > 0:
-                y_m.append(StampedVector(stamp_ns + offset_ns, y_m_value))
+                y_m.append(StampedVector(stamp_ns + offset_ns, sample.y_m))
         self._state, inputs = guard.tick(
             self._state, now_ns, y, y_m, self._guard, self._law, active
         )
@@ -399,11 +408,13 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
             offset_ns = round(float(log["y_m_offset"][k]) * NANOSECONDS)
             if log["dt"][k] == 0.0 and recorder.mode is Mode.ENGAGED:
                 recorder.restart()
-            sample = (int(log.stamp_ns[k]), groups["y"][k], groups["y_m"][k], offset_ns)
+            stamp_ns = int(log.stamp_ns[k])
+            sample = GuardSample(stamp_ns, groups["y"][k], groups["y_m"][k], offset_ns)
         elif log.stamp_ns[k] == recorder.state.stamp_ns:
             # The controller stands by at the same stamp as before. So its last y was older than
             # this stamp, and the law did not engage.
-            sample = (int(log.stamp_ns[k]) - 1, groups["y"][k], groups["y_m"][k], 0)
+            stamp_ns = int(log.stamp_ns[k]) - 1
+            sample = GuardSample(stamp_ns, groups["y"][k], groups["y_m"][k])
         recorder.guard_tick(int(now_ns[k]), sample, active=log["mode"][k] != Mode.INACTIVE)
         equal += recorder.state.command.tobytes() == groups[command][k].tobytes()
     return sets, recorder.recording(f"the log {printable(str(run.path))}"), equal
