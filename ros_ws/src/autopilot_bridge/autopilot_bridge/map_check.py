@@ -18,7 +18,7 @@ from rosbags.typesys import TypesysError, get_types_from_msg
 from autopilot_bridge import mavlink_link
 from autopilot_bridge.channel_map import QUATERNION, STEP, versioned_topic
 from autopilot_bridge.map_rows import MAVLINK
-from autopilot_bridge.params import ChannelMap
+from autopilot_bridge.params import ChannelMap, UsedField
 from flight_core.files import read_file
 from flight_core.installation import require_package
 from flight_core.outcome import Refusal
@@ -112,12 +112,14 @@ def check_map(channel_map: ChannelMap, releases: Iterable[Types]) -> list[Checke
     """
     releases = list(releases)
     rows = []
-    for key, topic, kind, path, components in channel_map.used_fields():
+    for used in channel_map.used_fields():
         faults = []
         for types in releases:
-            fault = _fault(types, topic, kind, path, components)
-            faults.append(fault or _constant_fault(types, channel_map, key, kind))
-        rows.append(CheckedRow(key, topic, path, tuple(faults)))
+            fault = _fault(types, used)
+            faults.append(fault or _constant_fault(types, channel_map, used.key, used.type))
+        rows.append(
+            CheckedRow(key=used.key, topic=used.topic, field=used.path, faults=tuple(faults))
+        )
     return rows
 
 
@@ -145,10 +147,9 @@ def _element(field: Any) -> tuple[Nodetype, Any]:
     return content[0] if node in {Nodetype.ARRAY, Nodetype.SEQUENCE} else (node, content)
 
 
-def _fault(
-    types: Types, topic: str, kind: str, path: str, components: str | None
-) -> Refusal | None:
+def _fault(types: Types, used: UsedField) -> Refusal | None:
     definitions = {**typestore().fielddefs, **types}
+    kind, topic, components = used.type, used.topic, used.components
     if not is_known(types, kind):
         return Refusal(f"no {kind}")
     version = next((value for name, _, value in definitions[kind][0] if name == VERSION), 0)
@@ -156,7 +157,7 @@ def _fault(
         return Refusal(f"{topic}: version {version}, whose topic is {expected}")
     member_kind = kind
     field = (Nodetype.NAME, kind)
-    for step in path.split("."):
+    for step in used.path.split("."):
         match = STEP.fullmatch(step)
         fields = dict(definitions[member_kind][1]) if member_kind in definitions else {}
         if match is None or match[1] not in fields:
@@ -169,13 +170,13 @@ def _fault(
         member_kind = element[1] if element[0] is Nodetype.NAME else ""
     if components is None or _has(definitions, field, components):
         return None
-    return Refusal(f"{path}: no {', '.join(components) or 'number'}")
+    return Refusal(f"{used.path}: no {', '.join(components) or 'number'}")
 
 
 def _has(definitions: Types, field: Any, components: str) -> bool:
     """Return whether a field has the given components, as members or in an array.
 
-    If `components` is None, the result says whether the field is a number.
+    If `components` is "", the result says whether the field is a number.
     """
     node, content = field
     if node is Nodetype.NAME:

@@ -4,6 +4,8 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
 from importlib.resources import files
 from itertools import chain
 from pathlib import Path
@@ -34,6 +36,17 @@ from flight_core.parameters import Config, Name, NodeConfig, NonNegative, Positi
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
 # The name of a parameter of the autopilot, up to 16 characters (common.xml, PARAM_VALUE).
 PARAMETER = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class UsedField:
+    """A field of a message that a row of a map reads or sets."""
+
+    key: str  # key of the row
+    topic: str
+    type: str
+    path: str
+    components: str | None = None  # those of `COMPONENTS` if a function reads the field
 
 
 class ChannelMap(Config):
@@ -345,22 +358,18 @@ class ChannelMap(Config):
             ]
         return topics
 
-    def used_fields(self) -> list[tuple[str, str, str, str, str | None]]:
-        """Return each field that is read or set, as (key, topic, type, path, components).
-
-        The key is that of the row. The components are those of `COMPONENTS` if a function reads the
-        field, and otherwise None.
-        """
-        fields: list[tuple[str, str, str, str, str | None]] = []
+    def used_fields(self) -> list[UsedField]:
+        """Return each field of a message that a row reads or sets."""
+        fields: list[UsedField] = []
         for kind, rows_by_name in self._readers().items():
             for name, row in rows_by_name.items():
-                source = (f"{kind}.{name}", row.topic, row.type)
+                of_row = partial(UsedField, key=f"{kind}.{name}", topic=row.topic, type=row.type)
                 components = COMPONENTS[getattr(row, "function", "value")]
-                fields.append((*source, row.field, components))
+                fields.append(of_row(path=row.field, components=components))
                 if (turned_by := getattr(row, "turned_by", None)) is not None:
-                    fields.append((*source, turned_by, QUATERNION))
+                    fields.append(of_row(path=turned_by, components=QUATERNION))
                 if getattr(row, "stamp", "") == "header":
-                    fields.append((*source, "header.stamp", None))
+                    fields.append(of_row(path="header.stamp"))
         set_fields = [
             (f"inputs.{name}", row.message, row.field) for name, row in self.inputs.items()
         ]
@@ -369,7 +378,7 @@ class ChannelMap(Config):
             set_fields += [(f"messages.{name}", name, path) for path in paths]
         for key, name, path in set_fields:
             message = self.messages[name]
-            fields.append((key, message.topic, message.type, path, None))
+            fields.append(UsedField(key=key, topic=message.topic, type=message.type, path=path))
         return fields
 
 

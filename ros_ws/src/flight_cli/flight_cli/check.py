@@ -175,7 +175,7 @@ def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: b
 
     The definitions come from releases of an autopilot.
     """
-    kinds = list(dict.fromkeys(kind for _, _, kind, *_ in channel_map.used_fields()))
+    kinds = list(dict.fromkeys(field.type for field in channel_map.used_fields()))
     installed = installed_definitions(kinds)
     mavlink_types = {
         kind: types for kind, types in installed.items() if kind.startswith(f"{MAVLINK}/")
