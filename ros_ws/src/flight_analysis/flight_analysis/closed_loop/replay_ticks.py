@@ -238,7 +238,9 @@ class Ticks:
             given_up = self._groups[internals.GIVEN_UP][k]
         else:
             given_up = np.zeros(0)
-        row = internals.values(after, inputs, limits, late, age, 0, 0, given_up)
+        row = internals.values(
+            after, inputs, limits, late, age, number=0, parameters=0, given_up=given_up
+        )
         row[self._copied] = self.values[k, self._copied]
         return after, np.concatenate([row, after.command])
 

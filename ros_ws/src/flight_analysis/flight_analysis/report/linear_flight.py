@@ -213,9 +213,13 @@ def _linear_errors(
         else:
             wind = _disturbance(tape, aircraft, ticks, len(plant.A))
             along_path = np.zeros_like(wind)
-        by_command = _flight(tape, controller, parts, ticks, along_path, still, y_m, e_0)
-        by_noise = _flight(tape, None, parts, ticks, 0.0 * wind, noise, still, 0.0 * e_0)
-        by_wind = _flight(tape, None, parts, ticks, wind, still, still, 0.0 * e_0)
+        calm = 0.0 * wind
+        in_trim = 0.0 * e_0
+        by_command = _flight(
+            tape, parts, ticks, d=along_path, noise=still, y_m=y_m, e_0=e_0, probed=controller
+        )
+        by_noise = _flight(tape, parts, ticks, d=calm, noise=noise, y_m=still, e_0=in_trim)
+        by_wind = _flight(tape, parts, ticks, d=wind, noise=still, y_m=still, e_0=in_trim)
         reach = _reach(controller, aircraft)
         held_noise = _share_within(reach, by_noise.u, loop.period) * by_noise.e
         held_wind = _share_within_travel(reach, by_wind.u) * by_wind.e
@@ -263,8 +267,8 @@ def _reach(controller: ControllerConfig, aircraft: AircraftConfig | None) -> Rea
 def _share_within(reach: Reach, u: FloatArray, period: float) -> FloatArray:
     """Return the fraction of u that the actuators can follow, (m,), at most 1.
 
-    u has the shape (N, m). NOISE_PEAK standard deviations of this fraction lie within travel and
-    rate.
+    u has the shape (N, m). Of this fraction of u, NOISE_PEAK standard deviations lie within travel
+    and rate of the actuators.
     """
     if len(u) < 2:
         return np.ones(u.shape[1])
@@ -317,17 +321,18 @@ class _LinearFlight(NamedTuple):
 
 def _flight(
     tape: Tape,
-    probed: ControllerConfig | None,
     parts: tuple[LinearPlant, LinearLaw, LoopTiming],
     ticks: FloatArray,
+    *,
     d: FloatArray,
     noise: FloatArray,
     y_m: FloatArray,
     e_0: FloatArray,
+    probed: ControllerConfig | None = None,
 ) -> _LinearFlight:
     """Fly the linear loop, x_dot = A x + B u + d, with d (N, n) and noise (N, m).
 
-    `probed` is the controller if its probe acts, else None.
+    The flight begins with the error `e_0`. `probed` is the controller if its probe acts.
     """
     plant, law, loop = parts
     n, m = plant.B.shape
