@@ -13,8 +13,8 @@ SOFT = 7.0 * FOOT
 built, 14 CFR 23.473(d), 7 ft/s."""
 
 LEVEL = math.radians(22.0)
-"""Largest bank of a landing, rad, if there is no model of the gear: a low wing of 2.5 m per metre
-of height touches the ground at 22 deg."""
+"""Largest bank of a landing, rad, if there is no model of the gear. At 22 deg, the tip of a low
+wing touches the ground, if the wing reaches 2.5 m to the side per metre of its height."""
 
 
 def touch(title: str, t_ns: int, sink: float, *, is_on_wheels: bool) -> FlightEnded:

@@ -202,10 +202,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return nanoseconds(self.parameters.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Return the silence of the publisher of u after which another may take over, ns.
+        """Return two silences of the publisher of u after which another may take over, ns.
 
-        The first value is for the same node in a new process. The second, for another node, ends
-        when the failsafe has brought u to trim.
+        After the first, the same node may take over in a new process. After the second, another
+        node may, because the failsafe has then brought u to trim.
         """
         return self._max_age_ns, self._max_age_ns + nanoseconds(
             self.parameters.hold + self.parameters.ramp

@@ -593,7 +593,7 @@ STILL_AIR = Gust(start=0.0, speed=0.0, length=1.0)
 
 
 def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:
-    """Return the values as an array; None for no values, or for zeros if `zero_is_none`."""
+    """Return values as an array; None if there are none, or if all are 0 and `zero_is_none`."""
     if not values or (zero_is_none and not any(values)):
         return None
     return np.array(values, dtype=np.float64)

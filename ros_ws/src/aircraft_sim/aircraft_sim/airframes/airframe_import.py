@@ -294,8 +294,8 @@ def _effect(model: ToolModel, name: str) -> str:
 def _gusts(frame: Airframe) -> dict[str, dict[str, float]]:
     """Return the effect of wind on x_dot by axis and state, for the section `gusts` of a file.
 
-    The unit of the effect is that of a wind w / V0 = 1. The effect is minus the column of the state
-    that moves relative to the air. Wind has no effect on angles and h.
+    The effect is that of a wind w / V0 = 1, which is minus the column of the state that moves
+    relative to the air. Wind has no effect on angles and h.
     """
     A = frame.matrix_a()
     names = list(frame.states)

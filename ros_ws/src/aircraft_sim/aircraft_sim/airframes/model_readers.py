@@ -478,7 +478,10 @@ def _avl_values(text: str) -> dict[str, float]:
 
 
 def _avl_controls(text: str, inputs: Mapping[str, Any]) -> dict[str, int]:
-    """Return the controls of AVL by number: those that are named, or that have a usual name."""
+    """Return the numbers of controls in AVL's file, by name.
+
+    The names are those of `inputs`, or the usual ones if there are no inputs.
+    """
     numbers = {
         _control(name): int(number) for name, number in re.findall(r"(\S+)\s+d0?(\d+)\b", text)
     }

@@ -41,9 +41,9 @@ KINDS = {
     "slow": FaultKind("slow_at", "slow_lag", 0.2),
     "loose": FaultKind("loose_at", "loose_play", 0.01),
 }
-"""The kinds of faults. If a sentence states no strength, `weak` leaves half of the effect, `slow`
-has the lag 0.2 s, ten times that of a servo of the osprey, and `loose` has a half-width of 0.01,
-which is 0.57 deg, or 1 % of thrust."""
+"""The kinds of faults. These strengths hold if a sentence states none: `weak` leaves half of the
+effect. `slow` has the lag 0.2 s, ten times the lag of a servo of the osprey. `loose` has the
+half-width 0.01, which is 0.57 deg or 1 % of thrust."""
 
 STOPPED = frozenset({"stuck", "lost", "failed", HARD_OVER})
 """The kinds after which an input no longer follows u."""
