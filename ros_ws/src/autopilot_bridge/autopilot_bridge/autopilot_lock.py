@@ -18,9 +18,9 @@ class AutopilotLock:
     """Locks to the first autopilot until it is silent, and then to the next one.
 
     Two autopilots behind the same address differ by the time since boot in their messages. In the
-    messages of one autopilot this time never goes back, and it advances no faster than the clock of
-    this host, except if a message was late. An autopilot that starts again counts as a second
-    sender at first. Once the messages of its earlier run have been missing for the time of a
+    messages of one autopilot this time never goes back. It advances no faster than the clock of
+    this host, except after a message that was late. An autopilot that starts again counts as a
+    second sender at first. Once the messages of its earlier run have been missing for the time of a
     silence, the lock goes to the new run.
     """
 
@@ -41,7 +41,10 @@ class AutopilotLock:
         return self._addresses.publisher
 
     def overran(self, duration_ns: int) -> None:
-        """Do not count a time in which the receiver did not run as silence, ns."""
+        """Note a time, ns, in which the receiver did not run.
+
+        This time does not count as silence.
+        """
         self._addresses.overran(duration_ns)
         self._starts.overran(duration_ns)
 

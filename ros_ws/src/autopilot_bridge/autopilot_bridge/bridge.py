@@ -261,7 +261,7 @@ class Bridge:
         return joined((warning, self.problem, silent, blindness))
 
     def u_timed_out(self, now_ns: int) -> bool:
-        """Return whether no u has been received, or none for longer than its age limit."""
+        """Return whether the last u is older than its age limit, or no u was received yet."""
         return self.u_lock.timed_out(now_ns, self._max_age_ns)
 
     def _u_timeout(self, now_ns: int) -> Refusal | None:

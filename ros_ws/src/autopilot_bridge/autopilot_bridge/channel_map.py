@@ -159,8 +159,8 @@ DERIVED: Mapping[str, Callable[[Any], float]] = MappingProxyType(
 """Functions from a field to the raw value.
 
 They give the number itself, the length of a vector, the airspeed for a dynamic pressure, or the
-Euler angles (z, y, x) of a quaternion. The angles of body FLU in ENU are roll, -pitch and pi/2 -
-yaw of body FRD in NED, which the row states by its sign and offset.
+Euler angles (z, y, x) of a quaternion. A message may have the angles of body FLU in ENU. These are
+roll, -pitch and pi/2 - yaw of body FRD in NED, so the row converts them by its sign and its offset.
 """
 
 QUATERNION = "wxyz"
