@@ -137,8 +137,8 @@ IDLE_IN_C = frozenset(
 def exportable(controller: ControllerConfig) -> RiseDiConfig:
     """Return the controller if it can be exported.
 
-    Raises ParameterError if it has another law than RISE-DI, or a key that the C code does not
-    know, such as models that are learned or switched off.
+    Raises ParameterError if its law is not RISE-DI, or if it has a section that the C code lacks,
+    such as one for models that are learned or switched off.
     """
     require(
         isinstance(controller, RiseDiConfig),
@@ -409,5 +409,5 @@ def _octal(character: str) -> str:
 
 
 def _comment(names: tuple[str, ...]) -> str:
-    """Return names for a comment in C, with the escapes of `_strings` so that none ends it."""
+    """Return names for a comment in C. The escapes of `_strings` keep it from ending early."""
     return ", ".join("".join(map(_octal, name)) for name in names)

@@ -163,7 +163,9 @@ def drawn_standstill(
 
 
 def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int) -> Recording:
-    """Draw single steps of an engaged controller from any state, and compute all at once.
+    """Draw single steps of an engaged controller from any state.
+
+    All steps are computed at once.
 
     The parameters are those at `index` in `sets`. Errors are 0.001 to 300 widths of the softened
     sign. dt is 0.2 to 10 periods, so that up to 9 samples are missing. It is always short enough

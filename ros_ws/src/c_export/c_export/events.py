@@ -170,14 +170,14 @@ class Recorder(Controller):
         self._add(START)
 
     def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """Take y as the controller does, or lose the sample if y is silent."""
+        """Hand a sample of y to the controller, or lose it if y is in `silent`."""
         if "y" in self.silent:
             return None
         self._add(TAKE_Y, now_ns, sample.stamp_ns, y=sample.value)
         return self._note_refusal(super().take_y, sample, now_ns)
 
     def take_y_m(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """Take y_m as the controller does, or lose the sample if y_m is silent."""
+        """Hand a sample of y_m to the controller, or lose it if y_m is in `silent`."""
         if "y_m" in self.silent:
             return None
         self._add(TAKE_Y_M, now_ns, sample.stamp_ns, y_m=sample.value)
@@ -204,7 +204,7 @@ class Recorder(Controller):
         self.retune(self.sets[index])
 
     def restart(self) -> None:
-        """Restart as the controller does, and record it."""
+        """Restart the controller, and record the restart."""
         self._add(RESTART)
         super().restart()
 

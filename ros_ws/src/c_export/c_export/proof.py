@@ -182,8 +182,8 @@ class Program:
     def run(self, recording: Recording) -> tuple[np.ndarray, FloatArray, Mapping[str, int]]:
         """Run the program, and return the integers and the reals of its states.
 
-        They have the form of the recording. The third result has the numbers that the program
-        prints, by name.
+        The integers and reals have the same form as in the recording. The third result has the
+        numbers that the program prints, by name.
         """
         (self._folder / "events").write_bytes(recording.events.tobytes())
         (self._folder / "loaded").write_bytes(recording.loaded.tobytes())
@@ -272,7 +272,7 @@ def prove(
 
     Every state of the C code is compared with the recorded state of the Python code. `runner`, such
     as qemu, starts the programs of a compiler for another machine. If g++ is installed, a further
-    program counts the operations on reals, which gives their largest number in one call.
+    program counts the operations on reals. It gives the largest number of them in one call.
     """
     comparisons: list[Comparison] = []
     with tempfile.TemporaryDirectory(prefix="rise_di_export_") as name:
