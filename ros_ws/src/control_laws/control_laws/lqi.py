@@ -127,10 +127,10 @@ def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:
         Q = 1 / size^2,  Q_i = integral^2 / size^2,  R = (effort / input_scale)^2 / size^2,
             q the integral of e
 
-    `integral` (m, N) and `fade` (1, N) are in 1/s, and `effort` (m, N) is in s. The weight of u
-    means: if an input gives y a rate of change a, it costs as much as an error of `effort` times a.
-    Source: E. Kreindler, D. Rothschild, AIAA J. 14(7), 1976, for model following. B. D. O.
-    Anderson, J. B. Moore, "Optimal Control", ch. 9.
+    `integral` (m, N) and `fade` (1, N) are in 1/s, and `effort` (m, N) is in s. An input that gives
+    y the rate of change a costs as much as an error of `effort` times a. Source: E. Kreindler, D.
+    Rothschild, AIAA J. 14(7), 1976, for model following. B. D. O. Anderson, J. B. Moore, "Optimal
+    Control", ch. 9.
     """
     size = (model.C @ model.size)[:, None]
     gains_by_set = []

@@ -107,16 +107,17 @@ def saturate_with_excess(
 ) -> tuple[Array, Array]:
     """Saturate u, shape (m,).
 
-    Returns the commanded u inside the limits, and how much the given u exceeds it.
+    Returns the u inside the limits, and by how much the given u exceeds this u.
     """
     commanded = saturation.saturate(u, measurements.u_before, dt, limits)
     return commanded, u - commanded
 
 
 def conditional_integration(before: Array, after: Array, effect: Array, excess: Array) -> Array:
-    """Return `before` if effect * excess > 0, else `after`, which is conditional integration.
+    """Return the integral after a step, or the one before if the step increases a saturation.
 
-    `effect` is the change of u (or of the scaled input) by the increment. `excess` is the part of u
+    This is conditional integration: the result is `before` if effect * excess > 0, else `after`.
+    `effect` is the change of u (or of the scaled input) by the step. `excess` is the part of u
     beyond the limit, in the same units and channels. Source: K. J. Astrom, T. Hagglund, "Advanced
     PID Control", 3.5.
     """

@@ -89,9 +89,9 @@ def corrections_near(
 
         dS = A dS A' + F_i (I - K H) S (I - K H)'F_i' + F_i K noise K'F_i' + process_i - S
 
-    This holds to first order, because S is the minimum over the gains, so that a change of the gain
-    has only an effect of second order. F and `process` have the models in their first axis. Source:
-    D. L. Kleinman, IEEE TAC 13(1), 1968.
+    This holds to first order. S is the minimum over all gains, so a change of the gain has only an
+    effect of second order. F and `process` have the models in their first axis. Source: D. L.
+    Kleinman, IEEE TAC 13(1), 1968.
     """
     S = riccati(transpose(F[:1]), transpose(H), process[:1], noise)
     K = transpose(np.asarray(np.linalg.solve(H @ S @ transpose(H) + noise, H @ S)))
