@@ -389,7 +389,8 @@ def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMe
 def known_entries(learned: Signal) -> list[str]:
     """Return the names of the entries of A and B that the flight shows, from samples of `learned`.
 
-    The flight shows an entry if its deviation is below MAX_DEVIATION times its value in a sample.
+    The flight shows an entry if, in a sample, the deviation of the entry is below MAX_DEVIATION
+    times the value of the entry.
     """
     values = learned.group("value")
     deviations = learned.group("deviation")

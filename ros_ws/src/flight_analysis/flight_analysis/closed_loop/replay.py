@@ -420,9 +420,10 @@ def _coverage_notes(ticks: Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
 
 
 def _controller_at(processes: Mapping[str, Process], stamp_ns: int) -> str:
-    """Return the name of the controller that runs at an instant, between commas for a note.
+    """Return the name of the controller that runs at an instant, to insert into a note.
 
-    This is the last controller that began before the instant. Returns "" if the log has no name.
+    This is the last controller that began before the instant. The name stands between commas.
+    Returns "" if the log has no name.
     """
     begins = [
         (process.first_ns, name)

@@ -107,7 +107,7 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
 
     The scenario keeps its own file if the nodes can read it. If this file names recorded commands,
     or has sections for another namespace, such as /uav7/controller, a new file is written into the
-    folder `run`. The new file has sections for any namespace and holds the values of the recorded
+    folder `run`. The new file has sections for any namespace. It holds the values of the recorded
     commands, so that the log can be flown again without another file. Raises ParameterError if the
     file cannot be written.
     """
@@ -149,9 +149,9 @@ def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
 def _reaches_nodes(path: Path, namespace: str) -> bool:
     """Return whether the nodes in a namespace get every section of a scenario file, and no other.
 
-    If the file has a section for all nodes, the result is False. In such a file, rcl would put the
-    overrides of a node into the section for all nodes, and the node's own section would then
-    replace them.
+    If the file has a section for all nodes, the result is False. With such a file, rcl would put
+    the overrides of a node into the section for all nodes. The node's own section would then
+    replace the overrides.
     """
     content = read_file(path, str(path), A_SCENARIO)
     if has_general(content, path):

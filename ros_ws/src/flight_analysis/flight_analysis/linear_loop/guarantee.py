@@ -63,7 +63,8 @@ class Zeros(NamedTuple):
 
     # fraction of its row up to which each of these entries may deviate in a stable aircraft
     stable: float
-    unstable: Unstable | None  # the one that deviates least; None if none was found up to LARGEST
+    # unstable aircraft that deviates least; None if none was found up to LARGEST
+    unstable: Unstable | None
 
 
 class Guarantee(NamedTuple):
@@ -71,7 +72,8 @@ class Guarantee(NamedTuple):
 
     uncertainty: float  # largest relative deviation in the box
     stable: float  # every aircraft within this deviation is stable, at most 1
-    unstable: Unstable | None  # the one that deviates least; None if none was found up to LARGEST
+    # unstable aircraft that deviates least; None if none was found up to LARGEST
+    unstable: Unstable | None
     # balanced disk margin that every aircraft of the box has at an input, with other loops closed
     disk: dict[str, float]
     disk_all: float  # disk margin with independent disks in all inputs at once
@@ -180,8 +182,8 @@ def quick_stable(linear: LinearLoop, most: float) -> float:
     """Return the size, at most `most`, up to which every aircraft of the box is proved stable.
 
     A box of the size s has s times the deviations of the loop's box. Search and proof stop early,
-    at a gap of GAPS[0], and there are no disk margins: this takes less than a tenth of the time of
-    `guarantee`. The result is 0 if the nominal loop is unstable, or if nothing is proved.
+    at a gap of GAPS[0], and disk margins are not computed. This takes less than a tenth of the time
+    of `guarantee`. The result is 0 if the nominal loop is unstable, or if nothing is proved.
     """
     return _quick(linear, most, 0.0)[0] if _is_nominal_stable(linear) else 0.0
 
@@ -224,9 +226,9 @@ def _loops(linear: LinearLoop, late: float) -> list[LoopTiming]:
 def _first_unstable(
     linear: LinearLoop, late: float, largest: float, *, quick: bool = False
 ) -> Unstable | None:
-    """Search for unstable aircraft up to a size of the box, and return the one of the least size.
+    """Search for unstable aircraft up to a size of the box, and return the one that deviates least.
 
-    Returns None if there is none.
+    Returns None if the search finds none.
     """
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy

@@ -575,7 +575,8 @@ def _largest_norm(balanced: ComplexArray) -> FloatArray:
     """Return the largest `scaled_norm` over the second axis of (N, F, m, m), shape (N,).
 
     `norm_bound` first bounds the norm of every matrix. The largest bound of each aircraft is then
-    refined to the scaled norm, until the largest value of every aircraft is a refined one.
+    replaced by the scaled norm of its matrix. This is repeated until the largest value of each
+    aircraft is a scaled norm.
     """
     bounds = norm_bound(balanced)
     rows = np.arange(len(balanced))

@@ -224,8 +224,8 @@ def _assessed_by_search(linear: LinearLoop, box: Box) -> LoopMargins:
 def _least_delay(linear: LinearLoop, nominal: float) -> float:
     """Find the smallest delay margin of the aircraft of a loop, s.
 
-    The result is at most `nominal`, the nominal margin. All aircraft are tried together with a
-    delay that rises in steps of half a period, or of 1/12 of the nominal margin if this is longer.
+    The result is at most `nominal`, the nominal margin. All aircraft are tried together. The delay
+    rises in steps of half a period, or of 1/12 of the nominal margin if this is longer.
     """
     longest = min(nominal, MAX_DELAY_MARGIN)
     uncertain = linear.plant
@@ -435,7 +435,8 @@ def box_of(
     """Return the box of the aircraft that `nominal_and_sampled` draws around an airframe file.
 
     Its channels are in the law's order. If there is an allocation, B of every effector is
-    uncertain. If `spread` has zeros, entries that are 0 in the file become parts of their rows.
+    uncertain. If `spread` has zeros, entries that are 0 in the file deviate as well, by a fraction
+    of their rows.
     """
     airframe_of_law = through_allocation(airframe, controller)
     T = distribution(airframe, controller)[:, law_order(airframe_of_law, controller)[1]]

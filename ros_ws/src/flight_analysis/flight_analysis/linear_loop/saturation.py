@@ -398,9 +398,10 @@ def _step(scaling: Scaling, mS: complex, factor: float) -> dict[str, Any]:
 def _interval(
     around: Channels, multiplier: Multiplier, step: dict[str, Any], region: Region, w: float
 ) -> tuple[float, float] | None:
-    """Find the interval around w, rad/s, at whose samples a step's inequality holds with MARGIN.
+    """Find the interval around w, rad/s, in which the inequality of a step holds with MARGIN.
 
-    Returns None if it fails at w itself, or at all neighbours.
+    The inequality is tried at samples of the interval. Returns None if it fails at w itself, or at
+    the next samples on both sides.
     """
     has_limit = "s" in step
     farthest = (
@@ -424,7 +425,7 @@ def _interval(
 
 
 def _samples(w: float, end: float, farthest: float) -> Iterator[float]:
-    """Yield frequencies from w to `end`, or BATCH of them, without w."""
+    """Yield frequencies from w to `end`, without w itself, at most BATCH of them."""
     side = float(np.sign(end - w))
     for _ in range(BATCH):
         if w == end:

@@ -210,10 +210,12 @@ def _compare_delays(
     """Compare the delays beyond sampling, and return the delay that flies and the differences.
 
     In simulation, y waits for the next tick and u for the next step of the aircraft, each up to a
-    period of the aircraft. The controller can be told any delay in this range. If it is told
-    another one, the longest delay of the range is assumed. For an aircraft of the user, the
-    transport delay is unknown. The law steps with each y. If y comes less often than the ticks, the
-    delay of one and a half ticks becomes one and a half periods of y.
+    period of the aircraft. Any controller.delay within this range is accepted. For any other
+    controller.delay, the longest delay of the range is assumed. For an aircraft of the user, the
+    transport delay is unknown.
+
+    The law steps with each y. If y comes less often than the ticks, the delay of one and a half
+    ticks becomes one and a half periods of y.
     """
     aircraft = scenario.aircraft
     told_delay = controller.delay
@@ -286,7 +288,7 @@ def _beyond_loop(scenario: Scenario, controller: ControllerConfig) -> list[Diffe
 
 
 def _other_effect(scenario: Scenario) -> list[str]:
-    """Return a sentence for each output whose row in allocation.effect differs from that in C B.
+    """Return a sentence for each output whose row in allocation.effect differs from its row in C B.
 
     Rows are compared up to a positive factor, because input_scale contains this factor.
     """

@@ -340,7 +340,7 @@ def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
 
 
 def _reduced(every: Channels, channels: IntArray) -> Channels:
-    """Keep some channels, and the states that are both moved by their w and seen in their z.
+    """Keep some channels, and the states that lie between the w and the z of these channels.
 
     The other states, which are constants, integrals and states of other parts, are left out.
     """

@@ -115,10 +115,10 @@ def _oscillation(
     """Find the least size at which a mode near a frequency, rad/s, is unstable, and its corner.
 
     The size is infinite if none is found. From each of STARTS corners, the search grows the size
-    until a mode near the frequency leaves abs(z) < 1. Then it moves to the corner at which abs(z)
-    is larger, and repeats this until it knows every such corner. If the search is not `quick`, it
-    finally climbs from further corners at a smaller size, as long as one of the climbs ends at an
-    unstable aircraft.
+    until a mode near the frequency leaves abs(z) < 1. Then it moves to the corner to which abs(z)
+    rises, and repeats this until it has been at all of these corners. If the search is not `quick`,
+    it finally climbs from further corners at a smaller size. It repeats this as long as one of the
+    climbs ends at an unstable aircraft.
     """
     rng = np.random.default_rng(SEED)
     k = len(part.entries)
@@ -217,9 +217,9 @@ def _near(z: NDArray[Any], frequency: float, period: float) -> FloatArray:
 
 
 def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float) -> float:
-    """Find the size along a corner at which a mode near a frequency becomes unstable.
+    """Find the size s at which a mode near a frequency becomes unstable, for deviations s corner.
 
-    The size is infinite if none becomes unstable up to the size `largest`.
+    The result is infinite if no mode near the frequency becomes unstable up to the size `largest`.
     """
 
     def unstable(size: FloatArray) -> NDArray[np.bool_]:

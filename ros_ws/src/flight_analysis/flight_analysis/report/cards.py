@@ -50,7 +50,7 @@ def claims(flight: RecordedFlight, scenario: Scenario, flown: FlownLoops) -> lis
 
 
 def _margin_card(margins: LoopMargins, command: str) -> Card:
-    """Return the card on the distance of the loop from instability, at the worst input."""
+    """Return the card that says how far the loop is from instability at its worst input."""
     step = Step(sentence="Compute them again:", command=command)
     nominal = margins.nominal
     if not nominal.stable:
@@ -80,7 +80,7 @@ def _margin_card(margins: LoopMargins, command: str) -> Card:
 
 
 def _guarantee_card(promise: Guarantee | None, command: str) -> Card:
-    """Return the card on what is guaranteed for aircraft that differ from the file."""
+    """Return the card that says what is guaranteed for aircraft that differ from the file."""
     title = "Guarantee"
     if promise is None:
         return Card(
@@ -150,7 +150,10 @@ def _changed_card(flown: FlownLoops) -> Card:
 
 
 def _learned_card(flight: RecordedFlight) -> Card:
-    """Return the card on which learned models flew, and how the error changed."""
+    """Return the card about the learned models.
+
+    It says which of them flew, and how the error changed.
+    """
     spans = flight.summary["models"]
     learned = learned_spans(flight)
     if not learned:
@@ -190,7 +193,7 @@ def _learned_card(flight: RecordedFlight) -> Card:
 
 
 def _replay_card(flight: RecordedFlight) -> Card:
-    """Return the card on how to check that the log has every input of the controller."""
+    """Return the card that says how to check that the log has every input of the controller."""
     ticks = len(flight.tape["internals"].stamp_ns)
     return Card(
         title="Replay",

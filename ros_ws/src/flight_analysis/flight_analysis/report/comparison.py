@@ -83,7 +83,10 @@ UNLIKE = "the conditions differ: a ratio between unlike flights says nothing of 
 
 
 def conditions(flights: Sequence[RecordedFlight]) -> list[Condition]:
-    """Return the conditions that differ: the parameters, wind first, and the pace."""
+    """Return the conditions that differ.
+
+    Parameters of the wind come first, then all other parameters, and then the pace.
+    """
     values = [_parameters(flight) for flight in flights]
     keys = sorted(
         {key for key in chain.from_iterable(values) if not key.startswith(NO_CONDITION)},

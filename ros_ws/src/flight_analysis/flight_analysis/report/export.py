@@ -54,7 +54,7 @@ def write_parquet(path: Path, flights: Sequence[RecordedFlight]) -> None:
 
 
 def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write a figure of y over y_m, the best error, and u of one or several flights.
+    """Write a figure of y over y_m, e and u of one or several flights.
 
     The figure has a column for each of these quantities, and a row for each channel.
     """

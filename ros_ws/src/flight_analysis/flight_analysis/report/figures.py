@@ -471,7 +471,10 @@ def state_figure(
 
 
 def sensor_figure(context: PlotContext) -> Figure | None:
-    """Draw the error of every sensor that has one, which is y less the true output."""
+    """Draw the error of every sensor that has one.
+
+    The error is y less the true output.
+    """
     noise = _nonzero_group(context.tape, "noise")
     if noise.names:
         return time_series_figure(

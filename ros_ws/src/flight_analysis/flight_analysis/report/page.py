@@ -219,7 +219,7 @@ class Page(NamedTuple):
 
     @property
     def contents(self) -> list[tuple[str, str]]:
-        """The line of contents, with anchor and name of each block that has a name there."""
+        """The entries in the line of contents, each with anchor and name."""
         entries = [(anchor(block.title), block.contents) for block in self.shown if block.contents]
         return [*entries, *([("words", "Words")] if self.words else [])]
 

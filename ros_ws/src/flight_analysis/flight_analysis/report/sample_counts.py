@@ -73,8 +73,8 @@ class TopicAccount(NamedTuple):
     def holds(self, count: int) -> bool:
         """Return whether `count` samples are the whole topic, or the expected number is unknown.
 
-        In a short topic one missing sample does not count, because the first or the last instant
-        may fall on either side of the beginning or end of the flight.
+        In a short topic one missing sample does not count. The reason is that the first instant may
+        lie just before the beginning of the flight, or the last one just after its end.
         """
         return self.expected is None or count >= min(
             WHOLE * self.expected, max(self.expected - 1, 1)

@@ -37,7 +37,7 @@ def _welch(values: FloatArray, rate: float, window: int) -> tuple[FloatArray, Fl
     """Return the frequencies, Hz, and the one-sided power spectral density of each column, (F, m).
 
     The result is that of `scipy.signal.welch`. scipy.signal is not used, because it takes half a
-    second to load, which is a tenth of a whole flight in one process.
+    second to load. A whole flight in one process takes only ten times as long.
     """
     hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(window) / window)
     # (parts, m, window)

@@ -171,7 +171,7 @@ def model_rows(
 
 
 def stated_deviations(number: float) -> str:
-    """Return a number of deviations, within which something is proved, rounded down."""
+    """Return as text the number of deviations within which something is proved, rounded down."""
     return f"{math.floor(10.0 * number + 1e-9) / 10.0:.1f}"
 
 

@@ -304,7 +304,7 @@ def model_table(
 ) -> MetricTable:
     """Return the rms of the error before the first learned model, and under every model.
 
-    `part` is a text, after a comma, on which part of the flight the log has.
+    `part` is the end of the caption. If the log has only a part of the flight, it names this part.
     """
     headings, rows = model_rows(models, units)
     columns = [Column(group="", head=head) for head in headings]
