@@ -59,8 +59,8 @@ class NetworkClient(Client):
     def exchange(self, timeout: float) -> tuple[set[str], dict[str, ClockOfPeer]]:
         """Exchange clocks until each host receives all other hosts, for at most `timeout` s.
 
-        Returns the hosts that this host receives, and the clocks of those that also receive this
-        host.
+        Returns the hosts that this host receives. Returns also the clocks of those hosts that
+        receive this host in turn.
         """
         heard_hosts: set[str] = set()
         clocks: dict[str, ClockOfPeer] = {}

@@ -183,7 +183,7 @@ def read_fleet(
         use_sim_time=by_clock,
         separation=config.separation,
     )
-    cheaper = "" if config.composed else "; composed: true takes one an aircraft"
+    cheaper = "" if config.composed else "; composed: true takes one for each aircraft"
     participants = f"{fleet.participants()} participants of the middleware"
     require(
         fleet.participants() <= MAX_PARTICIPANTS,
@@ -218,7 +218,11 @@ def _scenario(
 def _nested(
     scenario: Scenario, changes: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """Return changes; where a change is a mapping, the other keys of the group stay."""
+    """Return changes of whole groups.
+
+    If a change is a mapping, it changes only some keys of its group. The other keys of the group
+    are added with their values in the scenario.
+    """
 
     def merged(old: Any, new: Any) -> Any:
         if not (isinstance(new, Mapping) and isinstance(old, Config)):

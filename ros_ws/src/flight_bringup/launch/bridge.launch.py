@@ -75,8 +75,8 @@ def generate_launch_description() -> LaunchDescription:
             runs_argument(),
             watch_argument(),
             namespace_argument(
-                "namespace of all nodes, one an aircraft; topics that a map names in full are "
-                "not in it"
+                "namespace of all nodes, a different one for each aircraft; topics that a map "
+                "names in full are not in it"
             ),
             log_level_argument(),
             OpaqueFunction(function=_fly),

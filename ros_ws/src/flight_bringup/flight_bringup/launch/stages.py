@@ -149,7 +149,7 @@ def watch_page(flight: Flight) -> list[Action]:
 
 
 def namespace_argument(
-    description: str = "namespace of all nodes, one an aircraft",
+    description: str = "namespace of all nodes, a different one for each aircraft",
 ) -> DeclareLaunchArgument:
     """Declare the argument `namespace`."""
     return DeclareLaunchArgument("namespace", default_value="", description=description)
