@@ -99,9 +99,9 @@ def dask(
 ) -> Engine:
     """Return an engine that flies in processes of this machine, or on the workers of a scheduler.
 
-    The chunks of a dead worker run again. If a scheduler comes back within RECONNECT, it gets its
-    lost chunks again. On a host with GPUs, each process has a different GPU. With `on_devices`
-    False, no process has a GPU, because single flights need cores.
+    The chunks of a dead worker run again. If a scheduler is lost and comes back within RECONNECT,
+    the lost chunks are sent to it again. On a host with GPUs, each process has a different GPU.
+    With `on_devices` False, no process has a GPU, because single flights need cores.
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:

@@ -86,7 +86,7 @@ def shared(params: Any) -> Any:
 def with_equipment(
     vehicle: Vehicle, scenario: Scenario, values: Mapping[str, FloatArray]
 ) -> Vehicle:
-    """Put the lags and noise of N aircraft into the vehicle; `equipment.drawn` has the names."""
+    """Put the lags and noise of N aircraft into the vehicle, by the names of `equipment.drawn`."""
     channels = scenario.aircraft.channels()
     aircraft = scenario.aircraft
     if any(name.startswith("lag[") for name in values):

@@ -65,7 +65,7 @@ def _where_not(final: Array, value: Array, otherwise: Callable[[], Array]) -> Ar
 
 
 def _by_priority(start: Array, v: Array, limits: _Range, params: Allocation) -> Array:
-    """Return u after moves of the effectors for each input of the law, in order of priority."""
+    """Move the effectors for one input of the law after the other, in order of priority."""
     order = jnp.array(params.order)
     moves = params.T.T[order][:, :, None] * v[order][:, None]
     return jax.lax.scan(lambda u, move: (_towards(u, move, limits, params), None), start, moves)[0]

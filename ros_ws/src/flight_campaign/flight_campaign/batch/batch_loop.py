@@ -352,9 +352,9 @@ def advance(
 def _actuated(
     position: Array, command: Array, times: Array, vehicle: Vehicle, *, unroll: bool
 ) -> tuple[Array, Array]:
-    """Move the actuators through the lengths of time in `times`, one after the other.
+    """Move the actuators in steps of the integration, which begin at `times`, s.
 
-    Return their position at the end, and their mean position in each of these steps.
+    Returns their positions after the last step, and their mean positions in each step.
     """
     ordered_command = rows_of(command, np.argsort(vehicle.inputs))
 

@@ -153,7 +153,7 @@ def _matrices(
     dt: float,
     places: _Places,
 ) -> tuple[Array, Array, Array, Array]:
-    """Compute tick, forced, rate and forced_rate of `FleetMatrices`, with the aircraft first.
+    """Compute tick, forced, rate and forced_rate of `FleetMatrices`, but with N as the first axis.
 
     The rows of C are in the law's order.
     """
