@@ -199,8 +199,8 @@ def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool
     """Return whether the last samples were recorded in a burst, as a publisher's history is.
 
     The last samples are those of the last LEAP_NS by their stamps. In a burst they were recorded in
-    less than half of this time, because a recorder that starts late receives the history of the
-    publisher at once. A pause in such a history is no step of the clock.
+    less than half of this time. The reason is a recorder that starts late, and receives the history
+    of the publisher at once. A pause in such a history is no step of the clock.
     """
     recent = stamp_ns >= stamp_ns[-1] - LEAP_NS
     span_ns = stamp_ns[-1] - stamp_ns[recent][0]

@@ -67,10 +67,10 @@ def flight_processes(
     """Return the processes by name, such as "/controller#4711", from the `spans` of publishers.
 
     A node that was restarted has several processes. `ready` has the times at which nodes were
-    ready. Of the times of its node, a process has the last one that is not more than 1 s later than
-    its first sample. A node without samples, such as the recorder, has no process id in its name.
-    In lockstep no node has a process id. If there are nodes of the stack, every other publisher
-    counts as a process too, even `ros2 topic pub`, which has no name.
+    ready. A process gets the last of these times of its node that is at most 1 s later than its
+    first sample. A node without samples, such as the recorder, has no process id in its name. In
+    lockstep no node has a process id. If there are nodes of the stack, every other publisher counts
+    as a process too, even `ros2 topic pub`, which has no name.
     """
     waiting: dict[str, list[int]] = {}
     for node, time_ns in ready:

@@ -26,8 +26,8 @@ def latency(times: Mapping[str, Sequence[Times]]) -> Signal | None:
     """Compute the time from the sending of y to the sending of the u with the same stamp, s.
 
     The signal has one channel, and its stamps are those of u. `times` has the times by the full
-    names of the topics y and u. Returns None for a log without y or u, for a log with several
-    aircraft, and if u was sent at the times of y, as in a flight in one process.
+    names of the topics y and u. Returns None for a log without y or u, and for a log with several
+    aircraft. Returns None also if u was sent at the times of y, as in a flight in one process.
     """
     topics = {topic.rpartition("/")[2]: topic for topic in times}
     if len(times) != len(TOPICS) or len(topics) != len(TOPICS) or not all(times.values()):

@@ -131,14 +131,14 @@ class _Publisher:
             self.leads_ns = min(least, int(leads_ns.min())), max(largest, int(leads_ns.max()))
 
     def has_clock_of(self, other: "_Publisher") -> bool:
-        """Return whether every stamp may come from the clock of another publisher."""
+        """Return whether every stamp may come from the clock of the publisher `other`."""
         if self is other or self.leads_ns is None or other.leads_ns is None:
             return True
         (least, largest), (least_of_other, largest_of_other) = self.leads_ns, other.leads_ns
         return least_of_other - LATE_NS <= least and largest <= largest_of_other + LATE_NS
 
     def recording(self) -> Recording:
-        """Return the findings on the stamps in the order of the recording."""
+        """Return what a check of the stamps has found, in the order in which they were recorded."""
         is_counted = self._numbered and not self._restarted
         return self.clock.recording(self.zeros)._replace(lost=self._lost if is_counted else None)
 

@@ -65,7 +65,7 @@ def holds_texts(topic: str, type_name: str) -> bool:
 def log_message(
     message: Any, type_name: str, sent_ns: int, *, has_begun: bool = True
 ) -> LogMessage | None:
-    """Return a decoded message as a LogMessage; None for information only or an empty message.
+    """Return a decoded message as a LogMessage; None if it is mere information, or empty.
 
     Set `has_begun` to False before the first sample. New parameters then do not count as changes,
     because the nodes still declare them at their start.

@@ -29,9 +29,9 @@ def definition(name: str) -> MessageDefinition:
 
     The text begins with the main definition. For each referenced type, a line of 80 "=", a line
     "MSG: pkg/Type" and the definition of this type follow (MCAP registry, schema encoding ros2msg).
-    The hash by REP 2016 comes from the JSON of the package. rosbags has the common types of ROS 2
-    Jazzy with the same fields and the same hash, but without comments. Raises ParameterError if
-    neither an installed package nor rosbags has the type.
+    The hash by REP 2016 comes from the JSON of the package. For the common types of ROS 2 Jazzy,
+    rosbags has the same fields and the same hash, but no comments. Raises ParameterError if neither
+    an installed package nor rosbags has the type.
     """
     try:
         description = json.loads(read_definition(name, "json"))

@@ -186,7 +186,7 @@ def encoded(samples: Samples) -> NDArray[np.uint8]:
 
 
 def _marks(k: int) -> FloatArray:
-    """Return k values to look for in a serialised message, as their bytes occur in no string."""
+    """Return k values to look for in a serialised message. Their bytes occur in no string."""
     return np.asarray(-np.arange(1.0, k + 1.0) * np.pi)
 
 

@@ -48,8 +48,8 @@ class RateLoop(NamedTuple):
 def rate_loop(path: Path, rate: float | None = None, logged: float = 0.0) -> RateLoop:
     """Return the timing of a law at `rate`, by default the rate of the gyro.
 
-    The rate of the gyro is IMU_GYRO_RATEMAX. If the log has its samples at a lower rate, `logged`,
-    Hz, and this rate suffices for the law, the law runs at each logged sample instead.
+    The rate of the gyro is IMU_GYRO_RATEMAX. Its samples may be `logged` at a lower rate, Hz. If
+    this lower rate suffices for the law, it counts as the rate of the gyro.
 
         delay = 1 / (sqrt(2) pi f) + sum_k b_k / (2 pi f_k^2) + 1 / rate + wait
 

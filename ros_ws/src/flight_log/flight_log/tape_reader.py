@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read a bag as a Tape, without ROS.
 
-The bags are those of this stack and of `ros2 bag record`, even if they are truncated.
+It reads bags of this stack and of `ros2 bag record`. A bag may be truncated.
 """
 
 from collections import defaultdict
@@ -69,11 +69,11 @@ class RecordedRun(NamedTuple):
     """The content of a log for the aircraft in `namespace`, which is "" for the root.
 
     `metadata` holds the named sets of strings, and `attachments` the files except the scenario.
-    `latency` is the latency of the loop from y to u, `age_of_u` is the age of u at the aircraft,
-    and `engagements` are those of a bridge. Each of these is None if the log has no such samples or
-    no times of sending. `messages` are the warnings, errors and parameter changes in the log, and
-    the messages about learning and a bridge. `path` is the path of the log, and `topics` has the
-    types of all its topics by full name.
+    `latency` is the latency of the loop from y to u, and `age_of_u` is the age of u at the
+    aircraft. `engagements` has the engagements of a bridge. Each of these is None if the log has no
+    such samples or no times of sending. `messages` are the warnings, errors and parameter changes
+    in the log, and the messages about learning and a bridge. `path` is the path of the log, and
+    `topics` has the types of all its topics by full name.
     """
 
     tape: Tape
@@ -267,9 +267,10 @@ def _tape(
 def _publisher_notes(
     topics: Mapping[str, TopicSamples], of_flight: Mapping[str, Signal | None]
 ) -> list[str]:
-    """Write notes on other publishers of topics, with samples at the same time or foreign messages.
+    """Write notes on topics with several publishers.
 
-    A note covers all topics with the same publishers.
+    There is a note if they sent samples at the same time, and if some have sent messages that are
+    no samples of the flight. A note covers all topics with the same publishers.
     """
     conflicts = defaultdict[tuple[str, ...], list[str]](list)
     foreign = defaultdict[tuple[str, ...], list[str]](list)
@@ -386,7 +387,10 @@ def chosen_namespace(topics: Collection[str], namespace: str | None, where: str)
 
 
 def names_within(namespace: str, topics: Collection[str]) -> dict[str, str]:
-    """Map full topic names to names within an aircraft's namespace, without nested aircraft."""
+    """Map the full topic names of an aircraft to the names within its namespace.
+
+    Topics of aircraft in a namespace below it are left out.
+    """
     inner_aircraft = [
         f"{name}/" for name in aircraft_namespaces(topics) if name.startswith(f"{namespace}/")
     ]

@@ -40,8 +40,8 @@ class Messages:
 def whole_messages(content: bytes) -> Messages:
     """Return the messages that are followed by another message or by the end of the log.
 
-    The content is returned unchanged if no bytes are lost. The same holds if there are appended
-    parts, because offsets point to them.
+    If no bytes are lost, the content does not change. If the log has appended parts, it does not
+    change either, because offsets in the log point to these parts.
     """
     if any(content[APPENDED]) and content[HEAD + 2 : HEAD + 3] == b"B":
         return Messages(content=content, loss=None)

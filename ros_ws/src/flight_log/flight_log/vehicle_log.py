@@ -80,12 +80,12 @@ def _silent() -> Iterator[None]:
 
 
 LIMITS = (5.0, 6.0)
-"""Limit of the processor time of the decoding: s, and in addition s per megabyte of the log.
-pymavlink takes 1.2 s for a megabyte of DataFlash here."""
+"""Limit of the processor time of the decoding, in two parts: a time in s, and a further time in s
+for each megabyte of the log. pymavlink takes 1.2 s for a megabyte of DataFlash here."""
 
 MEMORY = (1 << 30, 100)
-"""Limit of the memory of the decoding: bytes, and in addition bytes per byte of the log. pymavlink
-takes some 35."""
+"""Limit of the memory of the decoding, in two parts: a number of bytes, and further bytes for each
+byte of the log. pymavlink takes some 35."""
 
 
 def read_foreign_log(path: Path, choice: Choice = ANY) -> VehicleLog:
