@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -82,7 +81,8 @@ REALS: Mapping[str, float] = MappingProxyType(
 """Reals of the algorithms, which are the same for every scenario."""
 
 
-class Constant(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Constant:
     """A member of struct rise_di_parameters.
 
     Its value is one or several integers (int, tuple), or reals (array). A matrix is stored row by
@@ -220,10 +220,13 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
         reals |= {name: getattr(law_params, name) for name in ("Phi", "Gamma", "H", "L", "F")}
         reals |= _limits("observer_limits", law_params.limits) | {"fade_rate": law_params.fade_rate}
     # Integers come first.
-    arrays = [
-        Constant(name, np.array(value, dtype=np.float64).ravel()) for name, value in reals.items()
+    return [
+        *(Constant(name=name, value=value) for name, value in integers.items()),
+        *(
+            Constant(name=name, value=np.array(value, dtype=np.float64).ravel())
+            for name, value in reals.items()
+        ),
     ]
-    return [*(Constant(name, value) for name, value in integers.items()), *arrays]
 
 
 def _limits(name: str, limits: Limits) -> dict[str, FloatArray]:
@@ -237,10 +240,10 @@ def packed(controller: RiseDiConfig, *, float32: bool) -> bytes:
     """
     real = np.float32 if float32 else np.float64
     content = b"".join(
-        _finite(value, real).astype(real).tobytes()
-        if isinstance(value, np.ndarray)
-        else np.array(value, np.int64).tobytes()
-        for _, value in constants(controller)
+        _finite(member.value, real).astype(real).tobytes()
+        if isinstance(member.value, np.ndarray)
+        else np.array(member.value, np.int64).tobytes()
+        for member in constants(controller)
     )
     return content + bytes(-len(content) % 8)
 
@@ -259,9 +262,12 @@ def reference_constants(reference: ReferenceModelConfig) -> list[Constant]:
     reals = (*stepper(seconds(period), model), model.C, live.bounds, live.reach)
     names = ("Phi", "Gamma", "C", "bounds", "reach")
     return [
-        Constant("period_ns", period),
-        Constant("max_age_ns", live.max_age_ns),
-        *(Constant(name, values.ravel()) for name, values in zip(names, reals, strict=True)),
+        Constant(name="period_ns", value=period),
+        Constant(name="max_age_ns", value=live.max_age_ns),
+        *(
+            Constant(name=name, value=values.ravel())
+            for name, values in zip(names, reals, strict=True)
+        ),
     ]
 
 
@@ -285,7 +291,7 @@ def header(
         return ", ".join(f"{float(real(x))!r}{suffix}" for x in _finite(value, real))
 
     def struct(members: list[Constant]) -> list[str]:
-        return [f"    /* {name} */ {_initialiser(name, value, numbers)}" for name, value in members]
+        return [f"    /* {member.name} */ {_initialiser(member, numbers)}" for member in members]
 
     members = constants(controller)
     rows = _rows(members, numbers)
@@ -364,31 +370,31 @@ def _rows(members: list[Constant], numbers: Callable[[FloatArray], str]) -> list
     """Return the rows of the parameter table in C, in the order of the reals of the struct."""
     rows = []
     place = 0
-    for name, value in members:
-        if isinstance(value, np.ndarray):
-            unit, least, largest = TABLE.get(name, ("SI", LEAST, LARGEST))
+    for member in members:
+        if isinstance(member.value, np.ndarray):
+            unit, least, largest = TABLE.get(member.name, ("SI", LEAST, LARGEST))
             bounds = numbers(np.array([least, largest]))
-            rows.append(f'    {{"{name}", "{unit}", {place}, {value.size}, {bounds}}}')
-            place += value.size
+            size = member.value.size
+            rows.append(f'    {{"{member.name}", "{unit}", {place}, {size}, {bounds}}}')
+            place += size
     return rows
 
 
-def _initialiser(
-    name: str, value: int | tuple[int, ...] | FloatArray, numbers: Callable[[FloatArray], str]
-) -> str:
+def _initialiser(member: Constant, numbers: Callable[[FloatArray], str]) -> str:
     """Return the C initialiser of a number, or of a list in braces.
 
     The limits are a nested struct. Its braces open before the list of `lower`, which is its first
     member, and close after that of `rate`, which is its last.
     """
+    value = member.value
     if isinstance(value, int):
         return str(value)
     if isinstance(value, tuple):
         return f"{{{', '.join(map(str, value))}}}"
-    if name in SCALARS:
+    if member.name in SCALARS:
         return numbers(value)
-    begin = name.endswith(".lower")
-    end = name.endswith(".rate")
+    begin = member.name.endswith(".lower")
+    end = member.name.endswith(".rate")
     return f"{'{' * begin}{{{numbers(value)}}}{'}' * end}"
 
 
