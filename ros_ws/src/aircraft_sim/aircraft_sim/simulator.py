@@ -174,9 +174,9 @@ class Simulator:
             angles = self._model.air_angles(t_ns)
             self._vane_state = vanes.turned(seconds(t_ns), angles, self._vane_state, self._vanes)
             true = np.concatenate([true, self._vane_state.angle])
-        measured, self._error, self._drift = sensors.measure(
-            number, true, self._drift, self._sensors
-        )
+        measurement = sensors.measure(number, true, self._drift, self._sensors)
+        measured = measurement.y
+        self._error, self._drift = measurement.error, measurement.drift
         if self._vanes is not None and self._vane_state is not None:
             size_y = len(measured) - len(self._vanes.places)
             self._vane_state = vanes.read_vanes(
@@ -242,9 +242,9 @@ class Simulator:
         measured_pose = None
         if due:
             number = self._number // self._pose_every
-            measured_pose, self._pose_error, self._pose_drift = sensors.measure(
-                number, self.pose(), self._pose_drift, self._pose_sensors
-            )
+            measurement = sensors.measure(number, self.pose(), self._pose_drift, self._pose_sensors)
+            measured_pose = measurement.y
+            self._pose_error, self._pose_drift = measurement.error, measurement.drift
             for k in WRAPPED:
                 measured_pose[k] = pose.wrapped(float(measured_pose[k]))
         self._poses, arrived = sensors.transmit(
