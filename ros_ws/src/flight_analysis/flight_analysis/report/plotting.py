@@ -196,10 +196,11 @@ class Curve(NamedTuple):
     start_ns: int | None = None  # stamp of t = 0; None for the start of the page's flight
 
 
-class Extent(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Extent:
     """The smallest and the largest value of a curve in a subplot, in the unit shown."""
 
-    place: int
+    index: int  # index of the subplot
     name: str
     low: float
     high: float
@@ -255,15 +256,21 @@ class Figure:
         shown = trace.get("y") if values is None else values
         finite = _finite(shown)
         if trace.get("name") and len(finite):
-            extent = Extent(index, trace["name"], float(finite.min()), float(finite.max()))
+            extent = Extent(
+                index=index,
+                name=trace["name"],
+                low=float(finite.min()),
+                high=float(finite.max()),
+            )
             self.extents.append(extent)
 
     @property
     def text(self) -> str:
         """The figure in words, with the smallest and largest value of each curve by subplot."""
         by_plot: dict[int, list[str]] = {}
-        for index, name, low, high in self.extents:
-            by_plot.setdefault(index, []).append(f"{name} from {low:.3g} to {high:.3g}")
+        for extent in self.extents:
+            words = f"{extent.name} from {extent.low:.3g} to {extent.high:.3g}"
+            by_plot.setdefault(extent.index, []).append(words)
         parts = []
         for index, ranges in sorted(by_plot.items()):
             title = self.y[index].get("title", {}).get("text", "")
