@@ -356,7 +356,7 @@ def test_check_names_an_edit_out_of_bounds(
     library.rise_di_check.restype = ctypes.c_char_p
     for config in case.sets:
         assert library.rise_di_check(packed(config, float32=False)) is None
-    members = constants(case.sets[0])
+    members = [(constant.name, constant.value) for constant in constants(case.sets[0])]
     good = packed(case.sets[0], float32=False)
     place = 8 * sum(np.size(value) for _, value in members if not isinstance(value, np.ndarray))
     for member, value in members:
