@@ -17,6 +17,7 @@ import typer
 from rich.console import Console
 
 from aircraft_sim.airframes.airframe import Airframe, load_airframe
+from aircraft_sim.uncertainty import Spread
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
@@ -24,7 +25,7 @@ from flight_analysis.linear_loop.loop_margins import margins
 from flight_analysis.report.page import page_html
 from flight_analysis.report.run_folder import remove_empty
 from flight_cli.output import COUNT_COLUMNS, LICENCE, parse_lags, progress_bar, say, write_text
-from flight_cli.tune_candidates import SAMPLES, Selectors, best_of, candidates
+from flight_cli.tune_candidates import LEAST, SAMPLES, Selectors, best_of, candidates
 from flight_cli.tune_page import OwnFlight, Tuned, show_tuning, tuning_page
 from flight_cli.words import REQUIRED, argument, option, rare_option, scenario_names, warn
 from flight_core.files import display_path, writing
@@ -62,7 +63,7 @@ from rise_di.c_code import export
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 UNPROVED = 1
-LEAST, MOST = 0.05, 0.3  # bounds on the uncertainty of A and B that the margins must cover
+MOST = 0.3  # largest uncertainty of A and B for which gains are searched
 MOST_LOST = 0.1  # largest share of the samples of y or u that may be missing
 WIDEST = 0.9  # largest half-width of an entry in the box, as a fraction of its value
 LOGGED_OFTEN = "each one: set SDLOG_PROFILE to 17, by which PX4 logs rates and torque at full rate"
@@ -192,6 +193,7 @@ class Tune:
             airframe=airframe,
             flight=flight,
             uncertainty=uncertainty,
+            entries=entries,
             lead=_with_lead if autopilot == "px4" else lambda controller: controller,
             calm=self.calm,
             accept=self.accept,
@@ -209,8 +211,8 @@ class Tune:
             best=best,
             candidates=found,
             promise=promise,
-            margins=margins(best.scenario, SAMPLES, uncertainty),
-            own=None if own is None else OwnFlight.of(own, selectors, uncertainty),
+            margins=margins(best.scenario, SAMPLES, LEAST, spread=Spread(entries)),
+            own=None if own is None else OwnFlight.of(own, selectors),
         )
 
     def _in_time(
@@ -384,7 +386,7 @@ def _kept_model(part: Part) -> str:
 
 
 def _uncertainty(identification: Identification) -> float:
-    """Return the uncertainty of A and B that the margins must cover, from LEAST to MOST.
+    """Return the uncertainty of A and B for which gains are searched, from LEAST to MOST.
 
     Of the effects on each output, only the one with the smallest relative deviation counts. The
     result is twice the largest standard deviation of these effects, as a fraction of the identified

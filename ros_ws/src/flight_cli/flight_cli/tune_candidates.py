@@ -33,6 +33,7 @@ ROLLING = {"amplitude": 0.7, "frequency": 5.0}
 """A rotation of the air about the roll axis as a sine: its amplitude, rad/s, and its frequency,
 rad/s. The rms is 0.5 rad/s, and 1 / frequency is 0.2 s."""
 SAMPLES = 60  # number of uncertain aircraft
+LEAST = 0.05  # uncertainty of an entry that the log does not show, and the least one of a search
 DELAY_MARGIN = 0.01  # with the observer, s, as in examples/px4_airplane/rates_observer.yaml
 FORMER = "as in the scenario"
 Report = Callable[[str], None]
@@ -63,7 +64,8 @@ class Selectors(NamedTuple):
 
     airframe: Airframe  # the identified airframe
     flight: Scenario  # scenario of the log, with the identified aircraft
-    uncertainty: float  # uncertainty of A and B, for the margins
+    uncertainty: float  # uncertainty of A and B, for the search of gains
+    entries: Mapping[str, float]  # uncertainty of each entry that the log shows, for the margins
     lead: Callable[[RiseDiConfig], RiseDiConfig]  # gives a feedforward the lead of the module
     calm: bool  # whether calm air counts alone, without an observer
     accept: bool  # whether gains with too small margins are accepted
@@ -143,7 +145,7 @@ def best_of(found: Sequence[Candidate], *, accept: bool) -> Candidate:
 
 
 def rms_of_own_loop(own: OwnLoop, selectors: Selectors) -> dict[str, FloatArray]:
-    """Return the rms of y - y_m of the autopilot's loop, by air, each with the shape (m,)."""
+    """Return the rms of y - y_m under the autopilot's own loop, (m,), for each of the airs."""
     flight, airframe = selectors.flight, selectors.airframe
     controller = flight.rise_di()
     errors = {}
@@ -168,7 +170,10 @@ def rms_of_own_loop(own: OwnLoop, selectors: Selectors) -> dict[str, FloatArray]
 
 
 def _judged(selectors: Selectors, name: str, controller: RiseDiConfig, origin: str) -> Candidate:
-    """Fly a controller in each air, and compare its margins with the requirement."""
+    """Fly a controller in each air, and compare its margins with the requirement.
+
+    The margins are those of aircraft in the box that the guarantee bounds.
+    """
     scenario = selectors.flight.vary(controller=controller)
     selectors.report(f"flying in {' and in '.join(selectors.airs)}: {name}")
     rms = {
@@ -178,8 +183,9 @@ def _judged(selectors: Selectors, name: str, controller: RiseDiConfig, origin: s
     answer = check_gains(
         selectors.airframe,
         scenario,
-        uncertainty=selectors.uncertainty,
+        uncertainty=LEAST,
         samples=SAMPLES,
+        entries=selectors.entries,
         as_told=True,
     )
     short = [row.sentence(controller.outputs) for row in answer.unmet]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from rich.console import Console
 
+from aircraft_sim.uncertainty import Spread
 from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_analysis.linear_loop.loop_margins import LoopMargins, margins
 from flight_analysis.report.margin_figures import margin_table
@@ -16,6 +17,7 @@ from flight_analysis.report.tables import MetricTable
 from flight_cli.output import entry_table, new_table, print_table, say
 from flight_cli.tune_candidates import (
     FORMER,
+    LEAST,
     SAMPLES,
     Candidate,
     Selectors,
@@ -62,13 +64,15 @@ class OwnFlight(NamedTuple):
     margins: LoopMargins
 
     @classmethod
-    def of(cls, loop: OwnLoop, selectors: Selectors, uncertainty: float) -> "OwnFlight":
+    def of(cls, loop: OwnLoop, selectors: Selectors) -> "OwnFlight":
         """Simulate the autopilot's loop in the airs in which the candidates fly."""
         flight = selectors.flight
         return cls(
             loop=loop,
             rms=rms_of_own_loop(loop, selectors),
-            margins=margins(loop.in_place(flight), SAMPLES, uncertainty),
+            margins=margins(
+                loop.in_place(flight), SAMPLES, LEAST, spread=Spread(selectors.entries)
+            ),
         )
 
 
