@@ -54,7 +54,7 @@ class Conditions:
     def engage(self, now_ns: int) -> None:
         """Store the present values of the overrides.
 
-        An override with `moved` becomes active when its value has moved from this one.
+        An override with `moved` becomes active when its value has moved away from the stored one.
         """
         self._at_engagement = {
             name: reading.value

@@ -255,8 +255,8 @@ class _Flight:
     def start(self, fleet: Fleet, pause: Callable[[float], None]) -> None:
         """Start the processes, and in real time wait until they are ready.
 
-        `pause` is called between two checks, because a host should not start many processes at
-        once.
+        `pause` sleeps for a duration, s, between two checks. The flights of a fleet start one after
+        another, because a host should not start many processes at once.
         """
         self.progress(0.0, "starting")
         try:

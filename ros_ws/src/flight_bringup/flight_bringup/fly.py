@@ -50,14 +50,14 @@ NUMBER = re.compile(r"-?\d+(\.\d+)?(e[-+]\d+)?")  # a number in a reason, such a
 STAMP_ERROR = 1e-5  # s, rounding error of a time of day as a float
 
 STALL_TIMEOUT = 40.0
-"""s. A lockstep flight ends if it makes no progress for so long. If contact with a node is lost, it
+"""Time without progress after which a lockstep flight ends, s. If contact with a node is lost, it
 ends within three seconds."""
 
 
 Progress = Callable[[float, str], None]  # flight time in s, and the text beside it
 
 Steps = Generator[None, None, Outcome]
-"""A flight that we follow: each step looks at it once, and the last one returns the outcome."""
+"""A flight that is followed: each step checks it once, and the last step returns the outcome."""
 
 
 def fly_over_topics(

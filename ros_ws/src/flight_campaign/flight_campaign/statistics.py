@@ -27,10 +27,11 @@ flight lie between these limits, and a bin is 2.3 % wide."""
 EDGES = 10.0 ** (np.arange(DECADES[0] * PER_DECADE, DECADES[1] * PER_DECADE + 1) / PER_DECADE)
 
 SCORE_UNIT = {ANGULAR_RATE: 0.010, SPEED: 0.1}  # rad/s, m/s
-"""Unit of an rms error in the score, by dimension of the channel. p counts half, because its
-commands are larger."""
+"""Unit of an rms error in the score, by dimension of the channel."""
 
-SCORE_UNIT_OF = {"p": 0.020}  # rad/s, by channel, in place of the unit of its kind
+# rad/s, by channel, in place of the unit of its dimension; p counts half, because its commands are
+# larger
+SCORE_UNIT_OF = {"p": 0.020}
 
 FIRST_MODEL = "first_model"
 """Name of a figure of aircraft with a learner, `LearningOutcome.first_model`."""
@@ -246,7 +247,7 @@ def score_units(
 def score(rms: FloatArray, unit: FloatArray) -> FloatArray:
     """Return the score, which is the sum over the channels of rms / unit, (N,).
 
-    rms has shape (m, N), and unit has shape (m,). A channel adds 1 if its error is 10 mrad/s or 0.1
-    m/s. The channel p adds 1 at 20 mrad/s.
+    rms has shape (m, N), and unit has shape (m,). With the usual units, a channel adds 1 if its
+    error is 10 mrad/s or 0.1 m/s, and the channel p if it is 20 mrad/s.
     """
     return np.asarray(np.sum(rms / unit[:, None], axis=0))

@@ -33,7 +33,7 @@ def show_identified(console: Console, aircraft: IdentifiedAircraft) -> None:
         + f"; largest residual acceleration {np.max(np.abs(trim.residuals[:3])):.1g} m/s^2,"
         f" {np.max(np.abs(trim.residuals[3:])):.1g} rad/s^2",
     )
-    # Print two tables with a row for each input, of its stops, and of its effects on the outputs.
+    # Two tables have a row for each input: one shows its stops, the other its effects.
     stops = new_table(
         "\nCommands: trim, and range down and up from trim", ("input", "trim", "down", "up")
     )

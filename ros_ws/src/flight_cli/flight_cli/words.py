@@ -247,7 +247,7 @@ class RiseDiCommand(TyperCommand):
             raise refused_words(error, _path(ctx), names) from None
 
     def _mend(self, name: str, names: Sequence[str], command: str) -> str:
-        """Return a suggestion in place of an unknown option."""
+        """Say what to write in place of an unknown option."""
         if name[2:] in names:
             return f"give it without a name, {command} {name[2:].upper()}"
         near = [

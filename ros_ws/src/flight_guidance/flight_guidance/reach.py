@@ -82,8 +82,8 @@ class RollTest(NamedTuple):
     def after(self, dt: float, command: float, p: float, largest: float) -> "RollTest":
         """Return the test after a further step of dt, s, with a command and a measured p, rad/s.
 
-        `largest` is the largest command, rad/s. Whether the command counts as ignored changes only
-        if the evidence a is above ASKED largest^2.
+        `largest` is the largest command, rad/s. The verdict `ignored` can only change while the
+        evidence a is above ASKED largest^2.
         """
         memory = math.exp(-dt / MEMORY)
         asked = memory * self.asked + dt * command**2

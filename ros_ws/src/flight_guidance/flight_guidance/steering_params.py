@@ -167,8 +167,9 @@ class SteeringConfig(NodeConfig):
     def largest_roll_rate(self) -> float:
         """Return the largest roll rate p_max, rad/s.
 
-        It is 0.35, but less if 0.4 w p_max would exceed a third of the authority. This product is
-        the largest p_m_dot after a step, and w is the natural frequency of the reference of p.
+        By rule it is FASTEST_ROLL, but less if 0.4 w p_max would exceed a third of the authority.
+        This product is the largest p_m_dot after a step, and w is the natural frequency of the
+        reference of p.
         """
         frequency = self._frequency()["p"]
         authority = math.inf if self.roll_authority is None else self.roll_authority

@@ -53,9 +53,10 @@ def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
 
 
 def newest_run(runs: Path, namespace: str | None = None) -> Path:
-    """Return the newest run that is being recorded, else the last run in the folder.
+    """Return the newest run that is being recorded, else the run to which `latest` points.
 
-    With a namespace, it is a run with this aircraft. Raises ParameterError if there is none.
+    With a namespace, only recordings of this aircraft count, but `latest` counts in any case.
+    Raises ParameterError if there is no run.
     """
     if recording := runs_in_recording(runs, namespace):
         return recording[0]

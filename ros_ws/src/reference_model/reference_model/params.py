@@ -371,7 +371,7 @@ class ReferenceModelConfig(NodeConfig):
         )
 
     def live_params(self) -> LiveParams:
-        """Return the limits of u_m and the gains of the ending.
+        """Return the limits of u_m and the gains of the ending, which follows the last u_m.
 
         The gains are a quarter of the reference model's natural frequencies of p and q. If the
         reference model has a damping of 0.9, the loop of the angle then has a damping of about

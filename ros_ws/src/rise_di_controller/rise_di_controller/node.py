@@ -54,7 +54,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 LONG_MAX_AGE = 1.0  # max_age, s, above which the log warns that the failsafe begins late
 SLOW_PERIOD_NS = 60 * NANOSECONDS  # time between two warnings that a rate is too low for max_age
 BEHIND_NS = 1_000_000
-"""Time from the instants of y and y_m, every 2 ms of the system clock at 500 Hz, to a tick. By then
+"""Time by which a tick follows the instants of y and y_m, which come every 2 ms at 500 Hz. By then
 both have arrived, and their nodes have finished their own ticks of up to 1 ms. Ticks at a random
 phase would delay u by up to 2 ms more, and ticks at the instants of y and y_m would wait for one of
 two processors."""

@@ -447,7 +447,7 @@ class RiseDiConfig(ControllerConfig):
         )
 
     def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:
-        """Return the groups as in the base class, and outputs given up if the controller learns.
+        """Return the groups of the base class. If the controller learns, `given_up` is added.
 
         Args:
             law: As in `ControllerConfig.logged_groups`.

@@ -128,7 +128,7 @@ def _check_identities(model: ToolModel, name: str, speed: float) -> None:
 
 
 def _with_thrust(model: ToolModel) -> ToolModel:
-    """Add an input thrust in units of the weight along the flight path.
+    """Add an input `thrust`, a force along the flight path in units of the weight.
 
     The input adds g times its value to V_dot or u_dot.
     """

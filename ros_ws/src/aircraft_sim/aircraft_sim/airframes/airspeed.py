@@ -132,7 +132,9 @@ def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
 
 
 def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatArray, FloatArray]:
-    """Return the trim at `ratio` times V0: deviations x, (n,), and u, (p,), from that at V0, SI.
+    """Return the deviations x, (n,), and u, (p,), of the trim at `ratio` times V0, SI.
+
+    They are deviations from the trim at V0.
 
         (A + gravity) dx + B du = 0
 

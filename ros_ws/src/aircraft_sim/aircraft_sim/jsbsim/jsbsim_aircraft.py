@@ -45,14 +45,14 @@ class Command(NamedTuple):
     upper: float
     each_engine: bool
     positive: str  # the effect of a positive value in models that follow JSBSim's sign convention
-    # properties named by the user, in place of `property` and `trim_property`
+    # properties named by the user, in place of `property` and `trim_property`; empty if none are
     named: "NamedProperties" = ()
 
 
 NamedProperties = tuple[tuple[str, float], ...]
 """Properties of a model, and the value of each at the command 1; empty if there is no rudder."""
 
-NONE = "none"
+NONE = "none"  # in place of the rudder's properties: the model has no rudder
 
 
 # A property outside of JSBSim's settings, as a pattern.
@@ -199,11 +199,11 @@ class FlightCondition(NamedTuple):
         }
 
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs in the order of INPUTS; a missing rudder is left out."""
+        """Return the names of the inputs in the order of INPUTS, without a missing rudder."""
         return tuple(INPUTS)[:-1] if ("rudder", ()) in self.named else tuple(INPUTS)
 
     def paired_outputs(self) -> tuple[str, ...]:
-        """Names of the outputs that are paired with `inputs`, in the order of OUTPUTS."""
+        """Return the names of the outputs paired with `inputs`, in the order of OUTPUTS."""
         return tuple(OUTPUTS)[: len(self.inputs())]
 
 
@@ -218,7 +218,7 @@ class Trim(NamedTuple):
 
 
 class WindModel(NamedTuple):
-    """The wind along the AXES of `disturbance`, by its sources."""
+    """The sources of the wind, each with its wind along the AXES of `disturbance`."""
 
     gusts: Gusts
     turbulence: Turbulence | None  # filters for one step; None without turbulence

@@ -22,7 +22,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 
 class ModelGuarantee(NamedTuple):
-    """What is proved of the loop of proposed parameters around the learned model."""
+    """What is proved of the loop of the law with proposed parameters and the learned model."""
 
     # Every aircraft is stable if each of its entries differs from the model by at most so many
     # times the stated deviation of this entry. 0 if nothing is proved.

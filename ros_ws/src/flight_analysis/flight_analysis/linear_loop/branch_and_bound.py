@@ -64,7 +64,7 @@ def proof_of(
     """Find the steps that prove the loop stable, or return None if `most` steps are too few.
 
     The proof holds for all abs(d_i) <= size, for delays that change from tick to tick within their
-    range, and for complex disks of size `disk` in the channels of disks. It starts from d = 0,
+    range, and for complex disks of size `disk` in the channels `part.disks`. It starts from d = 0,
     where the loop is stable, and shows that no aircraft of the box has a mode on abs(z) = RADIUS.
     The eigenvalues move continuously over the box, so none of them can leave the circle. Each
     region is proved for half widths that are larger by the fraction `reserve`.

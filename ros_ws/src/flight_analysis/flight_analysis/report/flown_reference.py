@@ -44,8 +44,8 @@ AHEAD_NS = 5_000_000
 """Time by which the clock of u_m may be ahead. If clocks differ by more, the nodes report it."""
 
 FITTING = 0.5
-"""Share of the samples that must be right so that an instant counts as t = 0 of a node that a user
-started singly."""
+"""If a user started the node singly, an instant counts as its t = 0 if at least this share of the
+samples is right."""
 
 
 MOST_PATHS = 16
@@ -206,8 +206,9 @@ def _computed(
                 trials.append((min(np.inf, error), sample, trial))
         trials.sort(key=lambda each: each[0])
         least, expected[k], _ = trials[0]
-        # A path that took a u_m too early has the right bits only as long as this u_m hardly
-        # differs from the one before.
+        # All paths with the right bits are followed, because a path that took a u_m too early only
+        # differs once this u_m differs from the one before. If none has the right bits, those
+        # within ROUNDING count as right.
         bound = ROUNDING if 0.0 < least <= ROUNDING else least
         paths = _distinct([trial for error, _, trial in trials if error <= bound])[:MOST_PATHS]
         before_ns = number * period_ns

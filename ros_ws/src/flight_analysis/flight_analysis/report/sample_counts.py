@@ -47,9 +47,8 @@ class TopicAccount(NamedTuple):
     Times are flight times in s, and None if there is no sample.
     """
 
-    expected: (
-        int | None
-    )  # None if unknown, as in a log without the rates or the start of its flight
+    # None if unknown, as in a log without the rates or the start of its flight
+    expected: int | None
     found: int
     first: float | None
     last: float | None
@@ -116,6 +115,7 @@ def topic_accounts(
             topics[name] = _with_unsent(tape, name, topics[name], step_ns)
             if unsent_at_end := _unsent_rest(tape, name, step_ns, span.end_ns):
                 topics[name] = topics[name]._replace(unsent=topics[name].unsent + unsent_at_end)
+                # They count as never sent, so the last sample may be as early as it is.
                 late[name] = seconds(span.end_ns)
             if not is_sent_by_stack(tape, name):
                 topics[name] = _of_foreign(topics[name])

@@ -273,9 +273,10 @@ def chatter_sentence(controller: ControllerConfig, margins: LoopMargins | None) 
 
 
 def _shown_response(responses: FloatArray) -> str:
-    """Write the factors on 1 / abs(Omega_ii) in the input scales.
+    """Write the numerators r_i of the input scales r_i / abs(Omega_ii).
 
-    A factor is less than 1 in a channel that is too slow for a K of (22), and 1 in all others.
+    r_i is less than 1 in a channel that is too slow for a K of (22), and 1 in all others. If all of
+    them are 1, the result is "1".
     """
     factors = [f"{value:.3g}" for value in responses]
     return "1" if set(factors) == {"1"} else f"({', '.join(factors)})"

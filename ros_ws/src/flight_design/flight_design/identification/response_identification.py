@@ -85,7 +85,8 @@ class Response(NamedTuple):
 
         y_i_dot = sum_j Omega_ij v_j + slower terms,   lag_j v_j_dot = u_j(t - delay_j) - v_j
 
-    The rows of a channel that is refused are NaN.
+    The lag, the delay and the column of Omega of an input without a step response are NaN. Other
+    refused channels keep their values.
     """
 
     outputs: tuple[str, ...]
@@ -128,7 +129,7 @@ def identify_response(
     excitation: Signal | None = None,
     engaged: Spans | None = None,
 ) -> Response:
-    """Return Omega, lag and delay of every channel of a log with standard errors, or refuse it.
+    """Return Omega, lag and delay of every channel of a log, with standard errors and refusals.
 
     Args:
         y: The outputs. Their stamps may have irregular intervals.

@@ -36,7 +36,7 @@ class ChannelSign(NamedTuple):
 
     output: str
     input: str
-    effect: float  # Omega_ii between the channels of the controller, SI
+    effect: float  # entry of Omega for this output and input through the map, SI
     D: int  # sign that follows from the airframe and the map
     D_controller: int
     measured: float | None  # Omega_ii from a recorded flight; NaN if the input never moves

@@ -76,10 +76,10 @@ def asked_margin(start: RiseDiConfig) -> float:
 
 
 def is_late(start: RiseDiConfig, latest: Mapping[str, float]) -> bool:
-    """Return whether the latest delay of an input requires more than the margin of the start.
+    """Return whether an input needs a larger delay margin than `asked_margin`.
 
-    `latest` has the latest delay of each input, s, by name. If `learn.margin` is set, it replaces
-    the margin of the start.
+    `latest` has the latest delay of each input, s, by name. An input needs a margin of this delay
+    and DELAY_LEFT.
     """
     return max(latest.values(), default=0.0) + DELAY_LEFT > asked_margin(start)
 

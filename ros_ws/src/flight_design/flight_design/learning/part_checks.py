@@ -36,7 +36,10 @@ def change_sentence(change: Change) -> str:
 
 
 def reason_against_innovations(part: Part) -> Refusal | None:
-    """Refuse a part if the whiteness of its least white innovations is above MAX_WHITENESS."""
+    """Refuse a part if the innovations of an output are too far from white noise.
+
+    The worst output counts. Its `whiteness` is 1 for white noise, and at most MAX_WHITENESS.
+    """
     worst = int(np.argmax(part.after.whiteness))
     white = float(part.after.whiteness[worst])
     if white <= MAX_WHITENESS:

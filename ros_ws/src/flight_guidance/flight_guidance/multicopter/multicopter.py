@@ -298,8 +298,8 @@ def _within_fence(
 ) -> tuple[GuidanceState, Escape]:
     """Return the state under the action of the fence; when the action begins, home is the target.
 
-    The action begins when the place where the aircraft can stop is nearer to the fence than MARGIN
-    of flight.
+    The action begins when the place where the aircraft can stop is too near to the fence, nearer
+    than the aircraft flies in the time MARGIN, at 1 m/s or more.
     """
     fence = params.fence
     if fence is None or state.mode is not GuidanceMode.ENGAGED:

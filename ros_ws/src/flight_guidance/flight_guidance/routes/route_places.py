@@ -72,8 +72,8 @@ def one_route(
 ) -> Places:
     """Return the route of a file: its only line, the line that `line` chooses, or its points.
 
-    The points are the route if the file has no line. Otherwise raises a ParameterError that lists
-    the content of the file.
+    The points are the route if the file has no line. `others` are the kinds of the geometries that
+    cannot be a route. Raises ParameterError if there are any, or if no single route remains.
     """
     joined_lines = _joined([geometry for geometry in geometries if geometry.kind not in POINTS])
     lines = [geometry for geometry in joined_lines if geometry.places]

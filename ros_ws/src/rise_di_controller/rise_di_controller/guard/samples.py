@@ -175,8 +175,9 @@ def step(
     During this time `largest` therefore takes at most `reach` of a near change, and nothing of a
     larger change.
 
-    A sample is FROZEN if at least MOVING samples in a row each had other values than the sample
-    before, and every value has since been the same for STILL samples and for as many periods.
+    A sample is FROZEN if y has moved and now stands still. It has moved if at least MOVING samples
+    in a row differed from the one before. It stands still if no value has changed since then, for
+    STILL samples and for as many periods.
     """
     stillness = _next_stillness(state.stillness, sample, state.last, limits)
     state = state._replace(stillness=stillness)
