@@ -11,13 +11,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import typer
 from rich.console import Console
 
 from aircraft_sim.airframes.airframe import Airframe, load_airframe
-from aircraft_sim.uncertainty import Spread
+from aircraft_sim.uncertainty import Spread, as_yaml
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
@@ -32,6 +33,7 @@ from flight_core.files import display_path, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from flight_design.gains.effectors import lags_by_input
+from flight_design.gains.feedforward_model import with_states_of
 from flight_design.gains.gain_design import check_gains
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.excitation import (
@@ -121,7 +123,9 @@ class Tune:
         autopilot, folder = self._target()
         console = Console()
         try:
-            tuned = self._tuned(console, autopilot, folder)
+            with TemporaryDirectory() as temporary:
+                aircraft = Path(temporary) / "aircraft.yaml"
+                tuned = self._tuned(console, autopilot, folder, aircraft)
         finally:
             remove_empty(folder)
         page = folder / "tuning.html"
@@ -158,8 +162,11 @@ class Tune:
             folder.mkdir(parents=True, exist_ok=True)
         return autopilot, folder
 
-    def _tuned(self, console: Console, autopilot: str, folder: Path) -> Tuned:
-        """Do everything except the export: identify, select the gains and bound them."""
+    def _tuned(self, console: Console, autopilot: str, folder: Path, aircraft: Path) -> Tuned:
+        """Do everything except the export: identify, select the gains and bound them.
+
+        The aircraft that flies is written to the file `aircraft`.
+        """
         scenario = find_scenario(self.scenario)
         nominal = load_airframe(scenario.aircraft.airframe)
         scenario = self._with_lags(scenario, nominal)
@@ -187,11 +194,11 @@ class Tune:
         identification = identification._replace(airframe=airframe, parts=taken_parts)
         path = folder / "airframe.yaml"
         write_text("--write", path, model_yaml(identification, self.log.name))
-        recorded = of_log.recorded
-        flight = _on_airframe(scenario, path, recorded)
+        aircraft.write_text(as_yaml(with_states_of(airframe, scenario.controller)), "utf-8")
         selectors = Selectors(
             airframe=airframe,
-            flight=flight,
+            flight=_on_airframe(scenario, path, of_log.recorded),
+            aircraft=aircraft,
             uncertainty=uncertainty,
             entries=entries,
             lead=_with_lead if autopilot == "px4" else lambda controller: controller,

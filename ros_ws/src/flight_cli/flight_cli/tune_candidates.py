@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.outcome import COMPLETED
@@ -63,7 +63,9 @@ class Selectors(NamedTuple):
     """The data and options with which candidates are selected and judged."""
 
     airframe: Airframe  # the identified airframe
-    flight: Scenario  # scenario of the log, with the identified aircraft
+    flight: Scenario  # scenario of the log, with the identified airframe
+    # file of the aircraft that flies: the airframe, with the bank angle if the feedforward has it
+    aircraft: Path
     uncertainty: float  # uncertainty of A and B, for the search of gains
     entries: Mapping[str, float]  # uncertainty of each entry that the log shows, for the margins
     lead: Callable[[RiseDiConfig], RiseDiConfig]  # gives a feedforward the lead of the module
@@ -122,7 +124,12 @@ def candidates(selectors: Selectors) -> list[Candidate]:
             reasons.append(f"{name}: {error}")
             selectors.report(reasons[-1])
             continue
-        found[name] = selectors.lead(selection.chosen), selection.origin
+        chosen = selection.chosen
+        if chosen.observer is None:
+            # It knows what the scenario's feedforward knows beyond the airframe, such as the bank.
+            beyond = chosen.model_copy(update={"feedforward": former.feedforward})
+            chosen = with_feedforward(beyond, airframe)
+        found[name] = selectors.lead(chosen), selection.origin
     if len(reasons) == len(options):
         raise ParameterError("; ".join(reasons))
     return [
@@ -146,11 +153,11 @@ def best_of(found: Sequence[Candidate], *, accept: bool) -> Candidate:
 
 def rms_of_own_loop(own: OwnLoop, selectors: Selectors) -> dict[str, FloatArray]:
     """Return the rms of y - y_m under the autopilot's own loop, (m,), for each of the airs."""
-    flight, airframe = selectors.flight, selectors.airframe
+    flight, airframe = selectors.flight, load_airframe(str(selectors.aircraft))
     controller = flight.rise_di()
     errors = {}
     for air, changes in selectors.airs.items():
-        tape = simulate(flight.vary(aircraft=changes))
+        tape = _flown(selectors, flight, changes)
         y_m = tape["y_m"]
         length = y_m.stamp_ns[-1] - tape.start_ns
         stamps = tape.start_ns + np.arange(0, length, period_ns(controller.rate, "rate"))
@@ -177,7 +184,7 @@ def _judged(selectors: Selectors, name: str, controller: RiseDiConfig, origin: s
     scenario = selectors.flight.vary(controller=controller)
     selectors.report(f"flying in {' and in '.join(selectors.airs)}: {name}")
     rms = {
-        air: _error(simulate(scenario.vary(aircraft=changes)), selectors.airframe)
+        air: _error(_flown(selectors, scenario, changes), selectors.airframe)
         for air, changes in selectors.airs.items()
     }
     answer = check_gains(
@@ -192,6 +199,11 @@ def _judged(selectors: Selectors, name: str, controller: RiseDiConfig, origin: s
     return Candidate(
         name=name, scenario=scenario, origin=origin, shortfall="; ".join(short), rms=rms
     )
+
+
+def _flown(selectors: Selectors, scenario: Scenario, air: Mapping[str, Any]) -> Tape:
+    """Fly a scenario on the aircraft that flies, in an air."""
+    return simulate(scenario.vary(aircraft={"airframe": str(selectors.aircraft), **air}))
 
 
 def _error(tape: Tape, airframe: Airframe) -> FloatArray:

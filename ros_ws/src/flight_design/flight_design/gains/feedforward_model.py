@@ -1,8 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Give a controller the feedforward of an airframe."""
+"""Give a controller the feedforward of an airframe, and an airframe the states of a feedforward."""
 
-from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -10,7 +9,6 @@ import numpy as np
 from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.linear_loop.loop_margins import law_order
 from flight_core.parameters import require
-from flight_core.vectors import FloatArray
 from rise_di_controller.extensions.model_sections import FeedforwardConfig
 from rise_di_controller.params import ControllerConfig
 
@@ -33,19 +31,12 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
             "outputs that are states of its model",
         )
     _, columns = law_order(airframe, controller)
-    states = list(airframe.states)
-    A, B = airframe.matrix_a(), airframe.matrix_b()[:, columns]
+    airframe = with_states_of(airframe, controller)
     gravity = airframe.matrix_gravity()
-    former = controller.feedforward
-    if former is not None and not set(former.states) <= set(states):
-        states += [name for name in former.states if name not in states]
-        A = _enlarged(A, former, states, former.A)
-        gravity = _enlarged(gravity, former, states, former.gravity or (0.0,) * len(former.A))
-        B = np.vstack([B, _rows(former, states[len(B) :], B.shape[1])])
     model = FeedforwardConfig(
-        states=tuple(states),
-        A=tuple(A.ravel().tolist()),
-        B=tuple(B.ravel().tolist()),
+        states=tuple(airframe.states),
+        A=tuple(airframe.matrix_a().ravel().tolist()),
+        B=tuple(airframe.matrix_b()[:, columns].ravel().tolist()),
         gravity=tuple(gravity.ravel().tolist()) if gravity.any() else None,
         lead=tuple(lag + controller.delay + 0.5 / controller.rate for lag in controller.lag),
     )
@@ -54,24 +45,32 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
     )
 
 
-def _enlarged(
-    matrix: FloatArray, former: FeedforwardConfig, states: list[str], values: Sequence[float]
-) -> FloatArray:
-    """Return a matrix for all `states`, of which those of `matrix` are the first.
+def with_states_of(airframe: Airframe, controller: ControllerConfig) -> Airframe:
+    """Return the airframe with the states of a controller's feedforward that it lacks.
 
-    The other entries are `values`, those of the former model, row by row. They are 0 where the
-    former model lacks a state.
+    They are angles, such as the bank angle. Their rows and columns of A are those of the
+    feedforward, and no input acts on them. Raises ParameterError if the enlarged airframe is
+    invalid.
     """
-    n = len(former.states)
-    target = [number for number, name in enumerate(states) if name in former.states]
-    source = [former.states.index(states[number]) for number in target]
-    large = np.zeros((len(states), len(states)))
-    large[np.ix_(target, target)] = np.reshape(values, (n, n))[np.ix_(source, source)]
-    large[: len(matrix), : len(matrix)] = matrix
-    return large
-
-
-def _rows(former: FeedforwardConfig, states: list[str], m: int) -> FloatArray:
-    """Return the rows of B of some states of the former model, (len(states), m)."""
-    B = np.reshape(former.B, (len(former.states), m))
-    return B[[former.states.index(name) for name in states]]
+    model = controller.feedforward
+    further = (
+        () if model is None else [name for name in model.states if name not in airframe.states]
+    )
+    if model is None or not further:
+        return airframe
+    states = [*airframe.states, *further]
+    n = len(airframe.states)
+    shared = [name for name in states if name in model.states]
+    here = [states.index(name) for name in shared]
+    there = [model.states.index(name) for name in shared]
+    of_model = np.reshape(model.A, (len(model.states), len(model.states)))
+    A = np.zeros((len(states), len(states)))
+    A[np.ix_(here, here)] = of_model[np.ix_(there, there)]
+    A[:n, :n] = airframe.matrix_a()
+    B = np.vstack([airframe.matrix_b(), np.zeros((len(further), len(airframe.inputs)))])
+    zeros = {"A": np.zeros_like(A).tolist(), "B": np.zeros_like(B).tolist(), "identities": False}
+    units = airframe.states | dict.fromkeys(further, "rad")
+    empty = airframe.validate_mapping(
+        airframe.model_dump() | zeros | {"states": units}, f"airframe {airframe.name}"
+    )
+    return empty.with_matrices(A, B, np.ones((len(states), len(airframe.gusts))))
