@@ -3,8 +3,8 @@
 """Print what `rise-di tune` makes of logs that lack something, beside the truth, as CSV.
 
 The logs are of linear airplanes with known A and B: that of examples/px4_airplane with other
-inertias, and that of examples/arduplane with other effects. A rate controller of PX4's form flies
-doublets of each rate for a minute.
+inertias, and that of examples/arduplane with other effects. In a bank gravity moves the sideslip. A
+rate controller of PX4's form flies doublets of each rate for a minute.
 
     python -m benchmarks.tune_logs > docs/evidence/tables/export-logs.csv
 """
@@ -22,12 +22,10 @@ from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.excitation import gust_warning, own_shares
-from flight_design.identification.innovation_filters import Actuation, FlightData, coarser
-from flight_design.identification.likelihood import Unknown
-from flight_design.identification.model_identification import Identification, identify_model
+from flight_design.identification.innovation_filters import Actuation, FlightData, coarser, rarer
 from flight_design.identification.model_quality import NoBetter
 from flight_design.identification.rates_log import SPARSE, scaled_torques
-from flight_design.identification.trim_check import doubted, without_trim
+from flight_design.identification.rates_model import banking, identify_rates
 
 ROOT = Path(__file__).parents[1]
 STEP = 5e-4  # step of the simulation, s
@@ -156,8 +154,9 @@ def nominal_of(plane: Plane) -> Airframe:
 
 
 def true_model(nominal: Airframe, plane: Plane) -> tuple[FloatArray, FloatArray]:
-    """Return A and B of the aircraft that flies."""
-    A, B = nominal.matrix_a(), nominal.matrix_b()
+    """Return A and B of the aircraft that flies, a fixed wing with the bank angle as last state."""
+    banked = banking(nominal)
+    A, B = banked.matrix_a(), banked.matrix_b()
     for name, factor in plane.changes.items():
         A[nominal.index(name)] *= factor
         B[nominal.index(name)] *= factor
@@ -185,11 +184,12 @@ def allocated(case: Case, outputs: Sequence[str]) -> Allocation:
     return Allocation(np.linalg.pinv(effects), effects / np.abs(effects).sum(axis=1)[:, None])
 
 
-def flown(case: Case, nominal: Airframe, plane: Plane) -> FlightData:
-    """Fly a case, and return what its log has."""
+def flown(case: Case, nominal: Airframe, plane: Plane) -> tuple[FlightData, FlightData]:
+    """Fly a case, and return the means and the samples of its log."""
     rng = np.random.default_rng(SEED)
     A, B = true_model(nominal, plane)
-    C = nominal.matrix_c()
+    banked = banking(nominal)
+    C = banked.matrix_c()
     n, m = B.shape
     outputs = list(nominal.outputs)
     both = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * STEP)
@@ -223,14 +223,14 @@ def flown(case: Case, nominal: Airframe, plane: Plane) -> FlightData:
             line.append(acting)
             air = air - air * STEP / 0.5 + case.gusts * np.sqrt(4.0 * STEP) * rng.normal(size=G)
             position = position + follows * (line.pop(0) - position)
-            x = both[:n, :n] @ x + both[:n, n:] @ position + STEP * nominal.matrix_gusts() @ air
+            x = both[:n, :n] @ x + both[:n, n:] @ position + STEP * banked.matrix_gusts() @ air
     return logged(case, plane, y, u, rng)
 
 
 def logged(
     case: Case, plane: Plane, y: FloatArray, u: FloatArray, rng: np.random.Generator
-) -> FlightData:
-    """Return what a log keeps of y and u.
+) -> tuple[FlightData, FlightData]:
+    """Return what a log keeps of y and u: means and samples, as `rise-di tune` identifies them.
 
     If u is logged rarely, the u between two samples is taken as linear.
     """
@@ -240,34 +240,21 @@ def logged(
     y = np.where(is_lost[:, None], np.nan, y)
     t = np.arange(len(y), dtype=np.float64) * plane.period
     if case.every == 1:
-        return coarser(FlightData(plane.period, t, y, u), max(1, round(0.008 / plane.period)))
+        whole, factor = FlightData(plane.period, t, y, u), max(1, round(0.008 / plane.period))
+        return coarser(whole, factor), rarer(whole, factor)
     rare = FlightData(
         case.every * plane.period, t[:: case.every], y[:: case.every], u[:: case.every]
     )
     following = np.vstack([rare.u[1:], rare.u[-1:]])
-    return rare._replace(u=(rare.u + following) / 2.0)
-
-
-def identified(
-    recorded: FlightData, nominal: Airframe, plane: Plane, timing: float | None
-) -> Identification:
-    """Identify the aircraft of a log, as `rise-di tune` does."""
-    return identify_model(
-        recorded,
-        nominal,
-        Actuation(np.full(len(nominal.inputs), plane.lag), 0.0),
-        ChannelPairing(nominal.outputs, tuple(nominal.inputs)),
-        unknown=Unknown(has_hidden_rows=False),
-        searches_again=True,
-        timing=timing,
-    )
+    between = rare._replace(u=(rare.u + following) / 2.0)
+    return between, between
 
 
 def rows(case: Case) -> list[list[str]]:
     """Return the rows of a case: one for each entry, or one for a log that is refused at once."""
     plane = PLANES[case.plane]
     nominal = nominal_of(plane)
-    recorded = flown(case, nominal, plane)
+    recorded, samples = flown(case, nominal, plane)
     pairing = ChannelPairing(nominal.outputs, tuple(nominal.inputs))
     period = case.every * plane.period
     if case.plane != "arduplane" and case.every > SPARSE:
@@ -277,10 +264,8 @@ def rows(case: Case) -> list[list[str]]:
     if still:
         return [[case.name, "", "", "", "", "", f"refused: {each.sentence}"] for each in still]
     timing = period / np.sqrt(12.0) / (2.0 if case.every > 1 else 1.0)
-    found = doubted(
-        identified(recorded, nominal, plane, timing),
-        identified(without_trim(recorded), nominal, plane, None),
-    )
+    actuation = Actuation(np.full(len(nominal.inputs), plane.lag), 0.0)
+    found = identify_rates(recorded, samples, nominal, actuation, pairing, timing=timing)
     parameters = {"CA_SV_CS_COUNT": float(len(case.surfaces))}
     for k, effects in enumerate(case.surfaces):
         for letter, effect in zip("RPY", effects, strict=True):

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from tests.conftest import REPOSITORY
 
 from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
@@ -20,17 +21,16 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.excitation import (
     OwnShare,
-    factors_of,
     gust_warning,
     own_shares,
     to_fly,
     to_set,
 )
-from flight_design.identification.innovation_filters import Actuation, FlightData, coarser
+from flight_design.identification.innovation_filters import Actuation, FlightData, coarser, rarer
 from flight_design.identification.likelihood import Unknown
 from flight_design.identification.model_identification import Identification, identify_model
 from flight_design.identification.model_quality import NoBetter
-from flight_design.identification.trim_check import doubted, without_trim
+from flight_design.identification.rates_model import banking, identify_rates
 
 PERIOD = 0.004  # s
 STEPS = 8  # of the aircraft in a period
@@ -127,16 +127,48 @@ def identified(
     )
 
 
-def twice_identified(
-    nominal: Airframe, y: FloatArray, u: FloatArray
-) -> tuple[Identification, Identification]:
-    """Identify with and without slow changes of trim, as `rise-di tune` does."""
+def by_rates(nominal: Airframe, y: FloatArray, u: FloatArray) -> Identification:
+    """Identify as `rise-di tune` does."""
     t = np.arange(len(y), dtype=np.float64) * PERIOD
-    steady = without_trim(FlightData(PERIOD, t, y[:, None], u[:, None]))
-    return (
-        identified(nominal, y, u),
-        identified(nominal, steady.y[:, 0], steady.u[:, 0], timing=None),
+    y, u = y.reshape(len(t), -1), u.reshape(len(t), -1)
+    whole = FlightData(PERIOD, t, y, u)
+    return identify_rates(
+        coarser(whole, 2),
+        rarer(whole, 2),
+        nominal,
+        Actuation(np.zeros(u.shape[1]), 0.0),
+        ChannelPairing(nominal.outputs, tuple(nominal.inputs)),
+        timing=TIMING,
     )
+
+
+def flown_in_turns(nominal: Airframe) -> tuple[FloatArray, FloatArray]:
+    """Return y and u, (T, 3), of the nominal airplane in doublets of each rate.
+
+    It banks, and its autopilot, PI with feedforward, sets the r of a coordinated turn.
+    """
+    rng = np.random.default_rng(5)
+    plane = banking(nominal)
+    A, B, C = plane.matrix_a(), plane.matrix_b(), plane.matrix_c()
+    n, m = B.shape
+    h = PERIOD / STEPS
+    both = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * h)
+    FF, P, gain = np.array([[0.331, 0.206, 0.259], [0.086, 0.05, 0.4155], [1.19, 2.95, 10.0]])
+    count = round(60.0 / PERIOD)
+    y, u = np.zeros((count, m)), np.zeros((count, m))
+    x, integral = np.zeros(n), np.zeros(m)
+    for k in range(count):
+        number, phase = divmod(k * PERIOD, 3.0)
+        wanted = np.zeros(m)
+        doublet = float(phase < 0.5) - float(0.5 <= phase < 1.0)
+        wanted[int(number) % 3] = (0.3, 0.6, 0.2)[int(number) % 3] * doublet
+        wanted[2] += 9.81 / plane.speed * x[plane.index("phi")]
+        y[k] = C @ x + np.array([0.05, 0.1, 0.02]) * rng.normal(size=m)
+        integral = np.clip(integral + gain * (wanted - y[k]) * PERIOD, -0.4, 0.4)
+        u[k] = 0.26 * np.clip(FF * wanted + P * (wanted - y[k]) + integral, -1.0, 1.0)
+        for _ in range(STEPS):
+            x = both[:n, :n] @ x + both[:n, n:] @ u[k]
+    return y, u
 
 
 def farthest(found: Identification) -> float:
@@ -183,26 +215,29 @@ def test_deviations_of_a_right_model_alone_are_too_small_for_a_late_input(
 
 @pytest.mark.slow
 def test_trim_of_a_climb_is_no_effect_of_the_input(nominal: Airframe) -> None:
-    """Without the check an entry would be 56 stated deviations off.
+    """An estimator that believes the trim is 56 stated deviations off.
 
-    The autopilot has no feedforward, so its doublets are slow. The doublets alone show the
-    aircraft.
+    The autopilot has no feedforward, so its doublets are slow.
     """
     y, u = flown(nominal, climb=0.04, feedforward=0.0)
-    once, steady = twice_identified(nominal, y, u)
-    found = doubted(once, steady)
-    assert str(found.refusal).startswith("trim: found B[q, elevator] changed by -5")
-    # tune uses a part that is refused for its innovations alone, so this is no reason to keep
-    (part,) = once.parts
-    coloured = once._replace(parts=(part._replace(refusal=NoBetter("not white")),))
-    assert doubted(coloured, steady).refusal == found.refusal
-    # more doublets would not help
-    assert factors_of(found.parts) == {}
-    assert farthest(found) < OFF
-    begin = round(21.0 / PERIOD)
-    found = doubted(*twice_identified(nominal, y[begin:], u[begin:]))
+    assert farthest(identified(nominal, y, u)) > 30.0
+    found = by_rates(nominal, y, u)
     assert not found.refusal
     assert farthest(found) < OFF
+
+
+@pytest.mark.slow
+def test_gravity_in_a_bank_is_no_effect_of_the_rudder() -> None:
+    """The aircraft turns in a bank, and its rudder follows the turn, as an autopilot has it.
+
+    An estimator that does not know the bank takes the turn for an effect.
+    """
+    nominal = load_airframe(str(REPOSITORY / "examples/px4_airplane/rates_airframe.yaml"))
+    y, u = flown_in_turns(nominal)
+    found = by_rates(nominal, y, u)
+    assert not found.refusal
+    off = [entry for entry in found.entries if abs(entry.error) > OFF * entry.deviation]
+    assert not off
 
 
 @pytest.mark.slow

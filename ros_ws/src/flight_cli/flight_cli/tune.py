@@ -33,7 +33,6 @@ from flight_core.files import display_path, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from flight_design.gains.effectors import lags_by_input
-from flight_design.gains.feedforward_model import with_states_of
 from flight_design.gains.gain_design import check_gains
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.excitation import (
@@ -45,12 +44,10 @@ from flight_design.identification.excitation import (
     to_set,
 )
 from flight_design.identification.innovation_filters import Actuation, FlightData, measured_noise
-from flight_design.identification.likelihood import Unknown
 from flight_design.identification.log_import import Window, lost_share
 from flight_design.identification.model_identification import (
     Identification,
     Part,
-    identify_model,
     model_yaml,
     with_entries,
 )
@@ -58,7 +55,7 @@ from flight_design.identification.model_quality import NoBetter
 from flight_design.identification.model_refusals import best_known, in_time
 from flight_design.identification.own_loop import own_loop
 from flight_design.identification.rates_log import SPARSE, RatesLog, rates_of_log, scaled_torques
-from flight_design.identification.trim_check import doubted, without_trim
+from flight_design.identification.rates_model import banking, identify_rates
 from flight_log.px4_parameters import low_pass_delay, rate_loop
 from flight_log.vehicle_log import read_foreign_log
 from rise_di.c_code import export
@@ -194,7 +191,7 @@ class Tune:
         identification = identification._replace(airframe=airframe, parts=taken_parts)
         path = folder / "airframe.yaml"
         write_text("--write", path, model_yaml(identification, self.log.name))
-        aircraft.write_text(as_yaml(with_states_of(airframe, scenario.controller)), "utf-8")
+        aircraft.write_text(as_yaml(banking(airframe)), "utf-8")
         selectors = Selectors(
             airframe=airframe,
             flight=_on_airframe(scenario, path, of_log.recorded),
@@ -307,29 +304,20 @@ def _identified(
     length = len(of_log.recorded.t) * of_log.recorded.period
     say(console, f"searching for A and B in {length:.0f} s of flight")
     controller = scenario.rise_di()
-    pairing = ChannelPairing(controller.outputs, controller.inputs)
-    unknown = Unknown(has_hidden_rows=False)
     with progress_bar(*COUNT_COLUMNS, quiet=console.quiet) as bar:
-        late = f"u {1e3 * actuation.delay:.1f} ms late"
-
-        def identified(recorded: FlightData, name: str, timing: float | None) -> Identification:
-            show: Callable[..., None] = partial(bar.update, bar.add_task(f"search, {name}"))
-            found = identify_model(
-                recorded,
-                nominal,
-                actuation,
-                pairing,
-                show,
-                unknown=unknown,
-                searches_again=True,
-                timing=timing,
-            )
-            show(completed=1, total=1)
-            return found
-
-        found = identified(of_log.recorded, late, of_log.timing)
-        steady = without_trim(of_log.recorded)
-        return doubted(found, identified(steady, "without slow changes of trim", None))
+        task = bar.add_task(f"search, u {1e3 * actuation.delay:.1f} ms late")
+        show: Callable[..., None] = partial(bar.update, task)
+        found = identify_rates(
+            of_log.recorded,
+            of_log.samples,
+            nominal,
+            actuation,
+            ChannelPairing(controller.outputs, controller.inputs),
+            show,
+            timing=of_log.timing,
+        )
+        show(completed=1, total=1)
+        return found
 
 
 def _require_shown(

@@ -64,7 +64,7 @@ class Selectors(NamedTuple):
 
     airframe: Airframe  # the identified airframe
     flight: Scenario  # scenario of the log, with the identified airframe
-    # file of the aircraft that flies: the airframe, with the bank angle if the feedforward has it
+    # file of the aircraft that flies: the airframe, with the bank angle if it is a fixed wing
     aircraft: Path
     uncertainty: float  # uncertainty of A and B, for the search of gains
     entries: Mapping[str, float]  # uncertainty of each entry that the log shows, for the margins

@@ -7,7 +7,7 @@ The matrices are converted to SI here and nowhere else.
 
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from importlib.resources import files
 from itertools import chain
@@ -355,6 +355,28 @@ class Airframe(Config):
             self.model_dump() | values | {"gusts": gusts, "identities": False},
             f"airframe {self.name}",
         )
+
+    def with_states(self, units: Mapping[str, str], A: FloatArray, B: FloatArray) -> Self:
+        """Copy the airframe with k further states, on which no wind acts.
+
+        The copy is not checked against the identities of physics.
+
+        Args:
+            units: Units of the further states by name, which come after the n states.
+            A: Shape (n + k, n + k), SI.
+            B: Shape (n + k, m), SI.
+
+        Returns:
+            The copy, not checked against physics.
+        """
+        values = {
+            "states": self.states | dict(units),
+            "A": np.zeros_like(A).tolist(),
+            "B": np.zeros_like(B).tolist(),
+            "identities": False,
+        }
+        empty = self.validate_mapping(self.model_dump() | values, f"airframe {self.name}")
+        return empty.with_matrices(A, B, np.ones((len(A), len(self.gusts))))
 
     def through(self, T: FloatArray, inputs: Sequence[str]) -> Self:
         """Copy the airframe with the m inputs v of u = T v, SI, in place of its p inputs u.

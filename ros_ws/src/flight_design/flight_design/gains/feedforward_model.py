@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Give a controller the feedforward of an airframe, and an airframe the states of a feedforward."""
+"""Give a controller the feedforward of an airframe."""
 
 from typing import TypeVar
 
@@ -31,7 +31,7 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
             "outputs that are states of its model",
         )
     _, columns = law_order(airframe, controller)
-    airframe = with_states_of(airframe, controller)
+    airframe = _with_states_of(airframe, controller)
     gravity = airframe.matrix_gravity()
     model = FeedforwardConfig(
         states=tuple(airframe.states),
@@ -45,7 +45,7 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
     )
 
 
-def with_states_of(airframe: Airframe, controller: ControllerConfig) -> Airframe:
+def _with_states_of(airframe: Airframe, controller: ControllerConfig) -> Airframe:
     """Return the airframe with the states of a controller's feedforward that it lacks.
 
     They are angles, such as the bank angle. Their rows and columns of A are those of the
@@ -68,9 +68,4 @@ def with_states_of(airframe: Airframe, controller: ControllerConfig) -> Airframe
     A[np.ix_(here, here)] = of_model[np.ix_(there, there)]
     A[:n, :n] = airframe.matrix_a()
     B = np.vstack([airframe.matrix_b(), np.zeros((len(further), len(airframe.inputs)))])
-    zeros = {"A": np.zeros_like(A).tolist(), "B": np.zeros_like(B).tolist(), "identities": False}
-    units = airframe.states | dict.fromkeys(further, "rad")
-    empty = airframe.validate_mapping(
-        airframe.model_dump() | zeros | {"states": units}, f"airframe {airframe.name}"
-    )
-    return empty.with_matrices(A, B, np.ones((len(states), len(airframe.gusts))))
+    return airframe.with_states(dict.fromkeys(further, "rad"), A, B)

@@ -142,13 +142,11 @@ def factors_of(parts: Iterable[Part]) -> dict[str, float]:
     """Return the factor on the amplitude of each output that needs more motion, by output.
 
     For such an output no effect is known to MAX_DEVIATION. An output is left out if its effects are
-    uncertain because of a delay or of a changing trim, since more motion would not help.
+    uncertain because of a delay, since more motion would not help.
     """
     factors = {}
     for part in parts:
         entries = in_time(part.entries, part.by_timing)
-        if part.by_trim:
-            entries = in_time(entries, part.by_trim)
         for effect in best_known(entries, part.outputs):
             if effect.deviation > MAX_DEVIATION:
                 factors[effect.row] = excitation_factor(effect)

@@ -100,9 +100,9 @@ class Part(NamedTuple):
     wind: float = 0.0  # level of the wind in most of its spans, relative to moderate turbulence
     # part of each entry's deviation that comes from an uncertain delay
     by_timing: tuple[float, ...] = ()
-    # part of each entry's deviation that comes from slow changes of trim, by `trim_check.doubted`;
-    # () if it was not computed
-    by_trim: tuple[float, ...] = ()
+    # difference of each entry from that of a second model, by `rates_model.doubted`; () if there is
+    # none
+    by_motion: tuple[float, ...] = ()
 
 
 class Identification(NamedTuple):
