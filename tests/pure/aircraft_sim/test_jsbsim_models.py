@@ -27,6 +27,7 @@ from aircraft_sim.jsbsim.jsbsim_aircraft import (
     aircraft_names,
     require_aircraft,
     root,
+    root_of,
 )
 from aircraft_sim.jsbsim.jsbsim_commands import hysteresis_of
 from aircraft_sim.jsbsim.jsbsim_model import JsbsimModel
@@ -304,6 +305,11 @@ def test_root_of_user_has_names_and_engines(
             root()
     finally:
         aircraft_names.cache_clear()
+
+
+@pytest.mark.parametrize("path", ["/plane.xml", "/aircraft/plane.xml"])
+def test_model_near_top_of_disk_has_root_of_package(path: str) -> None:
+    assert root_of(Path(path)) == root()
 
 
 @pytest.mark.parametrize(

@@ -297,10 +297,12 @@ def root_of(model: Path) -> Path:
     It is $JSBSIM_ROOT, the ROOT in ROOT/aircraft/NAME/NAME.xml, or the folder of the package.
     JSBSim looks beside the model first for files that the model names.
     """
-    folder = model.parents[min(2, len(model.parents) - 1)]
+    # The parent of the top folder is the top folder itself.
+    aircraft_folder = model.parent.parent
+    folder = aircraft_folder.parent
     is_tree = (
         not os.environ.get(ROOT_VARIABLE)
-        and model.parents[1].name == "aircraft"
+        and aircraft_folder.name == "aircraft"
         and (folder / "engine").is_dir()
     )
     return folder if is_tree else root()
