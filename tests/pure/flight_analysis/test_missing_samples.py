@@ -18,7 +18,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.account import account
 from flight_core.rates import NANOSECONDS
-from flight_core.tape import Signal, Tape
+from flight_core.tape import Recording, Signal, Tape
 
 RATES = {"y": 100, "y_m": 100, "truth": 100, "u": 100, "internals": 100, "pose": 50}  # Hz
 OF_AIRCRAFT = ("y", "y_m", "truth", "pose")  # no mode of the flight interrupts these
@@ -119,6 +119,28 @@ def test_topic_that_ends_a_second_early_is_named(name: str, end: float, named: b
     assert [lack.endswith(f"ends at t = {end:.3f} of 600.000 s") for lack in sentences] == [
         True
     ] * named
+
+
+def test_late_beginning_is_told_of_a_topic_that_also_stopped_early() -> None:
+    """A flight in real time whose publisher of y_m sends again after the end.
+
+    The numbers of the messages show that it sent nothing in the last second of the flight.
+    """
+    flight = scenario()
+    begin_ns = NANOSECONDS * 1_795_000_000
+    signals = {}
+    names = flight.controller.outputs
+    for name in ("y", "y_m"):
+        t_ns = np.arange(20 * RATES[name] + 1) * (NANOSECONDS // RATES[name])
+        signals[name] = Signal(begin_ns + t_ns, names, np.zeros((len(t_ns), len(names))))
+    t = (signals["y_m"].stamp_ns - begin_ns) / NANOSECONDS
+    signals["y_m"] = signals["y_m"].where((t >= 3.0) & ((t <= 17.0) | (t > 18.5)))
+    recording = {name: Recording(0, lost=0) for name in signals}
+    tape = Tape(signals, begin_ns, duration=18.0, recording=recording)
+    (lack,) = [lack for lack in account(tape, flight).lacks if lack.startswith("y_m ")]
+    assert lack == (
+        "y_m 1401 of 1801 samples, begins at t = 3.000 of 18.000 s, 100 were never sent"
+    )
 
 
 @cache

@@ -18,6 +18,7 @@ from flight_analysis.report.sample_counts import (
     SILENCE,
     TICKS,
     WHOLE,
+    Leeway,
     Span,
     TopicAccount,
     topic_accounts,
@@ -151,7 +152,7 @@ def account(
     """
     planned_ns = planned_end_ns(tape)
     span = _span(tape, planned_ns, outcome, simulated=simulated)
-    topics, late = topic_accounts(tape, scenario, span)
+    topics, leeways = topic_accounts(tape, scenario, span)
     end = seconds(span.end_ns - tape.start_ns)
     guided = [topics[name] for name in GUIDED if name in topics]
     unguided = bool(guided) and all(
@@ -162,12 +163,12 @@ def account(
     lacks = []
     host_lacks = []
     for name, topic in topics.items():
-        last = late.get(name, 0.0)
-        lack = _lack(name, topic, end, last, late_u=first is not None)
+        leeway = leeways.get(name, Leeway())
+        lack = _lack(name, topic, end, leeway, late_u=first is not None)
         if lack is None:
             continue
         lacks.append(lack)
-        if _is_of_host(tape, name, topic, starved, end - last):
+        if _is_of_host(tape, name, topic, starved, end, leeway):
             host_lacks.append(lack)
     busy = [
         f"{topic.unsent} of {topic.expected} {name} were never sent"
@@ -270,17 +271,18 @@ def _late_first_u(
     return first_u if first_u - scenario.aircraft.sensors.delay > SILENCE else None
 
 
-def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bool) -> str | None:
+def _lack(
+    name: str, topic: TopicAccount, end: float, leeway: Leeway, *, late_u: bool
+) -> str | None:
     """Return what a topic lacks, as the object of "the log lacks", or None if it lacks nothing.
 
-    `late` is the time, s, by which the first sample may come after the start, and the last sample
-    before the end. `late_u` says that the first u of the flight was late.
+    `late_u` says that the first u of the flight was late.
     """
     facts = []
     missing = not topic.holds(topic.found + topic.unsent) or (
         topic.share is not None and topic.share < LEAST
     )
-    begins_late = missing and topic.first is not None and topic.first - late > SILENCE
+    begins_late = missing and topic.first is not None and topic.first - leeway.begin > SILENCE
     if begins_late or (name == "u" and late_u):
         facts.append(f"begins at t = {topic.first:.3f} of {end:.3f} s")
     if topic.step and topic.last is not None:
@@ -293,7 +295,8 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bo
         facts.append(f"{topic.repeated} samples with the stamp of the sample before")
     if missing or name in STEADY:
         tail = 0.0 if topic.last is None or topic.expected is None else end - topic.last
-        if tail > min((1.0 - WHOLE) * end, SILENCE) + late:
+        longest = min((1.0 - WHOLE) * end, SILENCE)
+        if leeway.end is not None and tail > longest + leeway.end:
             facts.append(f"ends at t = {topic.last:.3f} of {end:.3f} s")
         silence = end * (1.0 - topic.share) if missing and topic.share is not None else math.inf
         # a gap is also named if it is more than half of what is missing
@@ -312,19 +315,26 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bo
 
 
 def _is_of_host(
-    tape: Tape, name: str, topic: TopicAccount, starved: Starvation, end: float
+    tape: Tape,
+    name: str,
+    topic: TopicAccount,
+    starved: Starvation,
+    end: float,
+    leeway: Leeway,
 ) -> bool:
     """Return whether the host alone is the cause of what a topic lacks.
 
     This needs three things. No message was lost and no stamp is wrong, so that what is missing was
-    never sent. The topic goes on to the `end`, s. It began in time, or so late because the host
-    starved the nodes.
+    never sent. The topic goes on to the `end`, s, as far as its leeway demands. It began in time,
+    or so late because the host starved the nodes.
     """
     is_whole = tape.recording.get(name, Recording(0)).lost == 0
     has_stamps = not (topic.step or topic.unset or topic.left_out or topic.repeated)
     if not (starved.spans and is_whole and has_stamps and topic.is_of_stack):
         return False
-    if topic.first is None or topic.last is None or topic.last < end - SILENCE:
+    if topic.first is None or topic.last is None:
+        return False
+    if leeway.end is not None and topic.last < end - leeway.end - SILENCE:
         return False
     before = np.array([topic.first - SILENCE / 2.0])
     return topic.first <= SILENCE or bool(starved.holds(before)[0])

@@ -88,10 +88,18 @@ class Span(NamedTuple):
     simulated: bool  # whether the aircraft of the scenario flew, no autopilot
 
 
+class Leeway(NamedTuple):
+    """How far inside the span of a flight the samples of a topic may begin and end, s."""
+
+    begin: float = 0.0  # time from the beginning of the span to the first sample
+    # time from the last sample to the end of the span; None if it may be any time
+    end: float | None = 0.0
+
+
 def topic_accounts(
     tape: Tape, scenario: Scenario | None, span: Span
-) -> tuple[dict[str, TopicAccount], dict[str, float]]:
-    """Return the account of each topic, and how long before the end its last sample may be, s.
+) -> tuple[dict[str, TopicAccount], dict[str, Leeway]]:
+    """Return the account of each topic, and the leeway of the topics that have one.
 
     The expected number of samples is rate times time. The rate is that of the scenario if a node of
     the stack sends the samples in the host's time. Otherwise it is that of the log. Ticks of the
@@ -103,7 +111,7 @@ def topic_accounts(
     names = [*dict.fromkeys([*(name for name in tape.signals if name in RATED), *expected])]
     begin_ns = tape.start_ns if span.from_start else None
     topics = {name: _topic(tape, name, expected.get(name), begin_ns, span.end_ns) for name in names}
-    late = {} if scenario is None else _latest(scenario)
+    leeways = {} if scenario is None else _leeways(scenario)
     has_clock = tape.is_by_clock or (
         tape.start_ns > SINCE_EPOCH_NS
         and not any(clock.step_ns for clock in tape.recording.values())
@@ -116,7 +124,7 @@ def topic_accounts(
             if unsent_at_end := _unsent_rest(tape, name, step_ns, span.end_ns):
                 topics[name] = topics[name]._replace(unsent=topics[name].unsent + unsent_at_end)
                 # They count as never sent, so the last sample may be as early as it is.
-                late[name] = seconds(span.end_ns)
+                leeways[name] = leeways.get(name, Leeway())._replace(end=None)
             if not is_sent_by_stack(tape, name):
                 topics[name] = _of_foreign(topics[name])
     failsafe = 0
@@ -127,7 +135,7 @@ def topic_accounts(
         # and it is unknown whether a sample is new.
         repeated = max(topic.repeated - (failsafe if name in TICKS else 0), 0)
         topics[name] = topic._replace(found=max(topic.found - repeated, 0), repeated=repeated)
-    return topics, late
+    return topics, leeways
 
 
 def _expected(
@@ -429,13 +437,12 @@ def _topic(
     )
 
 
-def _latest(scenario: Scenario) -> dict[str, float]:
-    """Return how long before the end the last sample of a topic may be stamped, s.
+def _leeways(scenario: Scenario) -> dict[str, Leeway]:
+    """Return the leeway of each topic with a delay.
 
     It is the delay of the topic. If the pose is slow, it is a period of the pose in addition.
     """
     aircraft = scenario.aircraft
-    return {
-        "y": aircraft.sensors.delay,
-        "pose": aircraft.pose.delay + aircraft.pose_every() / aircraft.rate,
-    }
+    of_y = aircraft.sensors.delay
+    of_pose = aircraft.pose.delay + aircraft.pose_every() / aircraft.rate
+    return {"y": Leeway(of_y, of_y), "pose": Leeway(of_pose, of_pose)}
