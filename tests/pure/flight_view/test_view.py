@@ -50,7 +50,7 @@ from flight_view.flight import ROUTE_TYPE, Flight
 from flight_view.series import Series
 from flight_view.server import FILES, Server, answer
 from flight_view.text import picture
-from flight_view.watch import namespaces, newest_run, runs_in_recording
+from flight_view.watch import namespaces, newest_run, runs_in_recording, serve
 
 pytestmark = pytest.mark.slow
 
@@ -844,3 +844,14 @@ def test_terminal_shows_newest_values_in_units_of_report(recorded: Path, tape: T
     assert rows["q"][0] == f"{1e3 * tape['internals']['y.q'][-1]:.3f}"
     assert rows["elevator"][0] == f"{np.degrees(tape['internals']['u.elevator'][-1]):.3f}"
     assert "0.00 s  mode: ENGAGED" in text
+
+
+def test_page_without_a_free_port_names_the_ports(tmp_path: Path) -> None:
+    with socket.create_server((http.ADDRESS, 0)) as taken:
+        port = taken.getsockname()[1]
+        with refusing(
+            rf"^--port: {port} cannot be used \(Address already in use\), expected a free port"
+        ):
+            serve([Flight(tmp_path)], [port], print)
+    with refusing(r"^--port: found no port, expected a free port of this host$"):
+        serve([Flight(tmp_path)], [], print)

@@ -115,19 +115,23 @@ def serve(
     asyncio.run(_serve(server, ports, announce))
 
 
-async def _serve(server: Server, ports: Sequence[int], announce: Callable[[str], None]) -> None:
+def _listen(server: Server, ports: Sequence[int]) -> None:
+    """Let a server listen on the first free port. Raises ParameterError if none is free."""
+    refusals = []
     for port in ports:
         try:
             server.listen(port)
         except OSError as error:
             # The address may already be in the text of `strerror`.
-            reason = os.strerror(error.errno or 0)
+            refusals.append(f"{port} cannot be used ({os.strerror(error.errno or 0)})")
         else:
-            break
-    else:
-        raise ParameterError(
-            f"--port: {port} cannot be used ({reason}), expected a free port of this host"
-        )
+            return
+    reason = ", ".join(refusals) or "found no port"
+    raise ParameterError(f"--port: {reason}, expected a free port of this host")
+
+
+async def _serve(server: Server, ports: Sequence[int], announce: Callable[[str], None]) -> None:
+    _listen(server, ports)
     announce(f"http://{ADDRESS}:{server.port}/#token={server.token}")
     announce(
         f"from another machine first: ssh -L {server.port}:{ADDRESS}:{server.port} "
