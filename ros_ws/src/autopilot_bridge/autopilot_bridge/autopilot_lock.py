@@ -33,7 +33,10 @@ class AutopilotLock:
         self._boot_ns = 0
 
     def _new_lock(self) -> PublisherLock:
-        return PublisherLock(lambda: (self._silence_ns, self._silence_ns))
+        # Neither an address nor an instant of boot tells a restart from another autopilot, so the
+        # limit for a restart is that for another autopilot.
+        limits_ns = (self._silence_ns, self._silence_ns)
+        return PublisherLock(lambda: limits_ns)
 
     @property
     def address(self) -> str | None:
@@ -103,10 +106,10 @@ class AutopilotLock:
         instant of boot.
         """
         boot_ns = now_ns - since_boot_ns
-        advances = (
+        is_same_run = (
             since_boot_ns >= self._newest_ns - CLOCK_TOLERANCE_NS
             and boot_ns >= self._boot_ns - CLOCK_TOLERANCE_NS
         )
-        if self._starts.publisher is not None and advances:
+        if self._starts.publisher is not None and is_same_run:
             return self._starts.publisher
         return str(boot_ns)
