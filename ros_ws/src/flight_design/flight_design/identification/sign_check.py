@@ -180,7 +180,7 @@ def check_signs(
     channels in the map's order. `outputs`, `inputs` and `D` are in the controller's order. Raises
     ParameterError if the map does not fit the airframe, or if Omega has no D.
     """
-    mapped = _through(channel_map, Omega, outputs, inputs)
+    mapped = _omega_of_law(channel_map, Omega, outputs, inputs)
     D_mapped = [int(sign) for sign in signs(mapped)]
     sentences = [
         f"outputs.{name} of the map {channel_map.name} has the wrong sign:"
@@ -243,7 +243,7 @@ def check_effectors(
     this output. `Omega`, (m, p), is that of `check_signs`, with a column for each effector. D of a
     channel in the result is the sign of its effect.
     """
-    mapped = _through(channel_map, Omega, outputs, effectors)
+    mapped = _omega_of_law(channel_map, Omega, outputs, effectors)
     largest = np.argmax(np.abs(effect) / np.abs(effect).max(axis=1, keepdims=True), axis=0).tolist()
     channels = []
     sentences = []
@@ -271,10 +271,10 @@ def check_effectors(
     return SignCheck(tuple(channels), tuple(sentences), (), 0.0)
 
 
-def _through(
+def _omega_of_law(
     channel_map: ChannelMap, Omega: FloatArray, outputs: Sequence[str], inputs: Sequence[str]
 ) -> FloatArray:
-    """Return Omega `through` the map, for the given outputs and inputs."""
+    """Return Omega `through` the map, in the law's order: that of `outputs` and `inputs`."""
     rows = _places(outputs, channel_map.outputs)
     columns = _places(inputs, channel_map.inputs)
     return through(channel_map, Omega)[np.ix_(rows, columns)]
@@ -292,7 +292,7 @@ def output_signs(channel_map: ChannelMap) -> FloatArray:
     quantity it is. Raises ParameterError if q, p, r or V has the motion of another channel, or if
     two channels have the same motion.
     """
-    signs: dict[str, int] = {}
+    sign_by_motion: dict[str, int] = {}
     for name, row in channel_map.outputs.items():
         moved, sign = row.motion
         key = f"map {channel_map.name}: outputs.{name}.positive"
@@ -303,13 +303,13 @@ def output_signs(channel_map: ChannelMap) -> FloatArray:
             f"a motion to which {name} responds",
         )
         require(
-            moved not in signs,
+            moved not in sign_by_motion,
             key,
             f"{row.positive!r}, the motion of another output too",
             "a motion of its own",
         )
-        signs[moved] = sign
-    return np.array(list(signs.values()), dtype=np.float64)
+        sign_by_motion[moved] = sign
+    return np.array(list(sign_by_motion.values()), dtype=np.float64)
 
 
 def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
@@ -318,7 +318,7 @@ def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
     Omega, (m, m), has rows and columns in the map's order. Raises ParameterError if an input has no
     effect on its output.
     """
-    signs = []
+    flips = []
     for j, (name, row) in enumerate(channel_map.inputs.items()):
         moved, sign = row.motion
         key = f"map {channel_map.name}: inputs.{name}.positive"
@@ -328,8 +328,8 @@ def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
         effect = Omega[list(outputs).index(moved), j]
         expected = f"a motion by {name}: in the airframe {outputs[moved]} does not respond"
         require(effect != 0.0, key, f"{row.positive!r}", expected)
-        signs.append(sign * np.sign(effect))
-    return np.array(signs)
+        flips.append(sign * np.sign(effect))
+    return np.array(flips)
 
 
 def through(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
