@@ -158,7 +158,7 @@ def recorded_response(
             "guidance" not in tape,
             str(bag),
             "a flight under guidance, whose y_m follows y",
-            "an experiment, or one without",
+            "an experiment, or a flight without guidance",
         )
     excitation: Signal | None = tape["y_m"] if "y_m" in tape and not open_loop else None
     return identify_response(
