@@ -31,12 +31,12 @@ from flight_core.parameters import require
 BOUND = 5  # version of the method by which this stack bounds a loop
 
 
-def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, str]) -> str:
+def certificate(linear: LinearLoop, guarantee: Guarantee, sources: Mapping[str, str]) -> str:
     """Return the certificate of a guarantee as JSON.
 
     Args:
         linear: The loop, with the box of the guarantee. The size of this box does not matter.
-        promise: The guarantee of this loop, computed for a u that is never late.
+        guarantee: The guarantee of this loop, computed for a u that is never late.
         sources: The files from which the loop was built, by name: SHA-256 of the airframe and of
             the scenario, and the text of the exported constants.
 
@@ -44,17 +44,17 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
         ParameterError: Nothing is proved, or u can be late. For a late u, the checker has no bound
             for the coefficients that are left out.
     """
-    require(promise.stable > 0.0, "certificate", "no stable box", "a loop with a guarantee")
-    require(promise.late == 0.0, "certificate", f"u up to {promise.late:g} s late", "u in time")
-    return _text(linear, promise.stable, {**sources, "parts": promise.proof})
+    require(guarantee.stable > 0.0, "certificate", "no stable box", "a loop with a guarantee")
+    require(guarantee.late == 0.0, "certificate", f"u up to {guarantee.late:g} s late", "u in time")
+    return _text(linear, guarantee.stable, {**sources, "parts": guarantee.proof})
 
 
 def limit_certificate(
-    linear: LinearLoop, promise: LimitGuarantee, sources: Mapping[str, str]
+    linear: LinearLoop, guarantee: LimitGuarantee, sources: Mapping[str, str]
 ) -> str:
     """Return the certificate of a guarantee with a limit of one input, as JSON."""
-    limit = {"input": promise.input, **promise.multiplier._asdict()}
-    return _text(linear, promise.size, {**sources, "parts": promise.proof, "limit": limit})
+    limit = {"input": guarantee.input, **guarantee.multiplier._asdict()}
+    return _text(linear, guarantee.size, {**sources, "parts": guarantee.proof, "limit": limit})
 
 
 def _text(linear: LinearLoop, deviation: float, proof: Mapping[str, Any]) -> str:
@@ -78,17 +78,17 @@ def _text(linear: LinearLoop, deviation: float, proof: Mapping[str, Any]) -> str
     return json.dumps(content | {"digest": digest}, default=np.ndarray.tolist) + "\n"
 
 
-def keep(promise: Guarantee) -> None:
+def keep(guarantee: Guarantee) -> None:
     """Store a guarantee in the folder of guarantees, for the pages of later flights.
 
     Nothing is stored if u can be late, or if the folder cannot be written.
     """
-    if promise.late:
+    if guarantee.late:
         return
-    path = _path(promise.loop)
+    path = _path(guarantee.loop)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, json.dumps(promise.as_json() | {"proof": promise.proof}))
+        write_file(path, json.dumps(guarantee.as_json() | {"proof": guarantee.proof}))
     except OSError:
         return
 
@@ -98,30 +98,30 @@ def kept_guarantee(linear: LinearLoop) -> Guarantee | None:
 
     Returns None if no guarantee is kept, if its file is damaged, or if `unstated` has a reason.
     """
-    promise = _kept(linear)
-    return None if promise is None or unstated(linear, promise) else promise
+    guarantee = _kept(linear)
+    return None if guarantee is None or unstated(linear, guarantee) else guarantee
 
 
-def unstated(linear: LinearLoop, promise: Guarantee) -> tuple[str, ...]:
+def unstated(linear: LinearLoop, guarantee: Guarantee) -> tuple[str, ...]:
     """Return the reasons why a guarantee cannot be stated for the aircraft that flies.
 
     The result is empty if the guarantee can be stated. A guarantee holds for a linear loop and for
     the aircraft within its box, so it says nothing about what the loop leaves out.
     """
     reasons = [each.sentence for each in linear.differences if each.standing is not Standing.TAKEN]
-    return (*reasons, *_beyond_box(linear, promise))
+    return (*reasons, *_beyond_box(linear, guarantee))
 
 
 def beyond_kept(linear: LinearLoop) -> tuple[str, ...]:
     """Return a sentence if the aircraft lies beyond the guarantee kept for its loop, else ()."""
-    promise = _kept(linear)
-    return () if promise is None else _beyond_box(linear, promise)
+    guarantee = _kept(linear)
+    return () if guarantee is None else _beyond_box(linear, guarantee)
 
 
-def _beyond_box(linear: LinearLoop, promise: Guarantee) -> tuple[str, ...]:
-    if linear.off <= promise.stable:
+def _beyond_box(linear: LinearLoop, guarantee: Guarantee) -> tuple[str, ...]:
+    if linear.off <= guarantee.stable:
         return ()
-    ends = math.floor(1e3 * promise.stable) / 10.0
+    ends = math.floor(1e3 * guarantee.stable) / 10.0
     off = f"the aircraft is {100.0 * linear.off:.1f} % off"
     return (f"aircraft.uncertainty: {off}, the guarantee ends at {ends:.1f} %: none is stated",)
 
@@ -129,16 +129,17 @@ def _beyond_box(linear: LinearLoop, promise: Guarantee) -> tuple[str, ...]:
 def _kept(linear: LinearLoop) -> Guarantee | None:
     try:
         content: dict[str, Any] = json.loads(_path(linear.digest).read_bytes())
-        first = content["unstable"]
-        content["unstable"] = None if first is None else Unstable(**first)
+        content["unstable"] = _unstable(content["unstable"])
         content["exact"] = tuple(content["exact"])
-        if content["zeros_alone"] is not None:
-            first = content["zeros_alone"]["unstable"]
-            unstable = None if first is None else Unstable(**first)
-            content["zeros_alone"] = Zeros(content["zeros_alone"]["stable"], unstable)
+        if (zeros := content["zeros_alone"]) is not None:
+            content["zeros_alone"] = Zeros(zeros["stable"], _unstable(zeros["unstable"]))
         return Guarantee(**{field: content[field] for field in Guarantee._fields})
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def _unstable(content: dict[str, Any] | None) -> Unstable | None:
+    return None if content is None else Unstable(**content)
 
 
 def _path(loop: str) -> Path:

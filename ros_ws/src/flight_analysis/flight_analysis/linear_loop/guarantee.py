@@ -106,9 +106,11 @@ class Guarantee(NamedTuple):
         if self.unstable is not None:
             content["unstable"] = self.unstable._asdict()
         if self.zeros_alone is not None:
-            first = self.zeros_alone.unstable
-            unstable = None if first is None else first._asdict()
-            content["zeros_alone"] = {"stable": self.zeros_alone.stable, "unstable": unstable}
+            unstable = self.zeros_alone.unstable
+            content["zeros_alone"] = {
+                "stable": self.zeros_alone.stable,
+                "unstable": None if unstable is None else unstable._asdict(),
+            }
         return content
 
 
