@@ -24,6 +24,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup import fly as flying
 from flight_bringup.fly import _follow_real_time, _Span, last
 from flight_bringup.interrupt import DeferredInterrupt, handle_signals, interrupt
+from flight_bringup.processes import FIRST_U
 from flight_core.outcome import Outcome, Refusal, ended_early
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
@@ -1001,6 +1002,42 @@ def test_flight_ends_once_log_holds_it(
     )
     assert str(sentence) == outcome
     assert now[0] == approx(end, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "published, outcome",
+    [(False, "y did not reach the controller"), (True, "u did not reach the aircraft")],
+)
+def test_flight_that_does_not_begin_says_which_signal_is_missing(
+    published: bool, outcome: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+
+    def sleep(period: float) -> None:
+        now[0] += period
+
+    monkeypatch.setattr(
+        "flight_bringup.fly.time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep)
+    )
+    processes = SimpleNamespace(
+        pop_end_of_learner=lambda: None,
+        started=0.0,
+        start_time=1000.0,
+        ended=lambda: None,
+        is_flying=lambda: False,
+        last_words=lambda name: None,
+    )
+    monitor = SimpleNamespace(
+        learned=list,
+        engagement=list,
+        newest=lambda: ("ENGAGED", np.zeros(4)) if published else None,
+        recorded=lambda: None,
+    )
+    sentence = followed(
+        cast("FlightProcesses", processes), cast("FlightMonitor", monitor), begins=True
+    )
+    assert str(sentence) == f"never flew: {outcome}"
+    assert now[0] == approx(FIRST_U, abs=0.1)
 
 
 def test_flight_announces_each_reason_once_without_those_in_which_number_alone_changes() -> None:

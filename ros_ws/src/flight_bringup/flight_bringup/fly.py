@@ -6,6 +6,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Generator, Mapping
+from enum import Enum, auto
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -158,12 +159,26 @@ def follow(
     return _follow_real_time(processes, progress, announce, engaged_for, span)
 
 
+class _Phase(Enum):
+    """How far a flight in real time has come."""
+
+    OPEN = auto()  # the flight need not begin: there may never be a u
+    WAITING = auto()  # the controller has not published
+    PUBLISHED = auto()  # the controller has published, but the aircraft has not taken u
+    FLYING = auto()  # the aircraft takes u
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether the flight must still begin."""
+        return self in {_Phase.WAITING, _Phase.PUBLISHED}
+
+
 class _Span:
     """Determines when a flight in real time has begun, and when it is over.
 
     A flight has begun once the aircraft takes u. It is over once the log holds y, y_m and u up to
     its end. With an autopilot, or with a controller that a user activates, there may never be a u.
-    In this case `begins` is False.
+    In this case `begins` is False, and the phase is OPEN to the end.
     """
 
     def __init__(
@@ -179,9 +194,12 @@ class _Span:
         self._monitor = monitor
         self._until = -math.inf  # s, flight time up to which the log holds y, y_m and u
         self._last_change = 0.0 if begins else -math.inf  # s, flight time of the last change
-        self._flies = not begins
-        self._begins = begins
-        self.engaged = False  # whether the controller has published
+        self._phase = _Phase.WAITING if begins else _Phase.OPEN
+
+    def note_u(self) -> None:
+        """Note that the controller has published."""
+        if self._phase is _Phase.WAITING:
+            self._phase = _Phase.PUBLISHED
 
     def outcome(self, t: float) -> Outcome | None:
         """Return the outcome once the log holds the flight or has stopped growing; else None."""
@@ -194,16 +212,19 @@ class _Span:
             return None
         if self._until >= self._duration - STAMP_ERROR:
             return COMPLETED
-        if not self._flies or t < self._last_change + LOG_TIMEOUT:
+        if self._phase.is_awaited or t < self._last_change + LOG_TIMEOUT:
             return None
-        return log_ends_at(self._until, self._duration) if self._begins else COMPLETED
+        if self._phase is _Phase.OPEN:
+            return COMPLETED
+        return log_ends_at(self._until, self._duration)
 
     def failed(self, t: float) -> Outcome | None:
-        """Return why the flight has not begun; None if it has, or if it still may."""
-        self._flies = self._flies or self._processes.is_flying()
-        if self._flies or t < FIRST_U:
+        """Return why the flight has not begun; None if it has, still may, or need not begin."""
+        if self._phase.is_awaited and self._processes.is_flying():
+            self._phase = _Phase.FLYING
+        if not self._phase.is_awaited or t < FIRST_U:
             return None
-        if self.engaged:
+        if self._phase is _Phase.PUBLISHED:
             return never_flew("u did not reach the aircraft")
         why = self._processes.last_words(CONTROLLER)
         return never_flew(f"y did not reach the controller{'' if why is None else f' ({why})'}")
@@ -247,7 +268,7 @@ def _follow_real_time(
             text = f"{phase}: {why}"
         elif (status := monitor.newest()) is not None:
             mode, values = status
-            span.engaged = True
+            span.note_u()
             errors = (
                 f"{name} {e * units[name].factor:+.2f}"
                 for name, e in zip(outputs, values, strict=True)
