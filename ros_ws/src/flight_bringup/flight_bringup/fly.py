@@ -407,11 +407,11 @@ def fly_and_report(
         progress,
         "a function of the flight time in s",
     )
-    library_scenario = find_scenario(scenario)
-    run = new_run(library_scenario, as_path(runs, "runs", "the path of a folder"))
-    library_scenario = as_file(library_scenario, run)
+    found = find_scenario(scenario)
+    run = new_run(found, as_path(runs, "runs", "the path of a folder"))
+    flown = as_file(found, run)
     outcome = fly_in_process(
-        library_scenario, run, lambda t, _: None if progress is None else progress(t), learn
+        flown, run, lambda t, _: None if progress is None else progress(t), learn
     )
     return write_report(run, outcome)
 
