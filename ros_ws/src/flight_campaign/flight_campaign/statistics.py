@@ -135,19 +135,19 @@ class Tally(Config):
         `figures` includes the "score". Each figure has shape (N,).
         """
         bounded = ~np.asarray(diverged, dtype=bool)
-        score = np.asarray(figures["score"])
-        rank = np.where(bounded, score, np.inf)
+        scores = np.asarray(figures["score"])
+        rank = np.where(bounded, scores, np.inf)
         order = np.argsort(-rank, kind="stable")[:WORST_KEPT]
         return cls(
             flights=len(bounded),
             diverged=int((~bounded).sum()),
-            lost=int(lost_track(diverged, score).sum()),
+            lost=int(lost_track(diverged, scores).sum()),
             figures={
                 name: FigureStatistics.from_values(np.asarray(values)[bounded])
                 for name, values in figures.items()
             },
             worst=tuple(
-                Worst(number=first + int(k), score=float(score[k]) if bounded[k] else None)
+                Worst(number=first + int(k), score=float(scores[k]) if bounded[k] else None)
                 for k in order
             ),
         )
@@ -209,12 +209,12 @@ class Tally(Config):
         return count / self.flights, low, high
 
 
-def lost_track(diverged: FloatArray, score: FloatArray) -> NDArray[np.bool_]:
+def lost_track(diverged: FloatArray, scores: FloatArray) -> NDArray[np.bool_]:
     """Return which flights lost track, (N,).
 
     A flight lost track if it did not diverge, but has a score above LOSS_OF_TRACK_SCORE.
     """
-    return np.asarray(~np.asarray(diverged, dtype=bool) & (score > LOSS_OF_TRACK_SCORE))
+    return np.asarray(~np.asarray(diverged, dtype=bool) & (scores > LOSS_OF_TRACK_SCORE))
 
 
 def score_units(
