@@ -254,7 +254,7 @@ class _Paired(NamedTuple):
     bandwidth: FloatArray  # (m,) rad/s, at the start of the search
     D: FloatArray  # (m,)
     unit: FloatArray  # (m,) 1 / abs(Omega_ii)
-    spread: FloatArray  # (m,) largest abs(Omega_ii) of the samples
+    largest_response: FloatArray  # (m,) largest abs(Omega_ii) of the samples
 
 
 def _paired(study: Study, setting: LoopSetting) -> _Paired:
@@ -289,7 +289,7 @@ def _paired(study: Study, setting: LoopSetting) -> _Paired:
         bandwidth=bandwidth[rows],
         D=signs_of_pairing(Omega[np.ix_(rows, rows)], channels),
         unit=1.0 / np.abs(np.diag(Omega))[rows],
-        spread=np.abs(responses).max(axis=0),
+        largest_response=np.abs(responses).max(axis=0),
     )
 
 
@@ -316,17 +316,18 @@ def _controller(
     setting: LoopSetting,
     pairs: _Paired,
     gains: GainSet,
-    response: FloatArray,
+    scaled_response: FloatArray,
     slower: FloatArray,
 ) -> RiseDiConfig:
     """Build the controller with the gains.
 
-    The integral gain is divided by `slower`, and abs(Omega_ii) is `response` in the scaled inputs.
+    The integral gain is divided by `slower`. In the scaled inputs abs(Omega_ii) is
+    `scaled_response`.
     """
     channels = pairs.channels
-    scale = pairs.unit * response
+    scale = pairs.unit * scaled_response
     base_inputs = setting.base.inputs
-    softening = (SOFTENING * np.broadcast_to(slower, response.shape)).tolist()
+    softening = (SOFTENING * np.broadcast_to(slower, scaled_response.shape)).tolist()
     has_limits = set(channels.inputs) <= set(base_inputs)
     limits = {key: getattr(setting.base, key) for key in INPUT_LIMITS} if has_limits else {}
     values = setting.base.model_dump(exclude=set(INPUT_LIMITS)) | {
@@ -339,7 +340,7 @@ def _controller(
         "beta": gains.beta.tolist(),
         "D": pairs.D.astype(int).tolist(),
         "input_scale": scale.tolist(),
-        "omega": (pairs.spread * scale).tolist(),
+        "omega": (pairs.largest_response * scale).tolist(),
         "sign": "auto",
         "lag": _by_name(setting.lag, channels.inputs, 0.0).tolist(),
         "delay": setting.delay,
@@ -460,7 +461,7 @@ def _rise_di_conditions(
     """
     rows, columns = law_order(study.airframe, controller)
     params = controller.law_params()
-    bounds, holds, counts = _bounds(
+    bounds, has_signs, is_counted = _bounds(
         study, rows, columns, params.input_scale, D, params.Lambda, setting.gamma_2
     )
     gains = GainSet(controller.k_g, np.array(controller.k_d), params.Lambda, params.beta)
@@ -468,13 +469,13 @@ def _rise_di_conditions(
     Bs = study.B[:, :, columns]
     plants = [
         KnownPlant(A, B * params.input_scale, C, lambda _, x: 0.0 * x)
-        for A, B in zip(study.A[counts], Bs[counts], strict=True)
+        for A, B in zip(study.A[is_counted], Bs[is_counted], strict=True)
     ]
     decay_rate = min(
         float(np.linalg.eigvalsh(decay_matrix(plant, params)).min()) for plant in plants
     )
     theorem = (
-        GainCondition("D (11)", None, float(np.mean(holds)), 1.0),
+        GainCondition("D (11)", None, float(np.mean(has_signs)), 1.0),
         GainCondition("zero dynamics", None, float(np.mean(study.stable)), 1.0),
         *gain_conditions.check_theorem(gains, bounds),
         GainCondition("V2_dot", None, decay_rate, 0.0, strict=True),
@@ -482,7 +483,7 @@ def _rise_di_conditions(
     # the engineering rules hold only without an observer
     if controller.observer is not None:
         return theorem, (), (), bounds
-    responses = np.abs(np.einsum("Nii->Ni", C @ Bs))[counts] * params.input_scale
+    responses = np.abs(np.einsum("Nii->Ni", C @ Bs))[is_counted] * params.input_scale
     rate_limit = _by_name(setting.rate_limit, controller.inputs, math.inf)
     slew, fastest = (values / params.input_scale for values in (study.slew[columns], rate_limit))
     timing = study.timing_of(controller)
@@ -517,9 +518,9 @@ def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
     surfaces = np.array([name != "V" for name in controller.outputs])
     no_delay = np.zeros(len(loop.inputs))
     for step in range(steps, round(MAX_SPEED_RATIO * steps) + 1):
-        response = np.where(surfaces, (step / steps) ** 2, 1.0)
+        factor = np.where(surfaces, (step / steps) ** 2, 1.0)
         if not is_stable(
-            loop.nominal._replace(B=loop.nominal.B * response), loop.law, loop.loop, no_delay
+            loop.nominal._replace(B=loop.nominal.B * factor), loop.law, loop.loop, no_delay
         ):
             return (step - 1) / steps if step > steps else 0.0
     return math.inf
@@ -541,11 +542,11 @@ def _bounds(
     """
     C = study.C[rows]
     Omegas = C @ study.B[:, :, columns] * scale
-    holds = np.array([_has_signs(Omega, D) for Omega in Omegas])
-    counts = holds & study.stable
-    Omegas = Omegas[counts]
-    v_dot = np.moveaxis(study.u_dot[..., columns], 1, 0)[counts] / scale
-    CAC = C @ study.A[counts] @ C.T
+    has_signs = np.array([_has_signs(Omega, D) for Omega in Omegas])
+    is_counted = has_signs & study.stable
+    Omegas = Omegas[is_counted]
+    v_dot = np.moveaxis(study.u_dot[..., columns], 1, 0)[is_counted] / scale
+    CAC = C @ study.A[is_counted] @ C.T
     bounds = Bounds(
         U=gain_conditions.bound_U(Omegas),
         N_d=np.max(
@@ -558,7 +559,7 @@ def _bounds(
         rho=max(gain_conditions.rho(*pair, Lambda) for pair in zip(Omegas, CAC, strict=True)),
         gamma_2=np.full(len(rows), gamma_2),
     )
-    return bounds, holds, counts
+    return bounds, has_signs, is_counted
 
 
 def _has_signs(Omega: FloatArray, D: FloatArray) -> bool:
