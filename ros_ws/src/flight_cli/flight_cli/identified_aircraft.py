@@ -18,6 +18,10 @@ from flight_design.identification.jsbsim_identification import IdentifiedAircraf
 # An input is not linear if its smallest effect is below this share of its largest effect.
 LINEAR = 0.8
 
+# An effect of at most this value is printed as 0, SI. No aircraft flies by so small an effect, and
+# its digits would hide the effects that matter.
+LARGEST_HIDDEN = 1e-3
+
 
 def show_identified(console: Console, aircraft: IdentifiedAircraft) -> None:
     """Print the trim, the effects, the gains and the flights of an aircraft."""
@@ -49,11 +53,14 @@ def show_identified(console: Console, aircraft: IdentifiedAircraft) -> None:
     )
     inputs = aircraft.condition.inputs()
     for j, name in enumerate(inputs):
+        # -0.0 + 0.0 is 0.0, which is printed without a sign.
         stops.add_row(
             name,
             *(f"{value + 0.0:.3f}" for value in (trim.commands[j], trim.lower[j], trim.upper[j])),
         )
-        column = [f"{value:.3g}" if abs(value) > 1e-3 else "0" for value in linear.Omega[:, j]]
+        column = [
+            f"{value:.3g}" if abs(value) > LARGEST_HIDDEN else "0" for value in linear.Omega[:, j]
+        ]
         responses.add_row(
             name, f"{linear.size[j]:.3g}", *column, f"{linear.lag[j]:.3f}", f"{aircraft.D[j]:+d}"
         )
