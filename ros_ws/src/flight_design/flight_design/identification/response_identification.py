@@ -166,7 +166,7 @@ def identify_response(
         share = np.minimum(
             explained(y, outputs, excitation, spans), explained(u, inputs, excitation, spans)
         )
-    return _responses(
+    return _fitted_response(
         tuple(outputs), tuple(inputs), layout, predictor.step_responses(), rows, share
     )
 
@@ -339,7 +339,9 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
     first_u = m * (layout.recent + len(layout.y_windows))
     moves = np.std(np.diff(Y, axis=0), axis=0) * max(WINDOW / layout.period, 1.0) ** 0.5
     spread = np.std(X[:, first_u : first_u + m], axis=0)
-    per_y, per_u = (1.0 / np.where(power > 0.0, power, np.inf) for power in (moves, spread))
+    per_y, per_u = (
+        1.0 / np.where(deviation > 0.0, deviation, np.inf) for deviation in (moves, spread)
+    )
     prior = PRIOR * block_diag(
         np.diag(np.kron(layout.y_decay(), per_y)), np.kron(layout.u_root(), np.diag(per_u))
     )
@@ -423,7 +425,7 @@ def _moves(parts: Iterable[FloatArray]) -> bool:
     return any(len(part) and np.ptp(part) > 0.0 for part in parts)
 
 
-def _responses(
+def _fitted_response(
     outputs: tuple[str, ...],
     inputs: tuple[str, ...],
     layout: Layout,
@@ -431,6 +433,12 @@ def _responses(
     rows: Sequence[_Rows],
     share: FloatArray,
 ) -> Response:
+    """Return the response of each channel, fitted to step responses of the predictor.
+
+    `responses` are those of `_Predictor.step_responses`. `share` is the share of each channel's
+    motion that the excitation explains, (m,). A channel that does not move in `rows`, or whose step
+    response is not finite, has no fit.
+    """
     every = max(round(RESOLUTION / layout.period), 1)
     t = layout.period * np.arange(every, responses.shape[1] + 1, every)
     responses = responses[:, every - 1 :: every]
