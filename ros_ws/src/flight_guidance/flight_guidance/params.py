@@ -268,7 +268,7 @@ class GuidanceConfig(SteeringConfig):
     def _airplane_route(self, waypoints: Sequence[Waypoint]) -> Route:
         floor = self._floor()
         climb, sink = self.climb_limits()
-        stall = floor / protection.FLOOR
+        stall = self._stall_speed()
         leg_speeds = speeds(waypoints, self.speed)
         lowest, highest = self.altitudes()
         can = Performance(

@@ -25,7 +25,12 @@ from flight_guidance import reach
 from flight_guidance.guidance_state import MULTICOPTER, CommandLimits, MulticopterParams
 from flight_guidance.multicopter import multicopter_rules
 from flight_guidance.steering import protection
-from flight_guidance.steering.attitude import AttitudeParams
+from flight_guidance.steering.attitude import (
+    BANDWIDTH_RATIO,
+    HEADING_RATIO,
+    AttitudeParams,
+    load_slope,
+)
 from flight_guidance.steering.lateral import PathParams, least_period, least_radius
 from flight_guidance.steering.vertical import VerticalParams, path_lag
 
@@ -45,6 +50,14 @@ TURN_LEAD = 2.4
 """r leads the bank by this number divided by the natural frequency of r in the reference model. 1.8
 is for the lag of the model at a damping of 0.9, the rest for the lag that the sideslip causes when
 the osprey rolls."""
+
+MODEL_LAG = 2.0
+"""The lag of a turn behind the bank without a lead, multiplied by the natural frequency of r in the
+reference model, or of p without a rudder: that of the model at a damping of 1."""
+
+SPEED_STEP = 1.0
+"""Change of the speed command, m/s, whose slew is SPEED_STEP / BANDWIDTH_RATIO times the natural
+frequency of V in the reference model."""
 
 RUDDERLESS = 1.5
 """Factor on the period of path following without a rudder, because then no lead compensates the lag
@@ -154,6 +167,10 @@ class SteeringConfig(NodeConfig):
             return FLOOR_FRACTION * self.speed
         return protection.speed_floor(self.stall_speed)
 
+    def _stall_speed(self) -> float:
+        """Return V_s, m/s. If it is unknown, it is the one to which the speed floor belongs."""
+        return self._floor() / protection.FLOOR
+
     def _largest_speed(self) -> float:
         return self.speed_limit or protection.FASTEST * self.speed
 
@@ -182,8 +199,10 @@ class SteeringConfig(NodeConfig):
         """
         if self.sideslip_gain is not None:
             return self.sideslip_gain
-        k_chi = self._frequency()["p"] / 14.0
-        return min(0.5, k_chi * self.speed * math.radians(1.0) / 1.5)
+        return min(0.5, self._k_chi() * self.speed * math.radians(1.0) / 1.5)
+
+    def _k_chi(self) -> float:
+        return self._frequency()["p"] / BANDWIDTH_RATIO / HEADING_RATIO
 
     def least_period(self) -> float:
         """Return the least period of path following, s."""
@@ -211,11 +230,8 @@ class SteeringConfig(NodeConfig):
         if self.drag is not None:
             return self._multicopter_numbers(self.drag)
         frequency = self._frequency()
-        floor = self._floor()
         lowest, highest = self.altitudes()
         climb, sink = self.climb_limits()
-        roll = frequency["p"] / 4.0
-        pitch = frequency["q"] / 4.0
         # without a rudder the turn follows the bank
         yaw = frequency.get("r", frequency["p"])
         lead = TURN_LEAD / yaw if "r" in frequency else 0.0
@@ -225,16 +241,17 @@ class SteeringConfig(NodeConfig):
             "p": frequency["p"] * roll_rate,
             "q": frequency["q"] * (self.load * GRAVITY / self.speed + turn * math.sin(self.bank)),
             "r": yaw * turn,
-            "V": 0.25 * frequency["V"],
+            "V": SPEED_STEP * frequency["V"] / BANDWIDTH_RATIO,
         }
         return {
-            "k_chi": roll / 3.5,
+            "k_chi": self._k_chi(),
             "attitude": AttitudeParams(
-                k_phi=roll,
-                k_theta=pitch,
+                k_phi=frequency["p"] / BANDWIDTH_RATIO,
+                k_theta=frequency["q"] / BANDWIDTH_RATIO,
                 roll_rate=roll_rate,
                 load=self.load,
-                n_alpha=20.0,
+                # until the first step, at which the angle of attack in trim is known
+                n_alpha=load_slope(0.0),
                 k_beta=self.k_beta(),
                 turn_lead=lead,
             ),
@@ -244,15 +261,15 @@ class SteeringConfig(NodeConfig):
                 bank=self.bank,
                 least_pitch=self.pitch[0],
                 largest_pitch=self.pitch[1],
-                floor=floor,
-                stall_speed=floor / protection.FLOOR,
+                floor=self._floor(),
+                stall_speed=self._stall_speed(),
                 radius=self.least_radius(),
                 largest_speed=self._largest_speed(),
                 lowest=lowest,
                 highest=highest,
             ),
             "slew": tuple(slew[name] for name in self.outputs),
-            "turn_lag": max(2.0 / yaw - lead, 0.0),
+            "turn_lag": max(MODEL_LAG / yaw - lead, 0.0),
         }
 
     def _frequency(self) -> dict[str, float]:
@@ -274,7 +291,7 @@ class SteeringConfig(NodeConfig):
         rates[climbs] = self.acceleration / frequency[climbs]
         climb = self.climb or multicopter_rules.CLIMB * self.speed
         sink = self.sink or multicopter_rules.SINK * self.speed
-        gain = self.altitude_gain or frequency[climbs] / 4.0
+        gain = self.altitude_gain or frequency[climbs] / BANDWIDTH_RATIO
         return {
             "k_chi": 0.0,
             "attitude": AttitudeParams(

@@ -37,7 +37,7 @@ from flight_guidance.modes.lateral_modes import escaping_bank, lateral_bank
 from flight_guidance.modes.legs import along_route, joining_state, with_commands
 from flight_guidance.modes.targets import hold, home, permitted_speed, within_reach
 from flight_guidance.steering import protection
-from flight_guidance.steering.attitude import BodyRates, body_rates, yaw_for_bank
+from flight_guidance.steering.attitude import BodyRates, body_rates, load_slope, yaw_for_bank
 from flight_guidance.steering.lateral import heading_estimate, slip_estimate
 from flight_guidance.steering.path import Route, Side
 from flight_guidance.steering.vertical import (
@@ -175,7 +175,7 @@ def _wanted_rates(
     They are 0 after the loss of the pose. The rate of a dead output is 0 too.
     """
     flies = state.mode is GuidanceMode.ENGAGED
-    attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
+    attitude = params.attitude._replace(n_alpha=load_slope(state.alpha_trim))
     beta = pose["beta"] if flies else 0.0
     flat = flies and state.lateral is Lateral.PHI and state.target.r != 0.0
     rates = body_rates(

@@ -12,6 +12,7 @@ from flight_guidance.feasibility import Performance, as_route, require_bounds, s
 from flight_guidance.guidance_state import MulticopterParams
 from flight_guidance.routes.route_file import Waypoint
 from flight_guidance.steering import path
+from flight_guidance.steering.attitude import BANDWIDTH_RATIO
 from flight_guidance.steering.path import Arc, Leg, Loiter, Route
 
 BRAKING = 0.3
@@ -36,13 +37,13 @@ def gains(
     largest sensitivity of 1.5. The lead is the delay of the tilt behind a ramp.
     """
     w = min(frequency["p"], frequency["q"])
-    k_tilt = w / 4.0
+    k_tilt = w / BANDWIDTH_RATIO
     k_v = k_tilt / 3.0
     fastest = min(2.0 * k_tilt * bank, reach.roll_rate(roll_authority, w))
     return MulticopterParams(
         drag=drag,
         k_tilt=k_tilt,
-        k_psi=frequency["r"] / 4.0,
+        k_psi=frequency["r"] / BANDWIDTH_RATIO,
         k_v=k_v,
         k_p=k_v / 2.0,
         lead=1.0 / k_tilt,

@@ -25,11 +25,24 @@ LARGEST_YAW = math.radians(20.0)
 deflected by half of its range."""
 
 
+BANDWIDTH_RATIO = 4.0
+"""Natural frequency of the reference model of a rate, divided by the gain of the loop around it, of
+an angle or of the altitude. With a damping of 0.9 of the reference model, the loop of the angle has
+a damping of 0.74."""
+
+HEADING_RATIO = 3.5
+"""k_phi divided by k_chi. If the bank follows its command with the lag 1 / k_phi, heading and
+course have a damping of 0.94."""
+
+ZERO_LIFT = 0.05
+"""Angle below the axis of the body at which the lift is taken to be zero, rad."""
+
+
 class AttitudeParams(NamedTuple):
     """Gains and limits of the attitude loop."""
 
-    k_phi: float  # 1/s, a quarter of the reference's natural frequency of p; damping 0.74
-    k_theta: float  # 1/s, a quarter of the reference's natural frequency of q
+    k_phi: float  # 1/s, of the bank
+    k_theta: float  # 1/s, of the pitch
     roll_rate: float  # largest phi_dot, rad/s
     load: float  # largest change of the load factor, without unit
     n_alpha: Scalar  # slope of the load factor over the angle of attack, 1/rad
@@ -43,6 +56,14 @@ class BodyRates(NamedTuple):
     p: Scalar
     q: Scalar
     r: Scalar
+
+
+def load_slope(alpha: Scalar) -> Scalar:
+    """Return the slope of the load factor over the angle of attack at a load factor of 1, 1/rad.
+
+    `alpha` is the angle of attack in trim, rad. The lift is proportional to alpha + ZERO_LIFT.
+    """
+    return 1.0 / (alpha + ZERO_LIFT)
 
 
 def body_rates(
