@@ -19,6 +19,7 @@ INFINITE_NS = 2**63 - 1  # rmw: RMW_DURATION_INFINITE
 def strongest_compatible(offered: Sequence[QoSProfile]) -> QoSProfile:
     """Return the strongest profile that is compatible with all offered profiles."""
     reliable = all(profile.reliability == ReliabilityPolicy.RELIABLE for profile in offered)
+    # A late subscriber asks for the earlier messages, and only a reliable one can ask.
     durable = reliable and all(
         profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in offered
     )
