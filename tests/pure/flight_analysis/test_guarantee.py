@@ -22,7 +22,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop import branch_and_bound
 from flight_analysis.linear_loop import guarantee as guarantee_module
 from flight_analysis.linear_loop.certificate import keep, kept_guarantee
-from flight_analysis.linear_loop.guarantee import Guarantee, guarantee, quick_stable
+from flight_analysis.linear_loop.guarantee import Guarantee, guarantee, quick_guarantee
 from flight_analysis.linear_loop.input_margins import input_margins
 from flight_analysis.linear_loop.loop_margins import LinearLoop, box_of, margins, scenario_loop
 from flight_analysis.linear_loop.structured_value import (
@@ -117,12 +117,12 @@ def test_quick_proof_ends_below_the_limit_or_at_the_most_that_was_asked_for(
     most: float, proved: float
 ) -> None:
     """The integrator with k T = 1.5 is stable up to d = 1 / 3, 10 / 3 times its box of 0.1."""
-    size = quick_stable(integrator(150.0, 0.1), most)
+    size = quick_guarantee(integrator(150.0, 0.1), most).stable / 0.1
     assert proved / (1.0 + guarantee_module.GAPS[0]) * 0.99 < size < proved * (1.0 + 1e-5)
 
 
 def test_quick_proof_of_an_unstable_loop_is_none() -> None:
-    assert quick_stable(integrator(250.0, 0.1), 1.0) == 0.0
+    assert quick_guarantee(integrator(250.0, 0.1), 1.0).stable == 0.0
 
 
 def test_each_step_of_the_work_is_told() -> None:

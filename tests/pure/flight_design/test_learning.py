@@ -6,6 +6,7 @@ Proposals that are wrong, damage, and the fallback.
 """
 
 import copy
+import json
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,6 +20,8 @@ import pytest
 from pytest import approx
 from scipy import stats
 from tests.conftest import invoke, refusing
+from tests.pure.flight_analysis.test_certificate import run as check
+from tests.pure.flight_analysis.test_certificate import signed
 
 import rise_di
 from aircraft_sim.airframes.airframe import Airframe, load_airframe
@@ -256,6 +259,37 @@ def test_log_has_the_guarantee_of_the_model_that_flies(flown: Flown) -> None:
     span = errors_by_model(tape)[-1]
     assert span.stable == deviations
     assert int(span.loop, 16) == loop
+
+
+def test_certificate_of_the_learned_model_is_proved_and_an_altered_one_is_refused(
+    flown: Flown, tmp_path: Path
+) -> None:
+    """Its loop is the one that the log names, and its constants are those of an export."""
+    path = tmp_path / "learned.json"
+    result = invoke("learn", flown.run, "--certificate", path)
+    assert result.exit_code == 0, result.output
+    rows = read_run(flown.run).tape["learned"]
+    within = f"{np.floor(10.0 * rows[GUARANTEE[1]][1]) / 10.0:.1f} stated deviations of the model"
+    assert f"stable for every aircraft within {within}" in " ".join(result.output.split())
+    content = json.loads(path.read_text())
+    assert int(content["loop"][:12], 16) == rows[GUARANTEE[2]][1]
+    constants = tmp_path / "c" / "rise_di_parameters.h"
+    rise_di.export(flown.run / "learn.yaml", tmp_path / "c", run=flown.run, proof=False)
+    done = check(content, tmp_path, str(constants))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("PROVED")
+    wider = signed(content | {"size": 1.5 * content["size"]})
+    other = copy.deepcopy(content)
+    other["B"][2][0] *= 0.5
+    for altered, reason in (
+        (wider, "not proved"),
+        (signed(other), "B[q,elevator]"),
+        (other, "digest"),
+    ):
+        refused = check(altered, tmp_path)
+        assert refused.returncode != 0
+        assert not refused.stdout.startswith("PROVED")
+        assert reason in refused.stderr, refused.stderr
 
 
 def test_page_says_within_which_deviations_the_last_model_is_stable(

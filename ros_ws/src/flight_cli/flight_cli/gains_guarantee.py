@@ -3,7 +3,6 @@
 """Compute, print and write what `rise-di gains guarantee` proves."""
 
 import math
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,10 +22,10 @@ from flight_analysis.linear_loop.loop_margins import LinearLoop
 from flight_analysis.linear_loop.told import Standing
 from flight_analysis.report.margin_figures import decibels, guarantee_rows, guarantee_text
 from flight_campaign.equipment import published, scenario_with_equipment
-from flight_cli.output import LICENCE, new_table, print_table, say, write_text
+from flight_cli.output import LICENCE, new_table, print_table, require_writable, say, write_text
 from flight_cli.words import warn
 from flight_core.arguments import as_number
-from flight_core.files import display_path, is_folder, writing
+from flight_core.files import display_path, writing
 from flight_core.parameters import require
 from flight_design.gains.first_scenario import (
     COMMANDED,
@@ -67,10 +66,8 @@ def require_guarantee(
     )
     # These checks come before the proof, which can take minutes.
     _require_worst(worst, airframe, scenario)
-    fits = certificate is None or (
-        os.access(certificate.parent, os.W_OK) and not is_folder(certificate)
-    )
-    require(fits, "certificate", certificate, "a file in a folder that can be written")
+    if certificate is not None:
+        require_writable("certificate", certificate)
 
 
 def proved(

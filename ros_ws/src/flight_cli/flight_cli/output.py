@@ -30,7 +30,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.flown_models import flown_loops
 from flight_analysis.report.summary import RecordedFlight, command_results, finite_or_null
 from flight_analysis.report.summary_rows import Column
-from flight_core.files import write_file, writing
+from flight_core.files import is_folder, write_file, writing
 from flight_core.outcome import STATUS_HOST
 from flight_core.parameters import require
 
@@ -299,6 +299,12 @@ def write_text(option: str, path: Path, text: str) -> None:
         return
     with writing(option, path, "the path of a file"):
         write_file(path, text)
+
+
+def require_writable(option: str, path: Path) -> None:
+    """Raise ParameterError if a file that an option names cannot be written, before long work."""
+    fits = os.access(path.parent, os.W_OK) and not is_folder(path)
+    require(fits, option, path, "a file in a folder that can be written")
 
 
 def require_yaml(option: str, path: Path) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flight_analysis.linear_loop.branch_and_bound import proof_of
 from flight_analysis.linear_loop.loop_margins import LAG_ENTRY, MOST_OF_LAG, LinearLoop
@@ -123,22 +124,11 @@ def guarantee(
     changes from tick to tick. The work can take minutes, and `report` is told each of its steps.
     Raises ParameterError if the loop has no box.
     """
+    none = _none(linear, late)
     box = linear.box
-    require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
     assert box is not None  # noqa: S101 - for mypy
     largest = box.largest
-    is_lag = np.array([name.startswith(LAG_ENTRY) for name in box.names])
-    none = Guarantee(
-        uncertainty=largest,
-        stable=0.0,
-        unstable=None,
-        disk=dict.fromkeys(linear.inputs, 0.0),
-        disk_all=0.0,
-        loop=linear.digest,
-        late=late,
-        has_exact_lags=not is_lag.any(),
-        exact=_exact_entries(linear, box),
-    )
+    is_lag = _is_lag(box)
     if not _is_nominal_stable(linear):
         return none
     uncertain = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
@@ -166,39 +156,72 @@ def guarantee(
     return promise._replace(disk=disks, disk_all=disk_all)
 
 
+def _none(linear: LinearLoop, late: float) -> Guarantee:
+    """Return the guarantee of a loop before anything is proved.
+
+    Raises ParameterError if the loop has no box.
+    """
+    box = linear.box
+    require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
+    assert box is not None  # noqa: S101 - for mypy
+    return Guarantee(
+        uncertainty=box.largest,
+        stable=0.0,
+        unstable=None,
+        disk=dict.fromkeys(linear.inputs, 0.0),
+        disk_all=0.0,
+        loop=linear.digest,
+        late=late,
+        has_exact_lags=not _is_lag(box).any(),
+        exact=_exact_entries(linear, box),
+    )
+
+
+def _is_lag(box: Box) -> NDArray[np.bool_]:
+    """Return which entries of a box are lags of actuators."""
+    return np.array([name.startswith(LAG_ENTRY) for name in box.names], dtype=bool)
+
+
 def zeros_alone(linear: LinearLoop, late: float = 0.0) -> Zeros | None:
     """Compute how far the entries that are 0 in the file may deviate, if the others are exact.
 
-    The box of the loop has only these entries. Search and proof stop early, as in `quick_stable`,
-    because such a box has very many entries. Returns None if the box is empty, or if the loop is
-    unstable.
+    The box of the loop has only these entries. Search and proof stop early, as in
+    `quick_guarantee`, because such a box has very many entries. Returns None if the box is empty,
+    or if the loop is unstable.
     """
     box = linear.box
     if box is None or not _is_nominal_stable(linear):
         return None
-    stable, first = _quick(linear, 1.0 / box.largest, late)
+    stable, first, _ = _quick(linear, 1.0 / box.largest, late)
     return Zeros(box.largest * stable, first)
 
 
-def quick_stable(linear: LinearLoop, most: float) -> float:
-    """Return the size, at most `most`, up to which every aircraft of the box is proved stable.
+def quick_guarantee(linear: LinearLoop, most: float) -> Guarantee:
+    """Compute the guarantee for the box of a loop, up to `most` times its deviations.
 
     A box of the size s has s times the deviations of the loop's box. Search and proof stop early,
-    at a gap of GAPS[0], and disk margins are not computed. This takes less than a tenth of the time
-    of `guarantee`. The result is 0 if the nominal loop is unstable, or if nothing is proved.
+    at a gap of GAPS[0], and there are no disk margins. This takes less than a tenth of the time of
+    `guarantee`. Nothing is proved if the nominal loop is unstable. Raises ParameterError if the
+    loop has no box.
     """
-    return _quick(linear, most, 0.0)[0] if _is_nominal_stable(linear) else 0.0
+    none = _none(linear, 0.0)
+    if not _is_nominal_stable(linear):
+        return none
+    size, first, proof = _quick(linear, most, 0.0)
+    return none._replace(stable=none.uncertainty * size, unstable=first, proof=proof)
 
 
-def _quick(linear: LinearLoop, most: float, late: float) -> tuple[float, Unstable | None]:
-    """Return the size of `quick_stable`, and the unstable aircraft that deviates least."""
+def _quick(
+    linear: LinearLoop, most: float, late: float
+) -> tuple[float, Unstable | None, list[dict[str, Any]]]:
+    """Return the size that is proved, the unstable aircraft that deviates least, and the proof."""
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
     first = _first_unstable(linear, late, LARGEST * most, quick=True)
     size = most if first is None else first.deviation / box.largest
     parts = parts_of(uncertain_loop(linear.nominal, linear.law, linear.loop, box, late))
-    proved, _ = _proved(parts, size, disks=False, exact=first is None, finer_gaps=())
-    return proved, first
+    proved, proof = _proved(parts, size, disks=False, exact=first is None, finer_gaps=())
+    return proved, first, proof
 
 
 def _is_nominal_stable(linear: LinearLoop) -> bool:

@@ -13,9 +13,9 @@ from aircraft_sim.airframes.airframe import Airframe
 from aircraft_sim.uncertainty import Spread
 from flight_analysis.closed_loop.learning_loop import ModelGuarantee
 from flight_analysis.linear_loop.delay_margin import delay_margin
-from flight_analysis.linear_loop.guarantee import quick_stable
+from flight_analysis.linear_loop.guarantee import Guarantee, quick_guarantee
 from flight_analysis.linear_loop.input_margins import input_margins
-from flight_analysis.linear_loop.loop_margins import linear_loop, with_box
+from flight_analysis.linear_loop.loop_margins import LinearLoop, linear_loop, with_box
 from flight_core.vectors import FloatArray
 from flight_design.gains.observer_search import RESOLUTION, SelectedObserver
 from flight_design.gains.requirement import OBSERVER_REQUIREMENT, Requirement
@@ -61,6 +61,49 @@ class Known(NamedTuple):
     deviation: Mapping[str, float]  # relative deviation of each entry, by name
     latest: Mapping[str, float]  # delay of each input plus two standard deviations, s
     delays: tuple[float, ...]  # delay of each input, s
+
+
+class LearnedLoop(NamedTuple):
+    """The loop of proposed parameters around a learned model."""
+
+    controller: RiseDiConfig
+    model: Airframe
+    known: tuple[Known, ...]
+    unlearned: float  # relative deviation of an entry that was not learned
+
+    def linear(self) -> LinearLoop:
+        """Return the linear loop, with the box of the model.
+
+        The box has DEVIATIONS standard deviations of each entry. The loop has no limits, and every
+        u is late by the longest delay in `known`, or by the delay that the controller was told if
+        this is longer.
+        """
+        model = self.model
+        deviation = chain.from_iterable(part.deviation.items() for part in self.known)
+        entries = {name.replace(", ", ","): DEVIATIONS * value for name, value in deviation}
+        linear = linear_loop(self.controller, model, model.matrix_a()[None], model.matrix_b()[None])
+        delay = max([linear.loop.delay, *chain.from_iterable(part.delays for part in self.known)])
+        linear = linear._replace(loop=linear.loop._replace(delay=delay))
+        spread = Spread(entries)
+        return with_box(linear, model, self.controller, DEVIATIONS * self.unlearned, 0, spread)
+
+    def proof(self) -> tuple[LinearLoop, Guarantee]:
+        """Return the linear loop, and how far from the model every aircraft is proved stable.
+
+        The search goes up to MOST_DEVIATIONS.
+        """
+        linear = self.linear()
+        return linear, quick_guarantee(linear, MOST_DEVIATIONS / DEVIATIONS)
+
+    def guarantee(self) -> ModelGuarantee:
+        """Compute within how many stated deviations of the model every aircraft is stable."""
+        _, proved = self.proof()
+        return ModelGuarantee(deviations_covered(proved), proved.loop)
+
+
+def deviations_covered(proved: Guarantee) -> float:
+    """Return how many stated deviations of a model its proof covers."""
+    return DEVIATIONS * proved.stable / proved.uncertainty
 
 
 def margin_of(controller: RiseDiConfig) -> float:
@@ -225,23 +268,3 @@ def with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> R
     return designed.model_copy(
         update={"feedforward": model.model_copy(update={"deviation": values})}
     )
-
-
-def model_guarantee(
-    controller: RiseDiConfig, model: Airframe, known: Collection[Known], unlearned: float
-) -> ModelGuarantee:
-    """Compute within how many stated deviations of a learned model every aircraft is stable.
-
-    The box has DEVIATIONS standard deviations of each entry. An entry that was not learned has the
-    relative deviation `unlearned`. The loop has the parameters of `controller` without their
-    limits. Every u is late by the longest delay in `known`, or by the delay that the controller was
-    told if this is longer.
-    """
-    deviation = chain.from_iterable(part.deviation.items() for part in known)
-    entries = {name.replace(", ", ","): DEVIATIONS * value for name, value in deviation}
-    linear = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
-    delay = max([linear.loop.delay, *chain.from_iterable(part.delays for part in known)])
-    linear = linear._replace(loop=linear.loop._replace(delay=delay))
-    linear = with_box(linear, model, controller, DEVIATIONS * unlearned, 0, Spread(entries))
-    size = quick_stable(linear, MOST_DEVIATIONS / DEVIATIONS)
-    return ModelGuarantee(DEVIATIONS * size, linear.digest)

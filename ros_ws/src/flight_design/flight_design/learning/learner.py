@@ -9,7 +9,6 @@ refused. The controller checks the parameters again when it loads them, and may 
 
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
-from functools import partial
 from itertools import chain
 from typing import NamedTuple
 
@@ -37,10 +36,10 @@ from flight_design.learning.designs import (
     Design,
     DesignOfFile,
     Known,
+    LearnedLoop,
     by_law_of_start,
     goal,
     is_late,
-    model_guarantee,
     price,
     with_deviations,
     with_flown_channels,
@@ -171,6 +170,7 @@ class Learner:
         self._proposed_ns = -self._latency_ns  # end of the record of the last proposal
         self._proposals = set[int]()  # digests of all proposals
         self.identification: Identification | None = None  # the last identification
+        self.proposed_loop: LearnedLoop | None = None  # that of the last proposal with a model
 
     @property
     def model(self) -> Airframe | None:
@@ -263,7 +263,8 @@ class Learner:
         if not self._quick:
             unlearned = max(self._believed.error, self._believed.effect)
             known = tuple(self._known.values())
-            promise = partial(model_guarantee, self._last, self._model, known, unlearned)
+            self.proposed_loop = LearnedLoop(self._last, self._model, known, unlearned)
+            promise = self.proposed_loop.guarantee
         return LearnerResult(self._last, told, promise)
 
     def _damaged(self, changes: Sequence[Change], end_ns: int) -> LearnerResult:

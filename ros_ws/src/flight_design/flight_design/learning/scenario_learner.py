@@ -30,7 +30,7 @@ from flight_design.gains.observer_search import SelectedObserver
 from flight_design.identification.jsbsim_identification import NOISE, STEP_MARGIN
 from flight_design.identification.likelihood import KNOWN
 from flight_design.identification.sketch import ROUGH, sketched, with_sketch
-from flight_design.learning.designs import ACTIVITY, Goal, asked_margin
+from flight_design.learning.designs import ACTIVITY, Goal, LearnedLoop, asked_margin
 from flight_design.learning.learner import Learner
 from flight_log.tape_reader import RecordedRun
 from rise_di_controller.internals import GIVEN_UP
@@ -199,6 +199,8 @@ class LearnResult(NamedTuple):
     steps: tuple[LearnStep, ...]
     model: Airframe | None
     entries: tuple[Entry, ...]  # the entries of the last identification
+    # the loop of the last proposal with a learned model; None if there was no such proposal
+    loop: LearnedLoop | None = None
 
 
 class _Ticks(NamedTuple):
@@ -291,7 +293,8 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
     length = f"at most {longest_ns / NANOSECONDS:.3g} s of ticks of an active controller"
     require(bool(steps), "the log", length, first)
     last = learned.identification
-    return LearnResult(tuple(steps), learned.model, () if last is None else last.entries)
+    entries = () if last is None else last.entries
+    return LearnResult(tuple(steps), learned.model, entries, learned.proposed_loop)
 
 
 def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
