@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from aircraft_sim.airframes.airframe import Airframe, load_airframe
+from aircraft_sim.atmosphere.disturbance import AIR_STATE
 from aircraft_sim.atmosphere.turbulence import MODERATE
 from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, wind_factors
 from flight_analysis.closed_loop.learning_loop import Learn, Learner, LearnerResult
@@ -454,6 +455,7 @@ def coupled(number: int) -> Airframe:
 
     An entry of B is at most COUPLING times the largest of its row. For A the row's root sum of
     squares takes its place, with V in m/s and the other states in 0.1 rad or 0.1 rad/s.
+    As in the file, the effect of wind along an axis is minus a column of A.
     """
     airframe = load_airframe("osprey")
     rng = np.random.default_rng([SEED, number, 1])
@@ -479,7 +481,15 @@ def coupled(number: int) -> Airframe:
         * dynamic[None, :]
     )
     B = B + COUPLING * rng.uniform(-1.0, 1.0, B.shape) * (row_B * dynamic)[:, None] * other_input
-    return airframe.with_matrices(A, B, wind_factors(airframe, A[None], AIR_RELATIVE)[0])
+    flown = airframe.with_matrices(A, B, wind_factors(airframe, A[None], AIR_RELATIVE)[0])
+    gusts = {}
+    for axis in flown.gusts:
+        column = -A[:, flown.index(AIR_STATE[axis])] * (
+            flown.speed if axis == "longitudinal" else 1.0
+        )
+        effects = zip(flown.states, column.tolist(), dynamic.tolist(), strict=True)
+        gusts[axis] = {name: effect for name, effect, is_dynamic in effects if is_dynamic}
+    return flown.model_copy(update={"gusts": gusts})
 
 
 def damage(name: str, cell: Cell, number: int) -> Row:

@@ -270,10 +270,11 @@ def test_flight_without_noise_that_is_mostly_at_rest_has_deviations() -> None:
     assert all(0.0 < entry.deviation < 0.3 for entry in model.entries)
 
 
-def test_coupled_parts_are_identified_together(tmp_path: Path) -> None:
+@pytest.mark.parametrize("rolled_by_alpha", [0.0, 0.2])
+def test_coupled_parts_are_identified_together(tmp_path: Path, rolled_by_alpha: float) -> None:
     """The elevator rolls this aircraft with a tenth of the effect of the ailerons.
 
-    Its roll pitches it.
+    Its roll pitches it. If alpha rolls it too, the vertical wind does.
     """
     A = OSPREY.matrix_a()
     B = OSPREY.matrix_b()
@@ -283,22 +284,28 @@ def test_coupled_parts_are_identified_together(tmp_path: Path) -> None:
     coupled = {
         "B[p, elevator]": 0.1 * B[row, aileron],
         "A[q, p]": 0.1 * A[OSPREY.index("q"), OSPREY.index("q")],
+        "A[p, alpha]": float(rolled_by_alpha * A[row, row]),
     }
-    B[row, elevator], A[OSPREY.index("q"), row] = coupled.values()
+    B[row, elevator], A[OSPREY.index("q"), row], A[row, OSPREY.index("alpha")] = coupled.values()
+    flown = OSPREY.with_matrices(A, B, np.ones((8, 3)))
+    vertical = flown.gusts["vertical"] | {"p": -coupled["A[p, alpha]"]}
+    flown = flown.model_copy(update={"gusts": flown.gusts | {"vertical": vertical}})
     airframe = tmp_path / "coupled.yaml"
-    airframe.write_text(as_yaml(OSPREY.with_matrices(A, B, np.ones((8, 3)))))
+    airframe.write_text(as_yaml(flown))
     scenario = servo("turbulence", 0.0, duration=20.0).vary(aircraft={"airframe": str(airframe)})
     model = identify_model(
         innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS
     )
     assert model.refusal is None
     assert [part.outputs for part in model.parts] == [OSPREY.outputs]
-    entries = {entry.name: entry for entry in model.entries}
-    for name, value in coupled.items():
-        assert (
-            abs(entries[name].value - value)
-            < 3.0 * abs(entries[name].unit) * entries[name].deviation
-        ), name
+    off = {
+        entry.name: (
+            entry.error - (coupled.get(entry.name, entry.nominal) - entry.nominal) / entry.unit
+        )
+        / entry.deviation
+        for entry in model.entries
+    }
+    assert {name: z for name, z in off.items() if abs(z) > 3.0} == {}
     assert model.airframe.matrix_b()[row, elevator] == approx(coupled["B[p, elevator]"], rel=0.2)
     assert "#   B[p, elevator]: " in model_yaml(model, "a flight")
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aircraft_sim.airframes.airframe import Airframe
-from aircraft_sim.atmosphere.disturbance import ROTARY
+from aircraft_sim.atmosphere.disturbance import AIR_STATE, ROTARY
 from aircraft_sim.uncertainty import AIR_RELATIVE, gust_directions
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.learning_loop import Entry
@@ -34,6 +34,7 @@ from flight_design.identification.innovation_filters import (
     filter_bank,
 )
 
+ANGLE_AXES = ("lateral", "vertical")  # axes along which wind changes an angle of the air, by w / V0
 PRIOR = 0.29  # standard deviation of a relative error before the flight: uniform within +-50 %
 SHEAR_PRIOR = 1.0  # prior standard deviation of the effect of the vertical wind's slope on a state
 WIND_PRIOR = 1.0  # prior standard deviation of the logarithm of the wind's strength along an axis
@@ -290,7 +291,8 @@ class Likelihood:
     def with_errors(self, thetas: FloatArray) -> NominalModel:
         """Return the models for N thetas, (N, p): A (N, n, n), B (N, n, m), wind (N, n, G).
 
-        The wind acts on each model through the A of this model.
+        The wind acts on each model through the A of this model, also through its entries that are 0
+        in the nominal airframe, since what moves an aircraft is its motion relative to the air.
         """
         matrices = []
         parts = np.split(thetas, [np.count_nonzero(self._units[0]), self.count], axis=1)[:2]
@@ -303,7 +305,13 @@ class Likelihood:
         A = np.tile(self._airframe.matrix_a(), (len(thetas), 1, 1))
         x = self._block.states
         A[:, x[:, None], x] = matrices[0]
-        wind = gust_directions(self._airframe, A, AIR_RELATIVE)[:, x[:, None], self._block.winds]
+        directions = gust_directions(self._airframe, A, AIR_RELATIVE)
+        coupled = np.where(self._airframe.matrix_a() == 0.0, A, 0.0)
+        for k, axis in enumerate(self._airframe.gusts):
+            if (state := AIR_STATE[axis]) in self._airframe.states:
+                moved = 1.0 / self._airframe.speed if axis in ANGLE_AXES else 1.0
+                directions[..., k] -= moved * coupled[..., self._airframe.index(state)]
+        wind = directions[:, x[:, None], self._block.winds]
         return self._model._replace(A=matrices[0], B=matrices[1], wind=wind)
 
     def models(
