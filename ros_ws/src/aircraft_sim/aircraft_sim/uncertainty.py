@@ -34,6 +34,10 @@ Distribution = Literal["uniform", "normal", "corners"]
 standard deviations; or the two limits, with equal probability."""
 
 
+ANGLE_AXES = ("lateral", "vertical")
+"""Axes along which wind changes an angle relative to the air."""
+
+
 class Spread(NamedTuple):
     """The distribution from which the entries of A and B are drawn."""
 
@@ -124,6 +128,21 @@ def gust_directions(airframe: Airframe, A: FloatArray, wind: WindEffect) -> Floa
     A has the matrices of N aircraft, see `wind_factors`.
     """
     return wind_factors(airframe, A, wind) * airframe.matrix_gusts()
+
+
+def coupled_gust_directions(airframe: Airframe, A: FloatArray) -> FloatArray:
+    """Compute `gust_directions` where wind acts through entries that are published as 0, too.
+
+    What moves an aircraft is its motion relative to the air, so the effect of wind through such an
+    entry is minus the entry, per w / V0 for an angle and per w otherwise.
+    """
+    directions = gust_directions(airframe, A, AIR_RELATIVE)
+    coupled = np.where(airframe.matrix_a() == 0.0, A, 0.0)
+    for k, axis in enumerate(airframe.gusts):
+        if AIR_STATE[axis] in airframe.states:
+            unit = airframe.speed if axis in ANGLE_AXES else 1.0
+            directions[..., k] -= coupled[..., airframe.index(AIR_STATE[axis])] / unit
+    return directions
 
 
 def sampled_matrices(

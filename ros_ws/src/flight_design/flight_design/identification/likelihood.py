@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aircraft_sim.airframes.airframe import Airframe
-from aircraft_sim.atmosphere.disturbance import AIR_STATE, ROTARY
-from aircraft_sim.uncertainty import AIR_RELATIVE, gust_directions
+from aircraft_sim.atmosphere.disturbance import ROTARY
+from aircraft_sim.uncertainty import coupled_gust_directions
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.outcome import Refusal
@@ -34,7 +34,6 @@ from flight_design.identification.innovation_filters import (
     filter_bank,
 )
 
-ANGLE_AXES = ("lateral", "vertical")  # axes along which wind changes an angle of the air, by w / V0
 PRIOR = 0.29  # standard deviation of a relative error before the flight: uniform within +-50 %
 SHEAR_PRIOR = 1.0  # prior standard deviation of the effect of the vertical wind's slope on a state
 WIND_PRIOR = 1.0  # prior standard deviation of the logarithm of the wind's strength along an axis
@@ -305,13 +304,7 @@ class Likelihood:
         A = np.tile(self._airframe.matrix_a(), (len(thetas), 1, 1))
         x = self._block.states
         A[:, x[:, None], x] = matrices[0]
-        directions = gust_directions(self._airframe, A, AIR_RELATIVE)
-        coupled = np.where(self._airframe.matrix_a() == 0.0, A, 0.0)
-        for k, axis in enumerate(self._airframe.gusts):
-            if (state := AIR_STATE[axis]) in self._airframe.states:
-                moved = 1.0 / self._airframe.speed if axis in ANGLE_AXES else 1.0
-                directions[..., k] -= moved * coupled[..., self._airframe.index(state)]
-        wind = directions[:, x[:, None], self._block.winds]
+        wind = coupled_gust_directions(self._airframe, A)[:, x[:, None], self._block.winds]
         return self._model._replace(A=matrices[0], B=matrices[1], wind=wind)
 
     def models(

@@ -260,13 +260,17 @@ class _Study(NamedTuple):
         fits: Sequence[tuple[Search, Fit]],
         used: NDArray[np.bool_],
         apart: Innovations,
+        flown: Airframe | None,
     ) -> tuple[Fit, Part] | None:
         """Fit the aircraft as one part, with coupling.
 
-        Returns None unless this fit predicts better than the parts that were fitted `apart`.
+        Returns None unless this fit predicts better than the parts that were fitted `apart`. A
+        model in flight that couples is compared with the nominal one in the winds of this fit.
         """
         search = self.search(model, whole_aircraft(model), coupled=True)
-        fit = self.again(search, search.fit(used, begin=search.joined(fits)), used, None)
+        also = None if flown is None else search.model_errors(flown)
+        fit = search.fit(used, begin=search.joined(fits), flown=also)
+        fit = self.again(search, fit, used, flown)
         part = self.part(search, fit)
         gain = part.after.log_likelihood - prediction(apart, self.validating).log_likelihood
         is_white = part.after.whiteness.max() <= MAX_WHITENESS
@@ -289,7 +293,6 @@ def identify_model(
     flown: Airframe | None = None,
     *,
     after: float = -np.inf,
-    may_couple: bool = True,
     quick: bool = False,
     searches_again: bool = False,
     timing: float | None = None,
@@ -308,7 +311,6 @@ def identify_model(
         flown: The model in flight. It is one more start of the search, and its advantage over the
             nominal model is computed.
         after: The advantage counts only samples after this flight time, s.
-        may_couple: Whether the parts may be joined to one if they couple.
         quick: Whether the search begins with a single start. It suffices if the air is the same in
             every span, and if the model that is found may be used.
         searches_again: Whether a part with too many entries of A at their bounds is searched again,
@@ -346,17 +348,17 @@ def identify_model(
     parts = [part for _, part in fitted]
     first = join_innovations([fit.before for _, fit in fits], every)
     last = join_innovations([fit.after for _, fit in fits], every)
-    z = 0.0
-    if flown is not None and _couples(flown, airframe):
+    coupled = flown if flown is not None and _couples(flown, airframe) else None
+    if coupled is not None:
         search = study.search(model, whole_aircraft(model), coupled=True)
-        by_flown = search.flying(search.model_errors(flown), fits)
+        by_flown = search.flying(search.model_errors(coupled), fits)
         z = study.advantage(by_flown, first)
         parts = [part._replace(advantage=z) for part in parts]
-    if may_couple and len(every) > 1 and _follows(fits, every, recorded.u, is_known) > FOLLOWS:
-        whole = study.whole(model, fits, used, last)
+    if len(every) > 1 and _follows(fits, every, recorded.u, is_known) > FOLLOWS:
+        whole = study.whole(model, fits, used, last, coupled)
         if whole is not None:
             fit, part = whole
-            parts = [part._replace(advantage=z)]
+            parts = [part]
             first = fit.before
             last = fit.after
     return study.identification(airframe, parts, first, last)

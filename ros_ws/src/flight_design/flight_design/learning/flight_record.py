@@ -64,11 +64,6 @@ class FlightRecord:
             return 0.0
         return seconds(self.end_ns - self._samples[0].stamp_ns) + self.period
 
-    @property
-    def is_full(self) -> bool:
-        """Whether the record covers the window."""
-        return nanoseconds(self.length + self.period / 2.0) >= self._window_ns
-
     def take(self, sample: Sample) -> None:
         """Take a sample if it is later than the last, and forget samples before the window."""
         if not self._samples or sample.stamp_ns > self.end_ns:

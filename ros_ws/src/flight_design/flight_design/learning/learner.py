@@ -462,7 +462,6 @@ class Learner:
             unknown=self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE),
             flown=model,
             after=seconds(self._tried_ns),
-            may_couple=self._record.is_full,
             quick=self._quick,
             searches_again=True,
         )
