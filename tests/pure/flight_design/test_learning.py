@@ -74,18 +74,18 @@ from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
 
 pytestmark = pytest.mark.slow
 
-SWITCH = 18.0  # s, when the model of the first 17 s flies
+SWITCH = 18.0  # s, when the model of the first 18 s flies
 END = 25.0  # s
 NAMES = ("q", "V", "p", "r")
 
 
 def scenario(**changed: Any) -> Scenario:
-    """osprey_learn at 100 Hz, 25 s, with a model of 10 s that 7 s more have to show as better."""
+    """osprey_learn at 100 Hz, 25 s, with a model of 11 s that 7 s more have to prove."""
     return find_scenario("osprey_learn").vary(
         flight={"duration": END},
         aircraft={"rate": 100.0, "step": 0.005},
         reference_model={"rate": 100.0},
-        controller={"learn": {"updates": [10.0, 17.0], "latency": SWITCH - 17.0}} | changed,
+        controller={"learn": {"updates": [11.0, 18.0], "latency": SWITCH - 18.0}} | changed,
     )
 
 

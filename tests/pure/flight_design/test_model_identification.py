@@ -19,6 +19,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx
 from tests.conftest import invoke, refusing
 
+from aircraft_sim import sensors
 from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import as_yaml
 from control_laws.nominal_model import NominalModel
@@ -31,6 +32,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_design.identification import innovation_filters
 from flight_design.identification.innovation_filters import Actuation, FlightData
+from flight_design.identification.likelihood import Unknown
 from flight_design.identification.likelihood_search import Search
 from flight_design.identification.model_identification import (
     Identification,
@@ -38,8 +40,14 @@ from flight_design.identification.model_identification import (
     identify_model,
     model_yaml,
 )
-from flight_design.identification.model_quality import MAX_WHITENESS, correlation, whiteness
+from flight_design.identification.model_quality import (
+    MAX_WHITENESS,
+    correlation,
+    whiteness,
+)
 from flight_design.identification.model_refusals import reason_against_excitation
+from flight_design.learning.change_test import ANGLE
+from flight_design.learning.part_checks import DELAY_DEVIATION, LAG_DEVIATION
 from flight_log.bag import LogAttachments
 from flight_log.tape_writer import write_run
 
@@ -102,6 +110,56 @@ def true_errors(aircraft: Airframe, entries: tuple[Entry, ...]) -> dict[str, flo
         )
         values[entry.name] = float(value / entry.nominal - 1.0)
     return values
+
+
+class Filter:
+    """A filter of first order through which the outputs reach the sensors, at 500 Hz."""
+
+    def __init__(self, lag: float) -> None:
+        self._share = 1.0 - np.exp(-0.002 / lag)
+        self._y: FloatArray | None = None
+        self._measure = sensors.measure
+
+    def measure(self, number: int, y: FloatArray, *others: Any) -> sensors.Measured:
+        """Measure the filtered y, for every sample in order."""
+        self._y = y if self._y is None else self._y + self._share * (y - self._y)
+        return self._measure(number, self._y, *others)
+
+
+MOST_OFF = 3.0  # stated deviations that an entry may be off
+
+
+@pytest.mark.parametrize("number", [2, 3])
+def test_filter_in_front_of_y_makes_no_effect_weaker(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Entries are within their stated deviations behind a filter of 20 ms, at each instant.
+
+    A model without the lag takes the filter for a delay of u, and its effects are too weak.
+    """
+    filtered = servo("turbulence", 0.3).vary(
+        aircraft={"rate": 500.0, "step": 0.002, "uncertainty": {"number": number}}
+    )
+    aircraft = filtered.aircraft.sampled_airframe()
+    monkeypatch.setattr(sensors, "measure", Filter(0.02).measure)
+    whole = innovation_filters.recording(simulate(filtered), OSPREY)
+
+    def largest(seconds: float, lag: float) -> float:
+        count = int(seconds / whole.period)
+        recorded = whole._replace(t=whole.t[:count], y=whole.y[:count], u=whole.u[:count])
+        unknown = Unknown(delay=DELAY_DEVIATION, angle=ANGLE, lag=lag)
+        found = identify_model(recorded, OSPREY, ACTUATORS, unknown=unknown)
+        true = true_errors(aircraft, found.entries)
+        off = [(entry.error - true[entry.name]) / entry.deviation for entry in found.entries]
+        if lag:
+            # the delay of the surfaces with the lag: a design keeps a margin for both
+            delays = np.concatenate([part.delays for part in found.parts])
+            assert_allclose(delays[[0, 2, 3]], 0.02, atol=0.01)
+        return float(np.abs(off).max())
+
+    for seconds in (15.0, DURATION):
+        assert largest(seconds, LAG_DEVIATION) < MOST_OFF
+    assert largest(DURATION, 0.0) > MOST_OFF
 
 
 FLIGHTS = [("gust", 0.5), ("turbulence", 0.3)]

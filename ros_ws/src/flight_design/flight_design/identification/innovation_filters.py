@@ -6,6 +6,7 @@ y and u have equal periods. The filters give the innovations of the models.
 """
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from aircraft_sim.atmosphere.disturbance import AXES, ROTARY
 from aircraft_sim.atmosphere.turbulence import MODERATE, dryden, roll_gust
 from control_laws import observer_design
 from control_laws.nominal_model import NominalModel
-from control_laws.observer_design import Names, ObserverModel, Weights
+from control_laws.observer_design import Correction, Names, ObserverModel, Weights
 from control_laws.riccati import correction_of, corrections_near
 from flight_core.parameters import require, require_channels
 from flight_core.rates import NANOSECONDS
@@ -26,6 +27,11 @@ from flight_core.tape import Tape
 from flight_core.units import unit_sizes
 from flight_core.vectors import FloatArray
 from flight_design.gains.nominal import airframe_model
+from flight_design.identification.output_filter import (
+    behind_filter,
+    filtered_correction,
+    kept_share,
+)
 from rise_di_controller.law.linear_loop import LoopTiming
 
 # s at the start of a recording whose innovations do not count, because the filter starts from y
@@ -439,6 +445,7 @@ def filter_bank(
     near: bool = False,
     span: float | None = None,
     shear: FloatArray | None = None,
+    lag: FloatArray | None = None,
 ) -> FilterBank:
     """Design the filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G).
 
@@ -458,7 +465,7 @@ def filter_bank(
     in other models of the air the slope also moves alpha. The noises of the wind are the rows
     `levels` of LEVELS, multiplied by `strength`, (N, G). `drift` is as in
     `observer_design.Weights`. If the models are `near` the first one, their gains are computed from
-    its gains, exact to first order.
+    its gains, exact to first order. With a `lag`, (N,), s, the outputs reach y through a filter, see `behind_filter`.
     """
     air = FilterAir(names, speed, span, shear)
     m = model.B.shape[-1]
@@ -474,9 +481,13 @@ def filter_bank(
         wind_time=np.zeros(0),
         loose=loose,
     )
-    L = observer_design.aircraft_correction(
-        sampled, each, weights, corrections_near if near else correction_of
-    )
+    correction: Correction = corrections_near if near else correction_of
+    if lag is not None:
+        keep = kept_share(lag, model.period)
+        correction = partial(filtered_correction, keep, correction)
+    L = observer_design.aircraft_correction(sampled, each, weights, correction)
+    if lag is not None:
+        sampled = behind_filter(sampled, keep)
     # S is the covariance. L = S H'(H S H' + R)^-1, so I - H L = R (H S H' + R)^-1.
     covariance = np.linalg.solve(
         np.eye(m) - sampled.H @ L, np.broadcast_to(np.diag(model.noise**2), (*L.shape[:2], m, m))

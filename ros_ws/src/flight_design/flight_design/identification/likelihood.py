@@ -114,7 +114,7 @@ class Models(NamedTuple):
 class Unknown(NamedTuple):
     """Standard deviations of what is identified, each 0 for a value that is known.
 
-    They are those of delay and angles, of the entries of A and B, and of the noise of the
+    They are those of delay, angles and lag, of the entries of A and B, and of the noise of the
     disturbances. Hidden states, such as alpha, are states that y does not contain. If y has only
     the rates, the rows of the hidden states count as known, because mass and lift give them.
     """
@@ -125,6 +125,7 @@ class Unknown(NamedTuple):
     error: float = PRIOR  # relative deviation of an entry of A before the flight
     drift: float = DRIFT  # sizes/s per root s, noise of the disturbances
     has_hidden_rows: bool = True  # whether the rows of states that are no outputs are identified
+    lag: float = 0.0  # s, deviation of the lag of a filter of first order through which y comes
 
     @property
     def factor(self) -> float:
@@ -144,12 +145,14 @@ class Fit(NamedTuple):
 
     theta: FloatArray
     """(p,) relative errors of the uncertain entries of A, then of B; logarithms of the strengths of
-    the winds; then, if they are identified, the shear, the angles at the beginning and the errors
-    of the delays, in units of their deviations."""
+    the winds; then, if they are identified, the shear, the angles at the beginning, the lag of y
+    and the errors of the delays, in units of their deviations."""
     deviation: FloatArray  # (p,) standard deviations of theta after the flight
     before: Innovations  # innovations of the nominal model in the winds of this fit
     after: Innovations  # innovations of the identified model
     levels: NDArray[np.int64]  # (spans,) levels of the wind with the identified model
+    late_deviation: FloatArray  # s, standard deviation of the delay of each input with the lag of y
+    by_lag: FloatArray  # (p,) part of each deviation that comes from the lag of y, see `by_lag`
     # innovations of the model in flight, in the winds that fit it best
     flown: Innovations | None = None
 
@@ -218,6 +221,7 @@ class Likelihood:
         self._period = recorded.period
         self._delay = np.broadcast_to(delay, len(block.inputs)) / recorded.period
         self._delay_deviation = unknown.delay / recorded.period
+        self._lag_deviation = unknown.lag
         self._drift = unknown.drift
         angles = np.flatnonzero(block.restricted(model).gravity.any(axis=0))
         self._angles = angles if unknown.angle else angles[:0]
@@ -257,8 +261,10 @@ class Likelihood:
         if self.coarse is not self:
             self.coarse.believe(deviation, centre)
         shear_prior = np.full(len(SHEARED) * self._is_sheared, SHEAR_PRIOR)
+        begin_prior = np.ones(len(self._angles))
+        lag_prior = np.ones(1 if self._lag_deviation else 0)
         self.prior = np.concatenate(
-            [deviation, wind_prior, shear_prior, np.ones(len(self._angles)), delay_prior]
+            [deviation, wind_prior, shear_prior, begin_prior, lag_prior, delay_prior]
         )
         self._errors = np.arange(len(self.prior)) < len(deviation)
         self._upper = MAX_ERROR / PRIOR * self.prior
@@ -286,6 +292,9 @@ class Likelihood:
         self._winds = slice(len(deviation), len(deviation) + len(wind_prior))
         self._shear = slice(self._winds.stop, self._winds.stop + len(shear_prior))
         self._begin = slice(self._shear.stop, self._shear.stop + len(self._angles))
+        self._lag = slice(self._begin.stop, self._begin.stop + len(lag_prior))
+        self._lower[self._lag] = 0.0
+        self._upper[self._lag] = MAX_DELAY_ERROR
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
         """Return the models for N thetas, (N, p): A (N, n, n), B (N, n, m), wind (N, n, G).
@@ -329,9 +338,12 @@ class Likelihood:
             near=near,
             span=airframe.span,
             shear=thetas[:, self._shear] if self._is_sheared else None,
+            lag=self._lag_deviation * thetas[:, self._lag.start] if self._lag_deviation else None,
         )
         first = np.where(np.isfinite(self._y[0]), self._y[0], 0.0)
         begin = np.tile(first @ bank.sampled.H, (len(thetas), 1))
+        if self._lag_deviation:  # y before the filter equals y behind it
+            begin[:, : len(self.names.states)] = first @ self._model.C
         begin[:, self._angles] = self._angle_deviation * thetas[:, self._begin]
         if not self._delay_deviation:
             return Models(bank, levels, begin, self._delayed(self._delay))
@@ -345,12 +357,34 @@ class Likelihood:
         return np.hstack([delayed(u[:, None], late) for u, late in columns])
 
     def delays(self, fit: Fit) -> tuple[FloatArray, FloatArray]:
-        """Return the delays of the inputs, s, and their standard deviations, (m,) each."""
-        if not self._delay_deviation:
-            return self._period * self._delay, 0.0 * self._delay
-        late = self._delay + self._delay_deviation * fit.theta[self._late]
-        deviation = self._delay_deviation * fit.deviation[self._late]
-        return self._period * late, self._period * deviation
+        """Return the delays of the inputs, s, and their standard deviations, (m,) each.
+
+        A delay includes the lag of y, because a loop is late by both.
+        """
+        late = self._period * self._delay
+        if self._delay_deviation:
+            late = late + self._period * self._delay_deviation * fit.theta[self._late]
+        return late + self._lag_deviation * np.sum(fit.theta[self._lag]), fit.late_deviation
+
+    def late_deviation(self, covariance: FloatArray) -> FloatArray:
+        """Return the deviations of `delays`, given the covariance of theta, (p, p)."""
+        m = len(self._delay)
+        size = np.zeros((m, len(self.prior)))
+        size[:, self._lag] = self._lag_deviation
+        size[:, self._late] = (
+            self._period * self._delay_deviation * np.eye(m)[:, : len(self.prior[self._late])]
+        )
+        return np.asarray(np.sqrt(np.einsum("ip,pq,iq->i", size, covariance, size)))
+
+    def by_lag(self, covariance: FloatArray) -> FloatArray:
+        """Return the part of each deviation that the lag of y causes, (p,), given the covariance.
+
+        If the lag were known, the variances would be smaller by the squares of these parts.
+        """
+        if not self._lag_deviation:
+            return np.zeros(len(self.prior))
+        lag = self._lag.start
+        return np.asarray(np.abs(covariance[:, lag]) / np.sqrt(covariance[lag, lag]))
 
     def levels(self, theta: FloatArray) -> NDArray[np.int64]:
         """Return the best level of the wind in each span, (spans,), for the parameters theta, (p,).
@@ -463,17 +497,18 @@ class Likelihood:
     def named(self) -> list[str]:
         """Return the names of the parameters theta, (p,).
 
-        Their order is entries, winds, shears, angles, delays.
+        Their order is entries, winds, shears, angles, lag, delays.
         """
         angles = [self.names.states[k] for k in self._angles]
         names = [entry.name for entry in self.nominal_entries()]
         shears = [f"shear of {name}" for name in SHEARED * self._is_sheared]
         delays = [f"delay of {name}" for name in self.names.inputs]
-        others = [*self.names.winds, *shears, *angles, *delays]
+        lag = ["lag of y"] if self._lag_deviation else []
+        others = [*self.names.winds, *shears, *angles, *lag, *delays]
         return names + others[: len(self.prior) - len(names)]
 
     def model_errors(self, airframe: Airframe) -> FloatArray:
-        """Return the theta, (p,), of a model, with winds, angles and delays as at theta = 0."""
+        """Return the theta, (p,), of a model, with winds, angles, lag and delays as at 0."""
         A = airframe.matrix_a()
         B = airframe.matrix_b()
         inputs = list(airframe.inputs)

@@ -127,7 +127,7 @@ class Search(Likelihood):
         spans have the same level.
         """
         coarse = self.coarse
-        begin = self._within(np.zeros(len(self.prior)) if flown is None else flown)
+        begin = self._lagging(np.zeros(len(self.prior)) if flown is None else flown)
         turbulent = np.full(len(coarse._spans), TURBULENT)
         theta = self._started(begin, turbulent, winds=True)
         counts = np.bincount(coarse.levels(theta))
@@ -151,7 +151,7 @@ class Search(Likelihood):
         the levels `same` if they cost less.
         """
         theta = best.theta
-        deviation = np.sqrt(np.diag(np.linalg.inv(best.hessian)))
+        covariance: FloatArray = np.asarray(np.linalg.inv(best.hessian), float)
 
         def beside(errors: FloatArray | float) -> Innovations:
             changed = np.where(self._errors, errors, theta)
@@ -164,10 +164,12 @@ class Search(Likelihood):
         by_flown = None if flown is None else beside(flown)
         return Fit(
             theta=theta,
-            deviation=deviation,
+            deviation=np.sqrt(np.diag(covariance)),
             before=beside(0.0),
             after=after,
             levels=best.levels,
+            late_deviation=self.late_deviation(covariance),
+            by_lag=self.by_lag(covariance),
             flown=by_flown,
         )
 
@@ -175,7 +177,7 @@ class Search(Likelihood):
         """Search from the best starts, and return the ends of these searches."""
         coarse = self.coarse
         fitted = coarse.fitted()
-        zero = np.zeros(len(self.prior))
+        zero = self._lagging(np.zeros(len(self.prior)))
         candidates = [(coarse.cost(zero, fitted), zero)]
         begins = [(zero, level) for level in STARTS]
         if self._is_sheared:
@@ -188,12 +190,22 @@ class Search(Likelihood):
             theta = self._started(begin, np.full(len(coarse._spans), level), winds=False)
             candidates.append((coarse.cost(theta, fitted), theta))
         if flown is not None and flown.any():
-            theta = self._started(self._within(flown), None, winds=True)
+            theta = self._started(self._lagging(flown), None, winds=True)
             candidates.append((coarse.cost(theta, fitted), theta))
         best = sorted(candidates, key=lambda start: start[0])[:REFINED]
         return [
             self._refined(theta, None, used) for cost, theta in best if cost < best[0][0] + CLOSE
         ]
+
+    def _lagging(self, theta: FloatArray) -> FloatArray:
+        """Return theta, (p,), within the bounds and with a lag of y of one deviation.
+
+        From a lag of 0 the search would end at a delay of u that explains a filter of y, although a
+        lag predicts better.
+        """
+        begin = self._within(theta)
+        begin[self._lag] = 1.0
+        return begin
 
     def _within(self, theta: FloatArray) -> FloatArray:
         """Return theta, (p,), clipped to the bounds of the search."""

@@ -54,6 +54,7 @@ from flight_design.learning.flight_record import (
 )
 from flight_design.learning.part_checks import (
     DELAY_DEVIATION,
+    LAG_DEVIATION,
     change_sentence,
     effect_sentence,
     entries_of_file,
@@ -459,7 +460,7 @@ class Learner:
             actuation=self._actuation,
             channels=ChannelPairing(self._controller.outputs, self._controller.inputs),
             bound_count=AT_BOUND,
-            unknown=self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE),
+            unknown=self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE, lag=LAG_DEVIATION),
             flown=model,
             after=seconds(self._tried_ns),
             quick=self._quick,

@@ -21,6 +21,10 @@ LIKELIER = 1.645
 # s, standard deviation of the delay. It suffices to find a host, a bridge or a servo that is 30 ms
 # later than the file says.
 DELAY_DEVIATION = 0.015
+# s, standard deviation of the lag of a filter in front of y, such as the low-pass of a gyro. If a
+# model has no lag, it takes a filter of 20 ms for a delay of u, and its effects of the inputs are
+# up to 8 standard deviations too weak. With 15 ms the deviations without a filter grow by more.
+LAG_DEVIATION = 0.01
 
 
 def is_within(part: Iterable[str], outputs: Iterable[str]) -> bool:
