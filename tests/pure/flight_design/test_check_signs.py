@@ -210,7 +210,8 @@ def test_flight_under_guidance_refused_since_commands_follow_y(tmp_path: Path) -
     (tmp_path / "run").mkdir()
     write_run(simulate(scenario), tmp_path / "run", attachments_for(scenario, tmp_path / "run"))
     with refusing(
-        "found a flight under guidance, whose y_m follows y, expected an experiment, or a flight without guidance$"
+        "found a flight under guidance, whose y_m follows y, "
+        "expected an experiment, or a flight without guidance$"
     ):
         recorded_response(tmp_path / "run", OUTPUTS, INPUTS)
 

@@ -465,7 +465,8 @@ def filter_bank(
     in other models of the air the slope also moves alpha. The noises of the wind are the rows
     `levels` of LEVELS, multiplied by `strength`, (N, G). `drift` is as in
     `observer_design.Weights`. If the models are `near` the first one, their gains are computed from
-    its gains, exact to first order. With a `lag`, (N,), s, the outputs reach y through a filter, see `behind_filter`.
+    its gains, exact to first order. With a `lag`, (N,), s, the outputs reach y through a filter,
+    see `behind_filter`.
     """
     air = FilterAir(names, speed, span, shear)
     m = model.B.shape[-1]
