@@ -33,6 +33,7 @@ from flight_design.identification.innovation_filters import (
     delayed,
     filter_bank,
 )
+from flight_design.identification.spans import held_out, span_length
 
 PRIOR = 0.29  # standard deviation of a relative error before the flight: uniform within +-50 %
 SHEAR_PRIOR = 1.0  # prior standard deviation of the effect of the vertical wind's slope on a state
@@ -55,20 +56,6 @@ UNEXPLAINED = 5.0
 FEW = 0.25  # gusts in a smaller share of the spans do not count, because gusts are no white noise
 # number of spans that are left out after a span that was left out, while the estimates recover
 RECOVERY = 2
-SPAN = 1.0  # s, length of a span, within which the level of the wind is constant
-# Every third span is held out, so that each command and gust is in both sets of samples. Commands
-# may be missing in the last third of a flight.
-HELD_OUT = 3
-
-
-def span_length(recorded: FlightData) -> int:
-    """Return the number of periods in a span: whole blocks of the filters, about SPAN s."""
-    return HOLD * max(round(SPAN / recorded.period / HOLD), 1)
-
-
-def held_out(periods: int, span: int) -> NDArray[np.bool_]:
-    """Return the mask of the periods that validate the model: every HELD_OUT-th span."""
-    return np.asarray(np.arange(periods) // span % HELD_OUT == HELD_OUT - 1)
 
 
 class Innovations(NamedTuple):

@@ -43,8 +43,6 @@ from flight_design.identification.likelihood import (
     Fit,
     Innovations,
     Unknown,
-    held_out,
-    span_length,
 )
 from flight_design.identification.likelihood_search import (
     REFINED,
@@ -71,6 +69,7 @@ from flight_design.identification.model_refusals import (
     reason_against_signs,
     reason_against_timing,
 )
+from flight_design.identification.spans import held_out, span_length
 
 # The innovations of a part follow the u of another part if their `correlation` is at least this. It
 # is up to 3 for aircraft without coupling.
