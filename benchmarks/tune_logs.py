@@ -22,7 +22,7 @@ from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.excitation import gust_warning, own_shares
-from flight_design.identification.innovation_filters import Actuation, FlightData, coarser, rarer
+from flight_design.identification.innovation_filters import Actuation, FlightData, coarser
 from flight_design.identification.model_quality import NoBetter
 from flight_design.identification.rates_log import SPARSE, scaled_torques
 from flight_design.identification.rates_model import banking, identify_rates
@@ -184,8 +184,8 @@ def allocated(case: Case, outputs: Sequence[str]) -> Allocation:
     return Allocation(np.linalg.pinv(effects), effects / np.abs(effects).sum(axis=1)[:, None])
 
 
-def flown(case: Case, nominal: Airframe, plane: Plane) -> tuple[FlightData, FlightData]:
-    """Fly a case, and return the means and the samples of its log."""
+def flown(case: Case, nominal: Airframe, plane: Plane) -> FlightData:
+    """Fly a case, and return what its log has."""
     rng = np.random.default_rng(SEED)
     A, B = true_model(nominal, plane)
     banked = banking(nominal)
@@ -229,8 +229,8 @@ def flown(case: Case, nominal: Airframe, plane: Plane) -> tuple[FlightData, Flig
 
 def logged(
     case: Case, plane: Plane, y: FloatArray, u: FloatArray, rng: np.random.Generator
-) -> tuple[FlightData, FlightData]:
-    """Return what a log keeps of y and u: means and samples, as `rise-di tune` identifies them.
+) -> FlightData:
+    """Return what a log keeps of y and u.
 
     If u is logged rarely, the u between two samples is taken as linear.
     """
@@ -240,21 +240,19 @@ def logged(
     y = np.where(is_lost[:, None], np.nan, y)
     t = np.arange(len(y), dtype=np.float64) * plane.period
     if case.every == 1:
-        whole, factor = FlightData(plane.period, t, y, u), max(1, round(0.008 / plane.period))
-        return coarser(whole, factor), rarer(whole, factor)
+        return coarser(FlightData(plane.period, t, y, u), max(1, round(0.008 / plane.period)))
     rare = FlightData(
         case.every * plane.period, t[:: case.every], y[:: case.every], u[:: case.every]
     )
     following = np.vstack([rare.u[1:], rare.u[-1:]])
-    between = rare._replace(u=(rare.u + following) / 2.0)
-    return between, between
+    return rare._replace(u=(rare.u + following) / 2.0)
 
 
 def rows(case: Case) -> list[list[str]]:
     """Return the rows of a case: one for each entry, or one for a log that is refused at once."""
     plane = PLANES[case.plane]
     nominal = nominal_of(plane)
-    recorded, samples = flown(case, nominal, plane)
+    recorded = flown(case, nominal, plane)
     pairing = ChannelPairing(nominal.outputs, tuple(nominal.inputs))
     period = case.every * plane.period
     if case.plane != "arduplane" and case.every > SPARSE:
@@ -265,7 +263,7 @@ def rows(case: Case) -> list[list[str]]:
         return [[case.name, "", "", "", "", "", f"refused: {each.sentence}"] for each in still]
     timing = period / np.sqrt(12.0) / (2.0 if case.every > 1 else 1.0)
     actuation = Actuation(np.full(len(nominal.inputs), plane.lag), 0.0)
-    found = identify_rates(recorded, samples, nominal, actuation, pairing, timing=timing)
+    found = identify_rates(recorded, nominal, actuation, pairing, timing=timing)
     parameters = {"CA_SV_CS_COUNT": float(len(case.surfaces))}
     for k, effects in enumerate(case.surfaces):
         for letter, effect in zip("RPY", effects, strict=True):

@@ -20,13 +20,12 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.excitation import (
-    OwnShare,
     gust_warning,
     own_shares,
     to_fly,
     to_set,
 )
-from flight_design.identification.innovation_filters import Actuation, FlightData, coarser, rarer
+from flight_design.identification.innovation_filters import Actuation, FlightData, coarser
 from flight_design.identification.likelihood import Unknown
 from flight_design.identification.model_identification import Identification, identify_model
 from flight_design.identification.model_quality import NoBetter
@@ -131,10 +130,8 @@ def by_rates(nominal: Airframe, y: FloatArray, u: FloatArray) -> Identification:
     """Identify as `rise-di tune` does."""
     t = np.arange(len(y), dtype=np.float64) * PERIOD
     y, u = y.reshape(len(t), -1), u.reshape(len(t), -1)
-    whole = FlightData(PERIOD, t, y, u)
     return identify_rates(
-        coarser(whole, 2),
-        rarer(whole, 2),
+        coarser(FlightData(PERIOD, t, y, u), 2),
         nominal,
         Actuation(np.zeros(u.shape[1]), 0.0),
         ChannelPairing(nominal.outputs, tuple(nominal.inputs)),
@@ -259,6 +256,17 @@ def test_lost_samples_do_not_move_an_entry_farther_than_stated(nominal: Airframe
     assert farthest(identified(nominal, y, u)) < OFF
 
 
+def test_output_that_only_its_noise_moves_is_named(nominal: Airframe) -> None:
+    """The elevator answers the noise of the gyro, and no doublets are flown."""
+    y, u = flown(nominal, setpoint=0.0, length=20.0)
+    recorded = FlightData(
+        PERIOD, np.arange(len(y), dtype=np.float64) * PERIOD, y[:, None], u[:, None]
+    )
+    (still,) = own_shares(coarser(recorded, 2), nominal, CHANNELS)
+    assert still.is_still
+    assert "times the noise of the gyro, expected 3 times" in still.sentence
+
+
 def test_output_that_its_own_input_does_not_move_is_named(nominal: Airframe) -> None:
     """Wind moves q, and the elevator stands still."""
     y, u = flown(nominal, setpoint=0.0, wind=0.5, length=20.0)
@@ -266,7 +274,7 @@ def test_output_that_its_own_input_does_not_move_is_named(nominal: Airframe) -> 
         PERIOD, np.arange(len(y), dtype=np.float64) * PERIOD, y[:, None], 0.0 * u[:, None]
     )
     (still,) = own_shares(recorded, nominal, CHANNELS)
-    assert still == OwnShare("q", "elevator", 0.0)
+    assert (still.output, still.input, still.share) == ("q", "elevator", 0.0)
     assert still.is_still
     assert still.sentence == "q: found that elevator explains 0 % of its motion, expected 5 %"
 

@@ -309,7 +309,6 @@ def _identified(
         show: Callable[..., None] = partial(bar.update, task)
         found = identify_rates(
             of_log.recorded,
-            of_log.samples,
             nominal,
             actuation,
             ChannelPairing(controller.outputs, controller.inputs),
@@ -341,7 +340,7 @@ def _require_shown(
     sentences = [each.sentence for each in own if each.is_still]
     if not sentences:
         return
-    outputs = [each.output for each in own if each.share < CLEAR_SHARE]
+    outputs = [each.output for each in own if each.is_still or each.share < CLEAR_SHARE]
     fly = to_fly(dict.fromkeys(outputs, 1.0), scenario, nominal, of_log.recorded.y)
     set_first = to_set(outputs, of_log.taken.parameters)
     raise ParameterError(f"{log}: {'; '.join(sentences)}{set_first}{fly}")

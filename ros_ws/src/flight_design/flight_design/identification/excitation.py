@@ -13,7 +13,7 @@ from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
-from flight_design.identification.innovation_filters import FlightData
+from flight_design.identification.innovation_filters import FlightData, measured_noise
 from flight_design.identification.model_identification import Part
 from flight_design.identification.model_refusals import (
     MAX_DEVIATION,
@@ -21,10 +21,16 @@ from flight_design.identification.model_refusals import (
     excitation_factor,
     in_time,
 )
+from flight_design.identification.rates_model import without_trim
 
 # Least share of an output's variance that its paired input must explain. With doublets of yaw the
 # share is 0.2, and without them it is 0.01 or less.
 LEAST_SHARE = 0.05
+# Least peak of an output, as a multiple of the noise of a sample. Without doublets the input
+# answers the noise alone, and its effect came out 20 % too weak. The peak is 1.7 then, and 6 or
+# more with doublets.
+LEAST_PEAK = 3.0
+PEAK = 0.1  # s, time over which the peak is a mean
 CLEAR_SHARE = 0.2  # an output with a smaller share is flown again if another output has to be
 WINDY = 1.0  # gusts above this, in units of moderate turbulence, hide the effects of the inputs
 # 1/s, shift of the poles to the left, so that the integrals of a neutral aircraft fade
@@ -42,15 +48,21 @@ class OwnShare(NamedTuple):
     output: str
     input: str
     share: float
+    peak: float  # largest mean of the output over PEAK, as a multiple of the noise of a sample
 
     @property
     def is_still(self) -> bool:
         """Whether the log fails to show the effect of the input on the output."""
-        return self.share < LEAST_SHARE
+        return self.share < LEAST_SHARE or self.peak < LEAST_PEAK
 
     @property
     def sentence(self) -> str:
         """Say what was found and what is expected."""
+        if self.share >= LEAST_SHARE:
+            return (
+                f"{self.output}: found a peak of {self.peak:.2g} times the noise of the gyro, "
+                f"expected {LEAST_PEAK:g} times"
+            )
         return (
             f"{self.output}: found that {self.input} explains {100 * self.share:.2g} % of its "
             f"motion, expected {100 * LEAST_SHARE:g} %"
@@ -83,11 +95,29 @@ def own_shares(
 ) -> list[OwnShare]:
     """Return the share of each output that its paired input explains, in the law's order."""
     share = shares(recorded, airframe)
+    peak = peaks(recorded)
     inputs = list(airframe.inputs)
+    rows = [airframe.outputs.index(output) for output in channels.outputs]
     return [
-        OwnShare(output, name, float(share[airframe.outputs.index(output), inputs.index(name)]))
-        for output, name in zip(channels.outputs, channels.inputs, strict=True)
+        OwnShare(
+            output=airframe.outputs[row],
+            input=name,
+            share=float(share[row, inputs.index(name)]),
+            peak=float(peak[row]),
+        )
+        for row, name in zip(rows, channels.inputs, strict=True)
     ]
+
+
+def peaks(recorded: FlightData) -> FloatArray:
+    """Return the largest mean of each output over PEAK, without trim, in units of its noise, (m,).
+
+    The noise is that of a sample.
+    """
+    y = without_trim(recorded).y
+    length = max(1, round(PEAK / recorded.period))
+    means = y[: len(y) // length * length].reshape(-1, length, y.shape[1]).mean(axis=1)
+    return np.asarray(np.nanmax(np.abs(means), axis=0) / measured_noise(y, np.ones(y.shape[1])))
 
 
 def to_set(outputs: Iterable[str], parameters: Mapping[str, float]) -> str:

@@ -96,18 +96,6 @@ def coarser(recorded: FlightData, factor: int) -> FlightData:
     return FlightData(factor * recorded.period, t, y, u)
 
 
-def rarer(recorded: FlightData, factor: int) -> FlightData:
-    """Keep each y after `factor` periods, and the mean u from it to the next one.
-
-    Unlike the means of `coarser`, no u answers the noise of a y that comes after it in the result.
-    A loop that feeds back much noise does not bias the model then, but the y in between are lost.
-    """
-    count = len(recorded.t) // factor
-    t, y = (values[: count * factor : factor] for values in (recorded.t, recorded.y))
-    u = recorded.u[: count * factor].reshape(count, factor, -1).mean(axis=1)
-    return FlightData(factor * recorded.period, t, y, u)
-
-
 class Actuation(NamedTuple):
     """The lags and the delay between u and the aircraft."""
 

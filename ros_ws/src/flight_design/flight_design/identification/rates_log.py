@@ -20,7 +20,7 @@ from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from flight_design.identification.innovation_filters import FlightData, coarser, rarer, recording
+from flight_design.identification.innovation_filters import FlightData, coarser, recording
 from flight_design.identification.log_import import Imported, Window, imported
 from flight_design.identification.parameter_agreement import Agreement
 from flight_log.vehicle_tables import VehicleLog
@@ -52,8 +52,7 @@ AXES: Mapping[str, str] = MappingProxyType({"R": "roll", "P": "pitch", "Y": "yaw
 class RatesLog(NamedTuple):
     """y and u from the rates and torques of a log, with what is known about them."""
 
-    recorded: FlightData  # means over a period of the identification
-    samples: FlightData  # samples of y at this period
+    recorded: FlightData
     taken: Imported
     rate: float  # rate of the samples of y, Hz
     cutoff: float  # cut-off of the gyro's second-order low-pass, Hz; 0 if the log names none
@@ -136,7 +135,6 @@ def rates_of_log(
     factor = max(1, round(PERIOD / recorded.period))
     return RatesLog(
         recorded=coarser(recorded, factor),
-        samples=rarer(recorded, factor),
         taken=taken,
         rate=NANOSECONDS / float(np.median(np.diff(y.stamp_ns))),
         cutoff=cutoff,

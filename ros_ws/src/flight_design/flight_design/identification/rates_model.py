@@ -9,8 +9,8 @@ the turn that follows for an effect of the rudder. The innovations stay white in
 most of the log is quiet, and entries come out up to 50 stated deviations off.
 
 Here one high-pass takes the slow changes out of y and u, and the model has the bank angle. A linear
-aircraft has the same model behind any high-pass, and in the means of a log as in its samples. If
-two such models differ, the difference is an error that the stated deviations of neither include.
+aircraft has the same model behind any high-pass. If the models behind two of them differ, the
+difference is an error that the stated deviations of neither include.
 """
 
 import math
@@ -44,7 +44,6 @@ MOST_APART = 0.15
 
 def identify_rates(
     recorded: FlightData,
-    samples: FlightData,
     nominal: Airframe,
     actuation: Actuation,
     pairing: ChannelPairing,
@@ -56,10 +55,10 @@ def identify_rates(
 
     The rows of states that are no outputs are known: mass and lift give them. The airframe of the
     result has the bank angle among its states if the nominal one can bank. `timing` is the standard
-    deviation of the instant at which u acts, s. A second model widens the deviations. It is that of
-    `samples`, which are rarer than the log and no means of it, behind a faster high-pass.
+    deviation of the instant at which u acts, s. A second model, behind a faster high-pass, widens
+    the deviations.
     """
-    searches = [(without_trim(recorded), timing), (without_trim(samples, FAST), None)]
+    searches = [(without_trim(recorded), timing), (without_trim(recorded, FAST), None)]
     found, steady = (
         identify_model(
             of_log,
@@ -165,7 +164,7 @@ def _reason_against_motion(part: Part, steady: Mapping[str, float]) -> Refusal |
         return None
     without = steady.get(worst.name, 0.0)
     return Refusal(
-        f"motion: found {worst.name} changed by {100 * worst.error:+.0f} % in the means of the "
-        f"log, and by {100 * without:+.0f} % in its samples and faster motion, expected at most "
+        f"motion: found {worst.name} changed by {100 * worst.error:+.0f} % in what the log shows "
+        f"within {SLOW:g} s, and by {100 * without:+.0f} % within {FAST:g} s, expected at most "
         f"{100 * MOST_APART:.2g} % apart: fly more and larger doublets of {worst.row}"
     )
