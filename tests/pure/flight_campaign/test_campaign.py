@@ -396,9 +396,10 @@ def test_quick_learner_of_campaign_finds_what_learner_of_node_finds(
     row = campaign.rows().collect().row(0, named=True)
     assert (row["first_model"], row["models"]) == (14.5, 1)
     single = flown_alone(campaign, 0, scenario_learner.learner)
-    # The searches end within 0.3 of log-likelihood: 20 aircraft differ by up to 0.2 deviations.
+    # The searches end within 0.3 of log-likelihood, which is up to sqrt(0.6) deviations apart. This
+    # aircraft differs by 0.23, most because the filter in front of y is identified too.
     for near, thorough in zip(*(each.entries for each in identified[::2]), strict=True):
-        assert near.error == approx(thorough.error, abs=0.2 * thorough.deviation)
+        assert near.error == approx(thorough.error, abs=0.4 * thorough.deviation)
     # The searches of a design may end a step of 5 % apart, which moves an rms by 0.5 %.
     assert {name: row[name] for name in single} == approx(single, rel=1e-2)
 

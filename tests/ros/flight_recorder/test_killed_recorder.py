@@ -17,7 +17,9 @@ from tests.ros.conftest import Recorder, Start, logged
 from tests.ros.peer import Peer
 from tests.ros.waiting import until
 
-from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.replay import recorded_scenario
+from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.outcome import STATUS_ENDED_EARLY
 from flight_core.rates import NANOSECONDS
 from flight_log.tape_reader import read_run
@@ -114,7 +116,8 @@ def test_log_of_killed_recorder_reported_and_repairable(
     run = (tmp_path / "runs" / "latest").resolve()
     before = read_run(run)
     assert (killed_ns - before.tape["y"].stamp_ns[-1]) / NANOSECONDS < 0.3
-    assert before.scenario == ("osprey_gust.yaml", osprey_gust.path.read_bytes())
+    flown = find_scenario(osprey_gust, 30.0)
+    assert scenario_yaml(recorded_scenario(before)) == scenario_yaml(flown)
     assert {stored.name for stored in before.attachments} == {"parameters.yaml", "airframe.yaml"}
     filled = {name for name in before.metadata if before.metadata[name]}
     assert filled >= {"rise_di_flight", "rise_di_host", "rise_di_versions"}

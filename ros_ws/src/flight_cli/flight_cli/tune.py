@@ -191,7 +191,7 @@ class Tune:
         identification = identification._replace(airframe=airframe, parts=taken_parts)
         path = folder / "airframe.yaml"
         write_text("--write", path, model_yaml(identification, self.log.name))
-        aircraft.write_text(as_yaml(banking(airframe)), "utf-8")
+        write_text("the aircraft that flies", aircraft, as_yaml(banking(airframe)))
         selectors = Selectors(
             airframe=airframe,
             flight=_on_airframe(scenario, path, of_log.recorded),
