@@ -31,7 +31,7 @@ from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
-from flight_design.gains.feedforward_model import with_feedforward
+from flight_design.gains.feedforward_model import with_feedforward, with_states_of
 from flight_design.identification.own_loop import own_loop
 from flight_design.identification.rates_model import banking
 
@@ -181,8 +181,8 @@ def main() -> None:
             )
             # Late samples of y do not count for the lead, which is that of the lag and of a sample.
             bare = law.model_copy(update={"delay": 0.0})
-            if not variation.has_bank:
-                bare = bare.model_copy(update={"feedforward": None})
+            if variation.has_bank and law.feedforward is not None:
+                known = with_states_of(known, law.feedforward)
             scale = np.multiply(law.input_scale, variation.loop_gain)
             scenario = original.vary(controller=with_feedforward(bare, known)).vary(
                 controller={"input_scale": scale, "delay": law.delay}

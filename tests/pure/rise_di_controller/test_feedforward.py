@@ -21,7 +21,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_core.integrators import rk4
 from flight_core.modes import Mode
 from flight_core.vectors import FloatArray, StampedVector
-from flight_design.gains.feedforward_model import with_feedforward
+from flight_design.gains.feedforward_model import with_feedforward, with_states_of
 from flight_design.gains.ideal_control import manoeuvre, study_airframe
 from rise_di_controller.extensions import feedforward
 from rise_di_controller.extensions.feedforward import Nominal, nominal_model
@@ -319,7 +319,7 @@ def test_feedforward_reduces_error_of_nominal_osprey_with_servos() -> None:
     assert with_it < 0.55 * error_without
 
 
-def test_states_that_an_airframe_lacks_stay_in_the_feedforward() -> None:
+def test_airframe_takes_the_states_of_a_feedforward_that_it_lacks() -> None:
     """The bank angle of PX4's rates, which their airframe does without."""
     scenario = find_scenario(str(REPOSITORY / "examples/px4_airplane/rates.yaml"))
     law = scenario.rise_di()
@@ -330,7 +330,7 @@ def test_states_that_an_airframe_lacks_stay_in_the_feedforward() -> None:
     heavy = airframe.with_matrices(
         0.5 * airframe.matrix_a(), 0.5 * airframe.matrix_b(), np.ones((5, 2))
     )
-    new = with_feedforward(law, heavy).feedforward
+    new = with_feedforward(law, with_states_of(heavy, former)).feedforward
     assert new is not None
     assert new.states == former.states
     A, B = np.reshape(new.A, (6, 6)), np.reshape(new.B, (6, 3))
@@ -340,3 +340,10 @@ def test_states_that_an_airframe_lacks_stay_in_the_feedforward() -> None:
     assert np.array_equal(A[:, 5], before[:, 5])
     assert B[:5] == approx(0.5 * np.reshape(former.B, (6, 3))[:5])
     assert not B[5].any()
+    # Without them the model is that of the airframe alone.
+    bare = with_feedforward(law, heavy).feedforward
+    assert bare is not None
+    assert bare.states == tuple(heavy.states)
+    with_gravity = former.model_copy(update={"gravity": (0.0,) * 36})
+    with refusing("gravity beside phi, expected an airframe with these states"):
+        with_states_of(heavy, with_gravity)

@@ -21,7 +21,7 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import period_ns
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
-from flight_design.gains.feedforward_model import with_feedforward
+from flight_design.gains.feedforward_model import with_feedforward, with_states_of
 from flight_design.gains.gain_design import check_gains, select_gains
 from flight_design.identification.own_loop import OwnLoop
 from rise_di_controller.rise_di_config import RiseDiConfig
@@ -97,8 +97,12 @@ def candidates(selectors: Selectors) -> list[Candidate]:
     flight, airframe = selectors.flight, selectors.airframe
     former = flight.rise_di()
     found = {FORMER: (former, "")}
+    # The feedforward knows what that of the scenario knows beyond the airframe, such as the bank.
+    beyond = airframe
+    if former.feedforward is not None:
+        beyond = with_states_of(airframe, former.feedforward)
     if former.feedforward is not None and former.observer is None:
-        of_aircraft = selectors.lead(with_feedforward(former, airframe))
+        of_aircraft = selectors.lead(with_feedforward(former, beyond))
         found["its gains, feedforward of this aircraft"] = of_aircraft, ""
     options: dict[str, dict[str, Any]] = {"without an observer": {}}
     observer = {"observer": True, "margin": DELAY_MARGIN}
@@ -126,9 +130,7 @@ def candidates(selectors: Selectors) -> list[Candidate]:
             continue
         chosen = selection.chosen
         if chosen.observer is None:
-            # It knows what the scenario's feedforward knows beyond the airframe, such as the bank.
-            beyond = chosen.model_copy(update={"feedforward": former.feedforward})
-            chosen = with_feedforward(beyond, airframe)
+            chosen = with_feedforward(chosen, beyond)
         found[name] = selectors.lead(chosen), selection.origin
     if len(reasons) == len(options):
         raise ParameterError("; ".join(reasons))

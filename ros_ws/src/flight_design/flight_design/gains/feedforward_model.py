@@ -18,10 +18,8 @@ Controller = TypeVar("Controller", bound=ControllerConfig)
 def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
     """Return the same controller with the airframe as the nominal model of its feedforward.
 
-    If the controller has a feedforward already, states of it that the airframe lacks stay in the
-    model, for example the bank angle, which an airframe of body rates does without. The lead is
-    lag + delay + half a period of the controller. Raises ParameterError if the airframe cannot be
-    the model, for example because it has a zero in the right half plane.
+    The lead is lag + delay + half a period of the controller. Raises ParameterError if the airframe
+    cannot be the model, for example because it has a zero in the right half plane.
     """
     for name in controller.outputs:
         require(
@@ -31,7 +29,6 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
             "outputs that are states of its model",
         )
     _, columns = law_order(airframe, controller)
-    airframe = _with_states_of(airframe, controller)
     gravity = airframe.matrix_gravity()
     model = FeedforwardConfig(
         states=tuple(airframe.states),
@@ -45,19 +42,18 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
     )
 
 
-def _with_states_of(airframe: Airframe, controller: ControllerConfig) -> Airframe:
-    """Return the airframe with the states of a controller's feedforward that it lacks.
+def with_states_of(airframe: Airframe, model: FeedforwardConfig) -> Airframe:
+    """Return the airframe with the states of a feedforward that it lacks.
 
-    They are angles, such as the bank angle. Their rows and columns of A are those of the
-    feedforward, and no input acts on them. Raises ParameterError if the enlarged airframe is
-    invalid.
+    They are angles, for example the bank angle, which an airframe of body rates does without. Their
+    rows and columns of A are those of the feedforward, and no input acts on them. Raises
+    ParameterError if the feedforward has sine terms of gravity, which would be lost.
     """
-    model = controller.feedforward
-    further = (
-        () if model is None else [name for name in model.states if name not in airframe.states]
-    )
-    if model is None or not further:
+    further = [name for name in model.states if name not in airframe.states]
+    if not further:
         return airframe
+    found, expected = f"gravity beside {', '.join(further)}", "an airframe with these states"
+    require(model.gravity is None, "feedforward.gravity", found, expected)
     states = [*airframe.states, *further]
     n = len(airframe.states)
     shared = [name for name in states if name in model.states]

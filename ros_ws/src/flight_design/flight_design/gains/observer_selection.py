@@ -264,9 +264,7 @@ class _AircraftDesigns(NamedTuple):
         rows, columns = law_order(airframe, controller)
         Omega = airframe.matrix_c()[rows] @ airframe.matrix_b()[:, columns]
         require_same_signs(Omega, controller.D, f"airframe {airframe.name}")
-        # The states of an observer begin with those of the feedforward, which are the airframe's.
-        without = {"observer": None, "schedule": None, "feedforward": None}
-        bare = controller.model_copy(update=without)
+        bare = controller.model_copy(update={"observer": None, "schedule": None})
         states = tuple(airframe.states)
         names = Names(states, controller.inputs, controller.outputs, tuple(airframe.gusts))
         model = model_for(airframe, controller, noise)
