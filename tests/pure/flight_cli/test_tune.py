@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di tune`: from the log of an autopilot to its module.
 
-The logs are of simulated aircraft whose A and B differ from the airframes of the scenarios by 10 %,
-under a rate controller of PX4's form, in doublets of each rate.
+The logs are of simulated aircraft whose A and B differ from the airframes of the scenarios by 10 to
+15 %, under a rate controller of PX4's form, in doublets of each rate.
 """
 
 import math
@@ -37,7 +37,7 @@ app = application(["tune", "gains", "export"])
 PX4 = REPOSITORY / "examples" / "px4_airplane" / "rates.yaml"
 PLANE = REPOSITORY / "examples" / "arduplane" / "rates.yaml"
 STEPS = 8  # of the aircraft in a period
-EFFECT, DAMPING = 0.9, 1.1  # of B, and of the damping of each rate, over the nominal ones
+EFFECT, DAMPING = 0.85, 1.1  # of the row of B, and of the damping of each rate, over the nominal
 CUTOFF = 40.0  # Hz, of the filter of PX4's gyro
 APART = 3.0  # s, from a doublet to the next, which lasts 1 s
 
@@ -65,14 +65,18 @@ def flown(
     noise: tuple[float, ...],
     length: float,
     cutoff: float,
+    **effects: float,
 ) -> Flight:
-    """A flight with doublets of these sizes, rad/s; the gyro has a filter of a cut-off, Hz."""
+    """A flight with doublets of these sizes, rad/s; the gyro has a filter of a cut-off, Hz.
+
+    The row of B of a rate is `effects` times the nominal one, EFFECT if it is not named.
+    """
     flight = find_scenario(str(scenario))
     airframe = banking(load_airframe(flight.aircraft.airframe))
-    A = airframe.matrix_a()
+    A, B = airframe.matrix_a(), airframe.matrix_b()
     for name in airframe.outputs:  # mass and lift fix the other rows
         A[airframe.index(name), airframe.index(name)] *= DAMPING
-    B = EFFECT * airframe.matrix_b()
+        B[airframe.index(name)] *= effects.get(name, EFFECT)
     C = airframe.matrix_c()
     n, m = B.shape
     # PX4's simulator has no servo: the lag of the scenario stands for the filter
@@ -119,6 +123,7 @@ def px4_log(
     still: int | None = None,
     lost: slice = slice(0, 0),
     every: int = 1,
+    **effects: float,
 ) -> Path:
     """A ULog at 250 Hz; the noise of the gyro is in rad/s before its filter.
 
@@ -128,7 +133,7 @@ def px4_log(
     own = PX4_GAINS
     if still is not None:
         own = Gains(*((*gains[:still], 0.0, *gains[still + 1 :]) for gains in PX4_GAINS))
-    flight = flown(PX4, own, size, noise, length, CUTOFF)
+    flight = flown(PX4, own, size, noise, length, CUTOFF, **effects)
     axes = [1, 0, 2]  # of PX4: roll, pitch, yaw
     ones = np.ones((len(flight.y), 1))
 
@@ -160,7 +165,7 @@ def ardupilot_log(path: Path, length: float) -> Path:
     ArduPlane logs the gyro at the rate of its loop, 200 Hz, and the servos at 25 Hz.
     """
     gains = Gains((0.25, 0.2), (0.3, 0.2), (0.5, 0.5))
-    flight = flown(PLANE, gains, (0.3, 0.6), (0.01, 0.01), length, 20.0)
+    flight = flown(PLANE, gains, (0.3, 0.6), (0.01, 0.01), length, 20.0, q=0.9, p=0.9)
     pulses = 1500.0 + 500.0 * flight.torque[:, [1, 0]]
     stamps = flight.stamp_us
     gyro = np.column_stack([flight.y[:, 1], flight.y[:, 0], np.zeros(len(stamps))])
@@ -220,20 +225,21 @@ class StoppedError(Exception):
 def test_log_of_px4_becomes_a_module_and_the_next_log_another_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The effects are those that flew, 10 % less than in the scenario, and so the errors fall."""
+    """The effects are those that flew, 15 % less than in the scenario, and so the errors fall."""
     pytest.importorskip("pyulog", reason="pyulog is not installed: make autopilot")
     log = px4_log(tmp_path / "flight.ulg", (0.3, 0.6, 0.2), 60.0)
     folder = tmp_path / "first"
     words = ["tune", str(log), "--px4", str(folder), "--calm", "--no-proof", "--lag", "0"]
     result = invoke(*words, "--scenario", brief(PX4, tmp_path, q=0.3, p=0.6, r=0.2))
-    assert result.exit_code == 0, result.output
+    holds = "every aircraft is stable by the guarantee" in result.output
+    assert result.exit_code == (0 if holds else 1), result.output
     nominal = load_airframe(str(REPOSITORY / "examples/px4_airplane/rates_airframe.yaml"))
     found = load_airframe(str(folder / "airframe.yaml"))
     for row, column in (("q", 0), ("p", 1), ("r", 2)):
         ratio = found.matrix_b()[found.index(row), column]
         ratio /= nominal.matrix_b()[nominal.index(row), column]
-        # twice the stated deviations, which are 5 % of q and r, and 11 % of p
-        assert ratio == approx(EFFECT, abs=0.1 if row != "p" else 0.2), row
+        # a mean over 8 ms in place of 4 ms, and a filter that stands for a delay
+        assert ratio == approx(EFFECT, abs=0.08), row
     # alpha and beta are not in y: mass and lift, which move them, are believed
     rows = [nominal.index("alpha"), nominal.index("beta")]
     assert np.array_equal(found.matrix_a()[rows], nominal.matrix_a()[rows])
@@ -275,7 +281,7 @@ def test_part_that_the_log_does_not_improve_stays_nominal_and_is_told(
     """In the noise of PX4's simulator doublets of q of 0.15 rad/s do not show 10 % of B."""
     pytest.importorskip("pyulog", reason="pyulog is not installed: make autopilot")
     monkeypatch.setattr("flight_cli.tune.candidates", Mock(side_effect=StoppedError))
-    log = px4_log(tmp_path / "flight.ulg", (0.15, 0.6, 0.2), 60.0, (0.07, 0.14, 0.028))
+    log = px4_log(tmp_path / "flight.ulg", (0.15, 0.6, 0.2), 60.0, (0.07, 0.14, 0.028), q=0.9)
     folder = tmp_path / "module"
     words = ["tune", str(log), "--px4", str(folder), "--calm", "--no-proof", "--lag", "0"]
     result = invoke(*words, "--scenario", str(PX4))
@@ -287,7 +293,7 @@ def test_part_that_the_log_does_not_improve_stays_nominal_and_is_told(
     q, p = found.index("q"), found.index("p")
     ratio = found.matrix_b()[[q, p], [0, 1]] / nominal.matrix_b()[[q, p], [0, 1]]
     assert ratio[0] == approx(1.0, rel=1e-5)
-    assert ratio[1] == approx(EFFECT, abs=0.2)  # twice the stated deviation
+    assert ratio[1] == approx(EFFECT, abs=0.08)
 
 
 def test_log_without_motion_names_the_doublets_to_fly(tmp_path: Path) -> None:
@@ -392,7 +398,7 @@ def test_log_of_arduplane_becomes_a_task(tmp_path: Path) -> None:
     for row, column in (("q", 0), ("p", 1)):
         ratio = found.matrix_b()[found.index(row), column]
         ratio /= nominal.matrix_b()[nominal.index(row), column]
-        assert ratio == approx(EFFECT, abs=0.1), row
+        assert ratio == approx(0.9, abs=0.1), row
     assert "RLL_RATE_FF" in (folder / "tuning.html").read_text("utf-8")
 
 

@@ -53,7 +53,7 @@ class OwnShare(NamedTuple):
     @property
     def is_still(self) -> bool:
         """Whether the log fails to show the effect of the input on the output."""
-        return self.share < LEAST_SHARE or self.peak < LEAST_PEAK
+        return not (self.share >= LEAST_SHARE and self.peak >= LEAST_PEAK)  # NaN shows nothing
 
     @property
     def sentence(self) -> str:
@@ -172,11 +172,14 @@ def factors_of(parts: Iterable[Part]) -> dict[str, float]:
     """Return the factor on the amplitude of each output that needs more motion, by output.
 
     For such an output no effect is known to MAX_DEVIATION. An output is left out if its effects are
-    uncertain because of a delay, since more motion would not help.
+    uncertain because of a delay, since more motion would not help, or because two models differ
+    (`rates_model.doubted`), which says nothing of how much more it must be.
     """
     factors = {}
     for part in parts:
         entries = in_time(part.entries, part.by_timing)
+        if part.by_motion:
+            entries = in_time(entries, part.by_motion)
         for effect in best_known(entries, part.outputs):
             if effect.deviation > MAX_DEVIATION:
                 factors[effect.row] = excitation_factor(effect)
