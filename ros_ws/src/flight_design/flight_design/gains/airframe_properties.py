@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the theorem's assumptions on an airframe, with the matrices of the airframe.
 
-The table of these facts covers Remark 1 and Assumptions 1 and 3. Assumption 2 (f is C1, and f and
-f_dot are bounded) needs no check. The schema of an airframe file bounds gusts and sine terms. They
-are C1, and their rates are bounded as long as the angular rates are.
+The checks cover Remark 1 and Assumptions 1 and 3. Assumption 2 (f is C1, and f and f_dot are
+bounded) needs no check, because f consists of gusts and sine terms, which the schema of an airframe
+file bounds. They are C1, and their rates are bounded as long as the angular rates are.
 """
 
 from collections.abc import Sequence
@@ -113,9 +113,9 @@ def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
     """Compute poles, zeros, Omega = C B with D, and Assumptions 1 and 3 of an airframe, in SI.
 
     Source: Assumptions 1 and 3, equations (10)-(11) and Remark 1 of Tanyer, Tatlicioglu,
-    Zergeroglu. The zeros are those of the linear part (A, B, C), so f has no effect on them. A
-    published A may still contain gravity. If there are more inputs than outputs, the pseudo-inverse
-    of C B, in SI, combines them to m inputs of the law.
+    Zergeroglu. The zeros are those of the linear part (A, B, C), so f has no effect on them. If an
+    airframe has more inputs than outputs, the pseudo-inverse of C B, in SI, combines them to m
+    inputs of the law. A published A may contain gravity, which then affects poles and zeros.
 
     Args:
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
@@ -222,7 +222,10 @@ def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
 
 
 def marginal_sentence(facts: Sequence[AirframeFacts]) -> str | None:
-    """Say which zeros on the imaginary axis Assumption 3 does not cover, if there are any."""
+    """Say which airframes have zeros on the imaginary axis, which Assumption 3 does not cover.
+
+    Returns None if there are no such airframes.
+    """
     states = list(dict.fromkeys(chain.from_iterable(airframe.integrated for airframe in facts)))
     names = [airframe.name for airframe in facts if airframe.zero_dynamics is ZeroDynamics.MARGINAL]
     if not names:
@@ -239,9 +242,10 @@ def marginal_sentence(facts: Sequence[AirframeFacts]) -> str | None:
 
 
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
-    """Say in which half plane the zeros of the zero dynamics (5)-(9) lie, (n - m,), 1/s.
+    """Say in which half plane the invariant zeros lie, the poles of the zero dynamics (5)-(9).
 
-    A zero counts as on the imaginary axis if its real part is at most ZERO_REAL_PART in magnitude.
+    `zeros` has shape (n - m,), in 1/s. A zero counts as on the imaginary axis if its real part is
+    at most ZERO_REAL_PART in magnitude.
     """
     rightmost = float(np.max(zeros.real, initial=-np.inf))
     if rightmost > ZERO_REAL_PART:

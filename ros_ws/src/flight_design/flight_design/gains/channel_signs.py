@@ -27,13 +27,15 @@ def signs_of_pairing(
 
     Omega = C B, (m, m), is in the order of the channels, and its inputs have the signs of the
     airframe. `input_signs` has -1 for an input whose sign is flipped between law and airframe. Such
-    a flip changes the sign of D_k and nothing else. The checks are made in this order:
+    a flip changes the sign of D_k and nothing else. If `D` is given, it is only checked. The checks
+    are made in this order:
 
-    1. The pairing has a D, and max abs(U - I) is at most 10.
+    1. Omega has a decomposition S D U, and max abs(U - I) is at most 10.
     2. The input signs fit the D that is given.
     3. D fits Omega.
 
-    Raises ParameterError, which names what contradicts Omega, and then a choice that fits Omega.
+    If a check fails, raises ParameterError. The error names the value that contradicts Omega, and
+    one that fits Omega.
     """
     m = len(Omega)
     flips = np.ones(m) if input_signs is None else np.array(input_signs, dtype=np.float64)

@@ -25,7 +25,7 @@ REACH = 16  # largest change of an exponent by one move while there is a shortag
 
 
 class Moves(NamedTuple):
-    """The moves that a search tries. A move changes the k exponents of a channel."""
+    """The moves that a search tries: each is k whole numbers, added to a channel's exponents."""
 
     mending: Sequence[tuple[int, ...]]  # moves that may reduce a shortage
     cheaper: Sequence[tuple[int, ...]]  # moves that may lower the cost
@@ -70,11 +70,11 @@ def descend(
 ) -> Trial[Content]:
     """Move from a start until no move of a single channel helps, and return the last trial.
 
-    `lowest` and `highest`, (k, m), bound the exponents. As long as there is a shortage, the search
-    takes the best move of all channels, and doubles the reach if no move helps. If no move helps up
-    to the reach REACH, the last trial still has a shortage. Without a shortage, each channel then
-    moves in turn, beginning with the reach that the search has at that moment, and the reach is
-    halved whenever no move helps.
+    `lowest` and `highest`, (k, m), bound the exponents. Each move is multiplied by a whole number,
+    the reach. As long as there is a shortage, the search takes the best move of all channels. If no
+    move helps, it doubles the reach. If no move helps up to the reach REACH, the last trial still
+    has a shortage. Without a shortage, the channels move in turn. The reach stays at first, and is
+    halved whenever no channel finds a move that helps.
     """
     best = start
     reach = moves.begin

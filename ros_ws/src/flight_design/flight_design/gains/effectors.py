@@ -30,7 +30,10 @@ SMALL = 1e-9
 
 
 class Effectors(NamedTuple):
-    """The effectors of an airframe in its order, as deviations from trim in SI, shape (p,) each."""
+    """The limits and lags of an airframe's effectors, in the airframe's order, shape (p,) each.
+
+    They are in SI, and the stops are deviations from trim.
+    """
 
     lower: FloatArray  # lower end stops
     upper: FloatArray
@@ -39,7 +42,7 @@ class Effectors(NamedTuple):
 
 
 class LawInputs(NamedTuple):
-    """The inputs v of the law before an allocation, one per output, shape (m,), units of y / s."""
+    """The inputs v of the law that an allocation takes, one per output, (m,), units of y / s."""
 
     names: tuple[str, ...]
     # limit of each input at which the first effector reaches its stop, if all other inputs are 0
@@ -56,15 +59,15 @@ def design_allocation(
 
     The allocation is the weighted pseudo-inverse of Omega = C B, (m, p).
 
-        T = W^-1 Omega' (Omega W^-1 Omega')^-1,  W = diag(((lag_j + SERVO) / range_j)^2),
-            effect = Omega
+        T = W^-1 Omega' (Omega W^-1 Omega')^-1,  W = diag(((lag_j + SERVO) / range_j)^2)
 
     The input v is the part of y_dot that the effectors cause, so D = S = U = I on this airframe.
     For a given v, T finds the u with the least sum of squares of (lag_j + SERVO) u_j / range_j.
-    Here range_j is half the distance between the stops. So a slow effector helps a fast one only a
-    little. The lag of v_i is lag_i = sum_j Omega_ij T_ji lag_j, exact to first order. `priority`
-    lists outputs. If an effector saturates, the input of the first output in the list is kept the
-    longest. The outputs that are not listed follow in their order.
+    Here range_j is half the distance between the stops, and SERVO is the lag of a fast servo. So a
+    slow effector helps a fast one only a little. The lag of v_i is lag_i = sum_j Omega_ij T_ji
+    lag_j, exact to first order. `priority` lists outputs. If an effector saturates, the input of
+    the first output in the list is kept the longest. The outputs that are not listed follow in the
+    airframe's order.
 
     Raises ParameterError for fewer effectors than outputs, for infinite stops, and for dependent
     rows of Omega. Source of the pseudo-inverse: M. W. Oppenheimer, D. B. Doman, M. A. Bolender,
@@ -145,8 +148,9 @@ def _pseudo_inverse(airframe: Airframe, Omega: FloatArray, effectors: Effectors)
 def _alone(T: FloatArray, sides: tuple[FloatArray, FloatArray]) -> FloatArray:
     """Return the largest v_i >= 0 of each input that keeps all effectors within their stops, (m,).
 
-    All other inputs are 0. `sides` are two arrays of stops: those that a movement along -T_ji
-    reaches, and those that a movement along +T_ji reaches. Only their magnitudes count.
+    All other inputs are 0. `sides` are two arrays of stops, one per effector. An effector with a
+    negative T_ji moves towards its stop in the first array, and one with a positive T_ji towards
+    that in the second. Only the magnitudes of the stops count.
     """
     against, along = (np.abs(side)[:, None] for side in sides)
     counts = np.abs(T) > SMALL * np.abs(T).max(axis=0)
@@ -163,7 +167,11 @@ def _rounded(matrix: FloatArray) -> list[float]:
 
 
 def lags_by_input(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:
-    """Return the lag of each input, s, by the input's name. Raises ParameterError."""
+    """Return the lag of each input, s, by the input's name.
+
+    `lag` is one value for all inputs, or one for each. Raises ParameterError for another number of
+    values, and for a negative one.
+    """
     names = list(airframe.inputs)
     values = as_numbers(lag, "lag", expected := "seconds, 0 or more")
     values = values * len(names) if len(values) == 1 else values

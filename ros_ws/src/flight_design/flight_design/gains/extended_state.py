@@ -19,7 +19,7 @@ from rise_di_controller.params import ControllerConfig
 
 @dataclass(frozen=True, kw_only=True)
 class WeightProducts:
-    """The `ExtendedStateWeights` of an output, made independent of the total lag T of its loop."""
+    """Weights of an output from which the total lag T of its loop gives `ExtendedStateWeights`."""
 
     effort: float  # effort / T
     drift: float  # drift T
@@ -56,7 +56,7 @@ def extended_state_weights(outputs: tuple[str, ...], T: FloatArray) -> ExtendedS
 def integrator_model(controller: ControllerConfig, Omega: FloatArray) -> FeedforwardConfig:
     """Build the model y_dot = Omega u of a feedforward, Omega (m, m) in the law's order.
 
-    The feedforward leads by the lag, the delay and half a period.
+    The lead of the feedforward is the sum of the lag, the delay and half a period.
     """
     return FeedforwardConfig(
         states=controller.outputs,

@@ -43,7 +43,7 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
 
 
 def with_states_of(airframe: Airframe, model: FeedforwardConfig) -> Airframe:
-    """Return the airframe with the states of a feedforward that it lacks.
+    """Add the states that a feedforward has and the airframe lacks, and return the airframe.
 
     They are angles, for example the bank angle, which an airframe of body rates does without. Their
     rows and columns of A are those of the feedforward, and no input acts on them. Raises

@@ -61,8 +61,9 @@ def first_flight(
     """Write a scenario file for the airframe that is in the file `path`.
 
     `controller` is the text of the section controller. The commands are those of `first_commands`,
-    and their heights are multiplied by `part`. `shortfall` becomes the first line of the file. The
-    gusts blow across the flight path at 3 % of the trim speed.
+    and their heights are multiplied by `part`. `shortfall` says which required margins the loop
+    misses, and becomes the first line of the file. The gusts blow across the flight path at 3 % of
+    the trim speed.
     """
     V0 = airframe.speed
     stops = _stops(airframe)
@@ -111,7 +112,7 @@ def first_flight(
 
 
 def _channels(airframe: Airframe, lag: Sequence[float]) -> dict[str, Channel]:
-    """Return the properties of each channel, by output."""
+    """Return the properties of each channel from which its commands follow, by output."""
     outputs = list(airframe.outputs)
     if len(airframe.inputs) > len(outputs):
         _, law = _distributed(airframe, lag)

@@ -86,12 +86,12 @@ class Channel(NamedTuple):
     def size(self, speed: float | None) -> float:
         """Return the height of a pulse of command; `speed` is V0 in m/s, None in hover.
 
-            least(size of the motion, reach), at least SEEN noise
-            reach (frequency / e + damping) = OF_AUTHORITY authority
+            height = max(min(size of the motion, reach), SEEN noise)
+            reach = OF_AUTHORITY authority / (frequency / e + damping)
 
-        A critically damped filter of second order answers a step A with a rate of at most A
-        frequency / e, at the time 1 / frequency. To hold A at the end, the input must give A
-        damping. The size of a pitch rate is at most 1 g / V0.
+        A critically damped filter of second order answers a step of height A with a rate of at most
+        A frequency / e, at the time 1 / frequency. To hold A at the end, the input must cause a
+        y_dot of A damping. The size of a pitch rate is at most 1 g / V0.
         """
         reach = OF_AUTHORITY * self.authority / (self.frequency / math.e + self.damping)
         return max(min(_largest(self.motion, speed), reach), SEEN * self.noise)
@@ -129,7 +129,7 @@ def first_commands(
     wait: float = 0.0,
     part: float = 1.0,
 ) -> FirstCommands:
-    """Choose the commands of a first flight by output: rates one after another, then the speeds.
+    """Choose the commands of a first flight: the outputs one after another, the speeds last.
 
     The frequency and height of each command follow from its `Channel`, and `part` multiplies the
     heights. If the aircraft `banks` to turn, the yaw rate is that of a coordinated turn, g / V0
@@ -208,10 +208,10 @@ def scenario_to_design(scenario: FilePath | Scenario) -> Scenario:
 
 
 def scenario_to_check(scenario: FilePath | Scenario) -> Scenario:
-    """Load a scenario, or put a controller alone into the scenario COMMANDED.
+    """Load a scenario, or a file with only the section controller.
 
-    A file with only the section controller gets the commands, gusts and rate limits of COMMANDED.
-    The aircraft in COMMANDED may differ from the aircraft that the controller is for. Raises
+    Such a controller gets the commands, gusts and rate limits of the scenario COMMANDED. The
+    aircraft in COMMANDED may differ from the aircraft that the controller is for. Raises
     ParameterError.
     """
     controller = controller_alone(scenario)

@@ -345,11 +345,12 @@ def check_rules(
         lag product:      K_i response_i total_i <= 0.8
             rad: the lag costs at most 46 degrees of phase
         Lambda below K:   Lambda_i <= 0.5 K_i response_i
-        beta above slew:  beta_i >= slew_i                   shown in inputs of unit response
-        softening:        eps_i K_i / beta_i >= total_i      softened sign
+        beta above slew:  beta_i >= slew_i
+        softening:        eps_i K_i / beta_i >= total_i      only for the softened sign
 
-    The search for gains begins at gains that meet these rules. The rules only estimate the margins
-    of the loop, so a loop may break a rule if its margins suffice.
+    total_i is the total lag of the loop, s. beta_i and slew_i are shown in inputs that are scaled
+    to unit response. The search for gains begins at gains that meet these rules. The rules only
+    estimate the margins of the loop, so a loop may break a rule if its margins suffice.
 
     response_i is the nominal abs(Omega_ii) in the scaled inputs of the law. slew is the largest
     rate of the ideal control in the same inputs, units of y / s^2. All have shape (m,).
@@ -380,8 +381,8 @@ def check_loop(
     """Evaluate the conditions that the linear margins of a loop do not cover, channel by channel.
 
         beta below rate:  beta_i <= 0.7 rate_limit_i
-        implicit: lag:    lag_i + delay <= period / 2
-        implicit: omega:  omega_i >= largest_i
+        implicit: lag:    lag_i + delay <= period / 2        only for the implicit sign
+        implicit: omega:  omega_i >= largest_i               only for the implicit sign
 
     If the first condition fails, beta may cause a limit cycle. For this condition, beta and the
     rate limit are converted to inputs of unit response. If one of the other conditions fails, the

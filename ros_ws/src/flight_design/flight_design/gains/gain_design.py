@@ -122,7 +122,7 @@ def select_gains(
             None for those of the scenario.
         delay: Pure delay in s; None for that of the scenario.
         inputs: Input of each output, in the airframe's order: a list, or a text with commas. If
-            empty, the scenario has the pairs, or the airframe if their channels differ.
+            empty, the pairs of the scenario, or if its channels differ, those of the airframe.
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
@@ -134,12 +134,12 @@ def select_gains(
             models of these speeds and a schedule. If empty, it holds only at the trim speed.
         weights: File of gains and weights at which the search for the margins begins
             (`observer_gains.read_gains`). With `accept` they are taken as they are. If None, the
-            search begins at tuned gains of the scenario, or else at gains by a rule.
+            search begins at tuned gains of the scenario, or else at gains by a rule from the lags.
         phase_margin: Least phase margin of the nominal loop behind servos, deg; with the observer
-            it is 35 deg. The gain margin must be 6 dB, the sensitivity at most 2, the damping 0.4.
+            35 suffice. Gain margin at least 6 dB, sensitivity at most 2, damping at least 0.4.
         accept: Whether a `phase_margin` below 40 deg is accepted.
-        mixing: "diagonal" for one input per output. "full", or more inputs than outputs, for an
-            allocation u = T v of the law's inputs v by the pseudo-inverse of C B.
+        mixing: "diagonal" for one input per output, "full" for an allocation u = T v by the
+            pseudo-inverse of C B. With more inputs than outputs there is always an allocation.
         progress: Called with a sentence before each step of the search for the observer.
 
     Returns:
@@ -190,9 +190,9 @@ def select_gains(
 
 
 def _beside_observer(required: Requirement, *, as_read: bool) -> Requirement:
-    """Adapt a requirement to a loop with an observer.
+    """Lower a required phase margin to that of a loop with an observer, if it is higher.
 
-    If the gains are taken `as_read` from a file, they only need a stable loop.
+    If the gains are taken `as_read` from a file, the loop only needs to be stable.
     """
     if as_read:
         return STABLE
@@ -200,7 +200,10 @@ def _beside_observer(required: Requirement, *, as_read: bool) -> Requirement:
 
 
 def _two_speeds(speeds: ArrayLike, *, observer: bool) -> tuple[float, float] | None:
-    """Return the two fractions of the trim speed, or None. Raises ParameterError."""
+    """Return the two fractions of the trim speed, or None if `speeds` is empty.
+
+    Raises ParameterError unless they lie on both sides of 1, and if there is no observer.
+    """
     ratios = as_numbers(
         speeds,
         "speeds",
@@ -245,10 +248,10 @@ def check_gains(
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
-        entries: Deviations by entry, {"A[q,alpha]": 0.6}, and by lag, {"1/lag[elevator]": 0.3}.
-        zeros: Bound of the entries of A and B that are 0 in the file, as a part of their row.
-        as_told: Whether lags and delay are those that the controller was told. Set it if the
-            aircraft of the scenario only stands in for your own.
+        entries: Largest relative deviations, {"A[q,alpha]": 0.6, "1/lag[elevator]": 0.3}.
+        zeros: Largest value of an entry that is 0 in the file, as a fraction of its row's size.
+        as_told: Whether to take lags and delay from the controller, not from the aircraft in the
+            scenario. Set it if this aircraft only stands in for your own.
 
     Returns:
         The controller, the conditions and the margins.
@@ -281,10 +284,10 @@ def study(
     spread: Spread = UNIFORM,
     flown: Flown | None = None,
 ) -> Study:
-    """Study the airframe as the law of a controller sees it, and uncertain airframes around it.
+    """Compute the `Study` of an airframe and of uncertain airframes around it.
 
-    The airframes fly the commands and gusts of a scenario. With `flown`, lags and delay are those
-    of the aircraft that flies, otherwise those in the controller. Raises ParameterError.
+    Inputs are those of the law, before an allocation. Commands and gusts are those of a scenario.
+    Lags and delay are those of `flown`, or if it is None of the controller. Raises ParameterError.
     """
     timing = loop_of(controller) if flown is None else flown.comparison.timing
     matrices, _ = of_matrices_and_lags(spread, timing, controller.inputs)
@@ -369,9 +372,9 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
 def _pairing(
     inputs: str | Sequence[str], controller: ControllerConfig, airframe: Airframe
 ) -> tuple[str, ...]:
-    """Return the input of each output from `inputs`, else from the controller, else ().
+    """Return the input of each output: from `inputs`, or if that is empty, from the controller.
 
-    The pairs of the controller count only if it has the same inputs as the airframe.
+    Returns () if the controller has an allocation, or other inputs than the airframe.
     """
     names = as_names(inputs, "inputs", f"the inputs {', '.join(airframe.inputs)} in any order")
     if names:
@@ -383,10 +386,7 @@ def _pairing(
 
 
 def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
-    """Return the loop of a scenario without its allocation, with the inputs of the aircraft.
-
-    The lags are those of the actuators.
-    """
+    """Return a loop without its allocation, with the inputs and lags of the actuators."""
     if loop.base.allocation is None:
         return loop
     names = tuple(scenario.aircraft.channels().inputs)
@@ -399,8 +399,8 @@ def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
 def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> LoopSetting:
     """Add an allocation to the loop, from the airframe's C B.
 
-    The lags are those of the loop, or of the actuators if it has none. Raises ParameterError if the
-    actuators have no end stops.
+    The lags are those of the loop, or of the actuators if the loop has none. Raises ParameterError
+    if the actuators have no end stops.
     """
     actuators = scenario.aircraft.actuators
     names = list(airframe.inputs)
@@ -467,7 +467,7 @@ def selected_observer(
     activity: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
-    """Return a controller with feedforward and observer of a model, and where its gains come from.
+    """Add feedforward and observer of a model to a controller, and say where its gains come from.
 
     The search for the least error begins at these gain sets:
 
@@ -477,7 +477,7 @@ def selected_observer(
       with the same airframe and lags. If the model has other states, or a total lag of SLOWER times
       that of the search, they do not count, and a rule derives gains from the lags.
 
-    Gains of a file or for a sketch stay, and are only relaxed if the margins need it. Channels that
+    Gains of a file or for a sketch stay, and are only lowered if the margins need it. Channels that
     are not free keep their gains. The other arguments are as for `with_aircraft_observer`.
     """
     seen = through_allocation(model, controller)
@@ -523,9 +523,9 @@ def selected_observer(
 def _noise(
     controller: RiseDiConfig, scenario: Scenario, model: Airframe
 ) -> tuple[FloatArray, dict[str, float]]:
-    """Return the noise of the outputs, (m,), and of the vanes in use, by channel, rms per sample.
+    """Return the noise of the outputs, (m,), and that of the vanes by channel, rms per sample.
 
-    A sensor without noise gets a small value.
+    Only vanes whose angle is a state of the model count. A perfect sensor gets a small value.
     """
     channels = scenario.aircraft.channels().outputs
     measured = scenario.aircraft.sensors.noise or (0.0,) * len(channels)

@@ -202,12 +202,12 @@ def gain_sets(study: Study, setting: LoopSetting) -> Selection:
 
     The set by Theorem 1 has the literal sign. In both sets the fastest channel comes first, so the
     last has the smallest K. Inputs are scaled by 1 / abs(Omega_ii), and D follows from the minors.
-    The theorem's set is `theorem_gains` with a Lambda of 1 (1/s), which needs the smallest k_g.
-    The other set is `engineering_gains` with the nominal slew. Behind servos, `within_requirement`
-    searches for the integral gains and bandwidths with the least error. The margins must meet the
-    requirement on the nominal airframe and on every sample. `omega` is the largest abs(Omega_ii) of
-    the samples. Raises ParameterError as `signs_of_pairing` does, and for parameters that the
-    controller does not accept.
+    The theorem's set is `theorem_gains` with a Lambda of 1 (1/s), which needs the smallest k_g. The
+    other set is `engineering_gains` with the `slew` of the nominal airframe. Behind servos,
+    `within_requirement` searches for the integral gains and bandwidths with the least error. The
+    margins must meet the requirement on the nominal airframe and on every sample. `omega` is the
+    largest abs(Omega_ii) of the samples. Raises ParameterError as `signs_of_pairing` does, and for
+    parameters that the controller does not accept.
     """
     pairs = _paired(study, setting)
     engineering = gain_candidates(study, setting)
@@ -223,7 +223,7 @@ def gain_sets(study: Study, setting: LoopSetting) -> Selection:
 def gain_candidates(
     study: Study, setting: LoopSetting
 ) -> Callable[[FloatArray, FloatArray], Candidate[RiseDiConfig]]:
-    """Return a function that builds the engineering gains and the loop for `slower` and `lower`.
+    """Return a function of `slower` and `lower` that builds engineering gains and their loop.
 
     Both factors have shape (m,). `lower` divides the bandwidth, and both divide the integral gain.
     Raises ParameterError as `gain_sets` does.
@@ -370,7 +370,10 @@ def assess_scenario(
 
 
 def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
-    """Return the loop of a scenario, with the lower rate limit of controller and actuator."""
+    """Return the loop of a scenario.
+
+    The rate limit of an input is that of the controller or of the actuator, whichever is lower.
+    """
     controller = scenario.controller
     rates = scenario.aircraft.actuators.rate
     slew = dict(zip(controller.inputs, controller.slew or (), strict=bool(controller.slew)))
@@ -397,10 +400,10 @@ def assess_gains(
 
     RISE-DI has the conditions of `_rise_di_conditions`. The linear loop of any law must be stable
     for every sample, and have the required margins. With an observer, 35 degrees of phase suffice.
-    The delay margin of the nominal loop must be one period, so that a tick may be missed. With an
-    observer it must be the observer's margin minus the delay. With the implicit sign, the loop is
-    linear only inside the sign's width, dt^2 omega beta. Its margin is then the delay at which
-    chatter begins, at most half a period.
+    The delay margin of the nominal loop must be at least one period, so that a tick may be missed.
+    With an observer it must be at least the observer's margin minus the delay. With the implicit
+    sign, the loop is linear only inside the sign's width, dt^2 omega beta, and no margins are
+    required. Its delay margin is then the delay at which chatter begins, at most half a period.
     """
     rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
@@ -454,10 +457,10 @@ def _rise_di_conditions(
 
     `check_rules` and `check_loop` apply only without an observer.
 
-    "D" and "zero dynamics" are the fractions of the samples that meet each condition. The bounds of
-    (29), (30), steps 2 and 3 are the largest over the samples that meet both. "V2_dot" is the
-    smallest eigenvalue of Q in V2_dot = -z'Qz over these samples; steps 2 and 3 are sufficient for
-    Q > 0.
+    The value of the condition "D" is the fraction of the samples whose Omega has the signs D. That
+    of "zero dynamics" is the fraction whose zeros are stable. The bounds of (29), (30), steps 2 and
+    3 are the largest over the samples that meet both conditions. "V2_dot" is the smallest
+    eigenvalue of Q in V2_dot = -z'Qz over these samples; steps 2 and 3 are sufficient for Q > 0.
     """
     rows, columns = law_order(study.airframe, controller)
     params = controller.law_params()

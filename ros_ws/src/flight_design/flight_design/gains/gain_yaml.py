@@ -190,7 +190,7 @@ def _comments(selection: Selection, controller: RiseDiConfig) -> dict[str, str]:
 
 
 def _within(uncertainty: float) -> str:
-    """Say over which uncertain aircraft a value is the largest, or return "" if there are none."""
+    """Say that a value is the largest within `uncertainty`, or return "" if that is 0."""
     return f", the largest within +-{100 * uncertainty:g} %" if uncertainty else ""
 
 
@@ -204,8 +204,8 @@ def section_yaml(
 ) -> str:
     """Write a controller as the section `/**/controller` of a scenario file.
 
-    A parameter without an entry in `comments` gets its description as comment. The margins that are
-    `unmet` come first.
+    A parameter without an entry in `comments` gets its description as comment. The text begins with
+    the margins that are `unmet`.
     """
     parameters = [
         (key, value, comments.get(key, type(controller).model_fields[key].description))
@@ -226,7 +226,7 @@ def section_yaml(
 
 
 def below_requirement(unmet: Sequence[GainCondition], outputs: Sequence[str]) -> str:
-    """Write the first line of a file that says which margins are too small; "" if none is."""
+    """Say which margins are too small, in the first line of a file; "" if none is."""
     lacking = "; ".join(condition.sentence(outputs) for condition in unmet)
     return f"Margins below the requirement: {lacking}." if lacking else ""
 

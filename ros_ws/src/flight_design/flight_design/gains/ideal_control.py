@@ -74,9 +74,10 @@ class Flown(NamedTuple):
 
 
 class Study(NamedTuple):
-    """The nominal airframe and N - 1 uncertain airframes along a manoeuvre, with the ideal control.
+    """The rates of the ideal control along a manoeuvre, and the airframes to which they belong.
 
-    The channels are in the airframe's order, in SI.
+    These are the nominal airframe and N - 1 uncertain airframes. The channels are in the airframe's
+    order, in SI.
     """
 
     airframe: Airframe
@@ -177,11 +178,12 @@ def study_airframe(
         u*_dot = Omega^-1 (y_m_ddot - C (A x_dot + f_dot)),  f_dot along (1, x_dot)
 
     eta is integrated by Runge-Kutta in steps of 0.01 s, and u*_dot is evaluated at the steps. Only
-    f_dot and u_m_dot are central differences, over 1e-5 s. f is that of the nominal airframe. If
-    there is an `effected` airframe, the uncertain entries are those of this airframe. Raises
-    ParameterError if Omega is singular, or if the nominal airframe has a zero in the right half
-    plane, because Assumption 3 fails then. Raises FlightEnded if the ideal flight of the nominal
-    airframe diverges. An uncertain airframe that diverges counts as unstable.
+    f_dot and the rate of the commands u_m, which y_m_ddot contains, are central differences over
+    1e-5 s. f is that of the nominal airframe. With `effected`, the entries of its airframe are
+    uncertain, and each B is then multiplied by its T. Raises ParameterError if Omega is singular,
+    or if the nominal airframe has a zero in the right half plane, because Assumption 3 fails then.
+    Raises FlightEnded if the ideal flight of the nominal airframe diverges. An uncertain airframe
+    that diverges counts as unstable.
     """
     drawn_airframe = airframe if effected is None else effected.airframe
     A, B = nominal_and_sampled(drawn_airframe, uncertainty, samples, seed, spread)
@@ -305,7 +307,8 @@ def _zero_dynamics(
 ) -> FloatArray:
     """Integrate eta by Runge-Kutta and return it at every step, shape (n - m, steps, N).
 
-    `halves` counts instants in half steps. A step begins and ends at every second instant.
+    `eta` is the value at the first step. `halves` has the numbers of the instants of y_m and
+    y_m_dot, in half steps. Every second instant is that of a step.
     """
     t = (STEP / 2.0 * halves)[:, None, None]
     held = y_m @ plant.P.T
@@ -385,9 +388,9 @@ def _references(
 
 
 def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Aircraft:
-    """Return the aircraft whose f takes states as columns, shape (n, columns).
+    """Return an aircraft whose f takes several states at once, as columns, shape (n, columns).
 
-    The last column has no gusts.
+    The gusts of the airframe act on all columns but the last.
     """
     gust_on = np.append(np.ones(columns - 1), 0.0)
     profiles = np.array([(gust.start, gust.speed, gust.length) for gust in gusts.values()]).reshape(

@@ -76,8 +76,9 @@ def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air)
 
         z+ = A z + N n,  P+ = A P A' + N N',  n white with unit variance
 
-    The covariance P after 2^j periods follows from P after 2^(j-1) periods. Noise only counts in
-    turbulence.
+    z is the state of the loop and P its covariance. P after 2^j periods follows from P after
+    2^(j-1) periods. The noise of the measurements is a part of n. The response to gusts is without
+    noise.
     """
     none = np.zeros(len(loop.lag))
     matrix = closed_loop(plant, law, loop, none)
@@ -150,8 +151,8 @@ def linear_error(loop: LinearLoop, u_dot: FloatArray) -> FloatArray:
 
     The ideal control u* keeps y on y_m, but the loop must produce u* by feedback. So e is the
     response of the loop to the disturbance -u* at the input of the aircraft, starting from trim.
-    The leading axes of the result are those of the laws of the loop. `u_dot`, (T, m), is the rate
-    of u* every STEP, with the inputs in the law's order.
+    `u_dot`, (T, m), is the rate of u* every STEP, with the inputs in the law's order. If the loop
+    has several laws, the result has the leading axes of their matrices.
     """
     period = loop.loop.period
     u = np.concatenate(

@@ -46,7 +46,8 @@ def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> O
         K = 0.026 / T,  Lambda = K / 4,  beta = K / T,  softening = 3
 
     With these, the softened sign has the half-width eps = 3 units of y. The noise of the wind is
-    0.12 of Dryden's, sqrt(2 V0 / L) sigma, and its time constant is 17 times Dryden's, L / V0.
+    0.12 times that of Dryden's model, sqrt(2 V0 / L) sigma. The time constant of the wind is 17
+    times that of Dryden's model, L / V0.
 
     `axes` are the axes of the wind in the order of the model's columns, and `speed` is V0, m/s.
     """
@@ -79,7 +80,10 @@ more than a model does."""
 def gains_beside_sketch(
     model: NominalModel, outputs: tuple[str, ...], axes: tuple[str, ...], speed: float
 ) -> ObserverGains:
-    """Derive gains for a model from a sketch: those of `gains_by_rule` times BESIDE_SKETCH."""
+    """Derive gains for a model that is only a sketch of the aircraft.
+
+    They are those of `gains_by_rule`, multiplied by BESIDE_SKETCH.
+    """
     by_rule = gains_by_rule(model, axes, speed)
     airspeed = [name == "V" for name in outputs]
     effort, K = (np.where(airspeed, *reversed(BESIDE_SKETCH[key])) for key in ("effort", "K"))
@@ -117,8 +121,8 @@ def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> Observer
 
     T is the total lag, (m,), s. Gains of rise_observer stay as they are. Gains K and Lambda of
     pi_observer become gains of RISE-DI that act as the same PI law inside the width of the softened
-    sign. RISE-DI gets the same K and SHARE times Lambda, and 1 / (softening T) is the rest of
-    Lambda.
+    sign. RISE-DI gets the same K, and SHARE times the same Lambda. The slope 1 / (softening T) of
+    the softened sign gives the rest of Lambda.
     """
     values = {name: np.array(row, dtype=np.float64) for name, row in gains.items()}
     weights = Weights(**{name: values[name] for name in Weights._fields})

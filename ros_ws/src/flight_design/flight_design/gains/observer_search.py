@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Search for the relaxation of a law's gains beside an observer, with the least error.
 
-The loop must have the required margins. The relaxation of a channel divides K and the integral
-gain, and multiplies `effort`. A relaxation above 1 makes the loop slower, and one below 1 makes it
-faster. Both may be needed, because the inputs of an aircraft may act less or more than those for
-which the gains were found.
+The loop must have the required margins. The relaxation of a channel is a factor. It divides K and
+the integral gain, and multiplies the observer's weight `effort`. A relaxation above 1 makes the
+loop slower, and one below 1 makes it faster. Both may be needed, because the inputs of an aircraft
+may act less or more than those for which the gains were found.
 """
 
 import math
@@ -93,7 +93,10 @@ class SelectedObserver(NamedTuple):
     left_out: int = 0  # number of uncertain aircraft that no gains can hold
 
     def not_counted(self) -> str:
-        """Write a sentence about the aircraft that are left out; "" if none is."""
+        """Say how many uncertain aircraft do not count, or return "" if all count.
+
+        Those that do not count diverge under any gains while their outputs are held.
+        """
         if not self.left_out:
             return ""
         return (
@@ -166,16 +169,16 @@ class ObserverSearch(NamedTuple):
 
     @property
     def loop(self) -> LoopTiming:
-        """Loop with zero delay, because the delay margin counts the declared delay too."""
+        """Timing of the loop with zero delay: the delay margin contains the declared delay."""
         return LoopTiming(self.model.lag, 0.0, self.model.period)
 
     def best(self, progress: Callable[[str], None] = lambda _: None) -> Trial[_Loops]:
         """Find the trial that meets the margins with the least error.
 
-        If no trial meets them, the result is the trial that lacks the least. The required damping
-        is lowered to that of the zeros of the aircraft if necessary, because no feedback moves a
-        zero. Without `air`, the least relaxed trial is best. `progress` gets a sentence for each
-        loop.
+        If no trial meets them, the result is the trial with the least shortage. The required
+        damping is lowered to about that of the aircraft's zeros if necessary, because no feedback
+        moves a zero. Without `air`, the least relaxed trial is best. `progress` gets a sentence for
+        each loop.
         """
         m = len(self.model.lag)
         free = np.ones((1, m)) if self.is_free is None else np.array([self.is_free])
@@ -203,8 +206,8 @@ class ObserverSearch(NamedTuple):
         """Evaluate the trial at a place.
 
         `least` is the least cost so far of a trial that meets the margins, infinite if there is
-        none. If it is finite, the margins are computed only if this trial tolerates its delay and
-        costs less.
+        none. If it is finite, a trial is rejected without its margins if it costs no less, or if a
+        loop is unstable when each input is late by the delay margin that it needs.
         """
         loops = self._loops(place)
         if least < math.inf:
@@ -258,7 +261,7 @@ class ObserverSearch(NamedTuple):
         return _Loops(controller, relaxation, around)
 
     def _is_tolerant(self, loops: _Loops) -> bool:
-        """Return whether each loop is stable if every input is late by its delay margin."""
+        """Return whether each loop is stable if each input is late by the margin that it needs."""
         late = self.margin + RESOLUTION
         return all(is_stable(plant, law, self.loop, late) for plant, law in loops.around)
 

@@ -113,11 +113,11 @@ def with_aircraft_observer(
 ) -> SelectedObserver:
     """Add the feedforward and the observer of an airframe to a controller, and select its gains.
 
-    A search relaxes the gains of each channel, or makes them faster. It minimises the error of the
-    linear loop in moderate turbulence with the noise of the sensors, while the loop must have its
-    margins. The search is made with each of the gain `sets`, and the result with the least error is
-    taken. With `keeps_gains` the gains stay as they are, and are only relaxed if the margins need
-    it.
+    A search lowers or raises the gains of each channel by a factor, the relaxation. Among the
+    linear loops with the required margins, it takes that with the least error in moderate
+    turbulence with the noise of the sensors. The search is made with each of the gain `sets`, and
+    the result with the least error is taken. With `keeps_gains` the gains stay as they are, and are
+    only lowered if the margins need it.
 
     `margin` is the least delay margin, s, either one value for all inputs, or one for each, (m,).
     If the airframe is `uncertain`, WORST_OF uncertain aircraft must have the phase margin too.
@@ -171,7 +171,7 @@ def with_aircraft_observer(
 
 
 def law_activity_unit(airframe: Airframe, controller: ControllerConfig) -> FloatArray:
-    """Return the mean abs(v_dot) of each input v that costs as much as a unit of error, (m,).
+    """Return, for each input v, the mean abs(v_dot) that costs as much as a unit of error, (m,).
 
         unit_i = min_j unit_j / abs(T_ji),  u = T v
 
@@ -192,7 +192,7 @@ def _with_schedule(
     controller: RiseDiConfig,
     airframe: Airframe,
 ) -> SelectedObserver:
-    """Add the models of the search at two speeds to the selected observer, as a schedule."""
+    """Add a schedule to the selected observer: the models of the search for two other speeds."""
     slow, fast = (speed.model(selected.relaxation).model_dump() for speed in search.others)
     schedule = {"speed": airframe.speed, "slow": slow, "fast": fast}
     if controller.schedule is not None:
@@ -319,7 +319,7 @@ class _AircraftDesigns(NamedTuple):
 
 
 def _require_no_vanes(vanes: Mapping[str, float], outputs: Sequence[str]) -> None:
-    """Refuse vanes and outputs that a design at several speeds does not cover."""
+    """Refuse vanes, and outputs without V, because a design at several speeds cannot use them."""
     require(
         not vanes,
         "speeds",
@@ -338,7 +338,7 @@ def _vanes(
 ) -> VanesConfig:
     """Build the section of the vanes.
 
-    They measure alpha and beta minus (wind on their axes / V0).
+    A vane measures its angle, alpha or beta, minus the wind on the angle's axis divided by V0.
     """
     model_by_tick = aircraft_model(model, names, weights.wind_time)
     H = []

@@ -45,7 +45,7 @@ def reason_against_gains(selection: Selection, *, options: Sequence[str] = ()) -
 
 
 def _relaxed(selection: Selection, options: Sequence[str]) -> dict[str, LoopSetting]:
-    """Return the relaxed settings of a loop, by a text that describes the change."""
+    """Return the setting of the loop after each of the changes, by a text for the change."""
     setting = selection.setting
     changes: dict[str, LoopSetting] = {}
     margins = selection.engineering.margins

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Define the required margins of a loop, and search for gains with these margins.
 
-Every margin is a condition, and the search evaluates the margins themselves.
+Every margin gives a `GainCondition`. The search computes the margins of every loop that it tries.
 
 The margins are those of the sampled loop with actuators, delay and hold
 (`flight_analysis.linear_loop.input_margins`). The values of 45 degrees and 6 dB come from
@@ -122,10 +122,10 @@ def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
 
 
 def above_zeros(requirement: Requirement, plant: LinearPlant) -> Requirement:
-    """Lower the damping of a requirement to what a loop around an aircraft can reach.
+    """Lower the required damping ratio to what a loop around an aircraft can reach.
 
-    The damping becomes at most about that of the zeros of the aircraft. No feedback moves a zero,
-    and a loop with small errors has modes near the zeros.
+    The ratio becomes at most about that of the aircraft's least damped zero. No feedback moves a
+    zero, and a loop with small errors has modes near the zeros.
     """
     zeros = invariant_zeros(plant.A, plant.B, plant.C[: plant.B.shape[-1]])  # without vanes
     modes = zeros[(np.abs(zeros.imag) > NO_MOTION) & (np.abs(zeros) > NO_MOTION)]
@@ -230,8 +230,8 @@ def within_requirement(
     `u_dot`, (T, m), with inputs in the law's order. The required damping is that of `above_zeros`.
     The search begins with the bandwidths of the rule, and with the largest integral gains with
     which each channel has its margins. If a margin is missing at the end, the search tries other
-    starts. While the worst uncertain aircraft has less than `worst_phase`, the required phase
-    margin of the nominal loop is raised in steps of 2.5 degrees.
+    starts. While the phase margin of the worst uncertain aircraft is below `uncertain_phase`, the
+    required phase margin of the nominal loop is raised in steps of 2.5 degrees.
     """
     loops = _Loops(build, u_dot)
     target = above_zeros(requirement, loops.start.loop.nominal)

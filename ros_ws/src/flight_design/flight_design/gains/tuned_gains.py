@@ -89,8 +89,8 @@ def save(
 ) -> None:
     """Write tuned gains, costs and the tuning command.
 
-    Laws come in the order of the catalogue, objectives as given. Raises ParameterError if the file
-    cannot be written.
+    The laws come in the order of the catalogue, and the objectives of each law in that of `order`.
+    Raises ParameterError if the file cannot be written.
     """
     known = set().union(*results.values())
     objectives = [name for name in order if name in known]

@@ -73,8 +73,8 @@ def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
     """Pair each output with the input that drives it, and return the signs of the effects, (m,).
 
     An output and an input belong together if the map gives them the same motion. Raises
-    ParameterError if an output has no input, or if the sign of an output is opposite to that of the
-    stack.
+    ParameterError if two inputs drive the same output, if an output has no input, or if the map
+    gives an output the opposite sign of the axes forward, right, down.
     """
     drivers: dict[str, tuple[str, int]] = {}
     for name, row in channel_map.inputs.items():
@@ -148,7 +148,8 @@ def experiment(
     """Plan the experiment of a channel map.
 
     `amplitude` is the amplitude of each input as a fraction of the smaller of its two limits.
-    `speed` is the airspeed in trim, m/s, or None in hover.
+    `speed` is the airspeed in trim, m/s, or None in hover. `airframe_file` is the path that the
+    scenario has for the airframe. The experiment lasts for `wait`, s, and the excitation.
     """
     pairing, sign = channel_pairs(channel_map)
     rows = [channel_map.inputs[name] for name in pairing.inputs]
@@ -279,8 +280,8 @@ def join(
 ) -> IdentifiedChannels:
     """Join the models of the channels; a channel without a model gets its step response.
 
-    Raises ParameterError if a channel has no certain result. It is also raised if the signs of the
-    effects contradict the map or each other.
+    Raises ParameterError if a channel has neither a usable model nor a certain step response. It is
+    also raised if the sign of an effect contradicts the map.
     """
     pairing, sign = channel_pairs(channel_map)
     Omega = np.where(np.isfinite(response.Omega), response.Omega, 0.0)

@@ -110,9 +110,10 @@ def own_shares(
 
 
 def peaks(recorded: FlightData) -> FloatArray:
-    """Return the largest mean of each output over PEAK, without trim, in units of its noise, (m,).
+    """Return how far each output moves from trim, (m,), as a multiple of its noise.
 
-    The noise is that of a sample.
+    The motion is the largest magnitude of the means over intervals of PEAK. The noise is that of a
+    single sample.
     """
     y = without_trim(recorded).y
     length = max(1, round(PEAK / recorded.period))
@@ -123,8 +124,8 @@ def peaks(recorded: FlightData) -> FloatArray:
 def to_set(outputs: Iterable[str], parameters: Mapping[str, float]) -> str:
     """Say which parameter of PX4 to set so that its controller flies the doublets, or return "".
 
-    Source: PX4 1.16, fw_rate_control. Without this parameter it does not control the yaw rate to
-    its setpoint.
+    Without this parameter, PX4 does not control the yaw rate to its setpoint. `parameters` are
+    those of the log. Source: PX4 1.16, fw_rate_control.
     """
     if "r" not in outputs or parameters.get(YAW_RATES) != 0.0:
         return ""
@@ -136,9 +137,10 @@ def to_fly(
 ) -> str:
     """Say which doublets would show the effects on some outputs.
 
-    `outputs` has each of these outputs with the factor on its amplitude. The doublets have the size
-    and length of the scenario's pulses. Their size is at least that of the motion in the log, y,
-    (T, m). Returns "" if there are no outputs.
+    `outputs` has, for each of these outputs, the factor by which its motion in the log is too
+    small. A doublet has the size and length of the scenario's pulses, and at least the size of the
+    motion in the log, y, (T, m). The factor gives the number of doublets. Returns "" if there are
+    no outputs.
     """
     pulses = scenario.reference_model.pulses
     texts = []
@@ -169,11 +171,11 @@ def gust_warning(part: Part) -> str:
 
 
 def factors_of(parts: Iterable[Part]) -> dict[str, float]:
-    """Return the factor on the amplitude of each output that needs more motion, by output.
+    """Return the outputs that need more motion, each with the factor by which it must grow.
 
-    For such an output no effect is known to MAX_DEVIATION. An output is left out if its effects are
-    uncertain because of a delay, since more motion would not help, or because two models differ
-    (`rates_model.doubted`), which says nothing of how much more it must be.
+    The standard deviation of every effect on such an output is above MAX_DEVIATION. Two outputs are
+    left out. One has uncertain effects because of a delay, and more motion would not help. For the
+    other, two models differ (`rates_model.doubted`), which does not say how much motion it needs.
     """
     factors = {}
     for part in parts:

@@ -141,7 +141,10 @@ class _Identified(NamedTuple):
 
     @property
     def loop(self) -> LoopTiming:
-        """The loop with the least delay of all channels; further delay counts as lag."""
+        """Timing of the loop.
+
+        Its delay is the least of all channels. Further delay of a channel counts as lag.
+        """
         channels = self.channels
         delay = float(np.min(channels.delay))
         return LoopTiming(channels.lag + channels.delay - delay, delay, 1.0 / RATE)
@@ -161,7 +164,7 @@ class _Identified(NamedTuple):
         return np.array([min(-row.lower, row.upper) for row in rows])
 
     def commands(self) -> FirstCommands:
-        """Return the `first_commands`, which the loop can follow; they begin after WAIT."""
+        """Return commands that the loop can follow, by `first_commands`; they begin after WAIT."""
         crossover = bandwidths(self.loop, np.array(list(self.products.values())))
         authority = np.abs(np.diag(self.channels.Omega)) * self.reach
         channels = {
@@ -184,10 +187,10 @@ class _Identified(NamedTuple):
         return Airframe.validate_mapping(yaml.safe_load(self.airframe_text(source)), "airframe")
 
     def of_integrators(self, manoeuvre: Manoeuvre) -> Study:
-        """Study the ideal control of y_dot = Omega u, for its slew.
+        """Study the ideal control of y_dot = Omega u along the first second of a manoeuvre.
 
-        A manoeuvre of 1 s suffices for the slew. Only the gain set of Theorem 1 would need more of
-        the manoeuvre, but it is not used.
+        This suffices for the `slew`. Only the gain set of Theorem 1 would need the rest of the
+        manoeuvre, but it is not used.
         """
         none = np.zeros_like(self.channels.damping)
         channels = self.channels._replace(damping=none, stiffness=none, zero=none)
@@ -218,8 +221,9 @@ def _within_margins(
 ) -> tuple[RiseDiConfig, LoopMargins | None]:
     """Lower the integral gains and bandwidths of a controller until its loop has the margins.
 
-    The loop is around the airframe of a study. Returns the controller and the margins. The input
-    scale is divided by the same factor as the bandwidth, so that the K of (22) stays.
+    The loop is around the airframe of a study. Returns the controller and the margins. A lower
+    bandwidth is a smaller input scale, and the K of (22) stays. Without the softened sign, the
+    controller is returned as it is, and None.
     """
     if controller.sampled_sign()[0] is not Sign.SOFT:
         return controller, None
@@ -287,9 +291,9 @@ def _with_integrals(
 
 
 def _integral(channels: IdentifiedChannels, i: int, crossover: float, total_lag: float) -> float:
-    """Return the integral gain of a channel, 1/s, for a loop with the crossover `crossover`, rad/s.
+    """Return the integral gain of a channel, 1/s, for a loop with `crossover`, rad/s.
 
-    It is at most the largest integral gain whose sensitivity is below MAX_SENSITIVITY.
+    The wanted gain is lowered by the INTEGRALS until the sensitivity is below MAX_SENSITIVITY.
     """
     omega = np.geomspace(0.1, 1e3, 400) * crossover
 

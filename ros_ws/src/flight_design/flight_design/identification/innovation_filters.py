@@ -443,8 +443,9 @@ def filter_bank(
         w_dot = v - w / wind_time + noise,  v_dot = a - v / GUST_TIME,
             a_dot = -a / RATE_TIME + noise
 
-    A rotary gust has neither v nor a. With a `shear`, (N, 2), the vertical wind w also turns the
-    air. The slope of w along the path acts behind the lag T = 4b / (pi V0) of the span b.
+    A rotary gust has neither v nor a. With a `shear`, (N, 2), the slope of the vertical wind w
+    along the path acts on the aircraft as a pitch rate q_g of the air. It acts behind the lag T =
+    4b / (pi V0), where b is the span.
 
         q_g = (w - l) / (V0 T),  l_dot = (w - l) / T
         alpha_dot -= shear_1 q_g,  q_dot -= shear_2 A[q, q] q_g

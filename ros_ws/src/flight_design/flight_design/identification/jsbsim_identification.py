@@ -123,7 +123,7 @@ class IdentifiedAircraft(NamedTuple):
 
     @property
     def D(self) -> tuple[int, ...]:  # noqa: N802 - the paper's name
-        """D in the canonical order of the inputs."""
+        """D in the order of the flight condition's inputs."""
         controller = self.selection.chosen
         return tuple(
             controller.D[controller.inputs.index(name)] for name in self.condition.inputs()
@@ -137,7 +137,8 @@ class IdentifiedAircraft(NamedTuple):
     def failure(self) -> Refusal | None:
         """Why the aircraft does not fly, or None if it flies.
 
-        It flies if every flight completes, and if the errors in calm air are below the commands.
+        It flies if every flight completes, and if the rms error of each output in calm air is below
+        its largest command.
         """
         for title, flight in self.flights.items():
             if flight.outcome != str(COMPLETED):
@@ -170,13 +171,13 @@ def identify_jsbsim(
 
     1. Trim, first in a separate process, and linearise: `linearize` gives the airframe.
 
-    2. Pair the channels, with outputs in units of the manoeuvre, and take D from the minors.
+    2. Pair the channels, and take D from the leading minors of Omega.
 
     3. Select gains by the engineering procedure for the airframe behind the lags, along the
     commands and gusts: `gain_selection.gain_sets`. The beta of V follows from `airspeed_slew`. If
-    `observer_margin` is given, the gains are those beside an extended-state observer for y_dot =
-    Omega u. The loop around this model then has the delay margin `observer_margin`, s, and its
-    margins meet `requirement`, with 35 degrees of phase.
+    `observer_margin` is given, the controller gets an extended-state observer for y_dot = Omega u.
+    The loop around this model then has the delay margin `observer_margin`, s, and its margins meet
+    `requirement`, where 35 degrees of phase suffice.
 
     4. Simulate the result in calm air, with a gust, and in turbulence.
 
@@ -186,7 +187,7 @@ def identify_jsbsim(
 
     If `learns`, the flight learns in moderate turbulence. The flight begins with the gains alone.
     The designs of the learner have the `observer_margin`, and its rough model is the `sketch` of
-    Omega and speed.
+    Omega and speed. `named` has properties that the user names for an input, in place of JSBSim's.
 
     Raises FlightEnded if the aircraft does not trim or does not respond, and ParameterError if its
     outputs and inputs cannot be paired, or if the speed is below guidance's speed floor.
@@ -379,8 +380,8 @@ def learning_selection(
 def _study(airframe: Airframe, commands: FirstCommands) -> Study:
     """Study an airframe along the commands and gusts, without any uncertain aircraft.
 
-    The study uses the equations of the aircraft that flies. An uncertain aircraft whose entries are
-    30 % off can have an unstable zero of sideslip, and then no gains could hold its outputs.
+    The airframe follows from the equations of the aircraft that flies. An uncertain aircraft, whose
+    entries are 30 % off, can have an unstable zero of sideslip. No gains could hold its outputs.
     """
     reference = ReferenceModelConfig.validate_mapping(commands.reference, "reference_model")
     gusts = {

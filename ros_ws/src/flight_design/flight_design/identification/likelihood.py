@@ -59,7 +59,7 @@ RECOVERY = 2
 
 
 class Innovations(NamedTuple):
-    """Innovations of a model over a recording, with the best level of the wind in each span."""
+    """Innovations of a model over a recording, with the likelihood of each sample."""
 
     r: FloatArray  # (T, m) in units of y, NaN where y is lost
     normalised: FloatArray  # (T, m) innovations whose covariance is I if the model is right
@@ -99,11 +99,11 @@ class Models(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """Standard deviations of what is identified, each 0 for a value that is known.
+    """Standard deviations, before the flight, of what is identified; 0 for a value that is known.
 
-    They are those of delay, angles and lag, of the entries of A and B, and of the noise of the
-    disturbances. Hidden states, such as alpha, are states that y does not contain. If y has only
-    the rates, the rows of the hidden states count as known, because mass and lift give them.
+    `drift` is not such a deviation, but the noise of the disturbances in the filter. Hidden states,
+    such as alpha, are states that y does not contain. If y has only the rates, the rows of the
+    hidden states count as known, because mass and lift give them.
     """
 
     delay: float = 0.0  # s, deviation of the delay of u
@@ -145,7 +145,7 @@ class Fit(NamedTuple):
 
 
 def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:
-    """Return the units of the errors of A and B, SI; an entry with the unit 0 is known.
+    """Return the size of an error of 1 in each entry of A and B, SI; with a unit of 0 it is known.
 
     The units are the nominal values, except in the rows of angles, where they are 0. If `coupled`,
     an entry that is 0 gets the unit COUPLING times the largest effect on its row, in units of
@@ -286,8 +286,8 @@ class Likelihood:
     def with_errors(self, thetas: FloatArray) -> NominalModel:
         """Return the models for N thetas, (N, p): A (N, n, n), B (N, n, m), wind (N, n, G).
 
-        The wind acts on each model through the A of this model, also through its entries that are 0
-        in the nominal airframe, since what moves an aircraft is its motion relative to the air.
+        The wind acts on each model through the A of this model, because an aircraft is moved by its
+        motion relative to the air. So entries that are 0 only in the nominal airframe count too.
         """
         matrices = []
         parts = np.split(thetas, [np.count_nonzero(self._units[0]), self.count], axis=1)[:2]
@@ -495,7 +495,10 @@ class Likelihood:
         return names + others[: len(self.prior) - len(names)]
 
     def model_errors(self, airframe: Airframe) -> FloatArray:
-        """Return the theta, (p,), of a model, with winds, angles, lag and delays as at 0."""
+        """Return the theta, (p,), whose errors of A and B give the model `airframe`.
+
+        The entries of theta for winds, shears, angles, lag and delays are 0.
+        """
         A = airframe.matrix_a()
         B = airframe.matrix_b()
         inputs = list(airframe.inputs)
@@ -531,7 +534,7 @@ class Likelihood:
     def reason_against_air(self, fit: Fit) -> Refusal | None:
         """Refuse a fit if the effect of the vertical wind's slope on a state is at a bound.
 
-        Such a wind explains errors of the aircraft's model.
+        So large an effect stands for errors of the aircraft's model, not for the wind.
         """
         effects = np.abs(fit.theta[self._shear])
         bounds = self._upper[self._shear]
@@ -580,9 +583,9 @@ class Likelihood:
     def _costs(
         self, innovations: Normalised, used: NDArray[np.bool_], thetas: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the costs of N models, the normalised innovations in use, and sum log det S / 2.
+        """Return the costs of N models, their normalised innovations, and sum log det S / 2.
 
-        `used` masks the samples. The innovations have shape (N, samples, m).
+        Only the samples in the mask `used` count. The innovations have shape (N, samples, m).
         """
         e = innovations.e[:, used]
         total = np.sum(innovations.half_log_det[:, used], axis=1)

@@ -85,7 +85,7 @@ class Search(Likelihood):
         the normalised innovations, S is the covariance of the innovations, and N is the number of
         samples. The cost has several minima, because a wrong wind can explain a wrong model.
 
-        So the search has several starts, which use means over the shortest lag:
+        So the search has several starts. They average the flight over the shortest lag:
 
         - theta = 0;
         - for each level in STARTS, a start with this level in all spans;
@@ -198,10 +198,10 @@ class Search(Likelihood):
         ]
 
     def _lagging(self, theta: FloatArray) -> FloatArray:
-        """Return theta, (p,), within the bounds and with a lag of y of one deviation.
+        """Return theta, (p,), clipped to the bounds, with a lag of y of one standard deviation.
 
-        From a lag of 0 the search would end at a delay of u that explains a filter of y, although a
-        lag predicts better.
+        From a lag of 0, the search would explain a filter of y by a delay of u, and end there. But
+        a lag of y predicts better.
         """
         begin = self._within(theta)
         begin[self._lag] = 1.0
@@ -214,7 +214,7 @@ class Search(Likelihood):
     def _started(
         self, theta: FloatArray, levels: NDArray[np.int64] | None, *, winds: bool
     ) -> FloatArray:
-        """Return theta, (p,), after some steps with means over the shortest lag.
+        """Return theta, (p,), after some steps with the flight averaged over the shortest lag.
 
         `levels` gives the level of each span. If it is None, theta decides the levels. `winds` says
         whether the strengths of the winds are free.

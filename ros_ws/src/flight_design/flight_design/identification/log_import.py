@@ -94,8 +94,9 @@ def imported(
 ) -> Imported:
     """Return y, u, `commands` and the pose of a log, as the bridge would have published them.
 
-    y holds the newest values at the stamps of the map's `instant`, and the pose holds those at the
-    stamps of its first channel. u is the command minus its median. The command is
+    The map's `instant` names an output. y has the newest value of each output at the stamps of this
+    one. The pose has the newest values at the stamps of its first channel. u is the command minus
+    its median. The command is
 
     - with PX4: the setpoint that the map names;
     - with ArduCopter: the output of the rate controllers;
@@ -255,7 +256,7 @@ def _measured(log: VehicleLog, quantity: str, key: str) -> LogField:
 
 
 def _messages(log: VehicleLog, quantity: str) -> str:
-    """Name the messages that hold a quantity, for the format of a log."""
+    """Name the messages in which a log of this format can have a quantity."""
     from flight_log.vehicle_tables import ULOG_SOURCES  # noqa: PLC0415 - only this sentence needs it
 
     sources = ULOG_SOURCES if log.format is None else log.format.sources
@@ -266,9 +267,10 @@ def _messages(log: VehicleLog, quantity: str) -> str:
 
 
 class _Reader(NamedTuple):
-    """Reads the command of an input from a log: in SI it is line(raw).
+    """Reads the command of an input from a log, and converts it to SI by `line`.
 
-    For a plane of ArduPilot, raw is computed from the pulse of the stick or of the servo.
+    For a plane of ArduPilot, the command is first computed from the pulse of the stick or of the
+    servo.
     """
 
     log: VehicleLog
@@ -343,9 +345,10 @@ def _commands(
 
 
 def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
-    """Return the reader of a multicopter's rate controller output, normalised as PX4's is.
+    """Return the reader of a multicopter's torque, the normalised output of its rate controller.
 
-    The sticks of a multicopter do not command its inputs in any mode.
+    The sticks of a multicopter do not command its inputs in any mode. Raises ParameterError if the
+    log does not have the torque, or if `servos` asks for the position of the servos.
     """
     quantity, sign = row.motion
     sources = log.format.torques.get(quantity, ()) if log.format else ()

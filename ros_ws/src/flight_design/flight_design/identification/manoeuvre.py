@@ -32,7 +32,8 @@ CLIMB_START = 30.0
 def moderate_turbulence(altitude: float) -> dict[str, Any]:
     """Return the parameters of moderate turbulence at an altitude, m.
 
-    At high altitude the rms of this turbulence is 10 ft/s.
+    At low altitude the turbulence follows from the wind near the ground. At high altitude its rms
+    is 10 ft/s.
     """
     values: dict[str, Any] = {"altitude": max(altitude, LOWEST), "seed": 1}
     if altitude < HIGH:

@@ -212,11 +212,12 @@ class _Study(NamedTuple):
     def again(
         self, search: Search, fit: Fit, used: NDArray[np.bool_], flown: Airframe | None
     ) -> Fit:
-        """Search again about a fit that has too many entries at a bound, because the file is rough.
+        """Search again around a fit in which too many entries are at a bound.
 
-        There is no further search if the effect of an input is at a bound, for two reasons. No law
-        designed from the file can fly an aircraft beyond these bounds. Besides, the cause may be
-        that the part couples with another part.
+        The cause may be that the airframe file is rough. There is no further search if the effect
+        of an input is at a bound, for two reasons. No law designed from the file can fly an
+        aircraft beyond these bounds. Besides, the cause may be that the part couples with another
+        part.
         """
         for _ in range(AGAIN * self.searches_again):
             entries = search.about_centre(search.entries(fit))
@@ -264,10 +265,11 @@ class _Study(NamedTuple):
         apart: Innovations,
         flown: Airframe | None,
     ) -> tuple[Fit, Part] | None:
-        """Fit the aircraft as one part, with coupling.
+        """Fit the whole aircraft as one part, with entries that couple its parts.
 
-        Returns None unless this fit predicts better than the parts that were fitted `apart`. A
-        model in flight that couples is compared with the nominal one in the winds of this fit.
+        Returns None unless the innovations of this fit are white, its model may be used, and it
+        predicts better than the parts that were fitted separately. `apart` are the innovations of
+        these parts. The fit also has the innovations of the model in flight, `flown`.
         """
         search = self.search(model, whole_aircraft(model), coupled=True)
         also = None if flown is None else search.model_errors(flown)

@@ -114,10 +114,10 @@ def reason_against_signs(
 
 
 def in_time(entries: Iterable[Entry], by_timing: Iterable[float]) -> list[Entry]:
-    """Return the entries with deviations from which the part by one cause is taken out.
+    """Return the entries with the deviations that they would have without one cause of error.
 
-    `by_timing` is this part of each deviation. For an uncertain delay of u, the result has the
-    deviations that the entries would have if the delay were known.
+    `by_timing` is the part of each deviation that this cause makes. If the cause is an uncertain
+    delay of u, the deviations of the result are those for a known delay.
     """
     return [
         entry._replace(deviation=float(np.sqrt(max(entry.deviation**2 - late**2, 0.0))))

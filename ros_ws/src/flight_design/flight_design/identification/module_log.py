@@ -51,10 +51,10 @@ def module_flight(log: VehicleLog, controller: ControllerConfig) -> ModuleFlight
 
     A stretch is the ticks from an engagement to the first gap or to the next engagement. Python
     starts each stretch with the u of its first tick in the log. In `internals`, e and u come from
-    the log, and the states of the law come from Python. At low airspeed the largest torque, 1,
-    limits u more than the parameters do. The limits of u then count as changed parameters. Raises
-    ParameterError if the log has no ticks or other parameters, or if the module computes in single
-    precision.
+    the log, and the states of the law come from Python. At low airspeed the largest torque, 1, may
+    limit u more than the parameters do. Then the limits of u count as changed parameters. Raises
+    ParameterError if the log has no ticks, or if the module had other parameters than `controller`.
+    It is also raised if the module computes in single precision, or if the law refuses a tick.
     """
     require(STATUS in log.tables, "the log", f"no {STATUS}", EXPECTED)
     table = log.tables[STATUS]
@@ -174,7 +174,10 @@ class _Ticks:
         return self._flight(stretches, rows, changes, equal)
 
     def _limits(self, k: int) -> dict[str, tuple[float, ...]]:
-        """Return the limits of u in a tick: the scenario's, or those of a torque of 1."""
+        """Return the limits of u in the tick k: those of the scenario, or of a torque of 1.
+
+        For each input, the narrower limit counts.
+        """
         end = self._values["u_end"][k]
         exported = self._controller.guard().limits
         return {

@@ -51,7 +51,7 @@ class OwnLoop(NamedTuple):
     def in_place(self, scenario: Scenario) -> Scenario:
         """Return the scenario with the feedback of this loop as the law `pi`.
 
-        An input u is its value at a torque of 1, times the torque.
+        The law computes u, which is the torque multiplied by the u at a torque of 1.
         """
         controller = scenario.rise_di()
         end = _ends(scenario)

@@ -104,8 +104,9 @@ def rates_of_log(
 
         u = sign(D) end torque (V / V0)^2
 
-    V / V0 is clipped as in the exported module. For ArduPlane, u is the position of the servos.
-    Raises ParameterError.
+    `end` is the upper end stop of an input. V / V0 is clipped as in the exported module. For
+    ArduPlane, the position of the servo takes the place of the torque. Raises ParameterError as
+    `rates_map`, `log_import.imported` and `innovation_filters.recording` do.
     """
     channel_map = rates_map(scenario, autopilot)
     taken = imported(channel_map, log, window, show, servos=autopilot == "ardupilot")

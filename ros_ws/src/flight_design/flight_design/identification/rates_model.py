@@ -2,15 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identify the aircraft that a log of body rates shows.
 
-A log of rates lacks two things that move the aircraft slowly. A climb or another airspeed has
-another trim: a linear model does not know this, and takes the inputs that hold the new trim for
-inputs that have little effect. In a bank gravity moves the sideslip: a model without the bank takes
-the turn that follows for an effect of the rudder. The innovations stay white in both cases, because
-most of the log is quiet, and entries come out up to 50 stated deviations off.
+A log of rates lacks two things that move the aircraft slowly. The first is the trim, which changes
+in a climb or at another airspeed. The inputs then hold the new trim without moving the rates, and
+to a linear model they seem to have little effect. The second is the bank. In a bank, gravity causes
+sideslip, and the aircraft turns. A model without the bank angle takes this turn for an effect of
+the rudder. The innovations stay white in both cases, because most of the log is quiet, and entries
+come out up to 50 stated deviations off.
 
-Here one high-pass takes the slow changes out of y and u, and the model has the bank angle. A linear
-aircraft has the same model behind any high-pass. If the models behind two of them differ, the
-difference is an error that the stated deviations of neither include.
+Here a high-pass takes the slow changes out of y and u, and the model has the bank angle. A linear
+aircraft has the same model behind any high-pass. If the models behind two different high-passes
+differ, the difference is an error that neither model's stated deviations include.
 """
 
 import math
@@ -125,9 +126,9 @@ def without_trim(recorded: FlightData, slow: float = SLOW) -> FlightData:
 
 
 def doubted(found: Identification, steady: Identification) -> Identification:
-    """Widen the deviations of a model by its differences from the second model.
+    """Widen the deviations of a model by its differences from the second model, `steady`.
 
-        deviation^2 + (error of the entry - its error in `steady`)^2
+        new deviation^2 = deviation^2 + (error of the entry - its error in `steady`)^2
 
     An entry that `steady` lacks is nominal in it, so its error is 0. A part is refused if the best
     known effect on one of its outputs differs by more than MOST_APART. A part that is already

@@ -175,9 +175,9 @@ def identify_response(
 
 
 class Layout(NamedTuple):
-    """The regressors of the predictor of y(k): samples of y, and windows of samples before k.
+    """The regressors that predict y(k): recent samples of y, and means of y and u over windows.
 
-    The ends of the windows count sample periods.
+    The windows lie before the sample k. Their ends are given in sample periods before k.
     """
 
     period: float  # s, period of y

@@ -58,7 +58,7 @@ class SignCheck(NamedTuple):
 def require_signs(channel_map: ChannelMap, scenario: Scenario) -> None:
     """Raise ParameterError if a map contradicts the D of a scenario's controller.
 
-    The effects are those of the scenario's airframe.
+    The effects of the inputs on the outputs are those of the scenario's airframe.
     """
     contradictions = check_scenario(
         channel_map, scenario, load_airframe(scenario.aircraft.airframe), None
@@ -239,9 +239,9 @@ def check_effectors(
 ) -> SignCheck:
     """Check the signs of the effectors against the `effect` of an allocation, (m, p).
 
-    The check of an effector uses the output that it moves most, relative to the largest effect on
-    this output. `Omega`, (m, p), is that of `check_signs`, with a column for each effector. D of a
-    channel in the result is the sign of its effect.
+    An effector is checked at the output that it moves most, relative to the largest effect on this
+    output. `Omega`, (m, p), is that of `check_signs`, with a column for each effector. In the
+    result, the D of an effector's channel is the sign of its effect.
     """
     mapped = _omega_of_law(channel_map, Omega, outputs, effectors)
     largest = np.argmax(np.abs(effect) / np.abs(effect).max(axis=1, keepdims=True), axis=0).tolist()
@@ -341,6 +341,6 @@ def through(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
 
 
 def motion_as_channel_grows(row: OutputRow | InputRow) -> str:
-    """Return how the aircraft moves as the channel grows, whatever its raw value does."""
+    """Return how the aircraft moves as the channel grows in SI, also if its raw value falls."""
     motions = list(MOTIONS)  # each motion stands next to its opposite
     return row.positive if row.sign > 0 else motions[motions.index(row.positive) ^ 1]

@@ -141,8 +141,9 @@ def with_sketch(
 ) -> RiseDiConfig:
     """Return a controller with the feedforward and observer of a sketch, which do not act yet.
 
-    Omega (m, m) and `noise`, (m,), are in the law's order; `margin` is the least delay margin, s.
-    Raises ParameterError.
+    `observer.part` is 0 for this. Omega (m, m) and `noise`, (m,), the rms per sample, are in the
+    law's order. `margin` is the least delay margin, s. Raises ParameterError as `sketch` and
+    `with_aircraft_observer` do.
     """
     rough = sketch(name, Omega, start.outputs, start.inputs, speed)
     model = model_for(rough, start, noise)

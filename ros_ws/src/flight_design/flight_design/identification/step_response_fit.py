@@ -67,9 +67,8 @@ def second_order_response(
 ) -> tuple[FloatArray, FloatArray]:
     """Return two step responses of a second order behind a lag and a delay, from rest, (N,) each.
 
-        y'' + damping y' + stiffness y = v' and = v,   lag v' = u(t - delay) - v
-
-    The first response has v' on the right-hand side, and the second has v.
+    first:   y'' + damping y' + stiffness y = v' second:  y'' + damping y' + stiffness y = v,    lag
+    v' = u(t - delay) - v
     """
     begin = np.maximum(t - delay, 0.0)
     # the state z, z', v; the output is z' for the first response, z for the second
@@ -134,10 +133,11 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
 
 
 def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
-    """Return whether a fitted response has the sign of Omega until EARLY after delay and lag.
+    """Return whether a fitted response begins with the sign of Omega.
 
-    If it does not, the slow part makes up the whole response. Its two poles then stand for a pole
-    and a lag, and Omega is about 0.
+    The sum of the response until EARLY after delay and lag counts. If it has the other sign, the
+    slow part makes up the whole response. Its two poles then stand for a pole and a lag, and Omega
+    is about 0.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     first, second = second_order_response(

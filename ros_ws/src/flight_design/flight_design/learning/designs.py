@@ -72,11 +72,11 @@ class LearnedLoop(NamedTuple):
     unlearned: float  # relative deviation of an entry that was not learned
 
     def linear(self) -> LinearLoop:
-        """Return the linear loop, with the box of the model.
+        """Return the linear loop around the model, with a box of uncertain aircraft.
 
-        The box has DEVIATIONS standard deviations of each entry. The loop has no limits, and every
-        u is late by the longest delay in `known`, or by the delay that the controller was told if
-        this is longer.
+        In the box, each entry deviates by up to DEVIATIONS standard deviations. The loop has no
+        limits. Every u is late by the longest delay in `known`, or by the delay that the controller
+        was told if this is longer.
         """
         model = self.model
         deviation = chain.from_iterable(part.deviation.items() for part in self.known)
@@ -107,7 +107,7 @@ def deviations_covered(proved: Guarantee) -> float:
 
 
 def margin_of(controller: RiseDiConfig) -> float:
-    """Return the delay margin that a controller must have when it loads, s."""
+    """Return the delay margin, s, that a controller checks when it loads its parameters."""
     assert controller.observer is not None  # noqa: S101 - a controller that learns has one
     return controller.observer.margin
 

@@ -113,8 +113,8 @@ class FlightRecord:
 def steady_end(recorded: FlightData, airframe: Airframe) -> tuple[FlightData, float]:
     """Return the longest end of a record with a steady airspeed, and this airspeed divided by V0.
 
-    A linear model holds in this end: the rms deviation of the airspeed from its mean is at most
-    SPREAD of the mean. The effects of the surfaces vary twice as much.
+    The airspeed is steady if its rms deviation from the mean is at most SPREAD of the mean. The
+    effects of the surfaces vary twice as much, and a linear model still holds.
     """
     V = recorded.y[:, airframe.outputs.index("V")] / airframe.speed
     known = np.isfinite(V)[::-1]

@@ -123,9 +123,9 @@ class Learner:
         """Make a learner with an empty record.
 
         `airframe` is the rough model, the prior. `delay` is the delay of the loop, s, beyond
-        sampling and lags. `design_of_rough` designs for a model with errors. With this design, the
-        rough model flies from the start, and later in the parts without a learned model. If it is
-        None, these parts fly by the law of the start.
+        sampling and lags. `design_of_rough` makes a design for the rough model that allows for its
+        errors. This design flies from the start, and later in the parts without a learned model. If
+        `design_of_rough` is None, these parts fly by the law of the start.
 
         `rough` has the deviation of B in the rough model, and the noise of the disturbances, which
         a test for a change uses too. `quick` is as for `identify`.
@@ -420,7 +420,7 @@ class Learner:
         """Return whether an identification is due: at `learn.updates`, then once in every window.
 
         If the last proposal does not fly (`lost`), or if a part has changed, an identification is
-        also due RETRY after the last one. Within AFTER_FALLBACK of a fallback this is not so.
+        also due RETRY after the last one, unless the law fell back less than AFTER_FALLBACK ago.
         """
         is_planned = False
         elapsed_ns = -1 if self._first_ns is None else end_ns - self._first_ns
@@ -494,8 +494,9 @@ class Learner:
         """Find changes in the last RECORD seconds, in the parts that have a learned model.
 
         An input counts as dead only in the second test in a row, unless the law fell back. No
-        change is found if the speed was not steady, if an output stood still, or if an output
-        oscillated over RETRY, since no model with a stable loop explains such an oscillation.
+        change is found if the speed was not steady, or if an output stood still. There is none
+        either if an output oscillated over RETRY, because no model with a stable loop explains such
+        an oscillation.
         """
         suspected, self._suspected = self._suspected, {}
         begin_ns = end_ns - nanoseconds(RECORD)

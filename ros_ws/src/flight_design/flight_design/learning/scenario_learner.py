@@ -100,7 +100,10 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
     of_rough: dict[RiseDiConfig, SelectedObserver] = {}
 
     def design_of_rough(start: RiseDiConfig) -> SelectedObserver:
-        """Design for an airframe with errors, only once for the learners of many aircraft."""
+        """Return the design for the rough model, which allows for its errors.
+
+        It is made only once, also for the learners of many aircraft.
+        """
         if start not in of_rough:
             margin = asked_margin(controller)
             of_rough[start] = selected_observer(start, scenario, airframe, margin, speeds=speeds)
@@ -248,9 +251,9 @@ def _ticks(tape: Tape, controller: RiseDiConfig) -> _Ticks:
 def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
     """Step the learner of a scenario with y and u of the engaged ticks of a log.
 
-    As in flight, the record ends if the law is deactivated. If the learner in the log had other
-    settings than the scenario, or none, each proposal counts as flown. Raises ParameterError if
-    nothing can be learned from the log.
+    As in flight, the record ends if the law is deactivated. If the flight in the log was without a
+    learner, or its learner had other settings than the scenario, each proposal counts as flown.
+    Raises ParameterError if nothing can be learned from the log.
     """
     # Simulated time begins at 0.
     make = learner(scenario, real_time=tape.start_ns > 0)
