@@ -110,9 +110,10 @@ def as_route(
     slopes: bool,
     notes: tuple[str, ...] = (),
 ) -> Route:
-    """Make a Route from legs through waypoints; `speed`, m/s, holds if no waypoint names one.
+    """Make a Route from legs through waypoints.
 
-    If `slopes`, the altitude changes along a line, and otherwise in a step at its start.
+    `speed` is the airspeed, m/s, up to the first waypoint that names one. If `slopes`, the altitude
+    changes along a line, and otherwise in a step at its start.
 
     A fillet counts as a part of the way to the next waypoint. A leg starts at the altitude and the
     airspeed of the previous waypoint. An orbit round a waypoint starts at the altitude of this
@@ -155,7 +156,8 @@ def _without_short_legs(
 ) -> tuple[list[tuple[int, Waypoint]], tuple[str, ...]]:
     """Return the waypoints with their numbers, without those that make legs too short.
 
-    A note names each waypoint that is left out. Raises ShortLegError if none can be left out.
+    `least` is the least radius of a circle, m. A note names each waypoint that is left out. Raises
+    ShortLegError if a leg is too short and none of its waypoints can be left out.
     """
     remaining = list(enumerate(waypoints))
     refusal = None
@@ -336,5 +338,5 @@ POINT_DISTANCE = 0.05
 
 
 def _up(value: float, step: float) -> float:
-    """Round a value up to a multiple of a step, so that it is still feasible."""
+    """Round a least value up to a multiple of a step, so that the result is feasible."""
     return math.ceil(value / step) * step

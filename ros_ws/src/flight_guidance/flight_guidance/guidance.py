@@ -56,7 +56,8 @@ class GuidanceOutput(NamedTuple):
 def u_m(state: GuidanceState) -> FloatArray:
     """Return the values that are published as u_m.
 
-    They are the commands in the order of the parameters' outputs, then ATTITUDE.
+    They are the commands in the order of the parameters' outputs, followed by the channels of
+    ATTITUDE.
     """
     return np.array([*state.u_m, state.phi, state.theta - state.alpha])
 
@@ -322,8 +323,8 @@ class Guidance:
     def reason_to_wait(self, now_ns: int) -> Refusal | None:
         """Return why guidance publishes no u_m, or None.
 
-        Guidance waits for a young pose, or for a step that does not fail. The result is None until
-        it has waited for STALE_TIME.
+        The reason is that the pose is too old, or that the steps fail. The result is None until
+        guidance has waited for STALE_TIME.
         """
         since = self._waits_from_ns
         pose = self._pose
@@ -350,7 +351,7 @@ class Guidance:
         return 0.0 if self._operated_ns is None else seconds(now_ns - self._operated_ns)
 
     def _test_roll(self, y: Sequence[float]) -> None:
-        """Test whether p follows the last command, and put the result into the authority."""
+        """Test whether p follows the last command, and set `roll` of the authority accordingly."""
         state = self._state
         params = self._params
         if state is None or params.multicopter is not None:

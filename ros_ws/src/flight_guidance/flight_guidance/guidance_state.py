@@ -270,9 +270,9 @@ def begun_again(
     """Return the state `holding`, with the fields CARRIED and `further` taken from `state`.
 
     `holding` is a state that holds the measured values, and `state` is the last state, if any. If
-    this step has to hold, or if there is no last state, the result is `holding` itself. The result
-    also keeps u_m of the last state up to the age limit of u_m, because the reference model flies
-    this u_m until then.
+    `inputs.begin` is HOLD, or if there is no last state, the result is `holding` itself. The result
+    also has u_m of the last state, unless this is older than the age limit of u_m. Until then the
+    reference model flies this u_m.
     """
     if state is None or inputs.begin is Begin.HOLD:
         return holding

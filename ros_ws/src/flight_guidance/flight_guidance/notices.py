@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write the notices of guidance: sentences on events of a flight.
 
-They report a missed leg, a go-around, the fence, a flight carried back, a strong wind, a lost link,
-and new limits. The node logs the sentences as warnings. The summary of a flight makes the same
-sentences from the log.
+They report a missed leg, a go-around, an action of the fence, an aircraft that the wind carries
+back, a strong wind, a lost link, and new limits. The node logs the sentences as warnings. The
+summary of a flight makes the same sentences from the log.
 """
 
 import math
@@ -70,9 +70,9 @@ TURNS = {FenceAction.RIGHT, FenceAction.LEFT}
 
 
 class _Lasting:
-    """Decides when a notice is due, because a condition has lasted for the time `dwell`.
+    """Decides when to give a notice: once, after a condition has held for the time `dwell`, s.
 
-    The notice is due once. It is due again only after the condition has been over for `dwell`.
+    The notice can be due again only after the condition has not held for `dwell`.
     """
 
     def __init__(self, dwell: float = DWELL) -> None:
@@ -96,8 +96,8 @@ class _Lasting:
 class Notices:
     """The notices of a flight, made from the log of guidance row by row.
 
-    `wind` is guidance.wind, m/s, and `max_age` is guidance.max_age, s. `largest_wind` returns, for
-    a commanded airspeed in m/s, the wind up to which circles fit into the largest bank.
+    `wind` is guidance.wind, m/s, and `max_age` is guidance.max_age, s. `largest_wind` returns the
+    largest wind, m/s, in which the aircraft can fly its route at a commanded airspeed, m/s.
     `link_timeout` is guidance.home.link_timeout, s. `reach` is `targets.reach_sentence`.
     `largest_tilt` is that of a multicopter, rad. `landing` is that of the route.
     """

@@ -99,7 +99,10 @@ AUTHORITY = tuple(f"{side}.{name}" for side, name in product(SIDES, ("q", "p", "
 
 
 def authority_of(channels: Mapping[str, float]) -> Authority:
-    """Read the authority from the topic's channels; for q and p the lesser direction counts."""
+    """Read the authority from the channels of the topic `authority`.
+
+    The topic has two sides for each output. For q and p, the side with the lesser value counts.
+    """
     q = min(channels[f"{side}.q"] for side in SIDES)
     p = min(channels[f"{side}.p"] for side in SIDES)
     return Authority(q, p, *(channels[f"{side}.V"] for side in SIDES))
@@ -108,7 +111,8 @@ def authority_of(channels: Mapping[str, float]) -> Authority:
 def climb_rates(down: float, up: float, speed: float) -> tuple[float, float]:
     """Compute the climb rate at full throttle and the sink rate at no throttle, m/s.
 
-    They are a V0 / g times the fractions CLIMB and SINK; a is the authority of the throttle.
+    The climb rate is CLIMB up V0 / g, and the sink rate is SINK down V0 / g. `up` and `down` are
+    the authority of the throttle in the two directions, m/s^2, and `speed` is V0, m/s.
     """
     return CLIMB * up * speed / GRAVITY, SINK * down * speed / GRAVITY
 
@@ -123,5 +127,8 @@ def roll_rate(authority: float, frequency: float) -> float:
 
 
 def least_period(bank: float, rate: float) -> float:
-    """Compute the least period of path following in which a bank can be reversed, s."""
+    """Compute the least period of path following, s, which lasts for REVERSALS bank / rate.
+
+    A reversal of the largest bank, rad, at the roll rate `rate`, rad/s, then fits into it.
+    """
     return REVERSALS * bank / rate

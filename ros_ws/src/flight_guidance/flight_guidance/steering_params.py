@@ -168,7 +168,7 @@ class SteeringConfig(NodeConfig):
         return protection.speed_floor(self.stall_speed)
 
     def _stall_speed(self) -> float:
-        """Return V_s, m/s. If it is unknown, it is the one to which the speed floor belongs."""
+        """Return the stall speed V_s, m/s; if it is unknown, it follows from the speed floor."""
         return self._floor() / protection.FLOOR
 
     def _largest_speed(self) -> float:
@@ -325,9 +325,9 @@ class SteeringConfig(NodeConfig):
     def _vertical(self, climb: float, sink: float) -> VerticalParams:
         """Return the parameters of the altitude loop.
 
-        If the lag T_L of the flight path is known, the rule requires T >= T_L and k_h <= 0.4 / T_L.
-        The flight path then has a damping of at least 0.5, and the altitude a gain margin of 2.5 by
-        Routh's criterion.
+        T is the time constant of the angle of attack's estimate. If the lag T_L of the flight path
+        is known, the rule requires T >= T_L and k_h <= 0.4 / T_L. The flight path then has a
+        damping of at least 0.5, and the altitude a gain margin of 2.5 by Routh's criterion.
         """
         lag = path_lag(self.stall_speed, self.speed) if self.stall_speed else 0.0
         gain = min(ALTITUDE_GAIN, 0.4 / lag) if lag else ALTITUDE_GAIN

@@ -108,9 +108,10 @@ def _groups(zones: tuple[Zone, ...]) -> tuple[tuple[Zone, ...], ...]:
 
 
 def _deepest(groups: tuple[tuple[Zone, ...], ...], north: Array, east: Array) -> Array:
-    """Return the distance from the border of the group inside which a place is deepest, m.
+    """Return how deep a place is inside a group of zones, m; negative outside of all groups.
 
-    The distance is negative for a place outside of all groups.
+    The depth in a group is the distance from the nearest border of its zones. Of several groups,
+    the one with the largest depth counts.
     """
     xp = array_namespace(north)
     depths = []

@@ -43,7 +43,7 @@ FASTEST_YAW = math.radians(6.0)
 
 
 class Landing(NamedTuple):
-    """The numbers of a landing at the end of a line of a route."""
+    """The geometry and the limits of a landing at the end of a line of a route."""
 
     leg: int  # number of the leg that is the glide path
     around: int  # number of the leg that a go-around flies
@@ -100,7 +100,8 @@ def landing_at(
 def flare_climb(height: float, path_sink: float, landing: Landing) -> float:
     """Compute the climb rate that is commanded in the flare, m/s.
 
-    It changes with the height, m, linearly from the rate on the glide path to -sink.
+    It changes with the height, m, linearly from the climb rate on the glide path to -sink.
+    `path_sink` is the sink rate on the glide path, m/s. A smaller one than `sink` counts as `sink`.
     """
     share = min(max(height / landing.flare, 0.0), 1.0)
     return -(landing.sink + max(path_sink - landing.sink, 0.0) * share)
@@ -174,6 +175,9 @@ class Lander:
         the right. The law is
 
         r = k (course - psi),  g tan(phi) = -w^2 e - 2 zeta w drift,  w = 2 pi / P
+
+        k is YAW_GAIN, and course is that of the line. P and zeta are the period and the damping of
+        path following.
         """
         landing = self._landing
         w = 2.0 * math.pi / self._params.path.period

@@ -29,9 +29,9 @@ LEVEL = 5.0
 def along_route(
     state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
 ) -> tuple[GuidanceState, float]:
-    """Put the state on the leg once it is joined, and on the next leg once the leg is passed.
+    """Put the state on a leg once the aircraft has joined it, and on the next leg at its end.
 
-    Also returns the distance by which the end of the leg was missed, m, or 0.
+    Also returns the distance by which the aircraft missed the end of the leg, m, or 0.
     """
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
@@ -82,9 +82,9 @@ def has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) 
 
 
 def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
-    """Return whether an aircraft may leave a circle: it is at the end and on the right course.
+    """Return whether an aircraft is near enough to the end of a circle, and on course, to leave it.
 
-    It must be beyond the end, and within `reach`, m, of the end.
+    It must be past the end, by at most `reach`, m.
     """
     return leg.end is not None and bool(
         path.is_joined(leg.end, path.end_course(leg), reach, position, course_and_speed(pose)[0])

@@ -27,8 +27,8 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
     file leaves out: climb and sink follow from the authority of the throttle, and the roll rate
     follows from that of the aileron. The bank is limited so that its reversals fit into the period
     of path following, and orbits have the radius for this bank. If the aileron has no effect, or p
-    ignores its command, the largest bank is YAWED_BANK. If the throttle has no effect, there is no
-    climb, and the limit of the sink stays, because the pitch then controls the airspeed at its
+    ignores its command, the largest bank is YAWED_BANK. If the throttle has no effect, the aircraft
+    does not climb. The limit of the sink then stays, because the pitch holds the airspeed at its
     floor.
     """
     if authority == Authority() or params.multicopter is not None:
@@ -232,9 +232,10 @@ def permitted(commands: Mapping[str, float], params: GuidanceParams) -> dict[str
 
 
 def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
-    """Return commands to orbit home clockwise on the least radius, or to hover at home.
+    """Return the commands of an orbit round home, or for a multicopter of a hover at home.
 
-    A multicopter hovers. The altitude is that of home, or the present altitude if home has none.
+    The orbit is clockwise and has the least radius. The altitude is that of home, or the present
+    altitude if home has none.
     """
     place = params.home
     altitude = pose["altitude"] if place.altitude is None else place.altitude

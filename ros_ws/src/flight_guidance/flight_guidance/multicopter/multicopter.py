@@ -78,7 +78,7 @@ def _gains(params: GuidanceParams) -> MulticopterParams:
 def hold(
     pose: Mapping[str, float], _y: tuple[float, ...], params: GuidanceParams
 ) -> dict[str, float]:
-    """Return commands to hover where the aircraft can stop, v abs(v) / (2 a) ahead.
+    """Return commands to hover at the place where the aircraft can stop.
 
     Heading and altitude stay at their present values.
     """
@@ -100,7 +100,10 @@ def _parts(vector: complex) -> tuple[float, float]:
 
 
 def _stop(pose: Mapping[str, float], gains: MulticopterParams) -> complex:
-    """Return the place where the aircraft can stop, m."""
+    """Return the place where the aircraft can stop, north + i east, m.
+
+    It lies lead v + v abs(v) / (2 braking) ahead, where v is the velocity.
+    """
     v = _velocity(pose)
     return _place(pose) + (gains.lead + abs(v) / (2.0 * gains.braking)) * v
 
@@ -422,7 +425,10 @@ def _on_path(
 def _by_tilt(
     attitude: Mapping[str, float], pose: Mapping[str, float], gains: MulticopterParams
 ) -> complex:
-    """Compute the acceleration that a tilt causes, (g + d climb) tan(tilt), m/s^2."""
+    """Compute the acceleration that a tilt causes, (g + drag climb) tan(tilt), m/s^2.
+
+    It is a vector, north + i east.
+    """
     angles = (tilt(attitude["phi"]), tilt(attitude["theta"]), attitude["psi"])
     north, east, up = thrust_axis(*angles)
     return _lift(pose, gains) / up * complex(north, east)
@@ -435,9 +441,10 @@ def _with_wind(
 
         W' = (v' - (g + d climb) tan(tilt) + d (v - W)) / (d T)
 
-    This is a low-pass of the wind that explains the acceleration of the pose. The tilt is that in
-    the pose, so commands that are not flown have no effect on the estimate. W stays within the wind
-    in which the largest tilt can still hover.
+    d is the drag, and T the time constant of the estimate. This is a low-pass of the wind that
+    explains the acceleration of the pose. The tilt is that in the pose, so commands that are not
+    flown have no effect on the estimate. W stays within the wind in which the largest tilt can
+    still hover.
     """
     gains = _gains(params)
     v = _velocity(pose)
@@ -456,7 +463,7 @@ def _within(vector: complex, largest: float) -> complex:
 
 
 def _lift(pose: Mapping[str, float], gains: MulticopterParams) -> float:
-    """Return the vertical thrust in steady flight, g + d climb, m/s^2, at least half of g."""
+    """Return the vertical thrust in steady flight, g + drag climb, m/s^2, at least half of g."""
     return max(GRAVITY + gains.drag * pose["climb"], GRAVITY / 2.0)
 
 

@@ -231,7 +231,7 @@ def wpl_items(content: bytes, key: str) -> tuple[list[Item], HomePlace | None]:
 
 
 class Area(NamedTuple):
-    """A zone of a fence in a file, which is a polygon by its corners, or a circle by its centre."""
+    """A zone of a fence as a file gives it: the corners of a polygon, or the centre of a circle."""
 
     places: list[Place]
     radius: Any  # m; None for a polygon
@@ -272,7 +272,7 @@ def plan_fence(tree: Any, key: str) -> FencePlaces:
 
 
 def _grouped(area: Area, group: Any = 0) -> Area:
-    """Put a zone from an autopilot into its group if the aircraft must stay in the zone.
+    """Put a zone into a group of zones, unless the aircraft must keep out of the zone.
 
     In a plan every zone is in group 0. Source: MAVLink, MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION
     and MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION, parameter 2, Inclusion Group: "Vehicle must be inside

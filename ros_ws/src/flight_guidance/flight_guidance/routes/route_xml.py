@@ -102,7 +102,7 @@ def read_kml(content: bytes, key: str, line: str | None = None) -> Places:
 
 
 def _outer_elements(kinds: Sequence[tuple[str, Element]], outer: str) -> dict[Element, Element]:
-    """Return the enclosing element of the kind `outer` for each element inside such an element."""
+    """Return, for each element inside an element of the kind `outer`, this enclosing element."""
     outers: dict[Element, Element] = {}
     for kind, element in kinds:
         if kind == outer:

@@ -87,11 +87,11 @@ def body_rates(
         q_m = (theta_dot_c + r sin(phi)) / cos(phi) + phi_dot_c tan(phi) / (cos(phi) n_alpha)
         p_m = phi_dot_c - tan(theta) (q_m sin(phi) + r cos(phi))
 
-    q_m and p_m use the measured r, in case r is not tracked exactly. `turn_lead` compensates the
-    lag of the turn behind the bank. This lag comes from the reference model of r and from the
-    sideslip in a roll. The last term of q_m anticipates the angle of attack that the turn needs.
-    Angles are in rad, `speed` V in m/s. Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft
-    (2012), chapters 2 and 9.
+    n_alpha is the `load_slope`. q_m and p_m use the measured r, in case it does not track r_m
+    exactly. `turn_lead` compensates the lag of the turn behind the bank. This lag comes from the
+    reference model of r and from the sideslip in a roll. The last term of q_m anticipates the angle
+    of attack that the turn needs. Angles are in rad, `speed` V in m/s. Source: R. W. Beard, T. W.
+    McLain, Small Unmanned Aircraft (2012), chapters 2 and 9.
     """
     speed = forward(speed)
     phi_dot = clip(params.k_phi * (phi_c - phi), params.roll_rate)

@@ -40,9 +40,10 @@ class PathParams(NamedTuple):
 
 
 def turn_towards(difference: Scalar) -> Scalar:
-    """Return the turn for a difference of courses, -1 to 1: its sine up to 90 deg, beyond that +-1.
+    """Return how hard to turn for a difference of courses, rad, from -1 to 1.
 
-    With the sine alone, an aircraft on the opposite course would not turn.
+    Up to 90 deg it is the sine of the difference, and beyond that 1 with the sign of the sine. With
+    the sine alone, an aircraft on the opposite course would not turn.
     """
     xp = array_namespace(difference)
     sine = xp.sin(difference)
@@ -82,12 +83,13 @@ def path_acceleration(
         a = (4 pi zeta / P) v_g turn_towards(bearing - course) + sin(l)^2 kappa / (1 - kappa e)
         v_g^2 cos(course - track)
 
-    Outside a circle of radius R, at the distance d from its centre, 1 - kappa e = d / R. The angle
-    between the tangent to the circle and the track is acos(R / d), so a distant aircraft flies
-    along the tangent. Near a line e'' + 2 zeta w e' + w^2 e = 0 with w = 2 pi / P. The equations
-    use the velocity over ground, so they also hold in a wind. On the inner side of an arc, e is
-    limited to half of the radius. Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp,
-    without the adaptation to wind.
+    e, track and the curvature kappa are those of `error`; P, zeta and capture are `params`, and v_g
+    is the speed over ground, m/s. Outside a circle of radius R, at the distance d from its centre,
+    1 - kappa e = d / R. The angle between the tangent to the circle and the track is acos(R / d),
+    so a distant aircraft flies along the tangent. Near a line e'' + 2 zeta w e' + w^2 e = 0 with w
+    = 2 pi / P. The equations use the velocity over ground, so they also hold in a wind. On the
+    inner side of an arc, e is limited to half of the radius. Source: PX4-Autopilot,
+    src/lib/npfg/DirectionalGuidance.cpp, without the adaptation to wind.
     """
     e, track, kappa = error
     xp = array_namespace(e)

@@ -214,7 +214,7 @@ def is_passed(leg: Leg, position: Point) -> bool:
 
 
 def is_beyond(end: Point, course: Scalar, position: Point) -> Any:
-    """Return whether a position lies beyond the line through a point across a course, rad."""
+    """Return whether a position lies beyond the line that crosses a course, rad, at a point."""
     xp = array_namespace(course)
     north = position[0] - end[0]
     east = position[1] - end[1]
