@@ -43,13 +43,13 @@ FALLS_SHORT = 3
 
 @dataclass(frozen=True, kw_only=True)
 class Airframes:
-    """Show airframes: poles, zeros, minors of Omega = C B, the published D and what gives D = I.
+    """Show airframes: poles, zeros, minors of Omega = C B, D, and pairs and signs that give D = I.
 
-    With --write FOLDER, make NAME.yaml, an airframe that is checked against physics, and
-    NAME_flight.yaml, a scenario with selected gains. The command flies it once in this process. You
-    fly it with: rise-di fly NAME_flight.yaml --in-process.
+    With --write FOLDER, make two files. NAME.yaml is an airframe that is checked against physics,
+    and NAME_flight.yaml is a scenario with selected gains. The command flies the scenario once in
+    this process. You fly it with: rise-di fly NAME_flight.yaml --in-process.
 
-    Exit status: 0, 2 if a file has a mistake, or 3 if the first flight of the files falls short.
+    Exit status: 0; 2 if a file has a mistake; 3 if this first flight does not reach its goal.
     """
 
     names: list[str] | None = argument(
@@ -192,7 +192,7 @@ def _roots(facts: AirframeFacts) -> tuple[str, str, str]:
 
 
 def _format_roots(roots: ComplexArray) -> str:
-    """Return roots as text, with a conjugate pair once, and a root at zero to rounding as 0."""
+    """Return roots as text, with one text for a conjugate pair; tiny parts are written as 0."""
     texts = []
     for root in roots:
         real, imaginary = (

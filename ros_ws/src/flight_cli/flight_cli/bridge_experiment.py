@@ -67,7 +67,7 @@ GUIDED = 600.0  # duration of a flight under guidance, s
 
 @dataclass(frozen=True, kw_only=True)
 class BridgeExperiment:
-    """An experiment on the aircraft behind a channel map, which is flown or read from its log.
+    """An experiment on the aircraft behind a channel map: it is flown, or its log is read.
 
     The files that fly the aircraft are written to `folder`. If the log was imported, the gains
     allow for `link_delay`, s, in addition to the delay in the log. If `link_delay` is None, it is
@@ -392,7 +392,7 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
 
 
 def _show_link(console: Console, channel_map: ChannelMap, link_delay: float | None) -> None:
-    """Print for which link the gains hold, if the log was written on the autopilot's board."""
+    """Print for which delay of the link the gains hold, because the log was written on board."""
     if link_delay is None:
         sentence = (
             f"The map {channel_map.name} states no link_delay. Gains and margins are without the "

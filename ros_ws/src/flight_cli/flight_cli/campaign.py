@@ -91,8 +91,8 @@ class Campaign:
     route or a learner fly one by one: a core needs 7 s for each minute of flight, and up to 20 s if
     they learn.
 
-    Exit status: 0 all flown, 2 bad input, 130 interrupted. You continue an interrupted campaign by
-    its folder.
+    Exit status: 0 all flown, 2 bad input, 130 interrupted. To continue an interrupted campaign,
+    give its folder.
     """
 
     context: typer.Context
@@ -250,7 +250,7 @@ def _parse_sweep(text: str) -> Sweep:
 def _fly_missing(
     monte_carlo: MonteCarlo, engine: engines.Engine, place: str, *, quiet: bool
 ) -> float | None:
-    """Fly the missing chunks, and return the speed in seconds of flight of all aircraft per second.
+    """Fly the missing chunks, and return the speed: flown seconds of all aircraft per second.
 
     Returns None if no chunk was missing. `place` is a text on where the campaign is computed, such
     as " on NVIDIA H200".

@@ -125,9 +125,10 @@ class Contest(NamedTuple):
         return registered_laws.with_courses(build, self.controllers)
 
     def tuned(self) -> Gains:
-        """Return the gains by law and objective, from a search or else from a controller.
+        """Return the gains by law and objective.
 
-        Raises ParameterError if there are no gains at all.
+        They come from the file, or if it lacks them, from the controller of the law. Raises
+        ParameterError if no law has gains.
         """
         tunings = tuned_gains.load(self.path)
         gains: Gains = {}
@@ -254,7 +255,7 @@ class Compare:
         benchmark: Benchmark,
         gains: Gains,
     ) -> None:
-        """Print a table for each objective, and explain the words."""
+        """Print a table for each objective, and a text that explains the words of the tables."""
         scenario = contest.scenario
         for aim in contest.aims:
             if results_of_aim := [result for result in results if result.objective == aim]:
@@ -382,7 +383,7 @@ def _format_margins(margins: Margins) -> str:
 def _notes(
     scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], aims: Iterable[str]
 ) -> str:
-    """Return a text on what the words of the table mean."""
+    """Return a text that explains the words of the tables."""
     units = display_units(scenario)
     controller = scenario.controller
     errors = zip(controller.outputs, benchmark.unit.tolist(), strict=True)

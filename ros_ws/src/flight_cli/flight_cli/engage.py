@@ -17,10 +17,10 @@ class Engage:
     """Engage the autopilot behind a running bridge without a jump of u, or disengage it.
 
     The command waits until u is at trim, and for a change of mode if the map asks for one. The
-    bridge keeps the controller active until the engagement ends. If the pilot's transmitter is
-    lost, the engagement ends, provided that the map has a condition for it. If it has none, the
-    engagement ends after max_engaged of the map, unless you engage again before. Exit status: 0
-    done, 1 refused with the bridge's reason, 2 service not available.
+    bridge keeps the controller active until the engagement ends. If the map has a condition for the
+    loss of the pilot's transmitter, the engagement ends with this loss. If the map has no such
+    condition, the engagement ends after its max_engaged, unless you engage again before. Exit
+    status: 0 done, 1 refused with the bridge's reason, 2 service not available.
     """
 
     off: bool = option("Disengage, which gives the channels back to the autopilot.", default=False)

@@ -170,8 +170,8 @@ def _show(
 def foreign_samples(summaries: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return sentences on the samples that foreign nodes sent on the topics of an aircraft.
 
-    A foreign node is outside the aircraft's namespace. The result is empty if the log has no
-    account of processes.
+    A foreign node is outside the aircraft's namespace. The result is empty if no log says which
+    process sent how many samples.
     """
     sentences = []
     total = 0

@@ -85,10 +85,9 @@ class Fly(RouteWords):
     this, the flight is in lockstep with one process for each aircraft, and a sentence says so.
 
     Exit status: 0 completed or landed; 2 bad input; 3 ended early or never flew; 4 completed or
-    landed, but short of something that the outcome names with its figure: the errors, the law
-    engaged, speed, height, fence, route, touch-down zone, log; 7 the host became too busy for real
-    time, and nothing else is wrong; 130 interrupted. For a fleet it is the severest status of its
-    aircraft.
+    landed, but with a fault that the outcome states with its figure (errors, time engaged, speed,
+    height, fence, route, touch-down zone, log); 7 the host became too busy for real time, and
+    nothing else is wrong; 130 interrupted. For a fleet it is the severest status of its aircraft.
     """
 
     context: typer.Context
@@ -335,7 +334,10 @@ def _falls_back(lack: Refusal | None, *, can_step: bool = True) -> bool:
 
 
 def _as_host_allows(fleet: Fleet) -> Fleet:
-    """Return the fleet unchanged, or in lockstep and composed if the host lacks something."""
+    """Return the fleet, which flies in lockstep and composed if the host lacks something.
+
+    Composed means that the nodes of an aircraft share a process.
+    """
     scenarios = [member.scenario for member in fleet.members]
     lack = shortage(scenarios, cores_given, composed=fleet.composed)
     has_common_time = any(member.delay > 0.0 for member in fleet.members)

@@ -121,7 +121,7 @@ class _Gains:
     def _show(
         self, sets: GainSets, sentences: Sequence[str], files: Mapping[str, Path | None] = {}
     ) -> None:
-        """Write the page, and print tables, sentences and paths, or JSON with --json.
+        """Print tables, sentences and paths, or JSON with --json; write the page of --page.
 
         `files` has the paths of the written files by their names in the output.
         """
@@ -237,7 +237,7 @@ class Select(_Gains):
 
 @dataclass(frozen=True, kw_only=True)
 class Check(_Gains):
-    """Check the gains of a scenario, of any law: its margins and every condition on its gains.
+    """Check the gains of a scenario with any law: the margins, and every condition on the gains.
 
     The exit status follows the verdict on the loop, because the conditions of Theorem 1 are only
     sufficient. The airframe may be jsbsim:NAME as in the scenario, and the scenario may be a file
@@ -332,7 +332,7 @@ class Guarantee(Check):
         self._exit_if_loop_fails(sets)
 
     def _bound_limited(self, answer: GainAssessment[Any], loop: LinearLoop) -> None:
-        """Bound the loop with limits of one input, write the certificate, and print the result."""
+        """Prove the guarantee for a loop in which one input saturates, write and print it."""
         name = self.saturation or ""
         require_linear(loop)
         promise = guarantee_with_limit(loop, name)

@@ -73,12 +73,12 @@ def require_guarantee(
 def proved(
     answer: GainAssessment[ControllerConfig], late: float, report: Callable[[str], None]
 ) -> Guarantee:
-    """Return the guarantee of a loop, and keep it for the pages of its flights.
+    """Return the guarantee of a loop, and store it for the report pages of this loop's flights.
 
     The box holds the entries of A and B that may deviate. If it leaves out the entries that are 0
     in the file, the guarantee also says how far these may deviate while all others are exact.
-    `report` is told each step. Raises ParameterError before the proof if the aircraft has no linear
-    loop.
+    `report` gets a sentence for each step. Raises ParameterError before the proof if the aircraft
+    has no linear loop.
     """
     loop = answer.loop_with_box()
     require_linear(loop)
@@ -134,8 +134,8 @@ def write_unstable(
     """Write the unstable aircraft nearest to the nominal one, if a folder is given.
 
     A second aircraft has the deviations of the first times FARTHER. Each is written as an airframe
-    and a scenario that flies it. Returns a sentence about each aircraft, on how far off it is, and
-    whether this is inside `--uncertainty`.
+    and a scenario that flies it. Returns a sentence for each aircraft, which says how far it
+    deviates, and whether this is within `--uncertainty`.
     """
     if folder is None:
         return []
@@ -179,7 +179,10 @@ def write_unstable(
 def show_guarantee(
     console: Console, promise: Guarantee | None, checked: GainAssessment[ControllerConfig]
 ) -> None:
-    """Print how the aircraft differs, the guarantee, and a table of the disk margins."""
+    """Print how the aircraft differs from what the controller was told, and what is proved.
+
+    The guarantee is followed by a table of the disk margins, if there is one.
+    """
     for difference in checked.study.differences:
         say(console, difference)
     if promise is None:

@@ -95,7 +95,10 @@ VERDICTS = {"loop": loop_verdict, "rules": rules_verdict, "theorem": theorem_ver
 
 
 def condition_name(row: tuple[GainCondition, ...], outputs: tuple[str, ...]) -> str:
-    """Return the name of a row of conditions, with the channel if all gain sets share it."""
+    """Return the name of a row, which has the same condition for each gain set.
+
+    The channel is in the name if it is the same in all gain sets.
+    """
     where = {None if condition.channel is None else outputs[condition.channel] for condition in row}
     channel = where.pop() if len(where) == 1 else None
     return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")

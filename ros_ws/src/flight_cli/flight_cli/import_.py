@@ -36,10 +36,10 @@ from flight_log.vehicle_tables import Choice
 class Import:
     """Make a bag of y, u and pose from the log of an autopilot that the stack did not fly.
 
-    By default it takes the longest stretch in the air, and for u from the sticks the longest in
-    MANUAL. `check --run`, `identify bridge`, `report` and `watch` read the bag. u is the deviation
-    from the median of the stretch, and `commands` is the whole command. With --scenario, the log is
-    that of a module of export --px4, and `replay` computes each of its ticks again.
+    By default it takes the longest stretch in the air. If u comes from the sticks, this stretch
+    must be in MANUAL. `check --run`, `identify bridge`, `report` and `watch` read the bag. u is the
+    deviation from the median of the stretch, and `commands` is the whole command. With --scenario,
+    the log is that of a module of export --px4, and `replay` computes each of its ticks again.
 
     Exit status: 0, or 2 bad input.
     """

@@ -35,7 +35,10 @@ def log_scenario() -> Any:
 
 
 def remaps_of(words: list[str] | None) -> dict[str, str]:
-    """Parse the topics of a log by their names in the stack. Raises ParameterError if invalid."""
+    """Parse words of the form NAME:=/TOPIC into the topics of a log by their names in the stack.
+
+    Raises ParameterError if a word has another form.
+    """
     remaps = [word.partition(":=") for word in words or ()]
     for name, _, topic in remaps:
         require(
@@ -78,6 +81,6 @@ def warn_of_lacks(recorded_run: RecordedRun) -> None:
 
 
 def warn_of_lacks_in(run: Path, namespace: str | None) -> None:
-    """Print the warnings of `warn_of_lacks` for a log that need not have a flight."""
+    """Print the warnings of `warn_of_lacks`, or nothing if the log has no flight."""
     with suppress(ParameterError):
         warn_of_lacks(read_run(run, namespace))

@@ -61,7 +61,7 @@ def show_outcome(console: Console, outcome: Mapping[str, Any]) -> None:
 
 
 def show_errors(console: Console, flight: RecordedFlight) -> None:
-    """Print the first table of a flight, with its errors, or the outputs of an imported log."""
+    """Print the first table of a flight: its errors, or for an imported log its outputs."""
     first, *_ = _tables(flight)
     print_table(console, grouped_table(first.caption, first.columns, first.rows))
 

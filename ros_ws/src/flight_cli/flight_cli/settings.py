@@ -20,7 +20,7 @@ def settings_option() -> Any:
 
 
 def setting_names(incomplete: str) -> list[str]:
-    """Return the keys of the shipped scenarios that complete the beginning of a key of --set."""
+    """Return the keys, with "=", that begin with `incomplete` in some shipped scenario."""
     keys: set[str] = set()
     for path in LIBRARY.glob("*.yaml"):
         scenario = find_scenario(path.stem)

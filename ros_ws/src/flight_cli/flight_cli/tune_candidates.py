@@ -76,7 +76,7 @@ class Selectors(NamedTuple):
 
     @property
     def airs(self) -> dict[str, dict[str, Any]]:
-        """The airs in which the candidates fly, each as changes of the aircraft."""
+        """The airs in which the candidates fly, each as parameters of the section aircraft."""
         airs: dict[str, dict[str, Any]] = {CALM: {}}
         if self.airframe.gusts and not self.calm:
             airs[GUSTS] = {"turbulence": dict(TURBULENCE)}

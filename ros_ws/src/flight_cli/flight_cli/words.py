@@ -109,7 +109,7 @@ def as_function(command: Callable[..., Executable]) -> Callable[..., None]:
 
 
 def _parameter(declared: Field[Any], hint: Any) -> Parameter:
-    """Turn a field into a parameter of the function. Typer declares a field without help."""
+    """Turn a field into a parameter of the function. A field without help has Typer's default."""
     default = Parameter.empty if declared.default is MISSING else declared.default
     if declared.metadata:
         hint = Annotated[hint, declared.metadata[DECLARE](declared.name)]
@@ -124,7 +124,7 @@ def values_of(command: Executable, *names: str) -> dict[str, Any]:
 def require_unused(
     command: Executable, names: Iterable[str], expected: str, found: str = ""
 ) -> None:
-    """Raise ParameterError if any of the fields has been set, for the first of them."""
+    """Raise ParameterError if one of these fields has been set. The error names the first one."""
     for name, value in values_of(command, *names).items():
         require(value in (None, False, "", []), name, found or f"{value}", expected)
 
@@ -192,7 +192,7 @@ def refused_words(error: Any, command: str, names: Sequence[str]) -> ParameterEr
 
 
 def _typers_sentence(error: Any, command: str) -> ParameterError:
-    """Return Typer's message about the words in the form of the other refusals."""
+    """Turn Typer's message into a ParameterError with the form of the other refusals."""
     text = error.format_message().strip().rstrip(".")
     return ParameterError(f"{command}: {text[:1].lower()}{text[1:]}; {command} --help shows more")
 
