@@ -24,10 +24,10 @@ CHANNELS = ("mean", "max")
 
 
 def age_of_u(messages: Iterable[bytes], namespace: str) -> Signal | None:
-    """Return the mean and the largest age of u, s, in each report of an aircraft.
+    """Return the mean and the largest age of u, s, in each diagnostics report of an aircraft.
 
-    Each report covers the time since the previous report. `namespace` is the namespace of the
-    aircraft. Returns None if the aircraft has no report.
+    A report covers the time since the previous one. `namespace` is the namespace of the aircraft.
+    Returns None if the messages have no report of it.
     """
     rows: dict[int, tuple[float, float]] = {}
     for data in messages:

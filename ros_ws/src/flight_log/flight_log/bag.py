@@ -84,7 +84,7 @@ class BagChannel:
 
 
 class _MessageIndex(MessageIndex):
-    """The offsets of a channel's messages in a chunk, which are packed in one step."""
+    """The offsets of a channel's messages in a chunk; the writer packs all offsets in one step."""
 
     def write(self, stream: RecordBuilder) -> None:
         size = 16 * len(self.records)
@@ -123,8 +123,8 @@ class _ChunkBuilder(ChunkBuilder):
 class _ChunkIndexes:
     """Chunk indexes as records on disk, in place of mcap's list in memory.
 
-    The list grows by 1 kB a chunk, which is 36 MB an hour. The reserve for the end of the file
-    grows with the number of chunks.
+    The list would grow by 1 kB a chunk, which is 36 MB an hour. Each chunk index also enlarges the
+    space that is reserved for the end of the file, because the indexes are written there.
     """
 
     def __init__(self, file: ReservedFile, channels: Sequence[BagChannel]) -> None:
@@ -149,7 +149,7 @@ class _ChunkIndexes:
 
 
 def full_names(remaps: Mapping[str, str]) -> dict[str, str]:
-    """Invert remaps: return the full name in the stack for each topic of a log.
+    """Return the full name in the stack for each topic of a log, the inverse of `remaps`.
 
     `remaps` has the topic of the log for each name in the stack.
     """
@@ -159,8 +159,8 @@ def full_names(remaps: Mapping[str, str]) -> dict[str, str]:
 def stack_topic(channel: Channel, remaps: Mapping[str, str] = {}) -> str:
     """Return the full name that a topic of a log has in the stack.
 
-    `remaps` has such names by topic of the log. They take precedence over the name before a remap
-    that the log states.
+    `remaps` has such names by topic of the log. If it lacks the topic, the name is the one that the
+    log states for the topic before a remap, or else the topic itself.
     """
     return remaps.get(channel.topic) or channel.metadata.get(BEFORE_REMAP) or channel.topic
 

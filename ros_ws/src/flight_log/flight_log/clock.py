@@ -57,12 +57,13 @@ class StampClock:
     ) -> tuple[NDArray[np.bool_], int]:
         """Return a mask of the usable messages among the first K messages, shape (K,), and K.
 
-        Give the messages after the first K to the next call again. There are such messages if
-        `more` messages follow immediately, and the last ones so far neither confirm nor exclude a
-        step of the clock. `end` is true for the last messages of the topic. `steps` has the
-        increase of the publisher's message number from message to message. If this number and both
-        times go back together, the log is out of order there, and the clock made no step. If a
-        forward jump of the stamps skips numbers, messages were lost, and the jump is a gap.
+        Give the messages after the first K to the next call again. Their stamps neither confirm nor
+        exclude a step of the clock, so the messages that follow must decide. `more` says whether
+        there are such messages, and if not, K is the number of all messages. `end` is true for the
+        last messages of the topic. `steps` has the increase of the publisher's message number from
+        message to message. If this number and both times go back together, the log is out of order
+        there, and the clock made no step. If a forward jump of the stamps skips numbers, messages
+        were lost, and the jump is a gap.
         """
         latest = np.maximum.accumulate(np.append(self._last_ns or 0, stamp_ns))[:-1]
         if self._step_ns:
@@ -117,7 +118,7 @@ class StampClock:
         return self._taken(stamp_ns, keep, len(stamp_ns))
 
     def _follow(self, stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> None:
-        """Note the stamps of successive messages of the same clock."""
+        """Store the last stamp of successive messages that have the same clock, for later calls."""
         self._last_ns = int(stamp_ns[-1])
         self._last_offset_ns = int(offset_ns[-1])
         self._offset_ns = max(self._offset_ns, int(offset_ns.max()))
@@ -175,7 +176,7 @@ class StampClock:
         return keep, count
 
     def recording(self, unset: int = 0) -> Recording:
-        """Return the findings, and add `unset` messages that had no usable stamp."""
+        """Return the findings. `unset` further messages count as messages without a stamp."""
         return Recording(
             found=self._count,
             unset=self._unset + unset,
@@ -188,7 +189,7 @@ class StampClock:
 
 
 def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which of the samples before the last one may have the clock of the last one."""
+    """Return a mask of all samples but the last: those whose clock may be that of the last one."""
     away_ns = stamp_ns[-1] - stamp_ns[:-1]
     lead_ns = offset_ns[-1] - offset_ns[:-1]
     is_near = (away_ns <= STRAY_NS) | (lead_ns <= LATE_NS)

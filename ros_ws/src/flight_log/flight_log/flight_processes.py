@@ -66,11 +66,11 @@ def flight_processes(
 ) -> dict[str, Process]:
     """Return the processes by name, such as "/controller#4711", from the `spans` of publishers.
 
-    A node that was restarted has several processes. `ready` has the times at which nodes were
-    ready. A process gets the last of these times of its node that is at most 1 s later than its
-    first sample. A node without samples, such as the recorder, has no process id in its name. In
-    lockstep no node has a process id. If there are nodes of the stack, every other publisher counts
-    as a process too, even `ros2 topic pub`, which has no name.
+    A node that was restarted has several processes. `ready` has the times at which each node was
+    ready. Such a time belongs to the process whose first sample follows, or came at most 1 s
+    earlier. Of several times, the last one counts. A node without samples, such as the recorder,
+    has no process id in its name. In lockstep no node has a process id. If there are nodes of the
+    stack, every other publisher counts as a process too, even `ros2 topic pub`, which has no name.
     """
     waiting: dict[str, list[int]] = {}
     for node, time_ns in ready:
@@ -143,9 +143,9 @@ RESTART = 10  # if the number of ticks falls by more than this, another controll
 def controller_starts(number: FloatArray) -> list[int]:
     """Return the indices at which a new controller begins, from the numbers of ticks, (N,).
 
-    The numbers are in the order of time. Two ticks of one instant may be stored in either order. So
-    a number slightly below the previous one does not begin a new controller if the present
-    controller has not had the number yet.
+    A new controller counts its ticks from the beginning, so the number falls. But two ticks of one
+    instant may be stored in either order, and then the number falls a little. This is no new
+    controller if the number has not yet occurred since the last start.
     """
     starts = []
     first = 0

@@ -144,10 +144,11 @@ class _Publisher:
 
 
 class TopicSamples:
-    """The samples of a topic, decoded in batches; samples with equal names form the signal.
+    """The samples of a topic, decoded in batches.
 
-    Steps of the clock, lost numbers and damage are counted for each publisher, so that the faults
-    of a foreign publisher are not attributed to another one.
+    The samples that have the same channel names form the signal. Steps of the clock, lost numbers
+    and damage are counted for each publisher, so that the faults of a foreign publisher are not
+    attributed to another one.
     """
 
     def __init__(self, decode: Decoder, expected: int) -> None:
@@ -158,7 +159,7 @@ class TopicSamples:
         self.spans: dict[str, SampleSpan] = {}  # by the name of the publisher
 
     def add(self, table: Table, log_ns: NDArray[np.int64], sequence: NDArray[np.int64]) -> None:
-        """Add messages of equal length, one per row, with log times and publisher's numbers."""
+        """Add messages of equal length, one per row, with their log times and sequence numbers."""
         for sender, rows in rows_by_sender(table):
             # A log with very many publishers may be an attack.
             known = sender in self._publishers or len(self._publishers) < MOST_PUBLISHERS
@@ -238,9 +239,9 @@ class TopicSamples:
     def signal(self, name: str) -> Signal | None:
         """Return the samples of a topic in the order of the stamps, or None if none has a stamp.
 
-        Samples whose stamp was left at 0 do not count as stamped. A single stamp of 0 may be the
-        flight time 0. In RESTING topics stamps may repeat, so several stamps of 0 may be this time.
-        UNSTAMPED topics need no stamp.
+        A publisher that sets no stamps leaves them at 0, and its samples are left out. But a single
+        stamp of 0 may be the flight time 0, and so may several stamps of 0 in RESTING topics, whose
+        stamps may repeat. UNSTAMPED topics need no stamp.
         """
         for publisher in self._publishers.values():
             while publisher.batch:
@@ -488,7 +489,8 @@ class LogContent:
 def read_content(run: Path, remaps: Mapping[str, str]) -> LogContent:
     """Read every file of a bag.
 
-    `remaps` has full names of the stack by topic of the log. Raises ParameterError.
+    `remaps` has full names of the stack by topic of the log. Raises ParameterError if the path has
+    no log, or if a file cannot be read.
     """
     log = LogContent(remaps)
     files = log_files(run)

@@ -155,7 +155,7 @@ def _sender(row: NDArray[np.uint8]) -> bytes:
 def flight_start_ns(stamp_ns: int, t: float) -> int | None:
     """Return the stamp of flight time 0, ns, from the stamp of a `truth` sample at time t.
 
-    t is in s. The result is the stamp minus t, or None if t is not a flight time.
+    t is in s. The result is the stamp minus t, or None if t is too large for a flight.
     """
     return stamp_ns - nanoseconds(t) if abs(t) <= MAX_FLIGHT_TIME else None
 

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Open the files of a log for every reader.
 
-This module unpacks packed files and compressed messages, and orders the files of a bag. It refuses
-a path that is no log in a sentence that says what the path contains.
+This module unpacks packed files and compressed messages, and orders the files of a bag. If a path
+is no log, the error says what the path contains.
 """
 
 import re
@@ -53,9 +53,10 @@ UNPACK = {".zst": "zstd -d", ".zstd": "zstd -d", ".lz4": "lz4 -d"}
 
 
 def log_files(run: Path) -> list[Path]:
-    """Return the files of a log in the order of recording; files in ROSBAG2 come last.
+    """Return the files of a log in the order of recording.
 
-    If the path has no log, raises ParameterError with a sentence on what it contains.
+    Files in the folder ROSBAG2 of a run come last. If the path has no log, raises ParameterError
+    with a sentence on what it contains.
     """
     files = [*bag_files(run), *(bag_files(run / ROSBAG2) if is_folder(run / ROSBAG2) else ())]
     kinds = [file_kind(file) for file in files]

@@ -74,7 +74,7 @@ def provenance() -> dict[str, dict[str, str]]:
 
 
 def recorded_arithmetic(metadata: Mapping[str, Mapping[str, str]]) -> str:
-    """Return the version of the arithmetic in a log; the present one if the log has none."""
+    """Return the version of the arithmetic of u from a log; the present one if it has none."""
     return metadata.get(VERSIONS, {}).get("arithmetic", ARITHMETIC)
 
 

@@ -365,7 +365,7 @@ def _decoded(
 def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """Map as `map` does, while a thread computes the next results.
 
-    Meanwhile the caller can run, because decompression and NumPy release the interpreter.
+    The caller runs at the same time, because decompression and NumPy release Python's global lock.
     """
     with ThreadPoolExecutor(1) as pool:
         queue: deque[Future[R]] = deque()

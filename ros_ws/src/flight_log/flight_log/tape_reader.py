@@ -209,7 +209,8 @@ def _tape(
 ) -> Tape:
     """Make the tape of an aircraft, without the duration.
 
-    `names` has the name of each topic within the namespace, and `filled` has the signals by name.
+    `names` has the name of each topic within the namespace. `filled` has the signals of the topics
+    that have samples, by name.
     """
     samples_by_name = {
         name: log.topics[topic] for topic, name in names_within(aircraft, log.topics).items()

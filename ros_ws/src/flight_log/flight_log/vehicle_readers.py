@@ -211,9 +211,10 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
 def _flown_system(
     messages_of: Mapping[int, list[Received]], choice: int | None
 ) -> tuple[int, tuple[tuple[str, str], ...]]:
-    """Choose the flying system of a tlog, and return a row about the choice.
+    """Choose the system of a tlog that flew, and return its number.
 
-    Raises ParameterError if two systems moved.
+    `choice` is the user's. Also returns the choice with its reason, if there were several systems.
+    Raises ParameterError if two systems moved, or if the log lacks the user's choice.
     """
     numbers = " and ".join(map(str, messages_of)) or "none with a heartbeat"
     if choice is not None:

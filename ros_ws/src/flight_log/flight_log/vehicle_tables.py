@@ -123,7 +123,7 @@ COPTER = "multicopter"
 
 
 class Choice(NamedTuple):
-    """What the user has chosen in a log: a system, sensors, and by the map the kind of vehicle."""
+    """The user's choice in a log: a system, sensors, and the kind of vehicle of the channel map."""
 
     system: int | None = None  # number of the system in a tlog; None for the system that flew
     # Number of the chosen instance, such as a sensor, by message. For any other message, the
@@ -136,7 +136,7 @@ ANY = Choice()
 
 
 class Loss(NamedTuple):
-    """The loss of a log, and the stamps before the first and the last loss, ns."""
+    """What a log has lost, and the last stamps before the first and before the last loss, ns."""
 
     what: str
     first_ns: int
