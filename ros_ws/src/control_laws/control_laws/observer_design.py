@@ -133,7 +133,7 @@ def extended_state_model(model: NominalModel, names: Names, decay: FloatArray) -
 
     The disturbances are of second order:
 
-        z = [x, position, d, d_dot]
+        z = [x, position, d, disturbance_rate]
         x_dot        = Omega position + d,  position_dot = (u - u_ff - position) / lag
         d_dot        = disturbance_rate - LEAK d,  disturbance_rate_dot = -decay disturbance_rate
 

@@ -52,7 +52,8 @@ def _limited(
 ) -> tuple[PiState, Array, Array]:
     """Advance the law by a tick: u = u_trim - input_scale D K (e - e_0 + Lambda integral of e).
 
-    The integral uses the trapezoidal rule, with the anti-windup of `limited_integral`.
+    e_0 is the e at engagement. The integral uses the trapezoidal rule, with the anti-windup of
+    `limited_integral`.
     """
     e = measurements.y - measurements.y_m
     after = PiState(state.e_0, e, state.integral_e + dt * (e + state.e) / 2.0)

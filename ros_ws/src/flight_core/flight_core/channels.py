@@ -20,7 +20,7 @@ the channel is 1 m/s."""
 
 
 def vertical(names: Sequence[str]) -> str:
-    """Return the name that is in VERTICAL, or "" if there is none, as for an airplane."""
+    """Return the name of the vertical speed among the names, or "" for an airplane, without one."""
     return next((name for name in names if name in VERTICAL), "")
 
 

@@ -3,8 +3,8 @@
 """Check that a computation knows every key of a parameter set that is not at its default.
 
 Some functions compute a flight without the code of the nodes. Each of them states the set of keys
-that it knows. `require_known` refuses every other key whose value is not the default. A key that is
-added later is unknown until somebody adds it to this set.
+that it knows. `require_known` refuses every other key whose value is not the default. So if a new
+key is declared, such a function refuses it until the key is added to the function's set.
 
 A key is a dotted name, such as `actuators.lag`. If sections are given by name in a mapping, they
 share their keys. For example, the `start` of every gust is `gusts.*.start`.
@@ -60,8 +60,8 @@ def set_keys(parameters: Config) -> Iterator[SetKey]:
     """Yield the keys whose value is not their default.
 
     If the default is the empty list, a list of zeros counts as the default, too, because both mean
-    none. Some sections are absent by default. If such a section is given, but all of its keys have
-    their defaults, the section itself is the key.
+    that there is no value. Some sections are absent by default. If such a section is given, but all
+    of its keys have their defaults, the section itself is the key.
     """
     return _set_keys(parameters, "", "")
 

@@ -49,7 +49,10 @@ class End(StrEnum):
 
 
 class Aim(StrEnum):
-    """What a flight must achieve. The gravest aim comes first, because it explains later ones."""
+    """What a flight must achieve, in the order of gravity.
+
+    The gravest aim comes first, because a shortfall of it explains shortfalls of the later ones.
+    """
 
     ENGAGEMENT = "engagement"  # the law flies while it should
     REFERENCE = "reference"  # y_m is that of the scenario
@@ -103,7 +106,10 @@ def joined(refusals: Iterable[Refusal | None]) -> Refusal | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Allowance:
-    """A tracking error that is allowed because noise or wind also causes it in the linear loop."""
+    """A large tracking error that is no shortfall, because the linear loop has it too.
+
+    Noise or wind causes it there.
+    """
 
     sentence: str
     figures: Mapping[str, Any] = field(default_factory=dict)
@@ -265,7 +271,10 @@ def read_outcome(record: object) -> Outcome:
 
 
 def _of_fleet(record: Mapping[str, Any]) -> tuple[Shortfall, ...]:
-    """Read the shortfalls of a record that only a fleet has, not the log of one aircraft."""
+    """Read those shortfalls of a record that do not follow from the log of a single aircraft.
+
+    They are those of the separation in a fleet.
+    """
     shortfalls = []
     for each in record.get("shortfalls") or ():
         if isinstance(each, Mapping) and each.get("aim") == Aim.SEPARATION:

@@ -101,9 +101,10 @@ def parse_sections(
 
 
 def names_node(content: bytes, path: Path, name: str, key: str, namespace: str) -> bool:
-    """Return whether a section of a node has the parameter `key`, except sections for all nodes.
+    """Return whether a section for the node `name` has the parameter `key`.
 
-    Raises ParameterError if the content is no ROS parameter file.
+    Sections for all nodes do not count. Raises ParameterError if the content is no ROS parameter
+    file.
     """
     return any(
         _is_of(pattern, name) and _matches(pattern, name, namespace) and key in values

@@ -112,7 +112,7 @@ def quantity(unit: str, key: str = "unit") -> Quantity:
 
 
 def unit_sizes(units: Iterable[str]) -> FloatArray:
-    """Return the sizes of values with these units, SI."""
+    """Return the typical size of a value with each of these units, SI."""
     return np.array([SIZES.get(quantity(unit).dimension, ANGLE_SIZE) for unit in units])
 
 

@@ -119,8 +119,8 @@ class StampedVector(NamedTuple):
 class ChannelError(ValueError):
     """An invalid sample.
 
-    `reason` is a short word for counters. The message is a sentence, printable and of limited
-    length.
+    `reason` is a short word by which counters group such samples. The message is a sentence,
+    printable and of limited length.
     """
 
     def __init__(self, reason: str, sentence: str) -> None:

@@ -224,8 +224,9 @@ def _sha256(text: str) -> str:
 def _certified(scenario: Scenario, constants: Path) -> tuple[str, str] | None:
     """Return the certificate of a loop's guarantee, and what it guarantees as a line of text.
 
-    The guarantee is the one that was kept for the loop of the scenario. `constants` is the file of
-    the C constants, whose text goes into the certificate. Returns None if there is no guarantee.
+    The guarantee is the one that `rise-di gains guarantee` has stored for the loop of the scenario.
+    `constants` is the file of the C constants, whose text goes into the certificate. Returns None
+    if no guarantee is stored.
     """
     if scenario.aircraft.is_jsbsim or is_literal(scenario.controller):
         return None
@@ -270,8 +271,8 @@ def _units(scenario: Scenario, controller: RiseDiConfig) -> Units:
 def _logged(run: FilePath | RecordedRun, controller: RiseDiConfig, title: str) -> Material:
     """Return the parameters and the ticks of a recorded flight.
 
-    The line for the report says in how many ticks Python computes the u of the log to the bit.
-    Raises ParameterError if the flight had other parameters.
+    Its `line` says in how many ticks Python computes exactly the u of the log. Raises
+    ParameterError if the flight had other parameters.
     """
     sets, recording, equal = run_recording(run if isinstance(run, RecordedRun) else read_run(run))
     same = sets[0].digest() == controller.digest()

@@ -237,9 +237,9 @@ def _shortfall(flight: Scenario, tape: Tape, hardest: str) -> Refusal:
     """Return what is wrong with the flight of a scenario, as a sentence.
 
     The sentence names the input `hardest`, which is at its stop, and says whether the commands or
-    the gusts drive it there. It also says which state or gust requires most of its travel, and how
-    much of it. This is a term of the input that keeps y constant, u = -Omega^+ C (A x + f), where f
-    includes the gusts.
+    the gusts drive it there. It also names the state or gust that requires the most of this input,
+    and says how large it gets. The input that keeps y constant is u = -Omega^+ C (A x + f), where f
+    includes the gusts. It has a term for each state and gust, and the largest term counts.
     """
     airframe = flight.aircraft.load()[0]
     calm = simulate(flight.vary(aircraft={"gusts": {}}))

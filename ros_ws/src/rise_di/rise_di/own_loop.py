@@ -90,10 +90,10 @@ class Loop:
     def step(self, t: float, y: ArrayLike | None, y_m: ArrayLike | None) -> FloatArray:
         """Compute u of a tick at t.
 
-        A sample that no aircraft can give is lost. None stands for a sample that is missing. In
-        both cases `lost` has the reason, and the first of several such samples in a row also gives
-        a RuntimeWarning. y and y_m belong to t, which may jitter but must not go back. The failsafe
-        of the guard starts if samples are older than `max_age`.
+        A sample counts as lost if it is None, or if no aircraft can give its values. `lost` then
+        has the reason, and the first of several lost samples in a row also gives a RuntimeWarning.
+        y and y_m belong to t, which may jitter but must not go back. The failsafe of the guard
+        starts if samples are older than `max_age`.
 
         Args:
             t: Instant of the tick, s.
