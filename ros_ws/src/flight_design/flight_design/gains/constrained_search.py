@@ -34,7 +34,7 @@ class Moves(NamedTuple):
 
 
 class Trial(NamedTuple, Generic[Content]):
-    """A place of the search, with the shortage and the cost of its loop."""
+    """A tuple of exponents that the search has tried, with the shortage and cost of its loop."""
 
     place: Place
     shortage: float  # sum of 1 - found / needed over the goals that the loop misses
@@ -57,7 +57,7 @@ Assess = Callable[[Sequence[Place]], list[Trial[Content]]]
 
 
 def exponent(factor: float) -> int:
-    """Return the largest exponent of STEP that does not exceed a factor."""
+    """Return the largest whole number k for which STEP^k does not exceed a factor."""
     return math.floor(math.log(factor) / math.log(STEP))
 
 

@@ -19,7 +19,7 @@ from rise_di_controller.params import ControllerConfig
 
 @dataclass(frozen=True, kw_only=True)
 class WeightProducts:
-    """Weights of an output from which the total lag T of its loop gives `ExtendedStateWeights`."""
+    """The `ExtendedStateWeights` of an output, multiplied or divided by the loop's total lag T."""
 
     effort: float  # effort / T
     drift: float  # drift T

@@ -202,7 +202,7 @@ def _beside_observer(required: Requirement, *, as_read: bool) -> Requirement:
 def _two_speeds(speeds: ArrayLike, *, observer: bool) -> tuple[float, float] | None:
     """Return the two fractions of the trim speed, or None if `speeds` is empty.
 
-    Raises ParameterError unless they lie on both sides of 1, and if there is no observer.
+    Raises ParameterError if they are not on both sides of 1, or given without an observer.
     """
     ratios = as_numbers(
         speeds,
@@ -474,8 +474,8 @@ def selected_observer(
     - If there is a file `weights`: the gains in it.
     - If `sketched`: gains for a model from a sketch.
     - Otherwise: the gains that `rise-di compare --tune` found in the scenario, or in a shipped one
-      with the same airframe and lags. If the model has other states, or a total lag of SLOWER times
-      that of the search, they do not count, and a rule derives gains from the lags.
+      with the same airframe and lags. If the model has other states, or at least SLOWER times the
+      total lag of that search, they do not count, and a rule derives gains from the lags.
 
     Gains of a file or for a sketch stay, and are only lowered if the margins need it. Channels that
     are not free keep their gains. The other arguments are as for `with_aircraft_observer`.

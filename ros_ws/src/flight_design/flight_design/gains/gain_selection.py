@@ -120,7 +120,7 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
     @property
     def delay_margin(self) -> float | None:
-        """Largest delay in every channel that the nominal loop tolerates, s.
+        """Largest delay in all channels at once that the nominal loop tolerates, s.
 
         It is None for the literal sign.
         """
@@ -135,7 +135,10 @@ class GainAssessment(NamedTuple, Generic[Controller]):
         return () if self.margins is None else self.margins.channel_delay
 
     def loop_with_box(self) -> LinearLoop:
-        """Return the `loop_with_box` of the study. Raises ParameterError for the literal sign."""
+        """Return the linear loop of the controller, with the deviations of the study as its box.
+
+        Raises ParameterError for the literal sign.
+        """
         return loop_with_box(self.study, self.controller)
 
     @property
@@ -258,7 +261,10 @@ class _Paired(NamedTuple):
 
 
 def _paired(study: Study, setting: LoopSetting) -> _Paired:
-    """Pair the channels of a study. Raises ParameterError as `signs_of_pairing` does."""
+    """Pair the outputs and inputs of a study, and order the channels, the fastest first.
+
+    Raises ParameterError as `signs_of_pairing` does.
+    """
     inputs = list(study.airframe.inputs)
     pairing = ChannelPairing(study.airframe.outputs, setting.inputs or tuple(inputs))
     require(

@@ -37,9 +37,10 @@ class KnownPlant(NamedTuple):
 
 
 class FlightSamples(NamedTuple):
-    """Signals of a flight at N >= 3 ticks of the law, from which `evidence` computes the proof.
+    """Signals of a flight at N >= 3 ticks of the law.
 
-    The law engages at the first tick.
+    From them `evidence` computes the signals of the stability proof. The law engages at the first
+    tick.
     """
 
     t: FloatArray  # (N,) s

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find the gains of a law beside an observer, with the weights of the observer.
+"""Find the gains of a law with an observer, and the weights of the observer.
 
 The gains and weights follow from a rule, from a sketch of the aircraft, or from a search.
 """

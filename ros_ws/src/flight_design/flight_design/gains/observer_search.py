@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Search for the relaxation of a law's gains beside an observer, with the least error.
+"""Search for factors on the gains of a law with an observer that give the least error.
 
-The loop must have the required margins. The relaxation of a channel is a factor. It divides K and
+The loop must have the required margins. The factor of a channel is its relaxation. It divides K and
 the integral gain, and multiplies the observer's weight `effort`. A relaxation above 1 makes the
 loop slower, and one below 1 makes it faster. Both may be needed, because the inputs of an aircraft
 may act less or more than those for which the gains were found.
@@ -141,7 +141,10 @@ class _Loops(NamedTuple):
 
 
 class ObserverSearch(NamedTuple):
-    """The search for the relaxation of a gain set with the least error within the margins."""
+    """The search for the factors on a gain set that give the least error within the margins.
+
+    The factor of a channel is its relaxation.
+    """
 
     base: RiseDiConfig  # the controller without an observer
     model: NominalModel
@@ -243,7 +246,10 @@ class ObserverSearch(NamedTuple):
         )
 
     def _loops(self, place: Place) -> _Loops:
-        """Build the loops of a place. At the start they are those of the earlier design."""
+        """Build the loops for a place, the exponents of the relaxation.
+
+        At the start they are those of the earlier design.
+        """
         earlier = self.earlier_design
         begin = np.ones(len(place)) if earlier is None else earlier.relaxation
         relaxation = begin * STEP ** np.array(place, dtype=np.float64)
@@ -290,7 +296,7 @@ class ObserverSearch(NamedTuple):
     def _cost(self, loops: _Loops) -> float:
         """Return the cost of a trial, which is the sum of log(error + activity) over the channels.
 
-        Error and activity are those in wind and noise, in the units of a score. Without `air`, the
+        Error and activity are those in wind and noise, each divided by its unit. Without `air`, the
         cost is the sum of log(relaxation).
         """
         if self.air is None:

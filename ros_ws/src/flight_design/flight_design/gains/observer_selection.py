@@ -271,7 +271,7 @@ class _AircraftDesigns(NamedTuple):
         return cls(with_feedforward(bare, airframe), airframe, noise, model, names)
 
     def plant(self, count: int, vanes: Iterable[str]) -> LinearPlant:
-        """Return the nominal aircraft, and the controllable ones of `count` uncertain aircraft.
+        """Return the nominal aircraft, and those of `count` uncertain ones that gains can hold.
 
         In C, the rows of the vanes come below those of the outputs.
         """

@@ -45,7 +45,10 @@ def reason_against_gains(selection: Selection, *, options: Sequence[str] = ()) -
 
 
 def _relaxed(selection: Selection, options: Sequence[str]) -> dict[str, LoopSetting]:
-    """Return the setting of the loop after each of the changes, by a text for the change."""
+    """Return the setting of the loop for each change that `reason_against_gains` tries.
+
+    The keys are texts that describe the change.
+    """
     setting = selection.setting
     changes: dict[str, LoopSetting] = {}
     margins = selection.engineering.margins

@@ -19,7 +19,7 @@ TRADED_PHASE_MARGINS = (30.0, 40.0, 45.0, 60.0)  # deg
 
 
 class TradeRow(NamedTuple):
-    """The margins and errors of the loop with the engineering gains for a phase margin."""
+    """The margins and errors of the loop whose gains are selected for a phase margin."""
 
     phase_margin: float  # deg, the requirement
     reached: float  # deg, least phase margin that the loop has

@@ -149,7 +149,8 @@ def experiment(
 
     `amplitude` is the amplitude of each input as a fraction of the smaller of its two limits.
     `speed` is the airspeed in trim, m/s, or None in hover. `airframe_file` is the path that the
-    scenario has for the airframe. The experiment lasts for `wait`, s, and the excitation.
+    scenario has for the airframe. The experiment lasts for `wait`, s, and for the time of the
+    excitation.
     """
     pairing, sign = channel_pairs(channel_map)
     rows = [channel_map.inputs[name] for name in pairing.inputs]

@@ -93,7 +93,10 @@ def shares(recorded: FlightData, airframe: Airframe) -> FloatArray:
 def own_shares(
     recorded: FlightData, airframe: Airframe, channels: ChannelPairing
 ) -> list[OwnShare]:
-    """Return the share of each output that its paired input explains, in the law's order."""
+    """Return the share of each output's variance that its paired input explains.
+
+    The outputs are in the law's order.
+    """
     share = shares(recorded, airframe)
     peak = peaks(recorded)
     inputs = list(airframe.inputs)
@@ -173,9 +176,10 @@ def gust_warning(part: Part) -> str:
 def factors_of(parts: Iterable[Part]) -> dict[str, float]:
     """Return the outputs that need more motion, each with the factor by which it must grow.
 
-    The standard deviation of every effect on such an output is above MAX_DEVIATION. Two outputs are
-    left out. One has uncertain effects because of a delay, and more motion would not help. For the
-    other, two models differ (`rates_model.doubted`), which does not say how much motion it needs.
+    The standard deviation of every effect on such an output is above MAX_DEVIATION. An output is
+    left out if its effects are uncertain because of a delay, since more motion would not help. It
+    is also left out if two models differ (`rates_model.doubted`), since this does not say how much
+    more motion is needed.
     """
     factors = {}
     for part in parts:

@@ -366,7 +366,8 @@ def learning_selection(
 ) -> Selection:
     """Add the section `learn`, and the feedforward and observer of a sketch, to a selection.
 
-    Feedforward and observer do not act yet. Omega has its channels in the aircraft's order.
+    `observer.part` is 0, so feedforward and observer do not act yet. Omega has its channels in the
+    aircraft's order.
     """
     start = selection.chosen
     name = Path(condition.name).stem

@@ -145,11 +145,11 @@ class Fit(NamedTuple):
 
 
 def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:
-    """Return the size of an error of 1 in each entry of A and B, SI; with a unit of 0 it is known.
+    """Return the units in which the errors of the entries of A and B are counted, SI.
 
-    The units are the nominal values, except in the rows of angles, where they are 0. If `coupled`,
-    an entry that is 0 gets the unit COUPLING times the largest effect on its row, in units of
-    motion. The columns of angles stay 0.
+    An entry with the unit 0 is known. The units are the nominal values, except in the rows of
+    angles, where they are 0. If `coupled`, an entry that is 0 gets the unit COUPLING times the
+    largest effect on its row, in units of motion. The columns of angles stay 0.
     """
     free = model.kinematic[:, None] == 0.0
     is_dynamic = model.kinematic == 0.0
@@ -452,7 +452,10 @@ class Likelihood:
         used: NDArray[np.bool_],
         levels: NDArray[np.int64] | None = None,
     ) -> float:
-        """Return the cost of `Search.fit` for theta, (p,), at given or at the best levels."""
+        """Return the cost of `Search.fit` for theta, (p,).
+
+        The levels of the wind are `levels`, or if it is None the best ones.
+        """
         levels = self.levels(theta) if levels is None else levels
         (cost,), _, _ = self._costs(self.passed(theta, levels), used, theta[None])
         return float(cost)

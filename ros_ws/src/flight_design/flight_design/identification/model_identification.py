@@ -282,7 +282,10 @@ class _Study(NamedTuple):
         return (fit, part) if is_white and is_better and not part.refusal else None
 
     def advantage(self, flown: Innovations, nominal: Innovations) -> float:
-        """Return the advantage of the model in flight over the nominal one in `later` samples."""
+        """Return how much better the model in flight predicts the samples in the mask `later`.
+
+        It is the `advantage` over the nominal model, in standard deviations.
+        """
         return advantage(flown, nominal, span_length(self.recorded), self.later)
 
 

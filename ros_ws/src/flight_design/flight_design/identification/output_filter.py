@@ -21,7 +21,7 @@ def behind_filter(sampled: ObserverModel, keep: FloatArray) -> ObserverModel:
 
         f+ = keep f + (1 - keep) H z+,   y = f
 
-    The states f follow those in z.
+    In the result, the states f come after those of z.
     """
     m, s = sampled.H.shape
     reach = _reach(sampled.H, keep)

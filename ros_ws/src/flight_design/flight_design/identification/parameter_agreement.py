@@ -189,7 +189,7 @@ def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
 
 
 class Agreement(NamedTuple):
-    """A row of the comparison of a log with a map."""
+    """A parameter as a log has it, compared with what a channel map says."""
 
     what: str  # the parameter, or the quantity that is taken from the log
     logged: str  # the value in the log; "" if the log has no record

@@ -65,8 +65,8 @@ class RatesLog(NamedTuple):
 def rates_map(scenario: Scenario, autopilot: str) -> ChannelMap:
     """Return the channel map of an autopilot with the channels and end stops of a scenario.
 
-    The map of a fixed wing keeps V, which shows when it flies. Raises ParameterError if an input
-    has no end stop, or if no row of the autopilot's map moves its output.
+    The map of a fixed wing keeps V, which shows when the aircraft flies. Raises ParameterError if
+    an input has no end stop, or if no row of the autopilot's map moves its output.
     """
     base = load_map(MAPS[autopilot])
     controller = scenario.controller

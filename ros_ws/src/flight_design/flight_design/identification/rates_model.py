@@ -52,7 +52,7 @@ def identify_rates(
     *,
     timing: float | None = None,
 ) -> Identification:
-    """Identify the rows of the rates from a log, around the nominal airframe.
+    """Identify the rows of A and B for the body rates from a log, around the nominal airframe.
 
     The rows of states that are no outputs are known: mass and lift give them. The airframe of the
     result has the bank angle among its states if the nominal one can bank. `timing` is the standard

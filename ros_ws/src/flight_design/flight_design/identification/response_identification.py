@@ -518,7 +518,8 @@ def _too_little_share(output: str, name: str, share: float) -> str:
 def _more_excitation(name: str, ratio: float) -> str:
     """Say how much more excitation is needed for a certain result.
 
-    The standard errors fall in proportion to the size of the excitation, and with the root of time.
+    The standard errors fall in proportion to the size of the excitation, and to the square root of
+    its duration.
     """
     factor = MIN_RATIO / max(ratio, 0.5)
     return f"excite {name} {factor:.1f} times as strongly, or for {factor**2:.1f} times as long"

@@ -67,8 +67,8 @@ def second_order_response(
 ) -> tuple[FloatArray, FloatArray]:
     """Return two step responses of a second order behind a lag and a delay, from rest, (N,) each.
 
-    first:   y'' + damping y' + stiffness y = v' second:  y'' + damping y' + stiffness y = v,    lag
-    v' = u(t - delay) - v
+    The first is that of y'' + damping y' + stiffness y = v', and the second has v in place of v'.
+    In both, lag v' = u(t - delay) - v.
     """
     begin = np.maximum(t - delay, 0.0)
     # the state z, z', v; the output is z' for the first response, z for the second

@@ -142,7 +142,7 @@ class Least(NamedTuple):
 
 
 class Effects(Search):
-    """The search for a factor on every column of B in a part of the aircraft."""
+    """The search for the factor by which each column of B has changed in a part of the aircraft."""
 
     def __init__(
         self,

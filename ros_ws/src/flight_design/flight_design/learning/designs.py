@@ -88,7 +88,7 @@ class LearnedLoop(NamedTuple):
         return with_box(linear, model, self.controller, DEVIATIONS * self.unlearned, 0, spread)
 
     def proof(self) -> tuple[LinearLoop, Guarantee]:
-        """Return the linear loop, and how far from the model every aircraft is proved stable.
+        """Return the linear loop, and the proof up to which deviations every aircraft is stable.
 
         The search goes up to MOST_DEVIATIONS.
         """
@@ -207,12 +207,12 @@ def by_law_of_start(
     """Return the outputs that fly by the law of the start.
 
     `left` has the parts that are left to this law, each with its dead input. The dead input is None
-    if the controller gave up the model of the part. All outputs of such a part fly by the law. So
-    do all outputs of a part with a dead input, unless the design for the file flies (`has_file`).
-    In that case only the output of the dead input flies by the law, and V if it is in the part. In
-    flights without an elevator, the observer of V erred four times as much as the law. The other
-    outputs keep the design, because their inputs work. In flights without a rudder, the error of p
-    was half of that under the law.
+    if the controller gave up the model of the part. Then all outputs of the part fly by the law. If
+    a part has a dead input, all of its outputs fly by the law, too, unless the design for the file
+    flies (`has_file`). In that case only the output of the dead input flies by the law, and V if it
+    is in the part. In flights without an elevator, the observer of V erred four times as much as
+    the law. The other outputs keep the design, because their inputs work. In flights without a
+    rudder, the error of p was half of that under the law.
     """
     driven = dict(zip(start.inputs, start.outputs, strict=True))
     return {

@@ -271,7 +271,7 @@ class Learner:
     def _damaged(self, changes: Sequence[Change], end_ns: int) -> LearnerResult:
         """Decide on parts that have changed; a part with a dead input flies without it at once.
 
-        Any other part is identified again, from the record since the change and about the flown
+        Any other part is identified again, from the record since the change and around the flown
         model.
         """
         self._record.forget_before(end_ns - nanoseconds(RECORD))

@@ -42,7 +42,8 @@ def change_sentence(change: Change) -> str:
 def reason_against_innovations(part: Part) -> Refusal | None:
     """Refuse a part if the innovations of an output are too far from white noise.
 
-    The worst output counts. Its `whiteness` is 1 for white noise, and at most MAX_WHITENESS.
+    The worst output counts. Its `whiteness` is 1 for white noise, and must be at most
+    MAX_WHITENESS.
     """
     worst = int(np.argmax(part.after.whiteness))
     white = float(part.after.whiteness[worst])
@@ -105,9 +106,10 @@ def reason_against_first_model(part: Part, name: str, *, flies: bool) -> Refusal
 
 
 def return_to_file(part: Part, name: str | None) -> str:
-    """Say by what a part flies after the file predicted better than the model in flight.
+    """Say by which model or law a part flies after the model in flight has predicted worse.
 
-    It flies by the airframe `name`, or by the law of the start if `name` is None.
+    The model of the airframe file has predicted better. The part flies by the airframe `name`, or
+    by the law of the start if `name` is None.
     """
     flies = "the law of the start" if name is None else f"the airframe {name} as it is"
     return f"{' and '.join(part.outputs)} by {flies}: {_file_advantage(part)}"

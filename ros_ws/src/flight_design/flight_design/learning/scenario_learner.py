@@ -146,7 +146,7 @@ def that_learns(scenario: Scenario) -> Scenario:
 
 
 def quick_learner(scenario: Scenario) -> Learn | None:
-    """Return the learner for a campaign, which needs less time for an identification."""
+    """Return the learner for a campaign, whose identifications take less time."""
     return learner(scenario, quick=True)
 
 
@@ -160,7 +160,7 @@ def with_law_inputs(airframe: Airframe, controller: RiseDiConfig) -> Airframe:
 
 
 def _speeds(controller: RiseDiConfig, airframe: Airframe) -> tuple[float, float] | None:
-    """Return the speeds of the models in a schedule divided by the trim speed, slow and fast.
+    """Return the slow and the fast speed of a schedule's models, divided by the trim speed.
 
     Returns None if there is no schedule. Raises ParameterError if the speed of the schedule is not
     that of the rough model.
@@ -197,7 +197,10 @@ class LearnStep(NamedTuple):
 
 
 class LearnResult(NamedTuple):
-    """The learner's steps over a log, and its model at the end; None if nothing was learned."""
+    """The learner's steps over a log, and its model at the end.
+
+    The model is None if nothing was learned.
+    """
 
     steps: tuple[LearnStep, ...]
     model: Airframe | None
