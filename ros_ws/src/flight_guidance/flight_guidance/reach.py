@@ -101,7 +101,8 @@ AUTHORITY = tuple(f"{side}.{name}" for side, name in product(SIDES, ("q", "p", "
 def authority_of(channels: Mapping[str, float]) -> Authority:
     """Read the authority from the channels of the topic `authority`.
 
-    The topic has two sides for each output. For q and p, the side with the lesser value counts.
+    The topic has a value for each of two directions of an output. For q and p the lesser one
+    counts.
     """
     q = min(channels[f"{side}.q"] for side in SIDES)
     p = min(channels[f"{side}.p"] for side in SIDES)

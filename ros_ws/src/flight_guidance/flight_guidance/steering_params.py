@@ -69,7 +69,7 @@ STEEPEST = 0.1
 
 
 class SteeringConfig(NodeConfig):
-    """Parameters of steering, and the numbers of the equations that follow from them."""
+    """Parameters of steering. They give the constants in the equations of guidance."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(
         default=50.0, description="rate at which u_m is published, Hz"
@@ -226,7 +226,7 @@ class SteeringConfig(NodeConfig):
         return self.climb or min(climb, steepest), self.sink or min(sink, steepest)
 
     def equation_numbers(self) -> dict[str, Any]:
-        """Return the numbers of the equations that follow by rule, by field of `GuidanceParams`."""
+        """Return the constants that follow by rule, by field of `GuidanceParams`."""
         if self.drag is not None:
             return self._multicopter_numbers(self.drag)
         frequency = self._frequency()
@@ -282,7 +282,7 @@ class SteeringConfig(NodeConfig):
         )
 
     def _multicopter_numbers(self, drag: float) -> dict[str, Any]:
-        """Return the numbers of a multicopter's equations that follow by rule."""
+        """Return a multicopter's constants that follow by rule, by field of `GuidanceParams`."""
         gains = self._gains(drag)
         frequency = self._frequency()
         lowest, highest = self.altitudes()

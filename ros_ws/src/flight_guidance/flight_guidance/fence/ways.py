@@ -45,9 +45,10 @@ class Ways(NamedTuple):
     straight: NDArray[np.bool_]
 
     def aim(self, fence: Fence, north: Array, east: Array) -> tuple[Array, Array, Array]:
-        """Return the aim of places, north and east, m, and whether the way home is straight.
+        """Return the aims of some places, north and east, m, and whether the way home is straight.
 
-        For a place outside of the map, the aim is the nearest cell.
+        An aircraft at the place flies towards its aim. For a place outside of the map, the aim is
+        the nearest cell.
         """
         xp = array_namespace(north)
         rows, columns = self.straight.shape

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a landing on a line of a route: flare, alignment of the nose, and go-around.
 
-The line to a waypoint on the ground is the glide path, which the modes of a route hold. Below the
-height of the flare, each step has commands of the landing. They are in the log, so a landing can be
-computed again from the log like any flight.
+The line to a waypoint on the ground is the glide path. Guidance follows it like any leg of a route,
+down to the flare. Below the height of the flare, each step has commands of the landing. They are in
+the log, so a landing can be computed again from the log like any flight.
 """
 
 import math

@@ -165,8 +165,8 @@ def escaping_bank(
 ) -> Scalar:
     """Compute the bank for the action of the fence, rad.
 
-    It is the bank of a turn, or of a course home. If the fence does not act, the result is `bank`,
-    the bank of the lateral mode.
+    It is the bank of a turn, or the bank that holds the course home. If the fence does not act, the
+    result is `bank`, the bank of the lateral mode.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)

@@ -77,7 +77,7 @@ def _loitering(
 
 
 def has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) -> bool:
-    """Return whether the loiter is over, with the aircraft at the altitude of the leg."""
+    """Return whether the loiter is flown, and the aircraft is at the altitude of the leg."""
     return state.loitered >= 1.0 and abs(pose["altitude"] - route.altitude[state.leg]) <= LEVEL
 
 

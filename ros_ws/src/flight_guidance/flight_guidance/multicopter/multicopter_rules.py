@@ -33,8 +33,8 @@ def gains(
             braking = BRAKING g tan(bank)
 
     w is the lesser frequency of p and q. With a reference model of damping 0.9, the loop of the
-    tilt has a phase margin of 65 deg. The loops of velocity and place together have 44 deg and a
-    largest sensitivity of 1.5. The lead is the delay of the tilt behind a ramp.
+    tilt has a phase margin of 65 deg. The loops of velocity and place together have a phase margin
+    of 44 deg and a largest sensitivity of 1.5. The lead is the delay of the tilt behind a ramp.
     """
     w = min(frequency["p"], frequency["q"])
     k_tilt = w / BANDWIDTH_RATIO

@@ -94,7 +94,7 @@ MOST_ITEMS = 20_000
 
 
 def _in_order(key: str, items: Sequence[Item]) -> list[int]:
-    """Return the positions of the items in the order of flight, up to an item of LAST.
+    """Return the positions of the items in the order of flight, up to the first command in LAST.
 
     Jumps are followed. A DO_JUMP states how often it jumps to its item; a negative number means for
     ever. An endless jump back ends the order. Raises ParameterError for a jump to no item, for a
@@ -199,7 +199,7 @@ def mission_route(
 
 
 def _skipped_name(item: Item) -> str:
-    """Return the name of an item that is not flown, with a remark if it is at 0, 0."""
+    """Return the name of an item that is not flown, with a remark if its position is 0, 0."""
     is_place = item.command in (WAYPOINT, SPLINE, *LOITERS)
     nowhere = is_place and not any(item.params[4:6])
     return f"{item.name}, at latitude and longitude 0" if nowhere else item.name

@@ -125,7 +125,7 @@ class Route(NamedTuple):
         return altitude - slope * (distance - along), slope
 
     def joining_altitude(self, leg: int, along: float) -> float:
-        """Return the altitude for joining a leg at a distance `along` it, m."""
+        """Return the altitude at which to join a leg at the distance `along` it, m."""
         if along or not self.from_altitude:
             return self.profile(leg, along)[0]
         return self.from_altitude[leg]
@@ -172,7 +172,7 @@ def error(leg: Leg, position: Point) -> PathError:
 
 
 def line_error(start: Point, track: Scalar, position: Point) -> PathError:
-    """Compute the `error` from the line through a point on a course, rad."""
+    """Compute the `error` from a line through the point `start` with the course `track`, rad."""
     xp = array_namespace(track)
     north = position[0] - start[0]
     east = position[1] - start[1]
