@@ -214,7 +214,7 @@ def _identified(
 ) -> tuple[dict[str, float], Response, IdentifiedChannels]:
     """Find the trims, the step responses and the channels of an experiment, and print them.
 
-    Raises ParameterError if a channel is not certain.
+    Raises ParameterError if the result for a channel is not certain.
     """
     pairing, _ = channel_pairs(channel_map)
     if COMMANDS in tape:

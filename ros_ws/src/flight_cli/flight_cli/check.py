@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Implement `rise-di check`, which compares a channel map with the D of the controller.
 
-It also checks a map against a recorded flight, and against releases of an autopilot.
+It also checks a map against a recorded flight, and against the message definitions of an
+autopilot's releases.
 """
 
 from collections.abc import Sequence
@@ -51,8 +52,9 @@ INSTALLED = "installed"  # stands for the message packages of this host, in plac
 class Check:
     """Compare the D of the controller with the D of a channel map, and with a recorded flight.
 
-    With --definitions, tell for which releases of an autopilot the rows of the map hold: the topic,
-    the field and the constants of each row. Rows of MAVLink are always compared with pymavlink.
+    With --definitions, compare the topic, the field and the constants of each row of the map with
+    releases of an autopilot, and tell for which releases the row holds. Rows of MAVLink are always
+    compared with pymavlink.
 
     A sign that was not measured with certainty is no contradiction: the table has a ? and a
     sentence says which excitation is necessary. Exit status: 0 agreement, 1 a contradiction or a
@@ -83,7 +85,7 @@ class Check:
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Compare signs, or the rows of the map with releases, and print what contradicts."""
+        """Compare signs, or the rows of the map with releases, and print the contradictions."""
         channel_map = load_map(self.map_name)
         if self.definitions:
             _check_rows(channel_map, self.definitions, self.as_json)

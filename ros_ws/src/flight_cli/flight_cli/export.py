@@ -36,8 +36,8 @@ class Export:
     """Write the controller of a scenario as C99, and prove that C and Python give the same bits.
 
     The code is compiled. The proof feeds it with flights in one process (with lost samples, faults,
-    new parameters, engagement, limits), with drawn calls and with drawn steps. It compares every u
-    and every state. Exit status: 0 proved, 1 a bit differs, 2 bad input.
+    new parameters, engagement, limits), with random calls and with random steps. It compares every
+    u and every state. Exit status: 0 proved, 1 a bit differs, 2 bad input.
     """
 
     scenario: str = argument(

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Implement `rise-di gains`, which selects gains, checks them, or bounds them for a box."""
+"""Implement `rise-di gains`, which selects gains, checks them, or proves them for all aircraft.
+
+The proof holds for every aircraft in a box around the nominal one.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -82,7 +85,7 @@ SELECTION = (
 
 @dataclass(frozen=True, kw_only=True)
 class _Gains:
-    """The options and arguments that the verbs of `rise-di gains` share."""
+    """The options and arguments that the subcommands of `rise-di gains` share."""
 
     airframe: str = argument(
         "Name or file (.yaml) of an airframe.",

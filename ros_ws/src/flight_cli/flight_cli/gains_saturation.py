@@ -42,7 +42,7 @@ def write_limit_certificate(
     airframe: str,
     scenario: str,
 ) -> list[str]:
-    """Write the certificate of a guarantee with a limit of one input, if a path is given.
+    """Write the certificate for a loop in which one input saturates, if a path is given.
 
     Returns a sentence if the law has no C constants from which a checker could compute the loop.
     """
@@ -57,7 +57,7 @@ def write_limit_certificate(
 
 
 def limit_text(name: str, promise: LimitGuarantee | None, certificate: str) -> list[str]:
-    """Return a guarantee with a limit of one input as sentences."""
+    """Write in sentences what is guaranteed for a loop in which one input saturates."""
     if promise is None:
         least = f"{100.0 * TRIED[-1]:g} % of this box"
         return [f"guarantee: none with any limits of {name}: no taps prove as much as {least}"]

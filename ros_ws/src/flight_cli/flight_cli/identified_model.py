@@ -77,7 +77,7 @@ def fly_again(scenario: Scenario, tape: Tape, model: Airframe, margin: float) ->
 def show_flights_of_model(
     console: Console, again: Reflight, identification: Identification
 ) -> None:
-    """Print the rms of the error of the recorded flight and of the flight with the model."""
+    """Print the rms errors of the recorded flight, and of the simulated flight with the model."""
     units = _units(identification)
     headings = ["flight", *(f"{name}\n{unit.unit}" for name, unit in units.items())]
     table = new_table("\nRms of the error", headings)

@@ -222,7 +222,7 @@ def flight_progress(
 
 
 def grouped_table(title: str, columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> Table:
-    """Return a table that begins with the names of the rows.
+    """Return a table whose first column has the names of the rows.
 
     Adjacent columns of the same group share a heading.
     """

@@ -43,10 +43,10 @@ FILES = ("html", "output", "png", "parquet", "figure")
 class Report:
     """Write the report page of a recorded run again, and print its tables.
 
-    If there are several runs, the page compares them. A log that --repair has rebuilt holds every
-    message that could be read, an index and, in the folder of a run, metadata.yaml. The damaged
-    file is kept as *.damaged, an intact log stays as it is, and metadata.yaml of another program is
-    never replaced.
+    If there are several runs, the page compares them. With --repair, a damaged log is rebuilt. The
+    new log has an index and every message that could be read, and the folder of a run also gets
+    metadata.yaml. The damaged file is kept as *.damaged. An intact log stays as it is, and
+    metadata.yaml of another program is never replaced.
 
     Exit status: that of the flight (see docs/outcomes.md), or the gravest of several flights; 2 bad
     input.

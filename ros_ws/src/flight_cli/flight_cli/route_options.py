@@ -39,7 +39,7 @@ class RouteWords:
     def read_waypoints(
         self, file: Path, *, above_sea: bool | None, fence: Path | None = None
     ) -> tuple[Waypoint, ...]:
-        """Read the waypoints of a route file, and print notes on the rest of it on standard error.
+        """Read the waypoints of a route file, and print notes on all that is left out of the file.
 
         `fence` is the file with the fence, which may be the route file itself. Raises what
         `read_route_file` raises.

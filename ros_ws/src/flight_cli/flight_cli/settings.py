@@ -20,7 +20,7 @@ def settings_option() -> Any:
 
 
 def setting_names(incomplete: str) -> list[str]:
-    """Return the keys, with "=", that begin with `incomplete` in some shipped scenario."""
+    """Return the keys of shipped scenarios that begin with `incomplete`, each followed by "="."""
     keys: set[str] = set()
     for path in LIBRARY.glob("*.yaml"):
         scenario = find_scenario(path.stem)

@@ -43,7 +43,7 @@ OTHER_NAMES: Mapping[str, Sequence[str]] = MappingProxyType(
 
 
 class Executable(Protocol):
-    """A command: a data class of its options, whose docstring is its help."""
+    """A command: a data class whose fields are the options, and whose docstring is the help."""
 
     def execute(self) -> None:
         """Run the command."""
@@ -135,7 +135,7 @@ def warn(text: str) -> None:
 
 
 def _names_of(library: str) -> Callable[[str], list[str]]:
-    """Return a shell completion that offers the names in a library, MODULE:FOLDER."""
+    """Return a shell completion that offers the names in a library, given as MODULE:FOLDER."""
 
     def complete(incomplete: str) -> list[str]:
         from flight_core.files import names_in  # noqa: PLC0415 - --help does not need it
@@ -180,7 +180,7 @@ EXPECTED: Mapping[str, str] = MappingProxyType(
 
 
 def refused_words(error: Any, command: str, names: Sequence[str]) -> ParameterError:
-    """Turn Typer's refusal of a command's words into a ParameterError with one sentence."""
+    """Turn Typer's refusal of a command line into a ParameterError with one sentence."""
     if isinstance(error, typer.BadParameter):
         return refused_value(error, command)
     option = getattr(error, "option_name", "")
