@@ -32,8 +32,8 @@ SINCE_EPOCH_NS = 10**15  # larger stamps count from 1970, not from the start of 
 class StampClock:
     """Finds the usable samples of a topic, up to a step of the clock that made their stamps.
 
-    A sample with a damaged stamp is left out. The samples after a forward step are kept here,
-    because only `without_leaps`, which sees all topics, can decide about them.
+    A sample with a damaged stamp is left out. The samples after a forward step stay, because only
+    `without_leaps`, which sees all topics, can decide about them.
     """
 
     def __init__(self) -> None:
@@ -244,9 +244,10 @@ LOOP = ("y", "y_m", "u", "internals", "truth")  # topics that must all show a le
 def without_leaps(
     signals: Mapping[str, Signal], recording: Mapping[str, Recording]
 ) -> tuple[dict[str, Signal], dict[str, Recording], list[Leap]]:
-    """Convert the signals to the clock before each leap, and return them with the leaps.
+    """Take the leaps of the clock out of the stamps, and return the signals and the leaps.
 
-    A forward step of a single topic is no leap, and the samples after this step are left out.
+    A leap is a forward step that the clock of all topics makes. After a forward step of a single
+    topic, the samples of this topic are left out.
     """
     mended = dict(signals)
     clocks = dict(recording)

@@ -90,7 +90,7 @@ class Packets(DFReader.DFReader_binary):
         return round(1e3 * stamp_us(self._parse_next(), 0.0))
 
     def loss(self) -> Loss | None:
-        """Return the loss, which is the bytes that hold no packet; None for a whole log."""
+        """Return how many bytes hold no packet, and when; None for a log without loss."""
         lost = self.lost
         if lost and lost[-1][1] == self.data_len and lost[-1][1] - lost[-1][0] < TAIL:
             lost = lost[:-1]
@@ -161,7 +161,7 @@ class Lines(DFReader.DFReader_text):
         return message
 
     def loss(self) -> Loss | None:
-        """Return the loss, which is the lines that hold no message; None for a whole log."""
+        """Return how many lines hold no message, and when; None for a log without loss."""
         if not self.lost_us:
             return None
         what = f"{len(self.lost_us)} of {self._count} lines hold no message"

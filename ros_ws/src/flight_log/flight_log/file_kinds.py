@@ -90,7 +90,7 @@ def file_kind(path: Path) -> str:
 def kind_of_head(head: bytes) -> str:
     """Return the kind of a file by its first HEAD_BYTES bytes.
 
-    Bytes that are in no row of the table are a text or unknown bytes.
+    If the bytes are those of no known format, they are a text or unknown bytes.
     """
     # A recorder that is killed at its start leaves a file that has only the first bytes of an MCAP.
     if MCAP0_MAGIC.startswith(head):

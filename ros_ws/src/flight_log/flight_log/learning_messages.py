@@ -19,7 +19,7 @@ WARN = 1
 
 
 def learning_message(stamp_ns: int, kind: str, sentence: str, *, warns: bool) -> bytes:
-    """Return a message of LEARNING on an event of this `kind`, as the controller publishes it."""
+    """Return a message of the topic LEARNING on an event, as the controller publishes it."""
     store = typestore()
     types = {
         name: store.types[f"diagnostic_msgs/msg/{name}"]

@@ -138,7 +138,7 @@ class _Publisher:
         return least_of_other - LATE_NS <= least and largest <= largest_of_other + LATE_NS
 
     def recording(self) -> Recording:
-        """Return what a check of the stamps has found, in the order in which they were recorded."""
+        """Return what a check of the stamps, in the order of the recording, has found."""
         is_counted = self._numbered and not self._restarted
         return self.clock.recording(self.zeros)._replace(lost=self._lost if is_counted else None)
 

@@ -31,7 +31,7 @@ TAIL = 528
 
 @dataclass(frozen=True, kw_only=True)
 class Messages:
-    """The whole messages of a ULog as the bytes of a ULog, and the loss."""
+    """The undamaged messages of a ULog, again as the bytes of a ULog, and what was lost."""
 
     content: bytes
     loss: Loss | None

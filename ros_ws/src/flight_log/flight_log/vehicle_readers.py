@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Decode the formats of autopilots' logs, and find the system, sensors and clock that flew.
+"""Decode the logs of autopilots, and find the system, the sensors and the clock of the flight.
 
 Sources: those of `vehicle_log`; MAVLink, common.xml (time_boot_ms), MAVLink guide, Serialization
 (the sequence of a link).
