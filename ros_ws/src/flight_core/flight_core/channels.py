@@ -20,7 +20,7 @@ the channel is 1 m/s."""
 
 
 def vertical(names: Sequence[str]) -> str:
-    """Return the name of the vertical speed among the names, or "" for an airplane, without one."""
+    """Return the name of the vertical speed among `names`; "" for an airplane, which has none."""
     return next((name for name in names if name in VERTICAL), "")
 
 

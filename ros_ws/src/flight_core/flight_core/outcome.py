@@ -145,8 +145,8 @@ class Outcome:
     def status(self) -> int:
         """Exit status, which is 0 for a flight that reached its end without a shortfall.
 
-        If the host was too busy in some spans, the flight is judged outside of them, so its
-        shortfalls count.
+        Spans in which the host was too busy are left out of the judgement, so a shortfall counts
+        also if there were such spans.
         """
         if self.end is End.INTERRUPTED:
             return STATUS_INTERRUPTED

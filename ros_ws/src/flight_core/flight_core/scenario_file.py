@@ -8,8 +8,8 @@
 
 A scenario file has a section for each node. rcl joins the sections that match the full name of a
 node, in the order of the file, so that a later value replaces an earlier one. In the name of a
-section, `**` stands for any number of names, and `*` for one. A node takes only the parameters that
-it knows from a section for all nodes.
+section, `**` stands for any number of names, and `*` for one. From a section for all nodes, a node
+takes only the parameters that it knows.
 """
 
 import difflib

@@ -94,13 +94,13 @@ def export(
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
         folder: Folder for the code and the report of the proof.
-        run: A recorded flight, whose ticks replace the flights and drawn inputs of the proof. If
+        run: A recorded flight, whose ticks replace the flights and random inputs of the proof. If
             the scenario learns, the last model of this flight is exported.
         float32: Whether to compute in single precision. The proof then bounds the difference of u.
         duration: Duration of each flight of the proof, s. If None, it is that of the scenario, at
             most 20 s.
-        drawn: Number of drawn steps in the proof.
-        seed: Seed of the drawn inputs.
+        drawn: Number of random steps in the proof.
+        seed: Seed of the random inputs.
         compiler: Commands of C compilers. If empty, they are gcc and clang.
         runner: Command that starts a program of the compiler, such as qemu-aarch64 for a cross
             compiler.
