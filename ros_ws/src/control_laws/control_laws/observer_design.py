@@ -185,7 +185,7 @@ def _sampled(
 
 
 def aircraft_observer(model: NominalModel, names: Names, weights: Weights) -> ObserverDesign:
-    """Design the observer over `aircraft_model`, with the gains of two Riccati equations.
+    """Design the observer with the model `aircraft_model` and the gains of two Riccati equations.
 
     F minimises the sum of (e / size)^2 + (effort (u - u_ff) / (input_scale size))^2, and L
     minimises the variance of the estimate. White noise drives the wind (`gust`), the disturbances
@@ -243,7 +243,7 @@ def vane_correction(
 def extended_state_observer(
     model: NominalModel, names: Names, weights: ExtendedStateWeights
 ) -> ObserverDesign:
-    """Design the observer over `extended_state_model`, with gains as in `aircraft_observer`."""
+    """Design the observer with `extended_state_model`, otherwise as `aircraft_observer` does."""
     model_by_tick = extended_state_model(model, names, weights.decay)
     size = model.C @ model.size
     intensities = [

@@ -133,9 +133,9 @@ def write_unstable(
 ) -> list[str]:
     """Write the unstable aircraft nearest to the nominal one, if a folder is given.
 
-    A second aircraft has the deviations of the first times FARTHER. Each is written as an airframe
-    and a scenario that flies it. Returns a sentence for each aircraft, which says how far it
-    deviates, and whether this is within `--uncertainty`.
+    A second aircraft has the deviations of the first multiplied by FARTHER. Each is written as an
+    airframe and a scenario that flies it. Returns a sentence for each aircraft, which says how far
+    it deviates, and whether this is within `--uncertainty`.
     """
     if folder is None:
         return []

@@ -140,9 +140,10 @@ def candidates(selectors: Selectors) -> list[Candidate]:
 
 
 def best_of(found: Sequence[Candidate], *, accept: bool) -> Candidate:
-    """Return the candidate with the least score whose margins suffice, or any with `accept`.
+    """Return the candidate with the least score among those whose margins suffice.
 
-    Raises ParameterError, with the shortfall of the best candidate, if no margins suffice.
+    With `accept`, it is the one with the least score among all. Raises ParameterError, with the
+    shortfall of the best candidate, if no margins suffice.
     """
     by_score = sorted(found, key=lambda candidate: candidate.score)
     enough = [candidate for candidate in by_score if accept or not candidate.shortfall]

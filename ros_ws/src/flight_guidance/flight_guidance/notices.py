@@ -206,7 +206,7 @@ class Notices:
         return [Notice(t, text) for text in texts]
 
     def _outside(self, t: float, clearance: float) -> list[str]:
-        """Return the sentence if the aircraft leaves the fence, or is back inside.
+        """Return a sentence if the aircraft has left the fence or is back inside, else nothing.
 
         While the pose is lost, there is no sentence, because the position is unknown.
         """

@@ -24,8 +24,7 @@ TAIL = 528
 class Packets(DFReader.DFReader_binary):
     """The packets of a log that are followed by another packet or by the end of the log.
 
-    The index of pymavlink would end at the first unknown packet, as it appears where bytes are
-    lost.
+    The index of pymavlink would end where bytes are lost, because an unknown packet appears there.
     """
 
     def init_arrays(self, progress_callback: Callable[[int], None] | None = None) -> None:

@@ -111,7 +111,7 @@ class _Log:
         return int.from_bytes(self._content[start : start + 2], "little")
 
     def take(self, here: int, end: int) -> None:
-        """Take a whole message and note its facts."""
+        """Take a whole message, and store what it says about later messages."""
         kind = self._content[here + 2]
         if kind == SUBSCRIPTION:
             self._sizes.setdefault(self._number(here, 1), 0)

@@ -76,7 +76,8 @@ class _Subscribed(RecordedTopic):
 class _RecordedTopics:
     """The topics that are recorded.
 
-    They are the topics of a flight, and those of `names`, each from its first publisher on.
+    They are the topics of a flight, and those of `names`. Each is recorded from the time of its
+    first publisher on.
     """
 
     def __init__(self, node: Node, bag: FlightBag, names: Sequence[str]) -> None:

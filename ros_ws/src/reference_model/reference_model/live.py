@@ -18,7 +18,7 @@ from flight_core.vectors import ChannelError, FloatArray
 
 
 class LiveParams(NamedTuple):
-    """Limits of u_m and the gains of the ending."""
+    """Limits of u_m, and the gains of the ending, the commands that follow the last u_m."""
 
     max_age_ns: int  # age above which u_m has timed out
     levelling_ns: int  # time in which the ending levels the wings, before all commands are 0

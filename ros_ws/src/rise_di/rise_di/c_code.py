@@ -271,7 +271,7 @@ def _units(scenario: Scenario, controller: RiseDiConfig) -> Units:
 def _logged(run: FilePath | RecordedRun, controller: RiseDiConfig, title: str) -> Material:
     """Return the parameters and the ticks of a recorded flight.
 
-    Its `line` says in how many ticks Python computes exactly the u of the log. Raises
+    The `line` of the result says in how many ticks Python computes exactly the u of the log. Raises
     ParameterError if the flight had other parameters.
     """
     sets, recording, equal = run_recording(run if isinstance(run, RecordedRun) else read_run(run))

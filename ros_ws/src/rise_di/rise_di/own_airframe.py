@@ -193,7 +193,7 @@ def _pairing_sentence(airframe: Airframe) -> str | None:
 def _flying(
     airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequence[float]
 ) -> tuple[str, Refusal | None]:
-    """Return the text of a scenario with selected gains whose flight ends as planned.
+    """Return the text of a scenario whose gains are selected so that its flight ends as planned.
 
     The flight must stay clear of the end stops. If there is no such flight, the scenario has the
     smallest commands, and the second result says what is wrong with its flight. `trial` is the file

@@ -121,10 +121,10 @@ def with_aircraft_observer(
 
     `margin` is the least delay margin, s, either one value for all inputs, or one for each, (m,).
     If the airframe is `uncertain`, WORST_OF uncertain aircraft must have the phase margin too.
-    Aircraft with a zero on the right do not count, because no gains can hold all of their outputs.
-    `speeds` are two airspeeds, divided by the trim speed. With them the controller gets a schedule,
-    and the loop must have the margins at these speeds too. `vanes` has the noise of each vane, rms
-    per sample in rad, by its channel, alpha or beta.
+    Aircraft with a zero in the right half plane do not count, because no gains can hold all of
+    their outputs. `speeds` are two airspeeds, divided by the trim speed. With them the controller
+    gets a schedule, and the loop must have the margins at these speeds too. `vanes` has the noise
+    of each vane, rms per sample in rad, by its channel, alpha or beta.
 
     If there is an `earlier_design`, the search begins at its loop with the new feedforward. It
     changes the relaxation of free channels only, so this loop stays if no change lowers the error.

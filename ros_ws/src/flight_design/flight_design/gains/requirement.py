@@ -220,7 +220,7 @@ def within_requirement(
     requirement: Requirement,
     u_dot: FloatArray,
 ) -> Candidate[Controller]:
-    """Search for the candidate with the least error whose margins meet a requirement.
+    """Search for the candidate with the least error among those that meet a requirement.
 
     If no candidate meets it, the candidate with the least shortage is returned.
 

@@ -223,7 +223,7 @@ def _within_margins(
 
     The loop is around the airframe of a study. Returns the controller and the margins. A lower
     bandwidth is a smaller input scale, and the K of (22) stays. Without the softened sign, the
-    controller is returned as it is, and None.
+    controller does not change, and the margins are None.
     """
     if controller.sampled_sign()[0] is not Sign.SOFT:
         return controller, None

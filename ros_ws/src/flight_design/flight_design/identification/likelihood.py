@@ -354,7 +354,7 @@ class Likelihood:
         return late + self._lag_deviation * np.sum(fit.theta[self._lag]), fit.late_deviation
 
     def late_deviation(self, covariance: FloatArray) -> FloatArray:
-        """Return the deviations of `delays`, given the covariance of theta, (p, p)."""
+        """Return the standard deviations of `delays`, s, from the covariance of theta, (p, p)."""
         m = len(self._delay)
         size = np.zeros((m, len(self.prior)))
         size[:, self._lag] = self._lag_deviation
@@ -364,9 +364,10 @@ class Likelihood:
         return np.asarray(np.sqrt(np.einsum("ip,pq,iq->i", size, covariance, size)))
 
     def by_lag(self, covariance: FloatArray) -> FloatArray:
-        """Return the part of each deviation that the lag of y causes, (p,), given the covariance.
+        """Return the part of each standard deviation of theta that the lag of y causes, (p,).
 
-        If the lag were known, the variances would be smaller by the squares of these parts.
+        `covariance` is that of theta. If the lag were known, the variances would be smaller by the
+        squares of these parts.
         """
         if not self._lag_deviation:
             return np.zeros(len(self.prior))

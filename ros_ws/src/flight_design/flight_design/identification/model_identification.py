@@ -321,7 +321,7 @@ def identify_model(
         quick: Whether the search begins with a single start. It suffices if the air is the same in
             every span, and if the model that is found may be used.
         searches_again: Whether a part with too many entries of A at their bounds is searched again,
-            about the result of the first search.
+            around the result of the first search.
         timing: Standard deviation of the delay in `actuation`, s. If it is given, even as 0, the
             deviations also hold for a model that is not right (`Search.with_doubt`).
 

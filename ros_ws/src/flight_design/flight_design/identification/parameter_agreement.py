@@ -148,7 +148,7 @@ class Servo(NamedTuple):
 
 
 def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
-    """Return the first servo whose function is that of an input's stick.
+    """Return the servo that an input's stick moves: the first servo with the stick's function.
 
     `values` has the parameters at the time of the samples. Raises ParameterError if there is no
     such servo, or if one of its parameters is missing.

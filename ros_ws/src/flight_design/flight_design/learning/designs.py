@@ -56,7 +56,7 @@ ParameterError."""
 
 
 class Known(NamedTuple):
-    """What is known about a part of the aircraft whose learned model flies."""
+    """What is known about a part of the aircraft that flies by a learned model."""
 
     deviation: Mapping[str, float]  # relative deviation of each entry, by name
     latest: Mapping[str, float]  # delay of each input plus two standard deviations, s

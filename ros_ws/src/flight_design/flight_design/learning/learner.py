@@ -436,7 +436,7 @@ class Learner:
         return is_planned or (is_wanted and is_rested and not has_fallen)
 
     def _identified(self) -> Identification:
-        """Identify A and B from the record, with starts at the prior and at the flown model.
+        """Identify A and B from the record; the search starts at the prior and the flown model.
 
         With models at several speeds, the record and the prior are those at a steady speed, and the
         result is converted to the trim speed. Raises ParameterError if no steady stretch is as long

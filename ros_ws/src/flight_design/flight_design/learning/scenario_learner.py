@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Make the learner of a scenario, whose rough model is the airframe file or a sketch.
+"""Make the learner of a scenario.
 
-The observers of its designs have the gains of `rise-di gains`.
+Its rough model is the airframe file or a sketch. The observers of its designs have the gains of
+`rise-di gains`.
 """
 
 from pathlib import Path
