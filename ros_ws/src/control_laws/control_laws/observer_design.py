@@ -79,9 +79,9 @@ class ObserverModel(NamedTuple):
 
 
 class ObserverDesign(NamedTuple):
-    """A model with the gains L and F, z_hat = z + L (e - H z), u - u_ff = -F z_hat.
+    """A model with the gain L of the estimate z_hat, and the gain F of the feedback.
 
-    z+ = Phi z_hat + Gamma (u - u_ff).
+    z_hat = z + L (e - H z), u - u_ff = -F z_hat, z+ = Phi z_hat + Gamma (u - u_ff).
     """
 
     states: tuple[str, ...]

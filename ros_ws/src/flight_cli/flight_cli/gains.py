@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Implement `rise-di gains`, which selects gains, checks them, or proves them for all aircraft.
+"""Implement `rise-di gains`, which selects gains, checks them, or proves what they guarantee.
 
-The proof holds for every aircraft in a box around the nominal one.
+The guarantee holds for every aircraft in a box around the nominal one.
 """
 
 from collections.abc import Mapping, Sequence

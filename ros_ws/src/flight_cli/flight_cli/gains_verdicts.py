@@ -95,9 +95,9 @@ VERDICTS = {"loop": loop_verdict, "rules": rules_verdict, "theorem": theorem_ver
 
 
 def condition_name(row: tuple[GainCondition, ...], outputs: tuple[str, ...]) -> str:
-    """Return the name of a row, which has the same condition for each gain set.
+    """Return the name of a table row, which shows one condition for each gain set.
 
-    The channel is in the name if it is the same in all gain sets.
+    If the condition names the same channel in all gain sets, the name of the row has this channel.
     """
     where = {None if condition.channel is None else outputs[condition.channel] for condition in row}
     channel = where.pop() if len(where) == 1 else None

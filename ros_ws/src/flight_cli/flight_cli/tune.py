@@ -382,10 +382,10 @@ def _kept_model(part: Part) -> str:
 def _uncertainty(identification: Identification) -> float:
     """Return the uncertainty of A and B for which gains are searched, from LEAST to MOST.
 
-    Of the effects on each output, only the one with the smallest relative deviation counts. The
-    result is twice the largest standard deviation of these effects, as a fraction of the identified
-    value. The uncertainty of the delay does not count. If the delay is wrong, A and B are wrong in
-    a way that compensates it, so that the loop is still that of the log.
+    Of the effects on each output, only the one with the smallest relative standard deviation
+    counts. The result is twice the largest standard deviation of these effects, as a fraction of
+    the identified value. The uncertainty of the delay does not count. If the delay is wrong, A and
+    B are wrong in a way that compensates it, so that the loop is still that of the log.
     """
     relative = [
         effect.deviation * abs(effect.nominal / effect.value)
@@ -426,7 +426,7 @@ def _on_airframe(scenario: Scenario, airframe: Path, recorded: FlightData) -> Sc
 
     The samples of the sensors may come at another rate than those of `recorded`. White noise has
     the same density at both rates if its variance is proportional to the rate. The density counts,
-    because the loop passes slow noise alone.
+    because the loop passes only slow noise.
     """
     noise = measured_noise(recorded.y, np.ones(recorded.y.shape[1]))
     noise = noise * math.sqrt(scenario.aircraft.rate * recorded.period)

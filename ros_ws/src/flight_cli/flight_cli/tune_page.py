@@ -122,7 +122,7 @@ def verdict(tuned: Tuned) -> list[str]:
 
 
 def guaranteed(promise: Guarantee) -> str:
-    """Return a sentence on how much of the stated deviations of A and B the guarantee covers."""
+    """Return a sentence on how many standard deviations of A and B the guarantee covers."""
     holds = "every aircraft is stable" if promise.holds else "an aircraft may be unstable"
     covered = 2.0 * promise.stable / promise.uncertainty
     return (

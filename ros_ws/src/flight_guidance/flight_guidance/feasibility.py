@@ -113,7 +113,7 @@ def as_route(
     """Make a Route from legs through waypoints.
 
     `speed` is the airspeed, m/s, up to the first waypoint that names one. If `slopes`, the altitude
-    changes along a line, and otherwise in a step at its start.
+    changes linearly along each line. Otherwise it changes in a step at the start of a leg.
 
     A fillet counts as a part of the way to the next waypoint. A leg starts at the altitude and the
     airspeed of the previous waypoint. An orbit round a waypoint starts at the altitude of this

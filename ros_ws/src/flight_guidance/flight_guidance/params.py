@@ -305,10 +305,11 @@ class GuidanceConfig(SteeringConfig):
         )
 
     def landing_on(self, route: Route) -> Landing | None:
-        """Find the landing at the end of a line of a route; None if there is none.
+        """Return the landing on a route; None without a section `landing`.
 
-        Raises ParameterError if no line leads to the waypoint, if no line goes straight on from it,
-        if the line does not descend, and for an airspeed out of bounds.
+        Raises ParameterError if no line of the route leads to the landing's waypoint, if this line
+        does not descend, if no line goes straight on from the waypoint, and for an airspeed out of
+        bounds.
         """
         if (section := self.landing) is None:
             return None

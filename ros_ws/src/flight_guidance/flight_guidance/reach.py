@@ -71,8 +71,8 @@ class RollTest(NamedTuple):
 
         a_dot = p_m^2 - a / MEMORY,   f_dot = p_m p - f / MEMORY
 
-    By least squares, f / a is the fraction of the command that the aircraft follows. The evidence,
-    on which the test decides, is a.
+    By least squares, f / a is the fraction of the command that the aircraft follows. The value of
+    a measures how much roll was commanded, and the test decides only if a is large enough.
     """
 
     asked: float = 0.0  # a, rad^2/s
@@ -82,8 +82,8 @@ class RollTest(NamedTuple):
     def after(self, dt: float, command: float, p: float, largest: float) -> "RollTest":
         """Return the test after a further step of dt, s, with a command and a measured p, rad/s.
 
-        `largest` is the largest command, rad/s. The verdict `ignored` can only change while the
-        evidence a is above ASKED largest^2.
+        `largest` is the largest command, rad/s. The verdict `ignored` can only change while `asked`
+        is above ASKED largest^2.
         """
         memory = math.exp(-dt / MEMORY)
         asked = memory * self.asked + dt * command**2
@@ -121,8 +121,8 @@ def climb_rates(down: float, up: float, speed: float) -> tuple[float, float]:
 def roll_rate(authority: float, frequency: float) -> float:
     """Compute the roll rate p_max for an authority of the aileron, rad/s.
 
-    With it, the largest p_m_dot of the reference after a step, 0.4 w p_max, is a third of the
-    authority. w is the natural frequency of the reference.
+    With this p_max, a step of the command asks for a third of the authority: the largest p_m_dot of
+    the reference is then 0.4 w p_max, where w is its natural frequency, `frequency`, rad/s.
     """
     return authority / (3.0 * 0.4 * frequency)
 

@@ -189,7 +189,7 @@ class StampClock:
 
 
 def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return a mask of all samples but the last: those whose clock may be that of the last one."""
+    """Return which of the samples before the last one may have the same clock as the last one."""
     away_ns = stamp_ns[-1] - stamp_ns[:-1]
     lead_ns = offset_ns[-1] - offset_ns[:-1]
     is_near = (away_ns <= STRAY_NS) | (lead_ns <= LATE_NS)

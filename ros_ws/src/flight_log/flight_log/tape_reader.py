@@ -90,9 +90,9 @@ class RecordedRun(NamedTuple):
 
     @property
     def account(self) -> Any:
-        """The account of the log: the share of each topic in it, and what the log lacks.
+        """The account of the log: how much of each topic it holds, and what it lacks.
 
-        `rise_di.read_run` computes the account; otherwise it is None.
+        It is None unless `rise_di.read_run` has read the log.
         """
         return self.tape.account
 

@@ -35,7 +35,7 @@ def simulate(
         progress: Called with the flight time, s, once per simulated second.
         guide: Makes the guidance from its parameters, if the scenario has guidance.
         control: Makes the controller from its parameters.
-        learn: Makes the learner if the scenario learns, as the result of `learner` does.
+        learn: Makes the learner if the scenario learns. `learner` returns such a function.
         announce: Takes the events of the learning.
 
     Returns:

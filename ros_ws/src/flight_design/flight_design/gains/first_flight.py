@@ -61,9 +61,9 @@ def first_flight(
     """Write a scenario file for the airframe that is in the file `path`.
 
     `controller` is the text of the section controller. The commands are those of `first_commands`,
-    and their heights are multiplied by `part`. `shortfall` says which required margins the loop
-    misses, and becomes the first line of the file. The gusts blow across the flight path at 3 % of
-    the trim speed.
+    and `part` multiplies the heights of their pulses. `shortfall` says which required margins the
+    loop misses, and becomes the first line of the file. The gusts blow across the flight path, at
+    3 % of the trim speed.
     """
     V0 = airframe.speed
     stops = _stops(airframe)

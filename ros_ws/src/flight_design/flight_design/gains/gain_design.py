@@ -190,7 +190,7 @@ def select_gains(
 
 
 def _beside_observer(required: Requirement, *, as_read: bool) -> Requirement:
-    """Lower a required phase margin to that of a loop with an observer, if it is higher.
+    """Lower a required phase margin to at most that of a loop with an observer.
 
     If the gains are taken `as_read` from a file, the loop only needs to be stable.
     """
@@ -467,7 +467,7 @@ def selected_observer(
     activity: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
-    """Add feedforward and observer of a model to a controller, and say where its gains come from.
+    """Add the feedforward and observer of a model to a controller, with a text on their gains.
 
     The search for the least error begins at these gain sets:
 
@@ -475,9 +475,9 @@ def selected_observer(
     - If `sketched`: gains for a model from a sketch.
     - Otherwise: the gains that `rise-di compare --tune` found in the scenario, or in a shipped one
       with the same airframe and lags. If the model has other states, or at least SLOWER times the
-      total lag of that search, they do not count, and a rule derives gains from the lags.
+      total lag of that search, a rule derives gains from the lags instead.
 
-    Gains of a file or for a sketch stay, and are only lowered if the margins need it. Channels that
+    The gains of a file or for a sketch only change if the margins need lower gains. Channels that
     are not free keep their gains. The other arguments are as for `with_aircraft_observer`.
     """
     seen = through_allocation(model, controller)

@@ -209,8 +209,9 @@ class ObserverSearch(NamedTuple):
         """Evaluate the trial at a place.
 
         `least` is the least cost so far of a trial that meets the margins, infinite if there is
-        none. If it is finite, a trial is rejected without its margins if it costs no less, or if a
-        loop is unstable when each input is late by the delay margin that it needs.
+        none. If `least` is finite, the margins of some trials need not be computed. A trial is
+        rejected if it costs no less, or if a loop is unstable when each input is late by the delay
+        margin that it needs.
         """
         loops = self._loops(place)
         if least < math.inf:
@@ -248,7 +249,8 @@ class ObserverSearch(NamedTuple):
     def _loops(self, place: Place) -> _Loops:
         """Build the loops for a place, the exponents of the relaxation.
 
-        At the start they are those of the earlier design.
+        At the start of the search they have the controller of the earlier design, if there is one,
+        with the new feedforward.
         """
         earlier = self.earlier_design
         begin = np.ones(len(place)) if earlier is None else earlier.relaxation

@@ -206,7 +206,8 @@ def _with_schedule(
 def _air(airframe: Airframe, model: NominalModel, vanes: Mapping[str, float]) -> Air:
     """Return moderate turbulence, gusts from below and from the side, and the noise of all sensors.
 
-    The air rolls too. Otherwise only noise would move a symmetrical aircraft in roll.
+    The turbulence has a rotary gust in roll if p is a state. Otherwise only noise would move a
+    symmetrical aircraft in roll.
     """
     speed = airframe.speed
     spectrum = dryden(**MODERATE, sigma=0.0)

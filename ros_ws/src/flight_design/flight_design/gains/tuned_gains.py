@@ -89,7 +89,7 @@ def save(
 ) -> None:
     """Write tuned gains, costs and the tuning command.
 
-    The laws come in the order of the catalogue, and the objectives of each law in that of `order`.
+    The laws come in the order of the catalogue, and the objectives of each law as in `order`.
     Raises ParameterError if the file cannot be written.
     """
     known = set().union(*results.values())

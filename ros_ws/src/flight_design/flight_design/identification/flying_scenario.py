@@ -199,7 +199,7 @@ class _Identified(NamedTuple):
         return ideal_control.study_airframe(integrators, short, samples=1)
 
     def setting(self, requirement: Requirement) -> LoopSetting:
-        """Return the loop for which gains are selected; they are 1 before the selection."""
+        """Return the loop for which gains are selected, with gains of 1 before the selection."""
         loop = self.loop
         lag = loop.lag.tolist()
         channels = controller_values(self.channel_map, self.pairing)

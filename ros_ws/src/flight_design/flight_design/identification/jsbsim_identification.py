@@ -292,9 +292,9 @@ def airspeed_slew(bandwidth: float, effect: float) -> float:
     """Return the throttle slew from which beta of V follows, 1/s.
 
     `bandwidth` is that of V, rad/s, and `effect` is that of the throttle, m/s^2. The airspeed V
-    contains the wind itself. Here beta is K sigma bandwidth / 4, with sigma = LIGHT_SIGMA. In light
-    turbulence the sign term then moves the throttle at most as fast as a Lambda of bandwidth / 4
-    would, which is the Lambda of the rule.
+    contains the wind itself, so the slew is chosen for light turbulence: beta becomes K sigma
+    bandwidth / 4, with sigma = LIGHT_SIGMA. The sign term then moves the throttle at most as fast
+    as a Lambda of bandwidth / 4, which is the Lambda of the engineering procedure.
     """
     return bandwidth**2 / 4.0 * LIGHT_SIGMA / (gain_selection.BETA_TO_SLEW * effect)
 

@@ -118,7 +118,8 @@ class Unknown(NamedTuple):
     def factor(self) -> float:
         """Largest factor by which an entry may exceed its nominal value, or fall short of it.
 
-        It is MAX_FACTOR for prior deviations of PRIOR, and grows with the larger of the deviations.
+        It is MAX_FACTOR if `error` and `effect` are at most PRIOR, and grows with the larger of the
+        two.
         """
         roughness = max(self.error, self.effect, PRIOR) / PRIOR
         return float(MAX_FACTOR**roughness)
@@ -148,8 +149,9 @@ def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, Fl
     """Return the units in which the errors of the entries of A and B are counted, SI.
 
     An entry with the unit 0 is known. The units are the nominal values, except in the rows of
-    angles, where they are 0. If `coupled`, an entry that is 0 gets the unit COUPLING times the
-    largest effect on its row, in units of motion. The columns of angles stay 0.
+    angles, where they are 0. If `coupled`, an entry that is 0 gets a unit that follows from its
+    row: COUPLING times the largest effect there. Effects of states are compared for motions of one
+    `size` each. The columns of angles stay 0.
     """
     free = model.kinematic[:, None] == 0.0
     is_dynamic = model.kinematic == 0.0
@@ -189,7 +191,7 @@ class Likelihood:
         *,
         coupled: bool = False,
     ) -> None:
-        """Set up the likelihood; the relative errors have the priors in `unknown`.
+        """Set up the likelihood, with the priors of the errors of A and B in `unknown`.
 
         `believe` may replace the priors later. `delay` is the delay of u, s. The search starts with
         means over `factor` periods, by default over the shortest lag. If `coupled`, the entries
@@ -238,10 +240,10 @@ class Likelihood:
         self.believe(np.repeat([unknown.error, unknown.effect], [count_A, count_B]))
 
     def believe(self, deviation: FloatArray, centre: FloatArray | None = None) -> None:
-        """Set the prior deviations and the prior mean of the relative errors, (p - G,) each.
+        """Set the prior of the relative errors: standard deviation and mean, (p - G,) each.
 
-        The mean is `centre`, by default 0. The deviations and the bounds of the search are relative
-        to the values of the entries at the centre.
+        The mean is `centre`, by default 0. The standard deviations and the bounds of the search are
+        relative to the values of the entries at the centre.
         """
         delay_prior = np.ones(len(self._block.inputs) if self._delay_deviation else 0)
         wind_prior = np.full(len(self._block.winds), WIND_PRIOR)
@@ -527,7 +529,7 @@ class Likelihood:
         ]
 
     def about_centre(self, entries: Iterable[Entry]) -> list[Entry]:
-        """Return entries whose errors and deviations are relative to the centre of the search."""
+        """Return entries whose errors and standard deviations are relative to the prior mean."""
         centred = []
         for entry, centre in zip(entries, self.centre.tolist(), strict=False):
             scale = 1.0 + centre if entry.nominal else 1.0

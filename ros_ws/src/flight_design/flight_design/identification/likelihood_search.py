@@ -61,7 +61,7 @@ class Slopes(NamedTuple):
 
 
 class Doubt(NamedTuple):
-    """Two sources of error that the deviations of a fit include beside the innovations' noise."""
+    """Two causes of error, beside noise, that the standard deviations of a fit include."""
 
     timing: float  # s, standard deviation of the delay of u, which is not identified
     whiteness: FloatArray  # (m,) `whiteness` of the innovations of the held-out samples
@@ -147,8 +147,8 @@ class Search(Likelihood):
         """Return the fit at the end of a search.
 
         The fit also has the innovations of the nominal model, and of the model `flown` if there is
-        one. For each of these two models, the wind has the level in each span that fits best, or
-        the levels `same` if they cost less.
+        one. For each of these two models, the wind has the best level in each span, or the levels
+        `same` if those have a lower cost.
         """
         theta = best.theta
         covariance: FloatArray = np.asarray(np.linalg.inv(best.hessian), float)
@@ -214,10 +214,11 @@ class Search(Likelihood):
     def _started(
         self, theta: FloatArray, levels: NDArray[np.int64] | None, *, winds: bool
     ) -> FloatArray:
-        """Return theta, (p,), after some steps with the flight averaged over the shortest lag.
+        """Return theta, (p,), after at most START_STEPS steps of the search.
 
-        `levels` gives the level of each span. If it is None, theta decides the levels. `winds` says
-        whether the strengths of the winds are free.
+        These steps use the flight averaged over the shortest lag. `levels` gives the level of each
+        span. If it is None, theta decides the levels. `winds` says whether the strengths of the
+        winds are free.
         """
         free = np.ones(len(theta), dtype=bool)
         free[self._winds] = winds
@@ -320,7 +321,7 @@ class Search(Likelihood):
         return Slopes(cost=float(costs[0]), e=e[0] / rms, J=J, half_log_det=log_det)
 
     def with_doubt(self, fit: Fit, doubt: Doubt) -> tuple[Fit, FloatArray]:
-        """Replace the deviations of a fit by deviations that also hold for a wrong model.
+        """Replace the standard deviations of a fit by ones that also hold for a wrong model.
 
             covariance = H^-1 (M + prior^-2) H^-1 + s s' timing^2,  s = -H^-1 J j
 
@@ -332,7 +333,7 @@ class Search(Likelihood):
         T. Birge, Phys. Rev. 40(2), 1932; S. F. Schmidt, Advances in Control Systems 3, 1966, for a
         delay that is not estimated.
 
-        Returns the fit, and the part of the entries' deviations that the delay causes, (p - G,).
+        Returns the fit, and how much of each entry's standard deviation the delay causes, (p - G,).
         """
         theta, used = fit.theta, self.fitted()
         slopes = self._slopes(theta, fit.levels, used, np.ones(len(theta), dtype=bool))
@@ -365,9 +366,10 @@ class Search(Likelihood):
         return self.predicted(theta, self.levels(theta))
 
     def joined(self, parts: Iterable[tuple[Likelihood, Fit]]) -> FloatArray:
-        """Return a theta, (p,), with the parts' mean winds, angles and delays, and errors of 0.
+        """Return theta, (p,), with the mean winds, angles and delays of the parts.
 
-        The errors stay 0, because those of a part are wrong if it couples with another part.
+        The errors of A and B in it are 0, because the errors that were found for a part are wrong
+        if the part couples with another one.
         """
         values: dict[str, list[float]] = {}
         for part, fit in parts:

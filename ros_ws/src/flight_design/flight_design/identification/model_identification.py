@@ -314,7 +314,7 @@ def identify_model(
             the airframe's order.
         progress: Takes the steps `completed` and their largest number `total`.
         bound_count: How many entries of a part may lie at their bound.
-        unknown: Deviations of all that is identified, such as delays.
+        unknown: Prior standard deviations of all that is identified, such as delays.
         flown: The model in flight. It is one more start of the search, and its advantage over the
             nominal model is computed.
         after: The advantage counts only samples after this flight time, s.
@@ -323,7 +323,8 @@ def identify_model(
         searches_again: Whether a part with too many entries of A at their bounds is searched again,
             around the result of the first search.
         timing: Standard deviation of the delay in `actuation`, s. If it is given, even as 0, the
-            deviations also hold for a model that is not right (`Search.with_doubt`).
+            standard deviations of the result also hold for a model that is not right
+            (`Search.with_doubt`).
 
     Raises:
         ParameterError: An output does not move.
@@ -440,7 +441,8 @@ def join_innovations(parts: Sequence[Innovations], blocks: Sequence[Block]) -> I
 def model_yaml(identified: Identification, origin: str) -> str:
     """Write the identified airframe as the text of an airframe file.
 
-    The header has the origin, the figures of the held-out samples and the deviations.
+    The header has the origin, the figures of the held-out samples, and the standard deviations of
+    the entries.
     """
     lines = [f"The airframe {identified.airframe.name}, with A and B identified from {origin}.", ""]
     lines.append(

@@ -34,8 +34,8 @@ def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
 def reason_against_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> Refusal | None:
     """Refuse a model if even the best known effect on some output is uncertain.
 
-    An effect is uncertain if its deviation is above MAX_DEVIATION. The refusal names the output
-    whose effects are known worst.
+    An effect is uncertain if its relative standard deviation is above MAX_DEVIATION. The refusal
+    names the output whose effects are known worst.
     """
     worst = max(best_known(entries, outputs), key=lambda effect: effect.deviation)
     if worst.deviation <= MAX_DEVIATION:
@@ -76,8 +76,8 @@ def reason_against_airframe(
 ) -> Refusal | None:
     """Refuse the airframe `name` if more than `allowed` entries are at a bound of the search.
 
-    A single entry is too many if the record shows it clearly, so that its deviation is at most half
-    of the prior one. The aircraft then lies beyond the bound.
+    A single entry is too many if the record shows it clearly, with less than half of the prior
+    standard deviation. The aircraft then lies beyond the bound.
     """
     found = at_bound(entries, factor)
     is_shown = any(entry.deviation < PRIOR / 2.0 for entry in found)
@@ -114,10 +114,10 @@ def reason_against_signs(
 
 
 def in_time(entries: Iterable[Entry], by_timing: Iterable[float]) -> list[Entry]:
-    """Return the entries with the deviations that they would have without one cause of error.
+    """Return the entries with the standard deviations that they would have without one cause.
 
-    `by_timing` is the part of each deviation that this cause makes. If the cause is an uncertain
-    delay of u, the deviations of the result are those for a known delay.
+    `by_timing` is the part of each standard deviation that this cause makes. If the cause is an
+    uncertain delay of u, the result has the standard deviations for a known delay.
     """
     return [
         entry._replace(deviation=float(np.sqrt(max(entry.deviation**2 - late**2, 0.0))))
@@ -130,7 +130,7 @@ def reason_against_timing(
 ) -> Refusal | None:
     """Refuse a part of the aircraft if its best known effects depend too much on the delay of u.
 
-    `by_timing` is the part of each entry's deviation that an uncertain delay of u causes.
+    `by_timing` is the part of each entry's standard deviation that an uncertain delay of u causes.
     """
     late = dict(zip((entry.name for entry in entries), by_timing, strict=False))
     worst = max(best_known(entries, outputs), key=lambda effect: late.get(effect.name, 0.0))

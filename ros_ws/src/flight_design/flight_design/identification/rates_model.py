@@ -6,12 +6,12 @@ A log of rates lacks two things that move the aircraft slowly. The first is the 
 in a climb or at another airspeed. The inputs then hold the new trim without moving the rates, and
 to a linear model they seem to have little effect. The second is the bank. In a bank, gravity causes
 sideslip, and the aircraft turns. A model without the bank angle takes this turn for an effect of
-the rudder. The innovations stay white in both cases, because most of the log is quiet, and entries
-come out up to 50 stated deviations off.
+the rudder. The innovations stay white in both cases, because most of the log is quiet. The entries
+are wrong by up to 50 of their standard deviations.
 
 Here a high-pass takes the slow changes out of y and u, and the model has the bank angle. A linear
 aircraft has the same model behind any high-pass. If the models behind two different high-passes
-differ, the difference is an error that neither model's stated deviations include.
+differ, the difference is an error that the standard deviations of neither model include.
 """
 
 import math
@@ -56,8 +56,8 @@ def identify_rates(
 
     The rows of states that are no outputs are known: mass and lift give them. The airframe of the
     result has the bank angle among its states if the nominal one can bank. `timing` is the standard
-    deviation of the instant at which u acts, s. A second model, behind a faster high-pass, widens
-    the deviations.
+    deviation of the instant at which u acts, s. A second model is fitted behind a faster high-pass.
+    Its differences from the first one widen the standard deviations of the result.
     """
     searches = [(without_trim(recorded), timing), (without_trim(recorded, FAST), None)]
     found, steady = (
@@ -106,9 +106,9 @@ def without_trim(recorded: FlightData, slow: float = SLOW) -> FlightData:
         y' = F(z) y,  u' = F(z) u,  F(z) = (1 + a)/2 (1 - 1/z)/(1 - a/z),  a = exp(-period / slow)
 
     F commutes with a linear aircraft, so the model from u' to y' is the model from u to y. F begins
-    at rest at the mean of the first 2 slow, which is close to the trim at the beginning. The first
-    sample itself may lie within a doublet. Across lost samples of y, a straight line is filtered,
-    and the samples stay lost in the result.
+    at rest at the mean over an initial time of 2 `slow`, s. This mean is close to the trim, while
+    the first sample itself may lie within a doublet. Across lost samples of y, a straight line is
+    filtered, and the samples stay lost in the result.
     """
     a = math.exp(-recorded.period / slow)
     numerator = (1.0 + a) / 2.0 * np.array([1.0, -1.0])
@@ -126,22 +126,21 @@ def without_trim(recorded: FlightData, slow: float = SLOW) -> FlightData:
 
 
 def doubted(found: Identification, steady: Identification) -> Identification:
-    """Widen the deviations of a model by its differences from the second model, `steady`.
+    """Widen the standard deviations of a model by its differences from a second one, `steady`.
 
-        new deviation^2 = deviation^2 + (error of the entry - its error in `steady`)^2
+        new sigma^2 = sigma^2 + (error of the entry - its error in `steady`)^2
 
-    An entry that `steady` lacks is nominal in it, so its error is 0. A part is refused if the best
-    known effect on one of its outputs differs by more than MOST_APART. A part that is already
-    refused for another reason keeps this reason. The exception is a part that is refused as no
-    better than the nominal model, but has the higher likelihood: such a part may be used, so it is
-    tested too.
+    An entry that `steady` lacks has the error 0 there. A part is refused if the best known effect
+    on one of its outputs differs by more than MOST_APART. A part that is already refused for
+    another reason keeps this reason. The exception is a part that is refused as no better than the
+    nominal model, but has the higher likelihood: such a part may be used, so it is tested too.
     """
     errors = {entry.name: entry.error for entry in steady.entries}
     return found._replace(parts=tuple(_doubted(part, errors) for part in found.parts))
 
 
 def _doubted(part: Part, steady: Mapping[str, float]) -> Part:
-    """Widen the deviations of a part, whose entries have other errors in the `steady` model."""
+    """Widen the standard deviations of a part by the differences from the `steady` model."""
     entries, by_motion = [], []
     for entry in part.entries:
         apart = abs(entry.error - steady.get(entry.name, 0.0))

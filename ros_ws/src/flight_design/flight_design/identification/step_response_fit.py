@@ -135,9 +135,9 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
 def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
     """Return whether a fitted response begins with the sign of Omega.
 
-    The sum of the response until EARLY after delay and lag counts. If it has the other sign, the
-    slow part makes up the whole response. Its two poles then stand for a pole and a lag, and Omega
-    is about 0.
+    The sign is that of the sum of the response until EARLY after delay and lag. If this is not the
+    sign of Omega, the slow term makes up the whole response. The two fitted poles then stand for a
+    pole and a lag, and Omega is about 0.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     first, second = second_order_response(

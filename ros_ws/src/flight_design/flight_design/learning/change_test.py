@@ -55,7 +55,7 @@ NONE = MAX_DEVIATION  # share of an effect that counts as none: it is known no b
 # A reversed effect of at most this share counts as none. No surface reverses in flight, but a
 # surface that is jammed off centre pushes steadily against the u that is to balance it. If it is
 # jammed at 5 deg while u is at its stop of 30 deg, it looks like an effect of -17 %. This effect
-# has a stated deviation of only 1 %, so a limit in deviations would not help.
+# has a standard deviation of only 1 %, so a limit in standard deviations would not help.
 OFF_CENTRE = 0.25
 # Difference of log-likelihood up to which an input without effect explains the flight as well as
 # the best loss does.
@@ -210,7 +210,7 @@ class Effects(Search):
         dead: int | None = None,
         levels: NDArray[np.int64] | None = None,
     ) -> Least:
-        """Minimise J, beginning at theta, (p,), or at 0 if theta is None.
+        """Minimise the J of `change_test`, beginning at theta, (p,), or at 0 if theta is None.
 
         Every kappa is at least `lower`. The input with the index `dead` has no effect. At each step
         the levels of the wind follow from theta, unless `levels` gives them.

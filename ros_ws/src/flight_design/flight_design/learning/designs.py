@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Derive from a learner's models what a design needs: margins to keep, and deviations of B."""
+"""Derive what a design needs from learned models: required margins, and how uncertain B is."""
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -88,21 +88,21 @@ class LearnedLoop(NamedTuple):
         return with_box(linear, model, self.controller, DEVIATIONS * self.unlearned, 0, spread)
 
     def proof(self) -> tuple[LinearLoop, Guarantee]:
-        """Return the linear loop, and the proof up to which deviations every aircraft is stable.
+        """Return the linear loop, and a proof of how far an aircraft may deviate and stay stable.
 
-        The search goes up to MOST_DEVIATIONS.
+        The proof goes up to MOST_DEVIATIONS standard deviations of each entry.
         """
         linear = self.linear()
         return linear, quick_guarantee(linear, MOST_DEVIATIONS / DEVIATIONS)
 
     def guarantee(self) -> ModelGuarantee:
-        """Compute within how many stated deviations of the model every aircraft is stable."""
+        """Compute within how many standard deviations of the model every aircraft is stable."""
         _, proved = self.proof()
         return ModelGuarantee(deviations_covered(proved), proved.loop)
 
 
 def deviations_covered(proved: Guarantee) -> float:
-    """Return how many stated deviations of a model its proof covers."""
+    """Return how many standard deviations of each entry the proof of a model covers."""
     return DEVIATIONS * proved.stable / proved.uncertainty
 
 
@@ -232,8 +232,9 @@ def with_flown_channels(
 ) -> RiseDiConfig:
     """Let the outputs `flying` fly a design, and all other outputs the law of the start.
 
-    `left` is that of `by_law_of_start`. Its dead inputs are held at a constant value. If any part
-    is left to the law, the margin in the controller is set to that of its loop.
+    `left` has the parts that are left to this law, as in `by_law_of_start`. The law does not move
+    their dead inputs. If any part is left and there is an observer, the margin in the controller is
+    set by `with_own_margin`.
     """
     bare = [output not in flying for output in start.outputs]
     mixed = with_channels_of(
@@ -256,8 +257,8 @@ def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> R
 def with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:
     """Put the standard deviations of B into the model of a controller's feedforward.
 
-    `deviation` has the relative deviation of each entry, by the entry's name. An entry that no
-    flight has shown gets PRIOR.
+    `deviation` has the relative standard deviation of each entry, by the entry's name. An entry
+    that no flight has shown gets PRIOR.
     """
     model = designed.feedforward
     assert model is not None  # noqa: S101 - a design has one

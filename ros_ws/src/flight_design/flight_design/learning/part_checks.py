@@ -163,7 +163,7 @@ def reason_against_effects(part: Part, flown: Airframe | None) -> Refusal | None
 def effect_sentence(part: Part) -> str:
     """Say which effects of the inputs on the outputs the flight has shown.
 
-    The effects are relative to those of the rough airframe, and are given with their deviations.
+    Each effect is given relative to that of the rough airframe, with its standard deviation.
     """
     effects = (entry for entry in part.entries if entry.matrix == "B" and entry.row in part.outputs)
     known = (entry for entry in effects if entry.nominal and entry.deviation < PRIOR / 2.0)

@@ -101,7 +101,8 @@ def flare_climb(height: float, path_sink: float, landing: Landing) -> float:
     """Compute the climb rate that is commanded in the flare, m/s.
 
     It changes with the height, m, linearly from the climb rate on the glide path to -sink.
-    `path_sink` is the sink rate on the glide path, m/s. A smaller one than `sink` counts as `sink`.
+    `path_sink` is the sink rate on the glide path, m/s. If it is below the `sink` of the landing,
+    the climb rate is -sink at every height.
     """
     share = min(max(height / landing.flare, 0.0), 1.0)
     return -(landing.sink + max(path_sink - landing.sink, 0.0) * share)

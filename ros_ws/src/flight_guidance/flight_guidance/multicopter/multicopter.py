@@ -301,8 +301,9 @@ def _within_fence(
 ) -> tuple[GuidanceState, Escape]:
     """Return the state under the action of the fence; when the action begins, home is the target.
 
-    The action begins when the place where the aircraft can stop is too near to the fence, nearer
-    than the aircraft flies in the time MARGIN, at 1 m/s or more.
+    The action begins when the way to the place where the aircraft can stop comes too near to the
+    fence: nearer than the distance flown in the time MARGIN at the present speed, or at 1 m/s if
+    this is faster.
     """
     fence = params.fence
     if fence is None or state.mode is not GuidanceMode.ENGAGED:

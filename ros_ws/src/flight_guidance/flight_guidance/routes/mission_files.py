@@ -322,9 +322,9 @@ def json_fence(tree: Any, key: str) -> FencePlaces:
 
 
 def wpl_fence(content: bytes, key: str) -> FencePlaces:
-    """Read the polygons, circles, return point and rally points of MAVLink.
+    """Read the polygons, circles, return point and rally points in a QGC WPL 110 file.
 
-    The commands are MAV_CMD_NAV_FENCE_... and MAV_CMD_NAV_RALLY_POINT.
+    They are the items with the commands MAV_CMD_NAV_FENCE_... and MAV_CMD_NAV_RALLY_POINT.
     """
     items, home = wpl_items(content, key)
     zones: list[Area] = []
@@ -383,7 +383,10 @@ def _group(item: Item, key: str) -> int:
 
 
 def lat_lon(position: Any, above: Above = Above.AS_POSE) -> Place:
-    """Read a position in a plan, which is latitude, longitude and perhaps altitude."""
+    """Read a position in a plan: a list of latitude, longitude and perhaps altitude.
+
+    `above` says what the altitude counts from.
+    """
     require(is_position(position), "fence", short_repr(position), "latitude and longitude")
     latitude, longitude, *altitude = position
     return Place("fence", latitude, longitude, altitude[0] if altitude else None, above=above)
