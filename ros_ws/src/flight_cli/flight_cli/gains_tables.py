@@ -68,7 +68,7 @@ class GainSets(NamedTuple):
 
     @property
     def titles(self) -> dict[str, Assessment]:
-        """The gain sets by the name to print, which after a check is that of the scenario."""
+        """Gain sets by the names to print. After a check, the name is that of the scenario."""
         return {self.checked: self.first} if self.checked else self.answers
 
     @property

@@ -205,7 +205,7 @@ def _judged(selectors: Selectors, name: str, controller: RiseDiConfig, origin: s
 
 
 def _flown(selectors: Selectors, scenario: Scenario, air: Mapping[str, Any]) -> Tape:
-    """Fly a scenario on the aircraft that flies, in an air."""
+    """Simulate a scenario with the airframe file `aircraft` in an air, such as calm air."""
     return simulate(scenario.vary(aircraft={"airframe": str(selectors.aircraft), **air}))
 
 

@@ -85,7 +85,10 @@ def instances_of_flight(
 
 
 def _of_motion(name: str, tables: Mapping[int, MessageTable], fields: Set[str]) -> tuple[int, str]:
-    """Return the moving instance, or the first of several instances that agree."""
+    """Return the number of the moving instance, or of the first of several that agree, and why.
+
+    Raises ParameterError if the moving instances differ.
+    """
     motions = {number: _motion(table, fields) for number, table in tables.items()}
     moving = {
         number: tables[number]

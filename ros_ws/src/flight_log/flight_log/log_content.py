@@ -313,7 +313,10 @@ class TopicSamples:
         )
 
     def of_flight(self, signal: Signal | None) -> list[_Publisher]:
-        """Return the publishers whose samples the nodes admit; all of them without a signal."""
+        """Return the publishers whose samples the nodes admit.
+
+        If there is no signal, all publishers are returned.
+        """
         publishers = [*self._publishers.values()]
         if signal is None or not self._samples:
             return publishers

@@ -191,12 +191,12 @@ class Selection:
 
     @cached_property
     def theorem(self) -> GainAssessment[RiseDiConfig]:
-        """Gain set of Theorem 1, assessed."""
+        """Gain set of Theorem 1, with conditions and margins."""
         return assess_gains(self.study, self.literal, self.setting)
 
     @cached_property
     def engineering(self) -> GainAssessment[RiseDiConfig]:
-        """Engineering gains, assessed."""
+        """Engineering gains, with conditions and margins."""
         return assess_gains(self.study, self.chosen, self.setting)
 
 

@@ -73,7 +73,7 @@ NO_MOTION = 1e-3
 
 
 class Requirement(NamedTuple):
-    """The margins that a loop must have, each with one input open; the worst input counts."""
+    """The margins that a loop must have if it is opened at one input; the worst input counts."""
 
     phase: float = math.radians(PHASE_MARGIN)  # rad, nominal aircraft
     gain: float = 10.0 ** (6.0 / 20.0)  # factor, up or down: 6 dB
