@@ -88,17 +88,16 @@ class LqiConfig(ControllerConfig):
 
 
 def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return F, G and E of the nominal aircraft with the reference and the integral of e.
+    """Return the matrices F, G and E of the model z+ = F z + G u, z = [x, y_m, w, integral of e].
 
-        z+ = F z + G u
         x_dot   = (A + gravity) x + B u
         y_m_dot = w - LEAK y_m,  w_dot = -fade w,  integral of e: C x - y_m
 
     F is (n + 3 m, n + 3 m), G (n + 3 m, m) and E (2 m, n + 3 m). The model is sampled with u held
     over a period, and the cost is on E z, which is e and the integral of e. In this model an
     angle only decays, angle_dot = -LEAK angle, so that the design takes the angles as measured
-    disturbances. In reality the angles integrate the controlled rates, but with the true rows the
-    integral of e would not be controllable.
+    disturbances. In reality an angle integrates the controlled rates, but a model with these
+    integrals could not control the integral of e.
     """
     n, m = model.B.shape
     free = 1.0 - model.kinematic[:, None]

@@ -190,7 +190,7 @@ def _comments(selection: Selection, controller: RiseDiConfig) -> dict[str, str]:
 
 
 def _within(uncertainty: float) -> str:
-    """Say that a value is the largest within `uncertainty`; return "" for an uncertainty of 0."""
+    """Say that a value is the largest for deviations up to `uncertainty`; "" if that is 0."""
     return f", the largest within +-{100 * uncertainty:g} %" if uncertainty else ""
 
 

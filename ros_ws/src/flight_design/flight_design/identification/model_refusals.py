@@ -114,7 +114,7 @@ def reason_against_signs(
 
 
 def in_time(entries: Iterable[Entry], by_timing: Iterable[float]) -> list[Entry]:
-    """Return the entries with the standard deviations that they would have without one cause.
+    """Return the entries with standard deviations that leave out one cause of error.
 
     `by_timing` is the part of each standard deviation that this cause makes. If the cause is an
     uncertain delay of u, the result has the standard deviations for a known delay.

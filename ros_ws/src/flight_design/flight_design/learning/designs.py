@@ -152,15 +152,16 @@ def goal(
     Each part needs a delay margin:
 
     - If `learn.margin` is set, it is this margin.
-    - Otherwise, with no design for the file, it is the margin of the start.
-    - With a design for the `file`, it is the margin that the loop of the file has around the model,
-      but at most the margin of the start. A learned part needs at least LEAST_MARGIN, or the margin
-      of the start if this is smaller.
+    - Otherwise, with no design for the airframe file, it is the margin of the controller at the
+      start.
+    - With a design for the airframe file (`file`), it is the margin that the loop with this design
+      has around the learned model, but at most the margin of the start. A learned part needs at
+      least LEAST_MARGIN, or the margin of the start if this is smaller.
 
     A `dead` output flies without this design, so it needs no margin. In any case an input must
     tolerate DELAY_LEFT, s, beyond its `latest` delay, s. With a design for the file, the
-    sensitivity is at most 2, or that of the file's loop if it is larger. This bounds the phase and
-    gain margins (Astrom, Murray, "Feedback Systems", 10.5).
+    sensitivity must be at most 2, or that of the loop with this design if it is larger. This bounds
+    the phase and gain margins (Astrom, Murray, "Feedback Systems", 10.5).
     """
     outputs = start.outputs
     margin = np.full(len(outputs), margin_of(start))
