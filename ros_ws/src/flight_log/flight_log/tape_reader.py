@@ -305,8 +305,8 @@ def _publishers(senders: Sequence[str]) -> str:
 def _is_before_epoch(start_ns: int, spans: Mapping[str, SampleSpan]) -> bool:
     """Return whether the processes took their stamps from /clock.
 
-    The stamps then lie long before the present, and the names have a process id. Stamps by the
-    host's clock count from 1970, and in lockstep the names have no process id.
+    The stamps then lie long before the present, and the names of the publishers have a process id.
+    Stamps by the host's clock count from 1970, and in lockstep the names have no process id.
     """
     return start_ns <= SINCE_EPOCH_NS and any(INSTANCE.fullmatch(sender) for sender in spans)
 

@@ -289,7 +289,7 @@ class Likelihood:
         """Return the models for N thetas, (N, p): A (N, n, n), B (N, n, m), wind (N, n, G).
 
         The wind acts on each model through the A of this model, because an aircraft is moved by its
-        motion relative to the air. So entries that are 0 only in the nominal airframe count too.
+        motion relative to the air. So an entry that is 0 only in the nominal airframe counts too.
         """
         matrices = []
         parts = np.split(thetas, [np.count_nonzero(self._units[0]), self.count], axis=1)[:2]
