@@ -449,9 +449,10 @@ def settling_time(
 ) -> float | None:
     """Return the time, s, after which abs(e) stays in the band for `dwell` s or until the end.
 
-    The time counts from t[0], and t and e have the shape (N,). It is 0 if abs(e) stays in the band
-    for the first `leaves` s. If e leaves the band only later, this has another cause. It is None if
-    abs(e) does not return to the band, or if there is no sample.
+    The time counts from t[0], and t and e have the shape (N,). `leaves` is the time, s, within
+    which a transient moves e out of the band. If abs(e) stays in the band for this time, the result
+    is 0, even if it leaves the band later. The result is None if abs(e) does not return to the
+    band, or if there is no sample.
     """
     if len(t) == 0:
         return None
@@ -474,10 +475,10 @@ class Settling(NamedTuple):
 
 
 def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling]:
-    """Return the settling times of `best_error` into `settling_bands` after each transient.
+    """Return, for each transient, how long `best_error` takes to settle in the `settling_bands`.
 
-    A settling time begins with the start of a transient, and only samples before the next transient
-    of the channel count. Transients after the end of the flight are left out. So are turns and
+    The time counts from the start of the transient. Only samples before the next transient that
+    excites the channel count. Transients after the end of the flight are left out. So are turns and
     captures, because their commands change until they end.
     """
     _, error = best_error(tape)
@@ -517,7 +518,7 @@ def inputs_by_part(
 
     The metrics are rms and max abs(u) about trim, and mean abs(u_dot). If `topic` is "y", y takes
     the place of u. mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1)) over the steps
-    that end in the part. It is NaN if there is no such step.
+    that end in the part. This mean is NaN if there is no such step.
     """
     if topic not in tape:
         return {}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compute every step of guidance in a log again, to check that the log is complete.
+"""Recompute every step of guidance that a log contains, to check that the log is complete.
 
 The inputs of a step come from its own sample in the log, and its initial state from the sample
 before.
@@ -35,17 +35,17 @@ class GuidanceReplay(NamedTuple):
     notes: tuple[str, ...]
 
     def equal(self) -> bool:
-        """Return whether every checked bit is equal."""
+        """Return whether no checked step differs from the log in a bit."""
         return self.differing == 0
 
 
 def _waypoints(rows: FloatArray) -> list[Waypoint]:
-    """Return the waypoints of a route from its messages, one per row."""
+    """Return the waypoints of a route, given its messages as rows of (number, *waypoint)."""
     return [Waypoint(*row[1:]) for row in rows.tolist()]
 
 
 def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
-    """Return the routes that guidance could fly in this flight, by digest.
+    """Return the routes that guidance could fly in this flight, by the digest of the route.
 
     They come from the section `guidance` of the scenario and from the topic `route`. The log of
     guidance names a route by the same digest.
@@ -63,7 +63,7 @@ def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
 
 
 def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceReplay:
-    """Compute every step of the topic `guidance` again, and the u_m published at the same instant.
+    """Recompute every step of the topic `guidance`, and its u_m, and compare both with the log.
 
     If a step failed in flight, the replay checks that the state stayed as it was and that the last
     u_m was published again. A step is not checked if the log lacks its route or the state before
@@ -117,7 +117,7 @@ class _Comparison:
         )
 
     def differences(self) -> Iterator[ReplayDifference]:
-        """Yield the first channel that differs, for each step with a difference, in order."""
+        """Yield, for each step that differs from the log, the first channel that differs."""
         previous: GuidanceState | None = None
         failed_before = 0.0
         rows = zip(self._signal.stamp_ns.tolist(), self._signal.values, strict=True)
@@ -148,9 +148,9 @@ class _Comparison:
         *,
         goes_on: bool,
     ) -> FloatArray:
-        """Compute the channels of the step after the state `previous`, and append its u_m.
+        """Compute the step that follows the state `previous`, and return its channels and u_m.
 
-        `goes_on` says that the step failed, so that guidance went on with the last u_m.
+        If `goes_on` is True, the step failed in flight, and guidance went on with the last u_m.
         """
         route = int(channels["route"])
         if goes_on and previous is not None:

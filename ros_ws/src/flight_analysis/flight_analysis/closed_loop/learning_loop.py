@@ -50,9 +50,10 @@ class Learner(Protocol):
     """
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
-        """Take y, u and the digest of the parameters of one tick of the engaged law.
+        """Record one tick of the engaged law.
 
-        y and u have the shape (m,), and u is the input after the limits were applied.
+        y and u have the shape (m,), and u is the input after the limits were applied. `flown` is
+        the digest of the parameters with which the law computed u.
         """
 
     def propose(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
@@ -67,7 +68,7 @@ Learn = Callable[[RiseDiConfig], Learner]
 
 
 class Entry(NamedTuple):
-    """An entry of A or B, and the error of its nominal value that was found in flight.
+    """An entry of A or B with its nominal value, and the error of this value as found in flight.
 
     The nominal value is in SI. `deviation` is the standard deviation of the error after the flight.
     `error` and `deviation` are fractions of `unit`, which is the nominal value, or another value if
@@ -89,16 +90,16 @@ class Entry(NamedTuple):
 
     @property
     def value(self) -> float:
-        """The value after the flight, SI."""
+        """The value of the entry as found in flight, SI."""
         return self.nominal + self.unit * self.error
 
 
 class Learned(NamedTuple):
     """The channels of the topic `learned`.
 
-    The first channel is `proposed`. The next channels have the values of those entries of A and B
-    that are in the rows of the outputs, and then their standard deviations. The last channels are
-    the digest of the proposed parameters and their guarantee.
+    The first channel, `proposed`, is 1 if parameters were proposed, else 0. Then follow the values
+    of the entries of A and B in the rows of the outputs, and after them their standard deviations.
+    The last three channels are those of GUARANTEE.
     """
 
     names: tuple[str, ...]
@@ -117,10 +118,10 @@ bits, which a channel holds exactly."""
 def learned_sample(
     entries: Iterable[Entry], outputs: tuple[str, ...], proposal: LearnerResult
 ) -> Learned:
-    """Return the sample of `learned` for what an identification found, and for its proposal.
+    """Return the sample of the topic `learned` for the `entries` of an identification.
 
-    This computes the guarantee of the proposal. The last three channels are 0 if nothing was
-    proposed.
+    The sample also has the proposal that followed, and this function computes the guarantee of the
+    proposal. The last three channels are 0 if nothing was proposed.
     """
     output_entries = [entry for entry in entries if entry.row in outputs]
     channels = {"proposed": float(proposal.controller is not None)}
@@ -136,7 +137,7 @@ def learned_sample(
 
 
 class Identifications:
-    """Hands out each identification of a learner once. A learner need not make any."""
+    """Hands out each identification of a learner once. Some learners make no identification."""
 
     def __init__(self, learner: Learner, outputs: tuple[str, ...]) -> None:
         self._learner = learner
@@ -145,9 +146,10 @@ class Identifications:
         self._names: tuple[str, ...] = ()
 
     def next(self, proposal: LearnerResult) -> Learned | None:
-        """Return the sample of a proposal's identification, or None if there was none.
+        """Return the sample of `learned` for the newest identification, and for its proposal.
 
-        This computes the guarantee of the proposal, so it comes after the proposal has been sent.
+        Returns None if there was no identification since the last call. Call this after the
+        proposal has been sent, because it computes the guarantee, which takes long.
         """
         identification = getattr(self._learner, "identification", None)
         if identification is None or identification is self._last:
@@ -178,7 +180,7 @@ def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown
 def proposed(
     learner: Learner, learning: Learning, controller: Controller, t_ns: int
 ) -> LearnerResult:
-    """Let the learner propose at a tick, and hand the proposal to the controller."""
+    """Let the learner propose at a tick, hand the proposal to the controller, and return it."""
     proposal = learner.propose(controller.digest, outputs_without(controller.parameters))
     received = as_received(proposal, learning.start, t_ns, controller.digest)
     learning.receive(received, controller, t_ns)
@@ -199,7 +201,7 @@ class ProposalStation:
         topics.advertise("authority", authority_names(controller.parameters.outputs))
 
     def step(self, t_ns: int) -> None:
-        """Put a proposal in force if it is due, and publish `authority` at its lower rate."""
+        """Put a proposal in force if it is due, and publish `authority` if this is due."""
         self._learning.step(self._controller, t_ns)
         if t_ns % (AUTHORITY_TICKS * self.period_ns) == 0:
             self._topics.publish(

@@ -89,7 +89,10 @@ class ReplayResult(NamedTuple):
         return different
 
     def equal(self) -> bool:
-        """Return whether all checked bits are equal and were recorded with these parameters."""
+        """Return whether the computed ticks equal the log, and used the recorded parameters.
+
+        Only checked ticks count, and they must be equal in every bit.
+        """
         return not self.different().any() and not self.other_parameters.any()
 
     def first(self) -> ReplayDifference | None:
@@ -328,10 +331,10 @@ class _Steps:
                 state = ticks.state(k, in_force.limits, in_force.law, state)
 
     def _state_after_gap(self, k: int) -> ControllerState | None:
-        """Return the state at tick k, with which the computation goes on after a gap.
+        """Return the state with which the computation goes on from tick k, after a gap in the log.
 
-        It is the recorded state after the tick or, in an open loop, the state of a law that engages
-        at this tick. Returns None if the recorded controller is not engaged at this tick.
+        This is the recorded state after tick k. In an open loop, it is the state of a law that
+        engages at tick k. Returns None if the recorded controller is not engaged at this tick.
         """
         if not self._ticks.flies[k]:
             return None
@@ -342,9 +345,9 @@ class _Steps:
 def _recorded(
     run: Tape | RecordedRun, parameters: ControllerConfig | None, changes: Sequence[Change] | None
 ) -> tuple[Tape, ControllerConfig, Sequence[Change]]:
-    """Return the tape of a run, and the parameters and changes, from the run if they are None.
+    """Return the tape of a run, the parameters, and their changes in flight.
 
-    Raises ParameterError.
+    If `parameters` or `changes` are None, they are those of the run. Raises ParameterError.
     """
     if isinstance(run, Tape):
         if parameters is None and isinstance(run.scenario, Scenario):
@@ -420,10 +423,9 @@ def _coverage_notes(ticks: Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
 
 
 def _controller_at(processes: Mapping[str, Process], stamp_ns: int) -> str:
-    """Return the name of the controller that runs at an instant, to insert into a note.
+    """Return the name of the controller that runs at an instant, as ", NAME," to insert in a note.
 
-    This is the last controller that began before the instant. The name stands between commas.
-    Returns "" if the log has no name.
+    This is the last controller that began before the instant. Returns "" if the log has no name.
     """
     begins = [
         (process.first_ns, name)

@@ -73,9 +73,10 @@ class ParametersInForce:
     def change(
         self, digest: int, number: int, state: ControllerState | None
     ) -> ControllerState | None:
-        """Apply changes until the parameters have a digest, and return the retuned state.
+        """Apply the next changes until the parameters have the digest `digest`.
 
-        If no sequence of changes leads to this digest, no change is applied.
+        Returns the state, adapted to the new parameters. If no number of changes leads to this
+        digest, none is applied, and the state is returned as it is. `number` is that of the tick.
         """
         if digest == self.digest or digest in self._unmatched:
             return state
@@ -155,9 +156,9 @@ class Ticks:
     def state(
         self, k: int, limits: GuardParams, law: TunedLaw, computed: ControllerState | None = None
     ) -> ControllerState:
-        """Return the recorded state after a tick.
+        """Return the recorded state after tick k.
 
-        Values that the log lacks come from the computed state, if there is one.
+        Values that the log lacks come from the state `computed`, if it is given.
         """
         row = {name: values[k] for name, values in self._groups.items()}
         law_state = restored(law.control_law, row)
@@ -200,9 +201,9 @@ class Ticks:
     def tick(
         self, k: int, state: ControllerState, limits: GuardParams, law: TunedLaw
     ) -> tuple[ControllerState, FloatArray]:
-        """Compute a tick, and return the state after the tick and its row of `values`.
+        """Compute tick k, and return the state after it and its values of the channels `names`.
 
-        If the tick has no output, the row is NaN.
+        If the tick has no output, all values are NaN.
         """
         stamp_ns = int(self.stamp_ns[k])
         y = None

@@ -153,7 +153,11 @@ class Scenario:
         return [key for key in SCHEMAS if name in getattr(getattr(self, key), "model_fields", ())]
 
     def _values(self, name: str, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the parameters of a section before its changes are added."""
+        """Return the parameters of a section to which `changes` will be added.
+
+        If the law will change, the gains of the present law are left out. If there is no section of
+        guidance, its parameters are those of `guidance_by_rule`.
+        """
         section: Config | None = getattr(self, name)
         if section is None:
             return guidance_by_rule(self.aircraft, self.reference_model, self.controller)
@@ -281,11 +285,11 @@ def parse_scenario_sections(content: bytes, path: Path, namespace: str | None = 
 
 
 def find_files(sections: Sections, path: Path) -> None:
-    """Find the files that the sections of a parameter file name.
+    """Replace the paths in the sections of a parameter file by paths at which the files exist.
 
     A section can name an airframe file and recorded commands. If such a path leads to no file from
     the working folder, it is tried relative to the folder of the parameter file. Then its bare file
-    name is tried in that folder.
+    name is tried in that folder. A path stays as it is if no file is found.
     """
     recorded = sections.get("reference_model", {}).get("recorded")
     signals = recorded.values() if isinstance(recorded, Mapping) else ()
@@ -441,9 +445,9 @@ def check_together(scenario: Scenario) -> None:
 
 
 def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
-    """Warn of each limit of the controller that is beyond an end stop of the actuators.
+    """Return a warning for each limit of the controller that is beyond the actuator's end stop.
 
-    If a limit is beyond the stop, the anti-windup starts too late.
+    With such a limit, the anti-windup starts too late.
     """
     controller = scenario.controller
     actuators = scenario.aircraft.actuators

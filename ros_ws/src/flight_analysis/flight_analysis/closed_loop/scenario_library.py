@@ -103,13 +103,13 @@ def with_route(
 
 
 def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
-    """Return the scenario with a file from which nodes in a namespace read the same values.
+    """Return the scenario with a file that the nodes in a namespace can read.
 
-    The scenario keeps its own file if the nodes can read it. If this file names recorded commands,
-    or has sections for another namespace, such as /uav7/controller, a new file is written into the
-    folder `run`. The new file has sections for any namespace. It holds the values of the recorded
-    commands, so that the log can be flown again without another file. Raises ParameterError if the
-    file cannot be written.
+    The scenario keeps its own file if the nodes read the same values from it. If this file names
+    recorded commands, or has sections for another namespace, such as /uav7/controller, a new file
+    is written into the folder `run`. The new file has sections for any namespace. It holds the
+    values of the recorded commands, so that the log can be flown again without another file. Raises
+    ParameterError if the file cannot be written.
     """
     if not scenario.reference_model.recorded and _reaches_nodes(scenario.path, namespace):
         return scenario
@@ -117,10 +117,10 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
 
 
 def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
-    """Return the scenario with the values from a parameter file for the nodes in a namespace.
+    """Return the scenario with values replaced by those of a parameter file.
 
-    The values replace those of the same names in the scenario. An error must be in the parameter
-    file, because the scenario alone is valid. ParameterError therefore names the parameter file.
+    Only the sections of the file for the nodes in `namespace` count. Raises ParameterError, which
+    names the parameter file, because the scenario was valid before.
     """
     content = read_file(path, str(path), "a ROS parameter file")
     further = parse_sections(content, path, SCHEMAS, tuple(SCHEMAS), namespace, with_general=True)
@@ -147,7 +147,7 @@ def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
 
 
 def _reaches_nodes(path: Path, namespace: str) -> bool:
-    """Return whether the nodes in a namespace get every section of a scenario file, and no other.
+    """Return whether every section of a scenario file is for one of the nodes in a namespace.
 
     If the file has a section for all nodes, the result is False. With such a file, rcl would put
     the overrides of a node into the section for all nodes. The node's own section would then

@@ -37,7 +37,7 @@ Record = Callable[[Mapping[str, Signal]], None]
 
 
 class _Recorder:
-    """Hands the samples on once per simulated second, and then reports the flight time."""
+    """Hands the samples to `record` once per simulated second, then the time to `progress`."""
 
     period_ns = NANOSECONDS
 
@@ -49,7 +49,7 @@ class _Recorder:
         self._progress = progress
 
     def step(self, t_ns: int) -> None:
-        """Hand on the samples since the last call, then report the flight time."""
+        """Hand the samples since the last call to `record`, then the flight time to `progress`."""
         self._record(self._topics.pop_signals())
         if self._progress is not None:
             self._progress(seconds(t_ns))
@@ -66,8 +66,9 @@ def simulate(
     """Simulate a flight in memory and return its tape, which also says how the flight ended.
 
     The tape is in SI and radians. `progress` is called with the flight time, s, once per simulated
-    second. `announce` takes the events of the learning. Raises ParameterError if `scenario` is no
-    Scenario, or if it learns and `learn` is None.
+    second. `guide`, `control` and `learn` make guidance, controller and learner. `announce` takes
+    the events of the learning. Raises ParameterError if `scenario` is no Scenario, or if it learns
+    and `learn` is None.
     """
     as_scenario(scenario)
     change = (

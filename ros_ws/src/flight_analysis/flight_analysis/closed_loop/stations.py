@@ -32,11 +32,11 @@ Take = Callable[[StampedVector, int], object]
 
 
 class Station(Protocol):
-    """A part of a flight that acts at the multiples of its period."""
+    """A part of the closed loop, such as the controller, that acts once in each of its periods."""
 
     @property
     def period_ns(self) -> int:
-        """The period, ns."""
+        """The period of the steps, ns."""
 
     def step(self, t_ns: int) -> None:
         """Act at flight time t. Raises FlightEnded or ChannelError if the flight ends."""
@@ -51,9 +51,9 @@ class FlightLoop:
         self.t_ns = -self._base_ns
 
     def run(self, end_ns: int) -> None:
-        """Step up to and including the instant `end_ns`.
+        """Step all stations from the present instant on, up to and including `end_ns`.
 
-        `t_ns` is the present instant, also after an error.
+        The attribute `t_ns` is the present instant. It is also correct after an error.
         """
         for t_ns in range(self.t_ns + self._base_ns, end_ns + 1, self._base_ns):
             self.t_ns = t_ns
@@ -83,7 +83,7 @@ class Topics:
     def subscribe(self, topic: str, take: Take, channels: Sequence[str] | None = None) -> None:
         """Hand each sample of a topic to `take`.
 
-        `take` gets the values of these `channels`, in this order. If None, it gets all channels.
+        `take` gets the values of `channels`, in this order, or of all channels if this is None.
         """
         self._subscriptions[topic].append((channels, take))
 

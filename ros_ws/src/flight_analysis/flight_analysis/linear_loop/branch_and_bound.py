@@ -29,10 +29,10 @@ DIGITS = 5  # significant digits of X and G in a step of a proof
 
 
 class Region(NamedTuple):
-    """A part of a box and of the frequencies that a step of a proof covers.
+    """A part of a box, with a range of frequencies, that one step of a proof covers.
 
-    It has the aircraft with abs(d - centre) <= half, where d holds the r deviations, at the
-    frequencies from `low` to `high`. d, `centre` and `half` have the shape (r,).
+    It has the aircraft with abs(d - centre) <= half, where d holds the r deviations. The range is
+    from `low` to `high`. d, `centre` and `half` have the shape (r,).
     """
 
     centre: FloatArray
@@ -52,7 +52,10 @@ class Region(NamedTuple):
         return [narrowed._replace(centre=self.centre + side * step) for side in (-1.0, 1.0)]
 
     def outside(self, begin: float, end: float) -> list["Region"]:
-        """Return the regions with the frequencies below and above an interval, rad/s."""
+        """Return what remains of the region without the interval from `begin` to `end`, rad/s.
+
+        These are a region below the interval and a region above it, unless they are empty.
+        """
         below = self._replace(high=begin)
         above = self._replace(low=end)
         return [side for side in (below, above) if side.high > side.low]
@@ -112,9 +115,9 @@ def proof_of(
 def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
     """Round the scalings X and G, and return them as `t` and `g` of a step.
 
-    Rounding is safe, because any X and G prove a bound. If the X and G of the second Legendre
-    coefficients follow from those of the means over a period, as in `tightened_at`, the step has
-    only the X and G of the means.
+    Rounding is safe, because any X and G prove a bound. The first `entries` channels are the means
+    over a period, and the others the second Legendre coefficients. If g is 0 for all others, the
+    step has only the X and G of the means, from which the other X follow as in `tightened_at`.
     """
     count = len(scaling.t) if scaling.g[entries:].any() else entries
     t, g = ([float(f"{x:.{DIGITS}g}") for x in values[:count]] for values in (scaling.t, scaling.g))
@@ -124,7 +127,8 @@ def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
 def frequency_in(region: Region, highest: float) -> float:
     """Choose the frequency, rad/s, at which the bound of a region is computed.
 
-    The ends 0 and pi / T come first, because M is real there.
+    This is an end of the region if the end is 0 or `highest`, pi / T, because M is real there.
+    Otherwise it is the geometric mean of the ends.
     """
     if region.low == 0.0:
         return 0.0

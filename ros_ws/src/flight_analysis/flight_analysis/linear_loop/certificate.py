@@ -58,7 +58,7 @@ def limit_certificate(
 
 
 def _text(linear: LinearLoop, deviation: float, proof: Mapping[str, Any]) -> str:
-    """Return the loop, its box up to a relative deviation, and a proof as JSON."""
+    """Return a loop, its box, the proved relative deviation `deviation`, and the proof, as JSON."""
     box = linear.box
     assert box is not None  # noqa: S101 - a guarantee has a box
     content = {

@@ -60,7 +60,7 @@ class Unstable(NamedTuple):
 
 
 class Zeros(NamedTuple):
-    """How far the entries that are 0 in the file may deviate, if all others are exact."""
+    """How far entries that are 0 in the airframe file may deviate, if all others are exact."""
 
     # fraction of its row up to which each of these entries may deviate in a stable aircraft
     stable: float
@@ -183,11 +183,12 @@ def _is_lag(box: Box) -> NDArray[np.bool_]:
 
 
 def zeros_alone(linear: LinearLoop, late: float = 0.0) -> Zeros | None:
-    """Compute how far the entries that are 0 in the file may deviate, if the others are exact.
+    """Compute how far entries that are 0 in the airframe file may deviate.
 
-    The box of the loop has only these entries. Search and proof stop early, as in
-    `quick_guarantee`, because such a box has very many entries. Returns None if the box is empty,
-    or if the loop is unstable.
+    All other entries are exact.
+    The box of `linear` must have only these entries. They can be very many, so search and proof
+    stop early, as in `quick_guarantee`. Returns None if there is no box, or if the nominal loop is
+    unstable.
     """
     box = linear.box
     if box is None or not _is_nominal_stable(linear):
@@ -269,7 +270,7 @@ def _first_unstable(
 def _disks(
     linear: LinearLoop, uncertain: Channels, late: float, report: Callable[[str], None]
 ) -> tuple[dict[str, float], float]:
-    """Return the disk margin proved in each input alone, by its name, and in all at once."""
+    """Return the proved disk margins of each input alone, by name, and of all inputs at once."""
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
     report("searching for the aircraft with the least margins")

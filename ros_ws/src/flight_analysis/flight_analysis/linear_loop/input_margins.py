@@ -84,7 +84,7 @@ class Margins(NamedTuple):
 
     @property
     def gain(self) -> FloatArray:
-        """Gain margin as a factor of at least 1, up or down, shape (..., m)."""
+        """Gain margin, (..., m): the smaller factor, up or down, as a number of at least 1."""
         with np.errstate(divide="ignore"):
             return np.minimum(self.gain_increase, 1.0 / self.gain_decrease)
 
@@ -263,10 +263,10 @@ def schur_form(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> SchurFor
 def _modal_form(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming
 ) -> tuple[SchurForm, NDArray[np.bool_]]:
-    """Return a form with a diagonal T, and whether the modes of each loop are independent.
+    """Return the loops as a `SchurForm` with a diagonal T, and whether it holds for each loop.
 
-    The modes count as independent if the condition number of their eigenvectors is at most
-    MOST_CONDITION.
+    It holds if the modes of the loop are independent, which means that the condition number of
+    their eigenvectors is at most MOST_CONDITION.
     """
     A, B, K = _from_inputs_to_inputs(plant, law, loop)
     eigenvalues, modes = (part.astype(np.complex128) for part in np.linalg.eig(A))
@@ -512,9 +512,10 @@ def _gain_margins(
 
 
 def _narrow(decrease: FloatArray, increase: FloatArray, place: tuple[int, int], L: float) -> None:
-    """Narrow the gain margin at a frequency at which L is real and negative.
+    """Lower the gain margin of an input in place, given a real L at some frequency.
 
-    There the loop would pass through -1 at the factor 1 / abs(L).
+    If L is negative, the loop passes through -1 at the gain factor 1 / abs(L). `place` is the index
+    of the aircraft and of the input.
     """
     if L < 0.0:
         factor = -1.0 / L

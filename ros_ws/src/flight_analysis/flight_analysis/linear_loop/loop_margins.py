@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compute the margins of a scenario's linear loop, for the nominal and for uncertain aircraft."""
+"""Compute the margins of a scenario's linear loop, for the nominal and uncertain aircraft."""
 
 import hashlib
 import json
@@ -277,15 +277,15 @@ def scenario_loop(
 
 
 def as_compared(linear: LinearLoop, scenario: Scenario, comparison: Comparison) -> LinearLoop:
-    """Add to a loop the differences that a comparison found, and the deviation of the aircraft."""
+    """Return the loop with the differences of a comparison, and with `off` of its scenario."""
     return _with_deviation(linear._replace(differences=comparison.differences), scenario)
 
 
 def _with_deviation(linear: LinearLoop, scenario: Scenario) -> LinearLoop:
-    """Return the loop with `off`, the deviation of the aircraft that the scenario draws.
+    """Return the loop with `off`, how far the scenario's aircraft is from its airframe file.
 
-    It is 0 if the airframe flies as in its file. It is infinite if the scenario changes an entry
-    that is exact in the box.
+    `off` is 0 if the airframe flies as in this file. It is infinite if the scenario changes an
+    entry that is exact in the box.
     """
     if linear.box is None or scenario.aircraft.is_jsbsim:
         return linear
@@ -394,7 +394,11 @@ def of_matrices_and_lags(
 def with_lags_pulled_out(
     linear: LinearLoop, box: Box, parts: Mapping[int, float], seed: int, spread: Spread
 ) -> tuple[LinearLoop, Box]:
-    """Return the loop and its box with the actuators of some inputs as states of the plant."""
+    """Return the loop and its box with the actuators of some inputs as states of the plant.
+
+    `parts` has the largest relative deviation of 1 / lag, by the index of such an input. The lags
+    of the drawn aircraft follow from `seed` and from the distribution of `spread`.
+    """
     places = [*parts]
     count, n, m = linear.plant.B.shape
     size = len(places)
@@ -435,8 +439,8 @@ def box_of(
     """Return the box of the aircraft that `nominal_and_sampled` draws around an airframe file.
 
     Its channels are in the law's order. If there is an allocation, B of every effector is
-    uncertain. If `spread` has zeros, entries that are 0 in the file deviate as well, by a fraction
-    of their rows.
+    uncertain. If `spread.zeros` is above 0, entries that are 0 in the file deviate as well, by this
+    fraction of their `row_sizes`.
     """
     airframe_of_law = through_allocation(airframe, controller)
     T = distribution(airframe, controller)[:, law_order(airframe_of_law, controller)[1]]
@@ -498,7 +502,7 @@ def distribution(airframe: Airframe, controller: ControllerConfig) -> FloatArray
 def _has_effectors(airframe: Airframe, controller: ControllerConfig) -> bool:
     """Return whether an allocation stands between the law and the inputs of an airframe.
 
-    The model of an aircraft of JSBSim already has the inputs of the law.
+    The model of an aircraft of JSBSim already has the inputs of the law, so the result is False.
     """
     return controller.allocation is not None and set(airframe.inputs) != set(controller.inputs)
 
@@ -533,7 +537,7 @@ def is_literal(controller: ControllerConfig) -> bool:
 
 
 def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[int], list[int]]:
-    """Return the index of each output, and of each input, of a law in the lists of an airframe.
+    """Return the indices of a law's outputs and inputs among those of an airframe.
 
     Raises ParameterError if the airframe lacks any of them.
     """

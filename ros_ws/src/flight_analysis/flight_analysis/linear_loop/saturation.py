@@ -143,9 +143,10 @@ def guarantee_with_limit(linear: LinearLoop, name: str) -> LimitGuarantee | None
 def limit_guarantee(
     linear: LinearLoop, name: str, part: float, slowest: float
 ) -> LimitGuarantee | None:
-    """Prove a part of the box from the lowest frequency `slowest`, rad/s, or return None.
+    """Prove the guarantee for the box scaled by `part`, or return None if no proof is found.
 
-    If `slowest` is 0, the proof shows that every aircraft settles. Raises ParameterError as
+    The proof covers the frequencies from `slowest`, rad/s, on. If this is 0, the proof shows that
+    every aircraft settles. `name` is the input with the limits. Raises ParameterError as
     `guarantee_with_limit` does.
     """
     require(name in linear.inputs, "limit", name, f"an input: {', '.join(linear.inputs)}")
@@ -184,8 +185,8 @@ def _proof(
 def _with_limit(part: Channels) -> Channels:
     """Turn a part with a disk in one input into a part with a limit of that input.
 
-    The inputs of the result are w of the entries, and the w that the limit cuts off from u. Its
-    outputs are z of the entries, and the a that the aircraft gets.
+    The inputs of the result are those of the entries, and last the part of u that the limit cuts
+    off. The outputs are those of the entries, and last a, which is u less this part.
     """
     W, D = part.W.copy(), part.D.copy()
     D[-1, -1] += 0.5
@@ -195,7 +196,7 @@ def _with_limit(part: Channels) -> Channels:
 
 
 def sensitivity(part: Channels, w: FloatArray, radius: float) -> ComplexArray:
-    """Compute S at the input with the limit, for the aircraft in the middle.
+    """Compute S at the input with the limit, for the aircraft in the middle of the box.
 
     w has the frequencies, rad/s, and `radius` is abs(z).
     """
@@ -206,8 +207,9 @@ def sensitivity(part: Channels, w: FloatArray, radius: float) -> ComplexArray:
 def multiplier_for(part: Channels, size: float, slowest: float) -> Multiplier | None:
     """Find taps that serve the middle of a box and its worst corners.
 
-    The room of an aircraft is the least Re(m S) / abs(S) over the frequencies, as a part of
-    `_expected`. A linear program finds the taps that leave the most room to some aircraft. A search
+    The room of an aircraft, by which it meets the inequality, is the least Re(m S) / abs(S) over
+    the frequencies, divided by `_expected`. A corner is an aircraft with each entry at an end of
+    its range. A linear program finds the taps that leave the most room to some aircraft. A search
     then adds the corners with the least room, until these have at least ENOUGH of the room in the
     program. Returns None if no taps serve all of them.
     """
@@ -240,9 +242,10 @@ def _expected(slowest: float, w: FloatArray) -> FloatArray:
 
 
 def _rooms(part: Channels, multiplier: Multiplier, d: FloatArray, w: FloatArray) -> FloatArray:
-    """Return the least room of N aircraft over the frequencies w, rad/s, shape (N,).
+    """Return the room of N aircraft, (N,): the least Re(m S) / (abs(S) `_expected`) over w, rad/s.
 
-    d has the k deviations of each aircraft, (N, k).
+    It is negative if an aircraft fails the inequality. d has the k deviations of each aircraft,
+    (N, k).
     """
     S = np.array([sensitivity(part.at(each), w, multiplier.radius) for each in d])
     phases = (multiplier.at(w * part.period) * S).real / np.abs(S)
@@ -252,7 +255,12 @@ def _rooms(part: Channels, multiplier: Multiplier, d: FloatArray, w: FloatArray)
 def _worst_corners(
     part: Channels, multiplier: Multiplier, starts: FloatArray, w: FloatArray
 ) -> FloatArray:
-    """Climb from N corners of a box, (N, k), to corners with the least room."""
+    """Search for the corners of a box with the least `_rooms`, starting from N corners, (N, k).
+
+    Only the CLIMBERS starts with the least room are used. Each step of a search flips between -1
+    and 1 the deviation whose flip gives the least room. The search ends when the room no longer
+    shrinks.
+    """
     flips = 1.0 - 2.0 * np.eye(len(part.entries))
     found = []
     for start in starts[np.argsort(_rooms(part, multiplier, starts, w))[:CLIMBERS]]:
@@ -269,9 +277,9 @@ def _worst_corners(
 def _program(
     part: Channels, aircraft: FloatArray, slowest: float
 ) -> tuple[Multiplier | None, float]:
-    """Find the taps that leave the most room to N aircraft, and return them and this room.
+    """Find the taps for which the least of the `_rooms` of N aircraft is largest.
 
-    `aircraft` has the deviations of each aircraft, (N, k).
+    Returns the taps and this room. `aircraft` has the deviations of each aircraft, (N, k).
     """
     from scipy.optimize import linprog  # noqa: PLC0415 - a flight starts without it
 
@@ -306,7 +314,7 @@ def _program(
 
 
 def inequality(M: ComplexArray, m: ComplexArray | None, step: dict[str, Any]) -> ComplexArray:
-    """Compute the matrices of a step that must be positive definite, at F frequencies.
+    """Compute, at F frequencies, the matrices that are positive definite if a step is valid.
 
     They are diag(1, ..., 1, 0) - N_d* N_d - Y N - N* Y*, where M has the shape (F, q, q) and m has
     (F,). t, g and s are the scalings of the step, with N = diag(e^t, 1) M diag(e^-t, e^-s) and Y =
@@ -425,7 +433,10 @@ def _interval(
 
 
 def _samples(w: float, end: float, farthest: float) -> Iterator[float]:
-    """Yield frequencies from w to `end`, without w itself, at most BATCH of them."""
+    """Yield at most BATCH frequencies from w to `end`, without w itself, rad/s.
+
+    `farthest` is the largest step from one to the next, rad/s.
+    """
     side = float(np.sign(end - w))
     for _ in range(BATCH):
         if w == end:

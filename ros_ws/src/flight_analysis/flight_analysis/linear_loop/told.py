@@ -118,7 +118,7 @@ PLANNED = FlightFacts()
 
 
 class Comparison(NamedTuple):
-    """The timing of the loop that flies, and how the aircraft differs from what was told."""
+    """The timing of the loop that flies, and how it differs from what the controller was told."""
 
     timing: LoopTiming
     differences: tuple[Difference, ...]
@@ -183,7 +183,7 @@ def flown_lag(aircraft: AircraftConfig, controller: ControllerConfig) -> FloatAr
 def _compare_lags(
     scenario: Scenario, controller: ControllerConfig
 ) -> tuple[FloatArray, list[Difference]]:
-    """Compare the lags, and return the lags of the aircraft that flies and the differences.
+    """Compare the lags of the actuators, and return the actual lags, (m,), s, and the differences.
 
     A model of JSBSim contains actuators, whose lag is not among the keys of the aircraft. The
     controller can therefore be told a longer lag than the keys state, but not a shorter lag.
@@ -207,12 +207,12 @@ def _compare_lags(
 def _compare_delays(
     scenario: Scenario, controller: ControllerConfig, flight: FlightFacts
 ) -> tuple[float, list[Difference]]:
-    """Compare the delays beyond sampling, and return the delay that flies and the differences.
+    """Compare the delays beyond sampling, and return the actual delay, s, and the differences.
 
     In simulation, y waits for the next tick and u for the next step of the aircraft, each up to a
     period of the aircraft. Any controller.delay within this range is accepted. For any other
     controller.delay, the longest delay of the range is assumed. For an aircraft of the user, the
-    transport delay is unknown.
+    delay of its sensors and actuators is unknown, and the told delay is accepted.
 
     The law steps with each y. If y comes less often than the ticks, the delay of one and a half
     ticks becomes one and a half periods of y.
@@ -266,7 +266,10 @@ def _of_log(controller: ControllerConfig, flight: FlightFacts) -> list[Differenc
 
 
 def _beyond_loop(scenario: Scenario, controller: ControllerConfig) -> list[Difference]:
-    """Compare end stops, rate limits and signs, and name what no linear loop contains."""
+    """Return the differences in end stops, rate limits, signs, and what no linear loop contains.
+
+    A linear loop cannot contain, for example, the faults of an aircraft.
+    """
     aircraft = scenario.aircraft
     known = IN_LOOP | OUTSIDE_LOOP
     if not controller.vanes:

@@ -66,13 +66,16 @@ class Box(NamedTuple):
 
     @property
     def largest(self) -> float:
-        """Largest relative deviation of an entry, or part of a row if only zeros deviate."""
+        """Largest relative deviation of an entry in the box.
+
+        If only entries deviate that are 0 in the airframe file, it is relative to `row_sizes`.
+        """
         is_zero = np.isin(self.names, self.zeros)
         return float(np.max(self.part[~is_zero], initial=0.0)) or float(self.part.max())
 
     @property
     def largest_zero(self) -> float:
-        """Largest deviation of the entries that are 0 in the file, as a part of their rows."""
+        """Largest deviation of entries that are 0 in the airframe file, relative to `row_sizes`."""
         return float(np.max(self.part[np.isin(self.names, self.zeros)], initial=0.0))
 
 
@@ -112,7 +115,7 @@ class Channels(NamedTuple):
 
     @property
     def disks(self) -> slice:
-        """Places of the channels that belong to disks."""
+        """Indices of the channels that belong to disks."""
         return slice(self.uncertain + self.late, None)
 
     def some(self, channels: IntArray) -> "Channels":
@@ -210,10 +213,10 @@ def uncertain_loop(
 
 
 def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
-    """Return the rows of a matrix that give the Legendre coefficients of k channels.
+    """Return the rows that map the state to the Legendre coefficients of k channels z.
 
     The coefficients follow from the integrals of z and from the integrals of these integrals. The
-    rows of `matrix` are those of n states, then of the integrals.
+    rows of `matrix` give the n states first, and then these integrals.
     """
     once = matrix[n : n + k]
     twice = matrix[n + k : n + 2 * k]

@@ -78,12 +78,13 @@ def first_unstable(
 
 
 def _divergence(part: Channels) -> tuple[float, FloatArray]:
-    """Find the least size at which an eigenvalue leaves the circle at z = 1, and its corner.
+    """Find the least size of the box at which an eigenvalue leaves the circle at z = 1.
 
-    The size is infinite if no eigenvalue leaves. At a corner s, the size is the reciprocal of the
-    largest real eigenvalue of M diag(s), because det(I - size M diag(s)) = 0 there. From STARTS
-    corners, each s_i moves to the side at which this eigenvalue is larger. Coefficients beyond the
-    means over a period are left out.
+    Returns the size, and the corner of the box, (k,), at which this happens. The size is infinite
+    if no eigenvalue leaves. At a corner s, the size is the reciprocal of the largest real
+    eigenvalue of M diag(s), because det(I - size M diag(s)) = 0 there. From STARTS corners, each
+    s_i moves to the side at which this eigenvalue is larger. Coefficients beyond the means over a
+    period are left out.
     """
     k = len(part.entries)
     M = part.response(0.0, 1.0 + SPECTRAL_RADIUS_TOLERANCE)[:k, :k].real
@@ -112,13 +113,14 @@ def _divergence(part: Channels) -> tuple[float, FloatArray]:
 def _oscillation(
     part: Channels, frequency: float, largest: float, *, quick: bool
 ) -> tuple[float, FloatArray]:
-    """Find the least size at which a mode near a frequency, rad/s, is unstable, and its corner.
+    """Find the least size of the box at which a mode near a frequency, rad/s, is unstable.
 
-    The size is infinite if none is found. From each of STARTS corners, the search grows the size
-    until a mode near the frequency leaves abs(z) < 1. Then it moves to the corner to which abs(z)
-    rises, and repeats this until it has been at all of these corners. If the search is not `quick`,
-    it finally climbs from further corners at a smaller size. It repeats this as long as one of the
-    climbs ends at an unstable aircraft.
+    Returns the size, infinite if none is found, and the corner of the box, (k,), at which this
+    happens. From each of STARTS corners, the search grows the size until a mode near the frequency
+    leaves abs(z) < 1. Then it moves to the corner towards which abs(z) rises. It repeats this until
+    it finds no new corner, at most ROUNDS times. If the search is not `quick`, it finally climbs
+    from further corners at a smaller size. It repeats this as long as one of the climbs ends at an
+    unstable aircraft.
     """
     rng = np.random.default_rng(SEED)
     k = len(part.entries)
@@ -217,8 +219,9 @@ def _near(z: NDArray[Any], frequency: float, period: float) -> FloatArray:
 
 
 def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float) -> float:
-    """Find the size s at which a mode near a frequency becomes unstable, for deviations s corner.
+    """Find the size s at which a mode near a frequency, rad/s, becomes unstable.
 
+    The deviations are s times `corner`.
     The result is infinite if no mode near the frequency becomes unstable up to the size `largest`.
     """
 
@@ -309,7 +312,7 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box)
 
 
 def _corners(slopes: FloatArray) -> FloatArray:
-    """Return the corner towards which each figure becomes smaller, given its slopes."""
+    """Return, for each figure, the corner of the box towards which its slopes point downwards."""
     return np.asarray(np.where(slopes > 0.0, -1.0, 1.0))
 
 

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find what the log of a flight holds and lacks, with its processes, commands and legs."""
+"""Find what the log of a flight holds and what it lacks.
+
+This includes the processes of the flight, its commands, and the legs of its route.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -77,7 +80,10 @@ class Account(NamedTuple):
         return Starvation(self.starved)
 
     def over(self, *topics: str) -> str:
-        """Return how much of these topics a figure is based on, or "" if it is all of them."""
+        """Return which share of each topic the log has, as in "over 49 % of truth".
+
+        Topics that the log has in full are left out. Returns "" if none remains.
+        """
         accounts = {name: self.topics[name] for name in topics if name in self.topics}
         parts = [
             f"{math.floor(100.0 * topic.share)} % of {name}"
@@ -194,7 +200,12 @@ def account(
 
 
 def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bool) -> Span:
-    """Return the time span of the flight that the account covers."""
+    """Return the time span that the account covers.
+
+    If the flight was simulated and its planned end is known, the span begins at t = 0. Otherwise
+    each topic counts from its first sample. A flight that begins at t = 0, and did not end early,
+    counts up to the planned end. Any other flight counts up to its last sample.
+    """
     lasts = [
         int(signal.stamp_ns.max())
         for name, signal in tape.signals.items()
@@ -324,9 +335,9 @@ def _is_of_host(
 ) -> bool:
     """Return whether the host alone is the cause of what a topic lacks.
 
-    This needs three things. No message was lost and no stamp is wrong, so that what is missing was
-    never sent. The topic goes on to the `end`, s, as far as its leeway demands. It began in time,
-    or so late because the host starved the nodes.
+    There are three conditions. No message was lost and no stamp is wrong, so that what is missing
+    was never sent. The topic lasts to the `end`, s, except for its leeway. It began in time, or it
+    began late while the host starved the nodes.
     """
     is_whole = tape.recording.get(name, Recording(0)).lost == 0
     has_stamps = not (topic.step or topic.unset or topic.left_out or topic.repeated)

@@ -80,7 +80,7 @@ def _margin_card(margins: LoopMargins, command: str) -> Card:
 
 
 def _guarantee_card(promise: Guarantee | None, command: str) -> Card:
-    """Return the card that says what is guaranteed for aircraft that differ from the file."""
+    """Return the card that says what is guaranteed if the aircraft differs from its file."""
     title = "Guarantee"
     if promise is None:
         return Card(
@@ -131,7 +131,7 @@ def _guarantee_card(promise: Guarantee | None, command: str) -> Card:
 
 
 def _changed_card(flown: FlownLoops) -> Card:
-    """Return the card of a flight with several parameter sets, or whose true aircraft is known."""
+    """Return the card that says how many of a flight's several linear loops are stable."""
     is_stable = [bool(each.margins.nominal.stable) for each in flown.loops]
     count = len(flown.loops)
     sentence = (

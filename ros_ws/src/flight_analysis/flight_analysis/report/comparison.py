@@ -44,9 +44,10 @@ class ComparisonRow(NamedTuple):
     alike: tuple[bool, ...] = ()
 
     def verdict(self, flight: int) -> str:
-        """Return whether a flight is "better", "worse" or the "same" as the first.
+        """Compare a flight with the first: "better", "worse" or "same".
 
-        A flight under other conditions counts as the "same".
+        The result is "same" if the flight had other conditions, or if a smaller value of the metric
+        is not better.
         """
         ratio = self.ratios[flight]
         if self.alike and not self.alike[flight]:
@@ -57,7 +58,7 @@ class ComparisonRow(NamedTuple):
 
 
 class ComparisonTable(NamedTuple):
-    """The metrics of a channel, or of the controller's ticks."""
+    """The metrics of one channel, or of the controller's ticks, in several flights."""
 
     caption: str
     rows: tuple[ComparisonRow, ...]
@@ -83,7 +84,7 @@ UNLIKE = "the conditions differ: a ratio between unlike flights says nothing of 
 
 
 def conditions(flights: Sequence[RecordedFlight]) -> list[Condition]:
-    """Return the conditions that differ.
+    """Return the parameters that differ between the flights, and the pace if it differs.
 
     Parameters of the wind come first, then all other parameters, and then the pace.
     """
@@ -202,7 +203,7 @@ def _settling_rows(flights: Sequence[RecordedFlight], channel: str) -> list[Comp
 
 
 def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
-    """Return a table of the controllers' timing in a list, which is empty if all times are 0."""
+    """Return the table of the controllers' timing, alone in a list, or [] if all times are 0."""
     same = has_same_conditions(flights, timed=True)
     summaries = [flight.summary for flight in flights]
     rows = []

@@ -88,7 +88,10 @@ def _verdict(flight: RecordedFlight, label: str, colour: str) -> Verdict:
 
 
 def _common_trim(scenarios: Sequence[Scenario]) -> dict[str, str]:
-    """Return the axis label of V, which states the trim speed if all flights share it."""
+    """Return the axis label of V, by the name "V".
+
+    The label states the trim speed if all flights have the same.
+    """
     trims = [about_trim(scenario) for scenario in scenarios]
     return trims[0] if all(each == trims[0] for each in trims) else {"V": "V about trim (m/s)"}
 

@@ -65,7 +65,10 @@ def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
 
 
 def about_trim(scenario: Scenario) -> dict[str, str]:
-    """Return the axis label of V in a figure of y, which says that the trim speed is subtracted."""
+    """Return the axis label of V for a figure of y, by the name "V".
+
+    The label says that the trim speed is subtracted.
+    """
     channels = scenario.aircraft.channels()
     return {"V": f"V - {channels.speed:g} (m/s)"} if "V" in channels.outputs else {}
 

@@ -54,9 +54,9 @@ def write_parquet(path: Path, flights: Sequence[RecordedFlight]) -> None:
 
 
 def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write a figure of y over y_m, e and u of one or several flights.
+    """Write a figure of one or several flights, with a row for each channel.
 
-    The figure has a column for each of these quantities, and a row for each channel.
+    The figure has three columns: y drawn over y_m, the error e, and u.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415
 

@@ -159,7 +159,7 @@ def _curves(
 
 
 def _references(context: PlotContext) -> dict[str, Curve]:
-    """Return the curves of y_m of the flights, where equal ones are a single curve."""
+    """Return the curves of y_m of all flights. Flights with equal y_m share one curve."""
     references: dict[str, Curve] = {}
     for label, curve in _curves(context, "y_m", lambda tape: tape["y_m"]).items():
         equal = next(
@@ -458,9 +458,10 @@ def wind_figure(context: PlotContext) -> Figure | None:
 def state_figure(
     context: PlotContext, units: Mapping[str, DisplayUnit], labels: Mapping[str, str]
 ) -> Figure | None:
-    """Draw the states of a simulated aircraft, and first those that are outputs.
+    """Draw the states of a simulated aircraft, beginning with those that are outputs.
 
-    The curves have these `units`. `labels` has axis labels that replace those of their channels.
+    `units` has the unit of each state. `labels` has axis labels that replace those of their
+    channels. Returns None if the tape has no states.
     """
     x = _truth_group(context.tape, "x")
     outputs = {name: units[name] for name in context.units if name in units}

@@ -58,7 +58,7 @@ def meta_lines(flight: RecordedFlight, scenario: Scenario) -> list[str]:
 
 
 def started(flight: RecordedFlight) -> str:
-    """Return the date and time at which a flight began as text, or "" if the log lacks it."""
+    """Return as text the date and time at which a flight began, or "" if the log lacks them."""
     start = (flight.summary["flight"] or {}).get("started")
     try:
         return f"{datetime.fromisoformat(start):%-d %b %Y, %H:%M} UTC" if start else ""
@@ -91,7 +91,7 @@ flight again."""
 
 
 def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
-    """Return the verdict on a flight, with a colour for its subject, and the next step."""
+    """Return the verdict on a flight: a headline, a colour, more text, and the next step."""
     outcome = flight.summary["outcome"]
     sentence = f"{outcome['sentence'][:1].upper()}{outcome['sentence'][1:]}."
     injected = _injected(scenario)
@@ -149,7 +149,11 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
 
 
 def _next_step(outcome: Mapping[str, Any], scenario: Scenario, name: str, otherwise: Step) -> Step:
-    """Return the next step for a flight that falls short, given its gravest shortfall."""
+    """Return the next step for a flight that falls short, chosen by its gravest shortfall.
+
+    `name` is the argument that stands for the scenario in commands. The result is `otherwise` if no
+    step is known for this shortfall.
+    """
     order = list(Aim)
     aims = sorted((Aim(each["aim"]) for each in outcome["shortfalls"]), key=order.index)
     gravest = aims[0] if aims else None
@@ -163,7 +167,7 @@ def _next_step(outcome: Mapping[str, Any], scenario: Scenario, name: str, otherw
 
 
 def _route_text(flight: RecordedFlight) -> str:
-    """Return how a guided flight followed its route as text, or "" without a route."""
+    """Say how a guided flight followed its route. Returns "" without a route."""
     legs = (flight.summary["guidance"] or {}).get("legs") or ()
     if not legs:
         return ""
@@ -181,7 +185,7 @@ def _route_text(flight: RecordedFlight) -> str:
 
 
 def _models_text(flight: RecordedFlight) -> str:
-    """Return how many learned models flew as text, or "" for a flight that did not learn."""
+    """Say how many learned models flew. Returns "" for a flight that did not learn."""
     if not flight.summary["models"]:
         return ""
     count = len(learned_spans(flight))
@@ -191,13 +195,16 @@ def _models_text(flight: RecordedFlight) -> str:
 
 
 def learned_spans(flight: RecordedFlight) -> list[Mapping[str, Any]]:
-    """Return the spans in which a learned model flew, rather than the first law or the file's."""
+    """Return the spans in which the law had a learned model.
+
+    Spans with the parameters of the start, or with the model of the airframe file, are left out.
+    """
     _, *later = flight.summary["models"]
     return [span for span in later if span["name"] != FILE_MODEL]
 
 
 def _injected(scenario: Scenario) -> str:
-    """Return the faults that the scenario injects as text, since they explain an error."""
+    """Say which faults the scenario injects, because they can explain an error."""
     faults = scenario.aircraft.actuators.read_faults()
     parts = [
         f"{fault.subject}{f' ({fault.extent})' if fault.extent else ''} at t = {fault.at:g} s"

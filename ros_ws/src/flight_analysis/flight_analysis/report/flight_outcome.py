@@ -20,12 +20,13 @@ def has_ticks(tape: Tape) -> bool:
 
 
 def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcome:
-    """Return the outcome of a flight from its signals, if the log has no outcome.
+    """Return the outcome of a flight, found from its signals.
 
-    This happens if nodes are started singly. The flight is completed if y, y_m and u last for its
-    whole duration. The duration comes from the log or, if the log lacks it, from the scenario. If
-    the log has only a part of the flight, the outcome is UNKNOWN. If the flight is not simulated, u
-    does not count, because an autopilot may end the last engagement earlier.
+    This is for a log without an outcome, as after a flight whose nodes were started singly. The
+    flight is completed if y, y_m and u last for its whole duration. The duration comes from the log
+    or, if the log lacks it, from the scenario. If the log has only a part of the flight, the
+    outcome is UNKNOWN. If the flight is not simulated, u does not count, because an autopilot may
+    end the last engagement earlier.
     """
     is_part = bool(tape.lost_parts) or any(
         recording.step_ns for recording in tape.recording.values()

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find the parameters of the controller that flew, and their linear loops.
+"""Find which parameters the controller had in a flight, and their linear loops.
 
-A loop has the aircraft of the file, or the true aircraft of a simulation.
+A loop has the aircraft of the airframe file, or the true aircraft of a simulation.
 """
 
 import re
@@ -57,7 +57,7 @@ class FlownController(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class FlownLoop:
-    """The linear loop of parameters that flew, around an aircraft."""
+    """The linear loop of an aircraft and of controller parameters that flew."""
 
     name: str  # name of the parameters; empty if they flew the whole flight
     times: str  # when the parameters flew, as text, s
@@ -177,7 +177,7 @@ def _period_of(tape: Tape, topic: str) -> float | None:
 
 
 def true_airframe(tape: Tape, scenario: Scenario) -> Airframe | None:
-    """Return the simulated airframe before a drift, or None if it is that of the file."""
+    """Return the simulated airframe before a drift, or None if it is that of the airframe file."""
     aircraft = scenario.aircraft
     uncertainty = aircraft.uncertainty
     differs = uncertainty.A > 0.0 or uncertainty.B > 0.0 or bool(uncertainty.entries)
@@ -195,10 +195,10 @@ def _loop_around(
 
 
 def learned_lines(tape: Tape, scenario: Scenario) -> dict[str, dict[str, float]]:
-    """Return known values of the entries in the topic `learned`, SI, by label.
+    """Return the known values of the entries of A and B that `learned` names, SI, by label.
 
-    One label has the values of the file. If the flight was simulated, another has those of the true
-    aircraft. For an aircraft of JSBSim no values are known.
+    The label FILE has the values of the airframe file. If the flight was simulated, the label TRUE
+    has those of the true aircraft. For an aircraft of JSBSim no values are known.
     """
     if "learned" not in tape or scenario.aircraft.is_jsbsim:
         return {}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compute the figures of merit of a guided flight.
+"""Compute the metrics of a guided flight.
 
-A flight is split into segments by mode and leg. For each segment, the figures are the errors of the
+A flight is split into segments by mode and leg. For each segment, the metrics are the errors of the
 quantities that guidance held.
 """
 
@@ -238,7 +238,7 @@ SCREEN = 15.24
 
 
 class Touch(NamedTuple):
-    """The figures of a touch-down, from the true pose if the log has it."""
+    """The sink rate, position and speed at a touch-down, from the true pose if logged."""
 
     sink: float  # m/s
     sideways: float  # speed across the heading, m/s
@@ -250,7 +250,7 @@ class Touch(NamedTuple):
 
 
 def landing_touch(tape: Tape, section: GuidanceConfig | None) -> Touch | None:
-    """Return the figures of a landing.
+    """Return the sink rate, position and speed at the touch-down of a landing.
 
     Returns None if guidance has no section `landing`, or if the flight did not end in a landing.
     """
@@ -361,7 +361,7 @@ def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[st
 
 
 def leg_results(legs: Sequence[Mapping[str, Any]]) -> str:
-    """Return the legs of a summary with their results as text, or "" without legs.
+    """Say with which result each leg in a summary was flown. Returns "" without legs.
 
     An example is "legs: 0 flown, 1 missed by 321 m, 2 not ended".
     """
@@ -373,7 +373,7 @@ def leg_results(legs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def landing_results(landing: Mapping[str, Any] | None) -> str:
-    """Return the figures of a `Touch` as a sentence, or "" without a landing."""
+    """Say how a `Touch` in a summary was, in a sentence. Returns "" without a landing."""
     if landing is None:
         return ""
     side = "right" if landing["beside"] > 0.0 else "left"
@@ -455,7 +455,7 @@ def _hold_errors(quantity: str, t: FloatArray, error: FloatArray, times: FloatAr
 
 
 def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
-    """Return the notices of a guided flight with their times."""
+    """Return the notices that guidance gave in a flight, as sentences with the time."""
     if section is None or "guidance" not in tape:
         return []
     log = tape["guidance"]
@@ -472,7 +472,7 @@ def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
 
 
 def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[str, Any] | None:
-    """Return the figures of a guided flight for `summary.json`, in SI.
+    """Return the metrics of a guided flight for `summary.json`, in SI.
 
     Returns None for a flight without guidance.
     """

@@ -79,7 +79,10 @@ def bounds_of(scenario: Scenario | None) -> Bounds:
 
 
 def flown_routes(scenario: Scenario | None, tape: Tape) -> list[Route]:
-    """Return the routes from the scenario and the topic `route` that flew, as the log shows."""
+    """Return the routes that flew, according to the topic `guidance`.
+
+    They come from the scenario and from the topic `route`.
+    """
     if scenario is None or scenario.guidance is None:
         return []
     numbers = set(tape["guidance"]["route"].tolist())
@@ -169,8 +172,9 @@ def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route
 def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
     """Return the mean wind, north and east, over equal parts of the flight, m/s, (parts, 2).
 
-    The wind is the velocity over ground less the velocity through the air, which is V cos(gamma)
-    along psi + beta with V = V0 + V of y.
+    The wind is the velocity over ground less the velocity through the air. The latter has the size
+    (V0 + V) cos(gamma), with V of y, and the direction psi + beta. `speed` is the trim speed V0,
+    m/s. For a multicopter, the log has the wind.
     """
     log = tape["guidance"]
     pose = log.group("pose")

@@ -236,7 +236,7 @@ def _motion(flight: RecordedFlight, scenario: Scenario, context: PlotContext) ->
 def _causes(
     flight: RecordedFlight, scenario: Scenario, context: PlotContext, flown: FlownLoops
 ) -> list[Block]:
-    """Return the figures of the causes: models, wind, states, the law, its loop and its ticks."""
+    """Return the figures that show causes: models, wind, states, the law, its loop, its ticks."""
     trim = about_trim(scenario)
     about = ABOUT_V if trim else ""
     spectrum = figures.spectrum_figure(context)

@@ -10,11 +10,11 @@ part of f that depends on the state. In the scenarios of the package, the error 
 to 1.3 times the error of the linear loop.
 
 Because the loop is linear, e is the sum of three errors, which the commands, the noise and the wind
-cause. An error of the flight is excused if these errors explain it. So a log with unusual noise or
-wind must not make them too large. Noise therefore counts only up to the declared noise of the
-sensor, and only as far as the actuators can follow the law's response to it. Wind counts only as
-far as the travel of the actuators can counter it. Gravity acts along the path of y_m, so that a
-pitch that was not commanded is no excuse.
+cause. An error of the flight is excused if these three explain it. Noise and wind must not excuse
+too much, so only a part of them counts. Noise counts only up to the declared noise of the sensor,
+and only as far as the actuators can follow the law's response to it. Wind counts only as far as the
+travel of the actuators can counter it. Gravity acts along the path of y_m, so that a pitch that was
+not commanded is no excuse.
 """
 
 from typing import NamedTuple
@@ -267,8 +267,8 @@ def _reach(controller: ControllerConfig, aircraft: AircraftConfig | None) -> Rea
 def _share_within(reach: Reach, u: FloatArray, period: float) -> FloatArray:
     """Return the fraction of u that the actuators can follow, (m,), at most 1.
 
-    u has the shape (N, m). Of this fraction of u, NOISE_PEAK standard deviations lie within travel
-    and rate of the actuators.
+    u has the shape (N, m). NOISE_PEAK times the standard deviation of this fraction of u lies
+    within the travel of the actuators. The same holds for its rate.
     """
     if len(u) < 2:
         return np.ones(u.shape[1])

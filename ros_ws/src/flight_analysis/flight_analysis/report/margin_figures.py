@@ -258,12 +258,12 @@ def guarantee_text(promise: Guarantee) -> list[str]:
 
 
 def proved_percent(part: float) -> str:
-    """Write the part of a box that is proved as a percentage, rounded down."""
+    """Write as a percentage, rounded down, which part of a box is proved."""
     return f"{math.floor(1e3 * part) / 10.0:.1f} %"
 
 
 def found_percent(part: float) -> str:
-    """Write the deviation of an unstable aircraft as a percentage, rounded up."""
+    """Write as a percentage, rounded up, how far an unstable aircraft deviates."""
     return f"{math.ceil(1e3 * part) / 10.0:.1f} %"
 
 

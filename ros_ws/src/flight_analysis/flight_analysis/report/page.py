@@ -38,7 +38,7 @@ HERE = Path(__file__).parent
 
 
 class Colour(StrEnum):
-    """The colour of a verdict, which shows its subject."""
+    """The colour of a verdict, which shows whether the flight, the host or nothing fell short."""
 
     GOOD = "good"  # green: nothing is wrong
     HOST = "host"  # amber: the host was too busy, and nothing is wrong with the aircraft
@@ -187,7 +187,7 @@ class TableGroup(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Figures:
-    """The block with groups of tables. The page of a flight can fold it."""
+    """The block with groups of tables. A reader can fold it on the page of a flight."""
 
     kind: ClassVar[str] = "tables"
     groups: Sequence[TableGroup]
@@ -284,7 +284,7 @@ def page_html(page: Page) -> str:
 
 
 def page_parts(page: Page) -> Iterator[str]:
-    """Return the text of a page in parts, because that of a long flight has some 100 MB."""
+    """Yield the HTML of a page in parts, because the page of a long flight has some 100 MB."""
     return _template().generate(
         page=page,
         dark=plotting.DARK | figures.DARK,
@@ -296,7 +296,7 @@ def page_parts(page: Page) -> Iterator[str]:
 
 @cache
 def _template() -> Template:
-    """Return the template of a page. It takes longer to compile it than to fill it."""
+    """Return the template of a page, compiled once because this takes longer than to fill it."""
     environment = Environment(
         loader=FileSystemLoader(HERE),
         autoescape=True,

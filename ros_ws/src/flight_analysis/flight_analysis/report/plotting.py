@@ -100,7 +100,11 @@ class SampleStore:
         return self._instants[key]
 
     def times(self, t_ns: NDArray[np.int64]) -> str:
-        """Store instants as float64 steps in ns, beginning at 0. Equal steps compress well."""
+        """Store instants, and return the name of the stored array.
+
+        It has the first instant, and then the steps from each instant to the next, ns, float64,
+        because equal steps compress well.
+        """
         if id(t_ns) not in self._times:
             self._times[id(t_ns)] = (
                 self._add("t", np.diff(t_ns, prepend=np.int64(0)).astype("<f8")),
@@ -109,11 +113,11 @@ class SampleStore:
         return self._times[id(t_ns)][0]
 
     def values(self, values: FloatArray) -> str:
-        """Store values as float32, rounded to MANTISSA bits.
+        """Store values as float32, rounded to MANTISSA bits, and return the array's name.
 
-        Values are rounded because noise does not compress, and a pixel shows fewer digits. Their
-        bits, as integers, are stored as differences modulo 2^32, beginning at 0, because successive
-        samples hardly differ.
+        Values are rounded because noise does not compress, and a pixel shows fewer digits. The bits
+        of a value are taken as an integer. The array has the first integer, and then the difference
+        of each from the one before, modulo 2^32, because successive samples hardly differ.
         """
         spare = 24 - MANTISSA
         bits = values.astype("<f4").view("<u4")
@@ -165,7 +169,7 @@ class Run:
 
 
 class PlotContext(NamedTuple):
-    """What the figures of a page have in common."""
+    """The flights, units, intervals and samples that the figures of a page share."""
 
     runs: Mapping[str, Run]  # by label; a single flight, or several to compare
     units: Mapping[str, DisplayUnit]  # units by channel

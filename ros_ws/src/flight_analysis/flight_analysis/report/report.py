@@ -68,8 +68,8 @@ def report(
 
     Args:
         runs: Folders of runs, or MCAP files.
-        html: Path of the page of a comparison, or of the only file for one run. If None, a
-            comparison is written to comparison.html in a new folder beside the first run.
+        html: Path of the page. One run then gets only this page. If None, a comparison is written
+            to comparison.html in a new folder beside the first run.
         output: Folder for the report of one run. If None, it is the folder of the log.
         png: Path of a figure with y over y_m, e and u.
         csv: Path of a table of all signals, with a row per instant and a column per channel.

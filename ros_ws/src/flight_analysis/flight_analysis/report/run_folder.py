@@ -152,9 +152,9 @@ def attachments_for(
     They are the scenario, the airframe or the user's model of JSBSim, every parameter after
     validation, the `further` files, and the provenance. Attachments that are no files yet are
     written into the folder of the run. `overrides` are parameters of the scenario's nodes by the
-    name of the node, or None for a flight without nodes. `replaced` names the nodes in place of
-    which other nodes fly, and the attachments state this. Raises ParameterError if a file cannot be
-    written.
+    name of the node, or None for a flight without nodes. `replaced` names the nodes of the stack
+    that other nodes replaced, and the attachments state this. Raises ParameterError if a file
+    cannot be written.
     """
     unflown = {
         name: comment([f"did not fly: {name}; another node took its place"]) for name in replaced
@@ -313,7 +313,7 @@ def _with_cause(
 
 
 def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedFlight:
-    """Return the flight of an aircraft of the user, whose log describes only the controller."""
+    """Return the flight of a user's aircraft, given a log that describes only the controller."""
     recorded.require("y", "u")
     controller = recorded_parameters(recorded.scenario_file(), recorded.namespace)
     summary = summarise_own(recorded.tape, controller.law, name, outcome)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Count the samples of each topic of a flight that were planned, logged, and never sent."""
+"""Count how many samples of each topic of a flight were planned, logged and never sent."""
 
 import math
 import re
@@ -270,10 +270,11 @@ def period_of(stamp_ns: NDArray[np.int64], lost: int, otherwise_ns: int) -> int:
 
 
 def _with_unsent(tape: Tape, name: str, topic: TopicAccount, step_ns: int) -> TopicAccount:
-    """Count the instants between first and last sample for which a publisher sent nothing.
+    """Return the account of a topic with `unsent`, the samples that its publisher left out.
 
-    An instant without a sample was left out by the publisher if no message was lost there, which
-    the numbers of the messages show. Samples with unusable stamps do not count as left out.
+    `unsent` counts the instants between the first and the last sample without a sample, less the
+    messages that were lost, as their numbers show. Samples with unusable stamps were sent, so they
+    do not count.
     """
     recording = tape.recording.get(name, Recording(0))
     if (
@@ -317,10 +318,10 @@ def ends_last(tape: Tape, name: str) -> bool:
 def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
     """Return for how many instants, from the last sample to the end, a publisher sent nothing.
 
-    This needs a proof that the publisher did not send, or else the result is 0. The numbers of the
-    messages must show that none was lost. In addition, the topic must have a sample after the end.
-    If it is one of OF_AIRCRAFT, it suffices that the aircraft later sent y, but at no instant at
-    which a sample of the topic was due.
+    The result is 0 unless the log proves that the publisher did not send. For this, the numbers of
+    the messages must show that none was lost, and the topic must have a sample after the end. A
+    topic of OF_AIRCRAFT needs no such sample if the log has every y. Then its instants up to the
+    last y count, but only if y has no sample at any of them.
     """
     signal = tape.signals.get(name)
     if signal is None or tape.recording.get(name, Recording(0)).lost != 0:
@@ -440,7 +441,7 @@ def _topic(
 def _leeways(scenario: Scenario) -> dict[str, Leeway]:
     """Return the leeway of each topic with a delay.
 
-    It is the delay of the topic. If the pose is slow, it is a period of the pose in addition.
+    The leeway is the delay of the topic. For the pose, a period of the pose is added.
     """
     aircraft = scenario.aircraft
     of_y = aircraft.sensors.delay

@@ -23,7 +23,7 @@ PLACE = ("north", "east", "altitude")  # m
 
 
 class Track(NamedTuple):
-    """Where an aircraft was, as stamps, and PLACE in a map that all aircraft share."""
+    """The positions of an aircraft over time, in the channels PLACE, and the origin of its map."""
 
     start_ns: int  # stamp of t = 0 of this aircraft's flight
     place: Signal
@@ -50,7 +50,7 @@ def approach(first: Signal, second: Signal) -> Approach | None:
     """Return the least distance of two aircraft, or None if they have no time in common.
 
     Between two samples each aircraft moves in a straight line. Let d_0 and d_1 be the differences
-    of their places at the ends of such an interval, and v = d_1 - d_0. They are nearest at the
+    of their positions at the ends of such an interval, and v = d_1 - d_0. They are nearest at the
     fraction -d_0 v / v^2 of the interval, if this lies between 0 and 1.
     """
     begin_ns = max(int(first.stamp_ns[0]), int(second.stamp_ns[0]))
@@ -76,7 +76,7 @@ def approach(first: Signal, second: Signal) -> Approach | None:
 
 
 def _at(signal: Signal, t: FloatArray, begin_ns: int) -> FloatArray:
-    """Return the places at the times t, (N, 3), where t is in ns since `begin_ns`."""
+    """Return the positions at the times t, (N, 3), where t is in ns since `begin_ns`."""
     own = (signal.stamp_ns - begin_ns).astype(float)
     return np.column_stack([np.interp(t, own, signal[name]) for name in PLACE])
 

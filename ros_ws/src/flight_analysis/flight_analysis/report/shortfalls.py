@@ -61,7 +61,7 @@ def judge(
 ) -> Outcome:
     """Return the outcome of a flight with its shortfalls, or without any if it ended early.
 
-    A flight without a scenario has its `controller`. Without either, errors are not judged.
+    Without a scenario, `controller` must be given. Without either, errors are not judged.
     """
     starved = account.starvation
     seems_unflown = outcome.end is End.NEVER_FLEW or account.late is not None

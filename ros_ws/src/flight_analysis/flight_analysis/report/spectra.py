@@ -19,8 +19,8 @@ def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, Float
     """Return the frequencies, Hz, and each channel's amplitude spectral density, unit / sqrt(Hz).
 
     The method is that of Welch (1967). The Hann windows overlap by half, and the mean of each is
-    removed. They span a tenth of the flight, but at most MAX_WINDOW. If a sample is missing, the
-    last one is repeated. This fills at most LONGEST_INTERVAL, because a gap of the log can have any
+    removed. A window spans a tenth of the flight, but at most MAX_WINDOW. If a sample is missing,
+    the last one is repeated for at most LONGEST_INTERVAL, because a gap of the log can have any
     length. The square of the density, integrated over the frequencies, is the variance.
     """
     places = np.round((signal.stamp_ns - signal.stamp_ns[0]) / period_ns).astype(np.int64)

@@ -54,11 +54,11 @@ class Starvation(NamedTuple):
 def starvation(
     tape: Tape, scenario: Scenario, topics: Mapping[str, TopicAccount], end: float
 ) -> Starvation:
-    """Return the spans in which the host was too busy to run the nodes, with recovery times.
+    """Return the spans in which the host was too busy to run the nodes.
 
-    `end` is the length of the flight, s.
-
-    There are no such spans in lockstep, in one process or by the clock of a simulator.
+    Each span is longer by the time RECOVERY, in which the flight recovers. `end` is the length of
+    the flight, s. There are no such spans in lockstep, in one process or by the clock of a
+    simulator.
     """
     if not is_real_time(tape) or tape.is_by_clock or end <= 0.0:
         return Starvation()
@@ -116,7 +116,7 @@ def _missing(tape: Tape, name: str, period: float, step: float, count: int) -> N
 
 
 def _windowed(is_missing: NDArray[np.bool_], length: int) -> FloatArray:
-    """Return the number of missing instants in the window around each instant, (N,)."""
+    """Return how many of the `length` instants around each instant are missing, (N,)."""
     total = np.concatenate([[0.0], np.cumsum(is_missing)])
     k = np.arange(len(is_missing))
     first = np.maximum(k - length // 2, 0)

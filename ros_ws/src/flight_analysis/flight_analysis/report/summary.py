@@ -195,7 +195,7 @@ def summarise(
         flight_account: The account of the whole flight, if the tape is only a part of it.
 
     Returns:
-        The figures by key.
+        The metrics by key.
 
     Raises:
         ParameterError: The tape has no y and y_m, or no scenario is known.
@@ -370,9 +370,9 @@ def _commands(tape: Tape, events: Sequence[Transient], end: float) -> Commands:
 
 
 def command_results(summary: Mapping[str, Any]) -> str:
-    """Return a text on commands that were not flown and on targets, or "" without either.
+    """Say how many commands were flown if some were not, and how many targets were given.
 
-    An example is "8 of 24 commands flown".
+    An example is "8 of 24 commands flown". Returns "" if there is nothing to say.
     """
     flight_account = account_of_json(summary)
     if flight_account is None or flight_account.commands is None:
@@ -398,10 +398,10 @@ STANDS_STILL = 5.0  # s; a vane that stands still longer at the end of a flight 
 def _with_late_ticks(
     flight_account: Account, ticks: TickMetrics | None, scenario: Scenario
 ) -> Account:
-    """Add to the account that the host is too busy, if too many ticks found no new y.
+    """Return the account, which says that the host is too busy if too many ticks had no new y.
 
-    Such ticks show this only if the log has every y, and if y has the rate of the scenario. An
-    aircraft outside of the stack or an autopilot has another rate.
+    These ticks are the host's fault only if the log has every y, and if y has the rate of the
+    scenario. In any other case, such as a y from outside of the stack, the account stays.
     """
     log_complete = (
         not (flight_account.over("y", "internals") and not flight_account.busy)
@@ -446,9 +446,9 @@ others show the parts of the flight."""
 
 
 def taken_over(summary: Mapping[str, Any], table: str) -> str:
-    """Return which part of the flight the metrics of a table cover, as a text after a comma.
+    """Say which part of the flight a table covers, as in ", over 49 % of truth".
 
-    If they cover the whole flight, the text is "".
+    Returns "" if the table covers the whole flight.
     """
     flight_account = account_of_json(summary)
     truth = ("truth",) if table == "errors" and summary["error"] == TRUE_ERROR else ()
@@ -462,7 +462,7 @@ def is_in_host_time(summary: Mapping[str, Any]) -> bool:
 
 
 def time_flown(summary: Mapping[str, Any]) -> str:
-    """Return a text with the duration of the flight, and the part that its errors cover."""
+    """Say how long the flight was, and which part of it the table of errors covers."""
     return f"{format_seconds(summary['duration'])} flown{taken_over(summary, 'errors')}"
 
 
@@ -491,7 +491,7 @@ def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: b
 
 
 def mode_notes(tape: Tape, part: str) -> list[str]:
-    """Return a sentence if the controller did not fly the law in more than 1 % of the ticks.
+    """Return a sentence if, in more than 1 % of the ticks, the law was not engaged.
 
     Ticks count from the first engagement on. `part` says which part of the ticks the log has, as in
     "over 49 % of internals", or is "" if it has all.

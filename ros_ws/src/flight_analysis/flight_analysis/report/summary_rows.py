@@ -44,7 +44,10 @@ class Column:
         return f"{self.group} {self.head}".strip()
 
     def value(self, figures: Mapping[str, Any]) -> float | None:
-        """Return the metric, SI, or None. `figures` is the summary's part where `path` begins."""
+        """Return the metric, SI, or None if there is none.
+
+        `path` leads to it from `figures`, a part of the summary.
+        """
         value: Any = figures
         for key in self.path:
             value = value.get(key) if isinstance(value, Mapping) else None

@@ -302,7 +302,7 @@ def _guidance_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
 def model_table(
     models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit], part: str
 ) -> MetricTable:
-    """Return the rms of the error before the first learned model, and under every model.
+    """Return a table of the rms errors before the first learned model, and under every model.
 
     `part` is the end of the caption. If the log has only a part of the flight, it names this part.
     """

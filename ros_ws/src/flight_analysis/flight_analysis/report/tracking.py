@@ -178,7 +178,7 @@ def _has_engaged(tape: Tape) -> bool:
 
 
 def _floor(pair: ErrorPair, i: int, unit: str) -> float:
-    """Return the floor of the error of output i, SI. `unit` is the unit of the output."""
+    """Return the floor in the allowed error of output i, SI. `unit` is the unit of the output."""
     is_speed = quantity(unit).dimension == SPEED
     smallest = LEAST[AIRSPEED] if is_speed else LEAST_RATE
     if pair.knowledge.has_wind:
@@ -201,9 +201,11 @@ def _most(unit: str) -> float:
 
 
 def _excesses(pair: ErrorPair, i: int, group: list[int], limits: _Limits) -> list[Excess]:
-    """Return, for output i, the worst parts of each span that the law flew, and of the end.
+    """Return the worst parts of the flight for output i.
 
-    `group` holds the outputs of the same kind, which are the airspeed or the rates.
+    There are up to two for each span in which the law flew, and two for the last END of the flight.
+    A span shorter than END is left out, unless all are. `group` holds the outputs of the same kind,
+    which are the airspeed or the rates.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], pair.is_flown, [False]])))
     spans = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
@@ -275,7 +277,7 @@ def _sums(values: FloatArray, count: int) -> FloatArray:
 
 
 def _shortfall(excess: Excess, pair: ErrorPair, i: int, unit: DisplayUnit) -> Shortfall:
-    """Return the shortfall for an error that is too large, with the period of a limit cycle."""
+    """Return the shortfall for an error that is too large, with its period if it oscillates."""
     rms, allowed = unlike_numbers(excess.rms * unit.factor, excess.allowed * unit.factor)
     brief = f"{excess.output} off by {rms} {unit.unit} rms, {allowed} allowed"
     sentence = f"{brief}, from t = {excess.start:.1f} to {excess.stop:.1f} s"
