@@ -18,10 +18,10 @@ wing touches the ground, if the wing reaches 2.5 m to the side per metre of its 
 
 
 def touch(title: str, t_ns: int, sink: float, *, is_on_wheels: bool) -> FlightEnded:
-    """Return the end of a flight that touches the ground at a sink rate `sink`, m/s.
+    """Return the end of a flight that touches the ground at t with the sink rate `sink`, m/s.
 
     The aircraft has landed if it is on its wheels and the sink rate is at most SOFT. Otherwise it
-    has hit the ground.
+    has hit the ground. `title` names the aircraft in the sentence.
     """
     has_landed = is_on_wheels and sink <= SOFT
     verb = "landed" if has_landed else "hit the ground"

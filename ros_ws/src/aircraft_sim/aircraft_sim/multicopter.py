@@ -49,7 +49,7 @@ class MulticopterModel(StateSpaceModel):
         return GRAVITY + self._up * float(row @ self._state.position)
 
     def _tilted(self, forced: Forcing) -> Forcing:
-        """Return the forcing of a step with the loss of lift in a tilt."""
+        """Return the forcing of a step, with the loss of lift that a tilt causes."""
         up = thrust_axis(self._phi, self._theta, self._psi)[2]
         return forced._replace(rate=forced.rate + (up - 1.0) * self._thrust() * self._into_climb)
 

@@ -79,7 +79,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return (self._u_receiver.subscription,)
 
     def on_parameters(self, parameters: AircraftConfig) -> None:
-        """Let faults begin or end between two samples."""
+        """Use the changed faults and gusts from the next sample on."""
         self._simulator.retune(parameters)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
@@ -135,7 +135,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return True
 
     def _complete(self) -> None:
-        """Report that the flight is complete, with the u of its last instant."""
+        """Report once that the flight is complete. The u of its last instant has arrived."""
         if not self._completed:
             self._completed = True
             self.publish_state(NodeState.COMPLETED)
@@ -202,10 +202,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return nanoseconds(self.parameters.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Return two silences of the publisher of u after which another may take over, ns.
+        """Return how long the publisher of u must be silent before another may take over, ns.
 
-        After the first, the same node may take over in a new process. After the second, another
-        node may, because the failsafe has then brought u to trim.
+        The first value is for the same node in a new process, and the second for another node. By
+        then the failsafe has brought u to trim.
         """
         return self._max_age_ns, self._max_age_ns + nanoseconds(
             self.parameters.hold + self.parameters.ramp

@@ -311,7 +311,7 @@ class AircraftConfig(NodeConfig):
         )
 
     def _stops(self) -> dict[str, Sequence[float]]:
-        """Return the end stops of the actuators by key."""
+        """Return the lists of the lower and upper end stops of the actuators, by key."""
         return {end: getattr(self.actuators, end) for end in effector_faults.ENDS}
 
     def _no_thrust(self) -> FloatArray:
@@ -404,7 +404,7 @@ class AircraftConfig(NodeConfig):
         )
 
     def drifted_airframe(self) -> Airframe:
-        """Return the airframe after its drift; without a drift, the airframe in flight."""
+        """Return the airframe after its drift; without a drift, that at the start."""
         airframe = self.sampled_airframe()
         section = self.drift
         if section is None:
@@ -505,7 +505,7 @@ class AircraftConfig(NodeConfig):
         )
 
     def wind_model(self) -> WindModel:
-        """Return the wind along every axis for an aircraft of JSBSim."""
+        """Return the sources of wind for an aircraft of JSBSim, along every axis."""
         turbulence = self._turbulence(self.flight_condition().speed, AXES, None)
         return WindModel(self.gust_arrays(AXES), turbulence, self.relative_wind())
 

@@ -118,7 +118,7 @@ class ShearConfig(Config):
             require(above, "reference", f"{self.reference:g} m", expected)
 
     def profile(self) -> wind_field.Log | wind_field.Power | wind_field.Table:
-        """Return the profile for the equations."""
+        """Return the wind profile over the height, as the equations use it."""
         if self.law == "table":
             return wind_field.Table(self.height, self.north, self.east)
         reference = self.reference or math.inf
@@ -138,7 +138,7 @@ class MicroburstConfig(Config):
     height: Positive = Field(description="height of the largest outflow above the ground, m")
 
     def model(self) -> wind_field.Microburst:
-        """Return the microburst for the equations."""
+        """Return the microburst as the equations use it."""
         values = self.model_dump(exclude={"ground"})
         return wind_field.Microburst(**values)
 
@@ -378,6 +378,9 @@ class StartConfig(Config):
 def by_state(
     configs: Mapping[str, Config], keys: Sequence[str], states: Iterable[str]
 ) -> list[FloatArray]:
-    """Return an array over the states for each key, with 0 for each state that is not named."""
+    """Return an array for each key, with the value of this key for each of `states`.
+
+    The value is 0 for a state without a section in `configs`.
+    """
     sections = [configs.get(state) for state in states]
     return [np.array([float(getattr(section, key, 0.0)) for section in sections]) for key in keys]

@@ -48,16 +48,16 @@ class FlightDynamicsModel(Protocol):
         """Return the values in the order of `truth_names`."""
 
     def pose(self) -> FloatArray:
-        """Return the pose relative to the air mass, absolute values, SI.
+        """Return the pose relative to the air mass, SI, in the order of `channels.POSE`.
 
-        The values are in the order of `channels.POSE`.
+        The values are no deviations from trim.
         """
 
     def diverged(self) -> bool:
         """Return whether the state is not finite, or too large for a flight."""
 
     def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
-        """Take the actuator faults and the gusts of these parameters from t on."""
+        """Use the actuator faults and the gusts of `parameters` from t on."""
 
 
 class Simulator:
@@ -115,7 +115,7 @@ class Simulator:
         self._require_above_ground(0)
 
     def retune(self, parameters: AircraftConfig) -> None:
-        """Take the faults and gusts of these parameters from now on.
+        """Use the faults and gusts of `parameters` from now on.
 
         Raises ParameterError if a fault or a gust would change the past.
         """
@@ -216,7 +216,7 @@ class Simulator:
             raise self._with_place(end)
 
     def _with_place(self, end: FlightEnded) -> FlightEnded:
-        """Return the end of the flight; for a landing, add the lateral speed and the place."""
+        """Return `end`; if it is a landing, its sentence gets the lateral speed and the place."""
         if end.end is not End.LANDED:
             return end
         at = dict(zip(POSE, self.pose().tolist(), strict=True))

@@ -120,7 +120,7 @@ class StateSpaceModel:
         return self._into @ (wind_field.body_axes(phi, theta, self._psi) @ self._wind_dot)
 
     def _drifts(self, t_ns: int) -> bool:
-        """Return whether the aircraft at t differs from the one that the block assumes."""
+        """Return whether the drift at t differs from that for which the block was computed."""
         drift = self._plant.drift
         if drift is None:
             return False
@@ -130,7 +130,7 @@ class StateSpaceModel:
         return bool(now != before)
 
     def pose(self) -> FloatArray:
-        """Return the pose relative to the air mass, absolute, in the order of `channels.POSE`."""
+        """Return the pose relative to the air mass, in the order of `channels.POSE`."""
         _, _, beta, phi, theta, *_ = self._states()
         attitude = (pose.wrapped(phi), theta, pose.wrapped(self._psi))
         velocity = np.array(self._velocity)
@@ -196,7 +196,7 @@ class StateSpaceModel:
         return plant.diverged(self._state)
 
     def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
-        """Take the actuator faults and the gusts of these parameters from t on."""
+        """Use the actuator faults and the gusts of `parameters` from t on."""
         aircraft = self._plant.aircraft._replace(gusts=parameters.gust_arrays(self._axes))
         self._plant = self._plant._replace(
             aircraft=aircraft,

@@ -19,9 +19,9 @@ def names(airframe: Airframe) -> tuple[str, ...]:
 
     - "x.state": the states of the airframe.
     - "f.state": f of equation (1), with the disturbances.
-    - "gust.axis": the wind along the axes of the airframe's gusts, m/s, which is 1-cosine gust plus
-      turbulence.
-    - "actuator.input": the present position.
+    - "gust.axis": the wind along the axes of the airframe's gusts, m/s, as the sum of 1-cosine
+      gusts and turbulence.
+    - "actuator.input": the present position of the actuator.
     """
     groups = (
         ("x", airframe.states),
@@ -40,10 +40,8 @@ def values(
 ) -> FloatArray:
     """Return the values of `truth` in the order of `names`.
 
-    `f` and `gust` are the values that act in the next step, because turbulence is constant over a
-    step.
-
-    `wind` (G,) and `rate` (n,) are the `dynamics.Forcing` of this instant.
+    The values of f and gust are those that act in the next step, because turbulence is constant
+    over a step. `wind` (G,) and `rate` (n,) are the `dynamics.Forcing` of this instant.
     """
     f = dynamics.f_state(state.x, plant.aircraft) + rate
     if plant.aircraft.trim is not None:

@@ -131,9 +131,9 @@ def gust_directions(airframe: Airframe, A: FloatArray, wind: WindEffect) -> Floa
 
 
 def coupled_gust_directions(airframe: Airframe, A: FloatArray) -> FloatArray:
-    """Compute `gust_directions` where wind acts through entries that are published as 0, too.
+    """Compute `gust_directions`, but let wind also act through entries that are published as 0.
 
-    What moves an aircraft is its motion relative to the air, so the effect of wind through such an
+    An aircraft is moved by its motion relative to the air. So the effect of wind through such an
     entry is minus the entry, per w / V0 for an angle and per w otherwise.
     """
     directions = gust_directions(airframe, A, AIR_RELATIVE)
@@ -158,7 +158,7 @@ def sampled_matrices(
 
     The shapes are (count, n, n) and (count, n, m). Every entry is multiplied by 1 + d, with an
     independent d within +-uncertainty and the distribution of `spread`. The rows of angles stay. An
-    entry that is 0 becomes d times its row (`row_sizes`), with d within +-zeros. An aircraft
+    entry that is 0 becomes d times its `row_sizes`, with d within +-zeros. An aircraft
     depends only on seed and number, and not on `count`. Raises ParameterError for an uncertainty
     outside [0, 1), and for an unknown entry.
     """
@@ -238,7 +238,7 @@ def drawn_places(airframe: Airframe, *, zeros: bool = False) -> dict[str, tuple[
 
 
 def row_sizes(airframe: Airframe) -> dict[str, FloatArray]:
-    """Compute the value that stands for the whole row of each entry published as 0, SI.
+    """Compute a reference value for each entry that is published as 0, from its row, SI.
 
         row_i / size_j,   row_i = max over A and B of abs(A_ik) size_k, abs(B_ik) size_k
 
@@ -265,7 +265,7 @@ def row_sizes(airframe: Airframe) -> dict[str, FloatArray]:
 
 
 def input_sizes(airframe: Airframe) -> FloatArray:
-    """Return the sizes of the inputs, (p,), SI; 0 for an input without a known size."""
+    """Return the deviation of each input for `row_sizes`, (p,), SI; 0 if it is not known."""
     trim = np.abs(np.nan_to_num(airframe.no_thrust()))
     dimensions = [quantity(channel.unit).dimension for channel in airframe.inputs.values()]
     has_range = [dimension in {ANGLE, DIMENSIONLESS} for dimension in dimensions]
@@ -275,10 +275,10 @@ def input_sizes(airframe: Airframe) -> FloatArray:
 def with_entries(
     airframe: Airframe, deviations: Mapping[str, float], wind: WindEffect = AIR_RELATIVE
 ) -> Airframe:
-    """Multiply entries of an airframe by 1 + deviation; `deviations` has their names.
+    """Multiply entries of an airframe by 1 + deviation, and return the new airframe.
 
-    The names are those of `drawn_entries`. An entry that is 0 becomes the deviation times its row
-    (`row_sizes`). The effect of the wind follows from `wind_factors`.
+    `deviations` has the deviations by the names of `drawn_entries`. An entry that is 0 becomes the
+    deviation times its `row_sizes`. The effect of the wind follows from `wind_factors`.
     """
     matrices = {"A": airframe.matrix_a().copy(), "B": airframe.matrix_b().copy()}
     places = drawn_places(airframe, zeros=True)

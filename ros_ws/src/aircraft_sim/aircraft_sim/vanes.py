@@ -80,7 +80,7 @@ class VaneSensorsConfig(Config):
 
 
 class VaneState(NamedTuple):
-    """State of the vanes between two samples."""
+    """State that the vanes keep from one sample to the next."""
 
     angle: FloatArray  # (k,) angles of the vanes
     reading: FloatArray  # (k,) last readings that were received

@@ -38,9 +38,10 @@ def import_airframe(
     text: str = "",
     **body: str | float,
 ) -> tuple[Airframe, str]:
-    """Make an airframe from a model of another tool, and a sentence that says how it was read.
+    """Make an airframe from a model of another tool.
 
-    The airframe is checked against physics.
+    Returns the airframe, and a sentence that says how the model was read. The airframe is checked
+    against physics.
 
     Args:
         source: A state space of python-control or SciPy, or the path of a MATLAB file (.mat), of an
@@ -57,7 +58,7 @@ def import_airframe(
             q, V, p, r that elevator, thrust, aileron and rudder move.
         thrust: Whether to add an input thrust, in units of the weight along the flight path, to a
             model without a thrust.
-        text: Where the figures come from.
+        text: Where the numbers of the model come from, as text for the airframe.
         body: mass, Ixx, Iyy, Izz, Ixz and density for the derivatives of AVL, and `length`, AVL's
             unit of length.
 
@@ -97,7 +98,11 @@ def _of_file(source: str | Path, name: str, options: Mapping[str, Any]) -> Airfr
 
 
 def _named(names: Named, key: str) -> dict[str, Any]:
-    """Split names from their units and effects, by name; {} if there are no names."""
+    """Return the text of each unit, with the effect if stated, by name of a state or input.
+
+    `names` may be such a mapping, a text like "u: ft/s, w: ft/s", or names without units, whose
+    texts are then "".
+    """
     if isinstance(names, str):
         parts = [part.strip() for part in names.split(",")] if names.strip() else []
         split = [(part.partition(":")[0].strip(), part.partition(":")[2].strip()) for part in parts]
@@ -200,7 +205,7 @@ def _airframe(
 def _rows_of_outputs(
     model: ToolModel, outputs: Sequence[str], labels: Sequence[str]
 ) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """Return rows of C by output, and units of the outputs that are not states.
+    """Return the row of C of each output, and the unit of each output that is no state, by name.
 
     `labels` name the rows of C in the model.
     """
@@ -254,7 +259,7 @@ def _output(text: str, names: Sequence[str]) -> tuple[str, str, FloatArray | Non
 
 
 def _default_outputs(model: ToolModel) -> list[str]:
-    """Return the outputs of q, V, p, r that elevator, thrust, aileron and rudder move.
+    """Return the output of each input: q for elevator, V for thrust, p for aileron, r for rudder.
 
     In body axes V = u cos(alpha_0) + w sin(alpha_0). The terms of q in u_dot and w_dot give
     alpha_0.
@@ -294,8 +299,8 @@ def _effect(model: ToolModel, name: str) -> str:
 def _gusts(frame: Airframe) -> dict[str, dict[str, float]]:
     """Return the effect of wind on x_dot by axis and state, for the section `gusts` of a file.
 
-    The effect is that of a wind w / V0 = 1, which is minus the column of the state that moves
-    relative to the air. Wind has no effect on angles and h.
+    The effect is that of a wind w with w / V0 = 1. It is minus the column of A that belongs to the
+    state of the motion relative to the air. Wind has no effect on angles and h.
     """
     A = frame.matrix_a()
     names = list(frame.states)

@@ -78,7 +78,7 @@ class Exponents(NamedTuple):
 
 
 def exponents(airframe: Airframe, thrust: str) -> Exponents:
-    """Return the exponents for an airframe whose input `thrust` is the thrust.
+    """Return the exponents for an airframe. `thrust` is the name of its input for the thrust.
 
     Raises ParameterError for a state whose exponents are not known.
     """

@@ -91,7 +91,7 @@ a column of B is per deg but is taken to be per rad, the strength is wrong by th
 
 
 class LinearModel(NamedTuple):
-    """The linear model of an airframe in the units of the file."""
+    """The linear model of an airframe, in the units of the airframe file."""
 
     name: str
     states: Mapping[str, str]  # units by state
@@ -121,7 +121,7 @@ class LinearModel(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """A contradiction to physics: what was found in the file, and what is expected."""
+    """A contradiction to physics: what the airframe file says, and what is expected."""
 
     key: str
     actual: str
@@ -247,8 +247,8 @@ def _effects(model: LinearModel) -> Iterator[Finding]:
 def _strengths(model: LinearModel) -> Iterator[Finding]:
     """Yield a contradiction for each control of implausible size.
 
-    The size is the angular acceleration per rad divided by stiffness plus damping, which is
-    |M_alpha| + |M_q| (|M_q| + |Z_alpha|).
+    The size is the angular acceleration per rad of the control, divided by the sum of stiffness and
+    damping. For pitch this sum is |M_alpha| + |M_q| (|M_q| + |Z_alpha|).
     """
     names = list(model.states)
     for k, name in enumerate(model.effects):

@@ -36,7 +36,7 @@ class Log(NamedTuple):
     roughness: float  # z0, m
 
     def factor(self, height: float) -> float:
-        """Return the factor at a height above the ground, m."""
+        """Return the wind at a height above the ground, m, divided by that at `reference`."""
         above = max(height / self.roughness, 1.0)
         return math.log(above) / math.log(self.reference / self.roughness)
 
@@ -48,7 +48,7 @@ class Power(NamedTuple):
     exponent: float  # a
 
     def factor(self, height: float) -> float:
-        """Return the factor at a height above the ground, m."""
+        """Return the wind at a height above the ground, m, divided by that at `reference`."""
         return float((max(height, 0.0) / self.reference) ** self.exponent)
 
 

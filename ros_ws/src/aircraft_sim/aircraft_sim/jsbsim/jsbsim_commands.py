@@ -74,7 +74,7 @@ def command_paths(command: Command, engines: int) -> list[tuple[str, float]]:
 
 
 def set_command(fdm: jsbsim.FGFDMExec, command: Command, value: float) -> None:
-    """Set the properties of a command to a value of the command."""
+    """Set the properties of a command so that the command has the value `value`."""
     for path, at_one in command_paths(command, engine_count(fdm)):
         fdm[path] = at_one * value
 
@@ -87,9 +87,10 @@ def residuals(fdm: jsbsim.FGFDMExec) -> FloatArray:
 def commands_and_limits(
     fdm: jsbsim.FGFDMExec, inputs: Iterable[Command]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the whole commands and their distances from the lower and upper stops, (4,) each.
+    """Return the whole commands, and their lower and upper stops as deviations, (4,) each.
 
-    A whole command includes the part of the trim.
+    A whole command is the sum of the command and its trim property. A stop is a deviation from the
+    whole command, so the lower stops are at most 0.
     """
     inputs = list(inputs)
     first = [command_paths(command, 1)[0] for command in inputs]
@@ -126,7 +127,8 @@ def _first(command: Command) -> str:
 def _moves(fdm: jsbsim.FGFDMExec, paths: Iterable[tuple[str, float]], part: float) -> bool:
     """Return whether a change of properties changes an acceleration.
 
-    The acceleration also varies between two equal runs, and must change by more than that.
+    `paths` has the properties with their values at the command 1, and `part` is the change of the
+    command. The acceleration also varies between two equal runs, and must change by more than that.
     """
     before = {path: fdm[path] for path, _ in paths}
     runs = []
@@ -166,7 +168,7 @@ def sentence_without_effect(
 
 
 def hysteresis_of(model: Path | None) -> str:
-    """Return a clause, for a sentence about a failed trim, that names servos with hysteresis.
+    """Name the servos of a model that have a hysteresis, as a clause about a failed trim.
 
     Such servos hold their output while a command changes little, so a solver may find no trim.
     Returns "" if no servo of the model has a hysteresis.

@@ -101,9 +101,9 @@ class _Place(NamedTuple):
 def model_files(model: Path) -> ModelFiles:
     """Collect the files of a model that does not come from the package jsbsim.
 
-    Raises ParameterError if a file is missing or cut short. It is also raised for a file outside of
-    the folders of the model and its root, even if only a link leads there, for a child model, and
-    for a property that writes a file.
+    Raises ParameterError if a file is missing or cut short, or if it lies outside of the folders of
+    the model and its root, even if only a link leads there. It is also raised if the model has a
+    child model, or a property that writes a file.
     """
     first = _Place(f"aircraft/{model.stem}/{model.name}", model)
     members: dict[str, bytes] = {}

@@ -59,7 +59,7 @@ class Linearization(NamedTuple):
 
     @property
     def Omega(self) -> FloatArray:  # noqa: N802 - the paper's name
-        """C B, (m, m): 1/s of the outputs per unit of a command."""
+        """Omega = C B, (m, m): y_dot per unit of each command."""
         return np.asarray(self.airframe.matrix_c() @ self.airframe.matrix_b())
 
     def travel(self) -> FloatArray:
@@ -221,7 +221,7 @@ def _set_rate(fdm: jsbsim.FGFDMExec, trim: Trim, name: str, value: float) -> Non
 
 
 def _airframe(condition: FlightCondition, trim: Trim, B: FloatArray) -> Airframe:
-    """Build the airframe of a trim; B has the columns of its inputs."""
+    """Build the airframe about a trim. `B` has a column for each input, (n, m)."""
     places = {name: i for i, name in enumerate(AIRPLANE_STATES)}
     V = condition.speed
     wind = np.column_stack([_derivative(condition, trim, axis) for axis in AXES])

@@ -204,9 +204,10 @@ class JsbsimModel:
         return np.concatenate([self._x, self._wind(t_ns), self._position])
 
     def pose(self) -> FloatArray:
-        """Return the pose relative to the air mass, absolute values in SI, by `channels.POSE`.
+        """Return the pose relative to the air mass, in the order of `channels.POSE`.
 
-        The position is integrated from the velocity by the trapezoidal rule.
+        The values are no deviations from trim, and are in SI. The position is integrated from the
+        velocity by the trapezoidal rule.
         """
         phi, theta, psi, altitude, *velocity, beta = (
             node.get_double_value() * si for node, si in self._pose_nodes
@@ -223,7 +224,7 @@ class JsbsimModel:
         return not bool(np.all(np.abs(self._x) < DIVERGENCE_LIMIT))
 
     def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
-        """Take the actuator faults and the gusts of these parameters from t on."""
+        """Use the actuator faults and the gusts of `parameters` from t on."""
         self._actuator_model = parameters.actuator_model()._replace(no_thrust=self._no_thrust)
         self._wind_model = self._wind_model._replace(gusts=parameters.gust_arrays(AXES))
 
@@ -252,7 +253,10 @@ class JsbsimModel:
         return node
 
     def _wind(self, t_ns: int) -> FloatArray:
-        """Return the wind along AXES, (3,), m/s, at the instant of the state of the turbulence."""
+        """Return the wind along AXES at t, (3,), m/s.
+
+        The present state of the turbulence must be that at t.
+        """
         gusts = one_minus_cosine(
             np.array(seconds(t_ns)), self._wind_model.gusts, np.array(self.condition.speed)
         )

@@ -409,7 +409,9 @@ def _solve_accelerations(
 ) -> tuple[float, ...]:
     """Find the trim at which accelerations vanish after `settling` s of frozen flight.
 
-    The unknowns are x = START + (scaled - 1) SCALE.
+    The unknowns are x = START + (scaled - 1) SCALE, and the result is `scaled`. `by_elevator` is
+    the share of the pitch trim that the command of the elevator sets instead of the trim property.
+    If it is not 0, the search stays within LOWEST and HIGHEST.
     """
     from scipy.optimize import fsolve, least_squares  # noqa: PLC0415 - a sixth of a second, which other aircraft do not need
 
@@ -504,7 +506,7 @@ def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str | Un
 
 
 def _engines_start(condition: FlightCondition) -> bool:
-    """Return whether every engine runs or gives thrust at half of the speed at sea level."""
+    """Return whether every engine runs or gives thrust at sea level, at half of the speed."""
     fdm = _load(condition._replace(speed=0.5 * condition.speed, altitude=0.0))
     _start_engines(fdm, condition)
     return all(
@@ -513,7 +515,10 @@ def _engines_start(condition: FlightCondition) -> bool:
 
 
 def nearest_trim(condition: FlightCondition) -> str | None:
-    """Say in words at which nearby speed and altitude of NEIGHBOURS an aircraft trims."""
+    """Say at which nearby speed and altitude an aircraft trims, or return None.
+
+    The conditions of NEIGHBOURS are tried in order.
+    """
     for speed, altitude in NEIGHBOURS:
         near = condition._replace(
             speed=speed * condition.speed, altitude=altitude * condition.altitude

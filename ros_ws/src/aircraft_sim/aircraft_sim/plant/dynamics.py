@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluate the aircraft, equation (1): x_dot = A x + f(x, t) + B u, y = C x, deviations from trim.
+"""Evaluate the aircraft, equation (1): x_dot = A x + f(x, t) + B u, y = C x.
 
-f(x, t) is the sum of f_state(x) and f_time(t). `x_dot` computes the sum at one instant, while
-`plant.advance` computes f_time once for all instants of the steps.
+x, u and y are deviations from trim. f(x, t) is the sum of f_state(x) and f_time(t). `x_dot`
+computes the sum at one instant, while `plant.advance` computes f_time once for all instants of the
+steps.
 """
 
 from typing import Any, NamedTuple

@@ -19,7 +19,7 @@ from flight_core.vectors import FloatArray
 
 
 class FaultKind(NamedTuple):
-    """A kind of fault: its fields in `actuators.Actuators`, and the number for its strength."""
+    """A kind of fault: its fields in `actuators.Actuators`, and the range of its strength."""
 
     begin: str
     strength: str = ""  # field of the strength; "" if the kind has no strength
@@ -142,7 +142,7 @@ def arrays(
 ) -> dict[str, Any]:
     """Return the faults as fields of `actuators.Actuators`, each of shape (m,).
 
-    For an input that never has a fault, the beginning of this fault is infinite.
+    If an input never has a fault of some kind, the time of this fault is infinite.
     """
     columns: dict[str, Any] = {}
     for fault in faults:

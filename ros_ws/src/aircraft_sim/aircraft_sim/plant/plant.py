@@ -82,9 +82,9 @@ class PlantParams(NamedTuple):
 def aircraft_at(t_ns: int, plant: PlantParams, x: Array | None = None) -> Aircraft:
     """Return the aircraft at t in the state x, (n,), or in trim if x is None.
 
-    The drift multiplies A, B and the effect of wind by 1 + share (factor - 1). If they follow the
-    airspeed, entries are multiplied by powers of r = 1 + V / V0, and deviations are taken from the
-    trim at r, (x_r, u_r):
+    The drift multiplies A, B and the effect of wind by 1 + share (factor - 1). If the plant follows
+    the airspeed, their entries are also multiplied by powers of r = 1 + V / V0. Deviations are then
+    taken from the trim at r, (x_r, u_r):
 
         x_dot = A x + gravity sin(x) + B u + trim,  trim = -(A x_r + gravity sin(x_r) + B u_r)
     """
@@ -102,7 +102,10 @@ def aircraft_at(t_ns: int, plant: PlantParams, x: Array | None = None) -> Aircra
 
 
 def _at_airspeed(x: Array, aircraft: Aircraft, over: OverAirspeed) -> Aircraft:
-    """Return the aircraft at the airspeed of a state, within the ratios of the trims."""
+    """Return the aircraft at the airspeed of the state x.
+
+    The airspeed counts as at least the lowest and at most the highest one that has a trim.
+    """
     least, most = over.ratio[[0, -1]].tolist()
     r = min(max(1.0 + x[over.place].item() / over.speed, least), most)
     A, B, gravity = (
