@@ -58,7 +58,10 @@ class Prepared(NamedTuple):
 
 
 def preparing(parameters: ControllerConfig) -> Generator[None, None, Prepared]:
-    """Prepare parameters as `prepared` does, but yield after at most about 1 ms."""
+    """Prepare parameters as `prepared` does, but in parts of at most about 1 ms.
+
+    The generator yields after each part.
+    """
     law = parameters.tuned_law()
     yield
     limits = parameters.guard()
@@ -454,7 +457,7 @@ class Controller:
         return next((sample for sample in reversed(self._y) if sample.stamp_ns <= known_ns), newest)
 
     def ages(self, now_ns: int) -> dict[str, float]:
-        """Return the ages of the newest y and y_m, s, without an input that never came.
+        """Return the ages of the newest y and y_m, s. An input that never came is left out.
 
         Args:
             now_ns: The clock, ns.

@@ -192,7 +192,7 @@ class ControllerSection(NodeConfig):
         )
 
     def models(self) -> tuple[Any, ...]:
-        """Return the sections with a model of the aircraft, which a learner may replace."""
+        """Return the sections that a learner may replace, because they hold a model."""
         return self.feedforward, self.observer
 
     def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:
@@ -238,7 +238,10 @@ class ControllerSection(NodeConfig):
         return np.zeros(0)
 
     def history_ticks(self) -> int:
-        """Return the number of past ticks from which a new observer gets its estimates."""
+        """Return over how many past ticks a new observer runs to get its estimates.
+
+        It is 0 unless the law learns its models.
+        """
         return 0
 
     def nominal(self) -> Nominal | None:
@@ -251,8 +254,8 @@ class ControllerSection(NodeConfig):
         """Return the nominal model with which the feedforward follows y_m.
 
         If the `part` of the observer is 0, feedforward and observer do not act yet. A learner still
-        needs the states of the model, so with a learner the result is the model without an effect
-        on u. Without a learner it is None.
+        needs the states of the model, so with a learner the result is the model, but with no effect
+        on u. Without a learner the result is None.
         """
         nominal = self.nominal()
         if nominal is None or self.observer is None or self.observer.part > 0.0:
@@ -295,9 +298,10 @@ class ControllerSection(NodeConfig):
         return gain
 
     def _probe(self) -> Probe | None:
-        """Build the probe, whose sines move y by the amplitudes of its section, or return None.
+        """Build the probe from the section `probe`, or return None without this section.
 
-        The size of each sine follows from `probe_gain`.
+        The section states the amplitudes of y. The amplitudes of the sines in u follow from them
+        by `probe_gain`.
         """
         if self.probe is None:
             return None

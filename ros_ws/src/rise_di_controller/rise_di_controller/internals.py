@@ -62,8 +62,8 @@ def groups(
     before (u_free) and after saturation (u), u_trim, limited (Saturation) and u_ff (feedforward).
     An observer adds its estimates z, u_o for each input, and sigma, the fade-in. Vanes add the mean
     of their readings, the mean square around the mean, 1 for a vane in use, the reading, and the
-    reading in the reference motion. An allocation adds the group effector with the commanded
-    effectors.
+    reading in the reference motion. An allocation adds the group effector with the commands
+    of the effectors.
     """
     state_groups = [
         name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS, *VANE_STATE)

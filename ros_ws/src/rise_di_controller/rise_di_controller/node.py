@@ -203,7 +203,10 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return taking
 
     def _tell_restart(self) -> None:
-        """Count if the law engaged again without a command, and log it at most once in 2 s."""
+        """Count and log that the law has engaged again by itself, if it has.
+
+        This is logged at most once in 2 s.
+        """
         if (reason := self._controller.pop_restart_reason()) is not None:
             self._restarts += 1
             self.get_logger().warning(f"the law engages again: {reason}", throttle_duration_sec=2.0)
@@ -328,9 +331,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self.adopt(parameters)
 
     def _publish_authority(self, now_ns: int) -> None:
-        """Publish the authority of the inputs, by the model that flies, for guidance.
+        """Publish the authority of the inputs for guidance.
 
-        Without a learner nothing is published.
+        It follows from the model in force. Without a learner nothing is published.
         """
         if self._learning is not None:
             self._send_authority(

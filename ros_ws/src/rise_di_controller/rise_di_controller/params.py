@@ -60,7 +60,7 @@ longest step that the law takes."""
 
 
 class ControllerConfig(ControllerSection):
-    """Parameters of the controller node that every control law has.
+    """The parameters that the controller node has under every control law.
 
     A subclass adds the parameters of a law as fields.
 

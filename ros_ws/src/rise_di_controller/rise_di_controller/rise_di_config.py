@@ -134,12 +134,13 @@ class LearnConfig(Config):
 
         It is the configured margin. If none is configured, it is the smaller of LEAST_MARGIN and
         `margin`, the delay margin of the loop at the start. That margin holds around the model in
-        the file. Around the real aircraft it can be smaller, so a learned model need not have it.
+        the scenario. Around the real aircraft it can be smaller, so a learned model need not have
+        it.
         """
         return min(margin, LEAST_MARGIN) if self.margin is None else self.margin
 
     def spacing(self) -> float:
-        """Return the shortest time between two of `updates`, s, or `window` for a single one."""
+        """Return the shortest time between two of `updates`, s; `window` if there is only one."""
         return min(
             (after - before for before, after in pairwise(self.updates)), default=self.window
         )
@@ -213,7 +214,10 @@ class RiseDiConfig(ControllerConfig):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Return the parameters that may change in flight, with input_scale, without `learn`."""
+        """Return the names of the parameters that may change in flight.
+
+        They are those of the base class, and input_scale, but not `learn`.
+        """
         return (super().tunable() | {"input_scale"}) - {"learn"}
 
     @classmethod
@@ -414,7 +418,10 @@ class RiseDiConfig(ControllerConfig):
         return (*super().models(), () if self.schedule is None else self.schedule.models)
 
     def guard(self) -> GuardParams:
-        """Return the guard of the base class with the feedforward's models over the airspeed."""
+        """Return the parameters of the guard, as in the base class.
+
+        With a schedule, they also have the model of the feedforward as a function of the airspeed.
+        """
         guard = super().guard()
         if guard.nominal is None or self.schedule is None or not self.schedule.models:
             return guard

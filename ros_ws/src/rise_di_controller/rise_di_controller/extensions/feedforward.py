@@ -92,10 +92,11 @@ def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
 def with_new_model(
     state: FeedforwardState | None, y_m: Array, y_m_dot: Array, dt: Array, nominal: Nominal
 ) -> FeedforwardState:
-    """Return the state with which a new model continues the same motion.
+    """Return the state with which the feedforward continues its motion by a new model.
 
-    If there is an old state with as many states, x and u_0 stay, and u is computed with the new
-    model, so that the feedforward goes on with u - u_0. y_m_dot and dt belong to the last tick.
+    If the old state has as many states, x and u_0 stay. Otherwise they begin anew, with the outputs
+    at y_m. u is computed with the new model, so that the feedforward goes on with u - u_0. y_m_dot
+    and dt belong to the last tick.
     """
     start = initial_state(y_m, nominal)
     if state is not None and state.x.shape == start.x.shape:

@@ -242,7 +242,7 @@ class AllocationConfig(Config):
     )
 
     def ordered(self, inputs: Sequence[str], order: Sequence[str]) -> "AllocationConfig":
-        """Return the allocation with the law's inputs in the order `order`, not `inputs`."""
+        """Return the allocation with its inputs reordered from `inputs` to `order`."""
         places = [list(inputs).index(name) for name in order]
         p = len(self.effectors)
         T = np.reshape(self.T, (p, -1))[:, places]

@@ -32,7 +32,7 @@ STEPS = 128
 
 
 class OverSpeed(NamedTuple):
-    """A model as a function of d = V / V0 - 1, from `least` to `most`, for the airspeed V."""
+    """A model as a function of the airspeed V, by d = V / V0 - 1 from `least` to `most`."""
 
     model: Callable[[float], Any]  # the model at d, a multiple of 1 / STEPS
     least: float
@@ -103,9 +103,9 @@ class ScheduleState(NamedTuple):
 
 
 def airspeed_range(params: ScheduleParams) -> tuple[Array, Array]:
-    """Return the airspeeds, m/s, at which the factor reaches both ends of SCALE_RANGE.
+    """Return the airspeeds, m/s, at which the factor of input_scale is largest and least.
 
-    The first has the largest factor, and the second the least.
+    These factors are the ends of SCALE_RANGE. The largest factor comes first.
     """
     return params.speed / math.sqrt(SCALE_RANGE[1]), params.speed / math.sqrt(SCALE_RANGE[0])
 
@@ -127,14 +127,14 @@ def target_scale(y: Array, params: ScheduleParams) -> Array:
 
 
 def side_by_side(params: ObserverParams, scale: FloatArray) -> FloatArray:
-    """Stack [Phi, Gamma, L, F'] of an observer, with F divided by `scale`, (s, s + 3 m)."""
+    """Stack Phi, Gamma, L and (F / `scale`)' of an observer side by side, (s, s + 3 m)."""
     return np.hstack([params.Phi, params.Gamma, params.L, (params.F / scale[:, None]).T])
 
 
 def observer_of(
     observer: ObserverParams, matrices: FloatArray, scale: FloatArray
 ) -> ObserverParams:
-    """Return the observer with stacked matrices, the inverse of `side_by_side`."""
+    """Return the observer with the matrices that `side_by_side` stacked with this `scale`."""
     s, m = observer.Gamma.shape
     F = np.ascontiguousarray(matrices[:, s + 2 * m :].T) * scale[:, None]
     return observer._replace(
@@ -143,7 +143,7 @@ def observer_of(
 
 
 def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
-    """Stack the matrices of a feedforward side by side, with the inverse divided by `scale`.
+    """Stack the matrices of a feedforward side by side, with Omega^-1 divided by `scale`.
 
     The result is [A, gravity, B, path A, path gravity, inverse'], where inverse' has zeros in the
     rows from m to n.
@@ -157,7 +157,7 @@ def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
 
 
 def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nominal:
-    """Return the feedforward's model with stacked matrices, inverting `nominal_side_by_side`."""
+    """Return the model with the matrices that `nominal_side_by_side` stacked with this `scale`."""
     n, m = nominal.B.shape
     ends = (0, n, 2 * n, 2 * n + m, 3 * n + m, 4 * n + m, 4 * n + 2 * m)
     A, gravity, B, path_A, path_gravity, inverse = (
@@ -188,7 +188,10 @@ def _scaled(params: Any, scale: Array) -> Any:
 
 
 def observers_of(params: Any, scales: Sequence[Array | None]) -> list[ObserverParams]:
-    """Return the observer at each tick, given each tick's factor of input_scale, if any."""
+    """Return the parameters of the observer at each tick.
+
+    `scales` has the factor of input_scale at each tick, or None without a schedule.
+    """
     if not isinstance(params, ScheduleParams):
         return [params] * len(scales)
     if params.observer is None:

@@ -123,7 +123,7 @@ class ControllerState(NamedTuple):
 
     @property
     def command(self) -> FloatArray:
-        """The command that is published, which is u or, with an allocation, the effectors."""
+        """The command that is published: u or, with an allocation, that of the effectors."""
         return self.u if self.effectors is None else self.effectors
 
 
@@ -494,10 +494,10 @@ def _vanes(
     guard: GuardParams,
     recorded: FloatArray | None,
 ) -> VaneReadings | None:
-    """Pair the readings of the vanes with their readings in the reference motion, or return None.
+    """Return the readings of the vanes, and what they would read in the reference motion.
 
-    The reference motion is the motion of the nominal model along y_m, in which the vanes would read
-    states of the model. Returns None without vanes.
+    The reference motion is the motion of the nominal model along y_m. The vanes would read states
+    of this model. Returns None without vanes.
     """
     if reading is None:
         return None
@@ -514,8 +514,8 @@ def law_within_limits(
 ) -> tuple[Any, FloatArray, FloatArray, FloatArray | None]:
     """Step the law inside the limits of the law and of the effectors.
 
-    Returns the state, u before saturation, u, and the effectors. The argument `effectors`, (p,),
-    has the effectors of the last tick, or is None without an allocation.
+    Returns the state, u before saturation, u, and the commands of the effectors. The argument
+    `effectors`, (p,), has these commands at the last tick, or is None without an allocation.
     """
     after, u_free = law.control_law.step(state, measurements, dt, law.params)
     u, effector_values = _within_effectors(
@@ -532,7 +532,7 @@ def law_within_limits(
 def _within_effectors(
     u: FloatArray, before: FloatArray | None, dt: Array, guard: GuardParams
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Return the u that the effectors give for a demanded u, and the effectors.
+    """Return the u that the effectors give for a demanded u, and their commands, (p,).
 
     Without an allocation the result is u itself and None.
     """
@@ -545,7 +545,10 @@ def _within_effectors(
 def _failsafe(
     state: ControllerState, stamp_ns: int, now_ns: int, guard: GuardParams, active: bool
 ) -> tuple[ControllerState, TickInputs | None]:
-    """Advance by a tick without fresh inputs, or while deactivated. u gets the stamp `stamp_ns`."""
+    """Advance by a tick without fresh inputs, or in which the controller is deactivated.
+
+    u gets the stamp `stamp_ns`.
+    """
     y = state.y
     y_m = state.y_m
     if y is None or y_m is None:

@@ -88,13 +88,12 @@ def _with_estimates(
     change: Array,
     observers: tuple[ObserverParams, ...],
 ) -> ObserverState:
-    """Return the state of an observer with new parameters that continues the same motion.
+    """Return the state with which a new observer continues the motion of the old one.
 
-    z has its estimates, and `change` is the change of u_ff, (m,).
-
-    From here on, u_o moves to -F z at its rate limit. In a channel that had no observer before, u_o
-    takes over what the law has integrated. Otherwise the integral would stay in the law, and the
-    observer would need a long time to build it up.
+    z has the estimates of the new observer, and `change` is the change of u_ff, (m,). `observers`
+    has the old and the new parameters. From here on, u_o moves to -F z at its rate limit. In a
+    channel that had no observer before, u_o takes over what the law has integrated. Otherwise the
+    integral would stay in the law, and the observer would need a long time to build it up.
     """
     law_part = state.u - state.u_trim - state.u_ff
     limits = observers[1].limits
@@ -114,9 +113,10 @@ def _with_estimates(
 def _with_nominal(
     state: ControllerState, y_m: FloatArray, nominal: Nominal | None
 ) -> tuple[ControllerState, Array]:
-    """Return the state with the feedforward of another model that continues the same motion.
+    """Return the state with a feedforward that continues its motion by another model.
 
-    The second result is the change of u_ff, (m,).
+    If `nominal` is None, there is no feedforward any more. The second result is the change of u_ff,
+    (m,).
     """
     u_ff = np.zeros_like(state.u)
     continued = None

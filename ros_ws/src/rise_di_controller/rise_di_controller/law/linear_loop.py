@@ -135,7 +135,7 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
 
 
 def _takes_columns(params: Any) -> bool:
-    """Return whether the law is known to accept columns side by side.
+    """Return whether the law is known to step many states at once, one in each column.
 
     RISE-DI does, also with an observer.
     """
@@ -170,7 +170,10 @@ def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatA
 
 @lru_cache(maxsize=64)
 def _exponential(matrices: bytes, shape: tuple[int, ...]) -> FloatArray:
-    """Compute exp of matrices. It is cached, because new gains in flight meet the same plant."""
+    """Compute exp of matrices, given as bytes with their shape; cached.
+
+    If gains change in flight, the matrices of the plant stay the same.
+    """
     from scipy.linalg import expm  # noqa: PLC0415 - a controller without an observer starts without it
 
     exponential = np.asarray(expm(np.frombuffer(matrices).reshape(shape).copy()), dtype=np.float64)

@@ -136,7 +136,7 @@ def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
 def with_fallback(
     start: RiseDiConfig, parameters: RiseDiConfig, bare: Sequence[bool]
 ) -> RiseDiConfig:
-    """Return the parameters with which the channels `bare` also fly the law of the start.
+    """Return the parameters with which the channels `bare` fall back to the law of the start.
 
     If no channel keeps a model, the result is `start` itself.
     """
@@ -177,7 +177,10 @@ def without_models(
 
 
 def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
-    """Return a mask, (m,), of the outputs that the feedforward's model couples with `names`."""
+    """Return a mask, (m,), of the outputs that the model couples with the outputs `names`.
+
+    The model is that of the feedforward.
+    """
     model = parameters.feedforward
     assert model is not None  # noqa: S101 - a learned model flies
     n = len(model.states)

@@ -216,7 +216,7 @@ class Learning:
             self._begin(proposal, controller, now_ns)
 
     def step(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
-        """Certify, let due proposals act, and fall back if the law diverges.
+        """Certify a part of a proposal, let due proposals act, and fall back if the law diverges.
 
         A deactivated law begins again with the parameters of the start, because its model may have
         been the reason to deactivate it. Returns the parameters that the controller has taken, or
@@ -503,9 +503,9 @@ def _speeds(parameters: RiseDiConfig) -> str:
 def design_changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
     """Return the values of all DESIGNED parameters of a new set, by dotted name.
 
-    A value of None removes a parameter. It is given for the parameters of the old set that the new
-    set lacks. It is also given for those in OPTIONAL that the new set lacks, because the parameters
-    in force may have them.
+    A value of None removes a parameter. If the new set lacks a parameter, the value is None if the
+    old set has it. It is also None if the parameter is in OPTIONAL, because the parameters in force
+    may have it.
     """
     before = _designed_values(old)
     after = _designed_values(new)
