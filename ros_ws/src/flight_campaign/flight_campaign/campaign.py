@@ -3,7 +3,7 @@
 """Run a Monte Carlo campaign: thousands of uncertain aircraft fly one scenario, in chunks.
 
 An interrupted campaign can be resumed. The folder of a campaign has its definition and a table for
-each completed chunk. At the end it also has the figures and the report.
+each completed chunk. At the end it also has the summary and the report.
 """
 
 import logging

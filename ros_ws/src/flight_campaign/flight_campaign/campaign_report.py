@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Write the report of a campaign: tables, histograms of the errors, and the score over the gain."""
+"""Write the report of a campaign: tables, histograms of errors, score over a swept gain."""
 
 import json
 import shlex
@@ -203,7 +203,7 @@ def write_page(
 ) -> None:
     """Write the report of a campaign.
 
-    For each case, the arguments have its tally, its figures in the summary, and its loop's margins.
+    For each case, the arguments have its tally, its part of the summary, and its loop's margins.
     """
     scenario = definition.scenario()
     units = QUANTITY_UNITS | display_units(scenario)
@@ -308,7 +308,10 @@ def _spread_of_entries(definition: Definition) -> str:
 
 
 def score_meaning(scenario: Scenario, score_units: Mapping[str, float] | None = None) -> str:
-    """Say what a campaign's score measures; `score_units` replaces usual units by output, SI."""
+    """Say what a campaign's score measures.
+
+    `score_units` has the units that replace the usual ones, by output, SI.
+    """
     if scenario.guidance is not None:
         half = CAPTURE_TIME * scenario.guidance.speed
         return (
@@ -374,7 +377,7 @@ def _figures(label: str, tally: Tally, units: Mapping[str, DisplayUnit]) -> Metr
 
 
 def figure_rows(tally: Tally, units: Mapping[str, DisplayUnit]) -> list[list[str]]:
-    """Return a row for each figure of a tally.
+    """Return a row for each metric of a tally.
 
     A row has the label with its unit, and then the values named by FIGURE_HEADINGS.
     """
@@ -393,7 +396,7 @@ def figure_rows(tally: Tally, units: Mapping[str, DisplayUnit]) -> list[list[str
 
 
 def _label(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:
-    """Return a figure's name with its unit, and the factor from SI."""
+    """Return the name of a metric with its unit, and the factor from SI."""
     kind, _, channel = name.partition(".")
     if not channel:
         return OF_LEARNER.get(name, name), 1.0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Define a campaign by all inputs of its figures."""
+"""Define a campaign by all inputs of its results."""
 
 from collections.abc import Iterator
 from itertools import product
@@ -50,7 +50,7 @@ class Sweep(Config):
         return self.parameter.partition("[")[0]
 
     def scaled(self, controller: ControllerConfig, factor: float) -> float | tuple[float, ...]:
-        """Return the parameter times a factor; if a channel is named, only this channel changes.
+        """Multiply the swept parameter by a factor, or only its value in a channel that is named.
 
         A channel of u means the channel of y with which it is paired. Raises ParameterError if the
         parameter or the channel cannot be swept.
@@ -88,7 +88,7 @@ class Sweep(Config):
 
 
 class Definition(Config):
-    """All inputs of a campaign's figures.
+    """All inputs of a campaign's results.
 
     The version of the stack and the arithmetic of the CPU are no part of the definition.
     """

@@ -44,8 +44,8 @@ Devices = Sequence[Mapping[str, str]]
 def require_jax(*, shared: bool = False) -> None:
     """Raise ParameterError if JAX is not installed or finds no device.
 
-    For example, JAX finds no device if JAX_PLATFORMS is for another host. If `shared`, the process
-    leaves the memory of its device to other processes as well.
+    For example, JAX finds no device if JAX_PLATFORMS is for another host. If `shared` is True, this
+    process does not reserve the whole memory of its device, so that others can use it, too.
     """
     require_package("jax")
     if shared:

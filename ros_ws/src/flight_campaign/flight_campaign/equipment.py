@@ -126,9 +126,10 @@ def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, fl
 def in_order(
     values: Mapping[str, Any], kind: str, names: tuple[str, ...], otherwise: tuple[float, ...]
 ) -> list[Any]:
-    """Return the lags or the noise, as `kind` says, of the channels `names` in their order.
+    """Return the value of each of the channels `names`, in their order.
 
-    `otherwise` has the result for channels without an entry in `values`.
+    `kind` is "lag" or "noise". A channel without an entry in `values` has its value from
+    `otherwise`.
     """
     return [
         values.get(f"{kind}[{name}]", value) for name, value in zip(names, otherwise, strict=True)
@@ -136,7 +137,10 @@ def in_order(
 
 
 def scenario_with_equipment(scenario: Scenario, values: Mapping[str, float]) -> Scenario:
-    """Return the scenario with other lags, other noise and an additional delay of u, by name."""
+    """Return the scenario with other lags, other noise and an additional delay of u.
+
+    `values` has them by the names of `drawn`.
+    """
     aircraft = scenario.aircraft
     channels = scenario.aircraft.channels()
     changes = {}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Store a campaign as a table; a row has an aircraft's figures, outcome and drawn entries."""
+"""Store a campaign as a table; a row has an aircraft's metrics, outcome and drawn entries."""
 
 import io
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ def join_chunks(parts: Sequence[Chunk]) -> Chunk:
 def encode_chunk(chunk: Chunk, seed: int, factor: float) -> bytes:
     """Encode the table of a chunk as Parquet (zstd), SI.
 
-    The figures of a diverged aircraft are null. NaN becomes null too.
+    The metrics of a diverged aircraft are null. NaN becomes null too.
     """
     import polars as pl  # noqa: PLC0415
 

@@ -114,7 +114,7 @@ def fly_single(scenario: Scenario, learner: MakeLearner | None = None) -> Single
 
 
 def _tracking_figures(tape: Tape, scenario: Scenario) -> dict[str, float]:
-    """Return the true error of each output, and the mean abs(u_dot) of each effector."""
+    """Return rms and largest true error of each output, and mean abs(u_dot) of each effector."""
     true = true_error(tape)
     assert true is not None  # noqa: S101 - simulated flights have the truth
     is_tick = true.stamp_ns % period_ns(scenario.controller.rate, "controller.rate") == 0
@@ -128,9 +128,9 @@ def _tracking_figures(tape: Tape, scenario: Scenario) -> dict[str, float]:
 
 
 def mission_figures(tape: Tape, guidance: GuidanceConfig) -> dict[str, float]:
-    """Return the figures of a mission, SI.
+    """Return the metrics of a mission, by name, SI.
 
-    The figures are the score, the cross-track and altitude errors on the route, the largest bank
+    They are the score, the cross-track and altitude errors on the route, the largest bank
     and the missed legs. With a fence there are also the distance flown outside of it and the
     distance from home at the end. The score is the largest cross-track error divided by the
     distance that the aircraft flies in half a second at V0. Errors on the orbit round the last

@@ -42,7 +42,7 @@ WORST_KEPT = 10  # number of worst flights in a tally
 
 
 class FigureStatistics(Config):
-    """The statistics of a figure over many flights.
+    """The statistics of a metric over many flights.
 
     The order of the sums is fixed, so the same chunks give the same result to the last bit.
     """
@@ -132,7 +132,7 @@ class Tally(Config):
     ) -> Self:
         """Return the statistics of the aircraft first, first + 1, ...
 
-        `figures` includes the "score". Each figure has shape (N,).
+        `figures` has the metrics of the aircraft by name, (N,) each. One of them is "score".
         """
         bounded = ~np.asarray(diverged, dtype=bool)
         scores = np.asarray(figures["score"])
@@ -171,13 +171,16 @@ class Tally(Config):
         )
 
     def without_model(self) -> int | None:
-        """Count the flights without a learned model that did not diverge; None without learners."""
+        """Count the flights that neither diverged nor had a learned model.
+
+        Returns None in a campaign without learners.
+        """
         if FIRST_MODEL in self.figures:
             return self.flights - self.diverged - self.figures[FIRST_MODEL].count
         return None
 
     def summary(self) -> dict[str, Any]:
-        """Return the statistics as figures for a file, SI."""
+        """Return the statistics, ready for a JSON file, SI."""
         unmodelled = self.without_model()
         shares: dict[str, Any] = {} if unmodelled is None else {"without_model": unmodelled}
         for word, count in (("diverged", self.diverged), ("lost", self.lost)):

@@ -43,7 +43,7 @@ jax.config.update("jax_enable_x64", True)  # float64 as everywhere else in the s
 
 
 def vehicle(scenario: Scenario) -> Vehicle:
-    """Return what all aircraft of a scenario share. Raises as `require_flyable` does."""
+    """Return the properties that all aircraft share. Raises as `require_flyable` does."""
     require_flyable(scenario)
     plant = scenario.aircraft.plant()
     channels = scenario.aircraft.channels()
@@ -86,7 +86,11 @@ def shared(params: Any) -> Any:
 def with_equipment(
     vehicle: Vehicle, scenario: Scenario, values: Mapping[str, FloatArray]
 ) -> Vehicle:
-    """Put the lags and noise of N aircraft into the vehicle, by the names of `equipment.drawn`."""
+    """Return the vehicle with the lags and the noise of N aircraft.
+
+    `values` has them by the names of `equipment.drawn`, (N,) each. Lags and noise without a value
+    are those of the scenario.
+    """
     channels = scenario.aircraft.channels()
     aircraft = scenario.aircraft
     if any(name.startswith("lag[") for name in values):
@@ -106,16 +110,16 @@ def with_equipment(
 
 
 def _rows(values: Sequence[Any]) -> Array:
-    """Return an array whose rows are numbers or arrays of shape (N,)."""
+    """Stack numbers and arrays of shape (N,) as the rows of an array."""
     return jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, values)))
 
 
 def _reduced(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
-    """Reduce an aircraft to what its remainder needs.
+    """Reduce an aircraft to what `remainder_of` needs.
 
     The remainder is the part of f_state that is not linear in the state. Returns the indices of the
-    states on which it depends, and the aircraft with only these states and with the rows
-    `remainder_rows`.
+    states on which the remainder depends. Returns also the aircraft with only these states, and
+    with the rows `remainder_rows`.
     """
     rows = remainder_rows(aircraft)
     coupling = aircraft.coupling
@@ -160,7 +164,7 @@ def fly(
     `params` of the law have shape (m, 1) or (m, N). If all aircraft have the same parameters,
     `shared` converts those of one aircraft, (m,). `schedule` divides the ticks into compiled loops.
     None selects the schedule that is fastest on the device. The schedule does not change the
-    figures.
+    result.
     """
     timing = _timing(fleet, course)
     constants = batch_loop.Constants(fleet._replace(blocks=()), vehicle, params)
@@ -179,7 +183,7 @@ def fly(
 
 
 def on_host(result: FleetResult) -> FleetResult:
-    """Copy the figures from the device to NumPy arrays, after the flights."""
+    """Copy the metrics of the flights from the device to NumPy arrays."""
     return jax.tree.map(np.asarray, result)
 
 
@@ -237,11 +241,11 @@ class FleetStepper:
         self._k += 1
 
     def restart(self, which: NDArray[np.bool_]) -> None:
-        """Put the aircraft `which`, a mask (N,), into trim now. Their figures begin anew."""
+        """Put the aircraft in the mask `which`, (N,), into trim now. Their metrics begin anew."""
         self._state = jax.tree.map(partial(jnp.where, which), self._begin, self._state)
 
     def result(self) -> FleetResult:
-        """Return the figures after the last tick."""
+        """Return the metrics of the flights, after the last tick."""
         return figures(self._state, self.ticks, self._course.period)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compute `rise_di_controller.extensions.allocation.allocate` for N aircraft at once, compiled."""
+"""Compute the `allocate` of rise_di_controller for N aircraft at once, compiled."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -65,7 +65,10 @@ def _where_not(final: Array, value: Array, otherwise: Callable[[], Array]) -> Ar
 
 
 def _by_priority(start: Array, v: Array, limits: _Range, params: Allocation) -> Array:
-    """Move the effectors for one input of the law after the other, in order of priority."""
+    """Add the inputs v of the law to u one by one, in order of priority.
+
+    Returns u. For each input, u moves from `start` as far as the limits allow.
+    """
     order = jnp.array(params.order)
     moves = params.T.T[order][:, :, None] * v[order][:, None]
     return jax.lax.scan(lambda u, move: (_towards(u, move, limits, params), None), start, moves)[0]

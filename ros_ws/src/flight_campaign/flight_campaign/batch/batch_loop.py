@@ -74,7 +74,7 @@ class FleetResult(NamedTuple):
 
 
 def rows_of(array: Array, places: Sequence[int] | NDArray[np.int64]) -> Array:
-    """Return the rows at constant places.
+    """Return the rows with constant indices.
 
     Each row is taken as a slice, because a GPU compiler can fuse slices with other operations.
     """
@@ -92,7 +92,7 @@ def remainder_of(states: Array, aircraft: Aircraft) -> Array:
 
 
 class Timing(NamedTuple):
-    """Constants of the compiled loop, which are hashable."""
+    """Constants of the compiled loop. The tuple is hashable."""
 
     blocks: tuple[StateBlock, ...]
     steps: int  # steps of the integration in each tick
@@ -282,7 +282,10 @@ def _measured(
 
 
 def sense(now: LoopState, segment: Segments, vehicle: Vehicle) -> tuple[LoopState, LoopSample]:
-    """Sense a tick's sample for the law, and add the true error to the figures."""
+    """Return the state after the measurement of a tick, and the sample that the law gets.
+
+    The true error of the tick is added to the state's sums for the metrics.
+    """
     true = rows_of(now.x, vehicle.outputs)
     e = true - segment.y_m[:, None]
     y = true + segment.error[:, None]
@@ -368,7 +371,7 @@ def _actuated(
 
 @partial(jax.jit, static_argnames=("ticks",))
 def figures(end: LoopState, ticks: int, period: Array) -> FleetResult:
-    """Compute the figures of flights at their end."""
+    """Compute the metrics of flights from the sums at their end."""
     return FleetResult(
         jnp.sqrt(end.squares / ticks),
         end.max,

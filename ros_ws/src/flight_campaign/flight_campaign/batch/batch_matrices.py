@@ -136,7 +136,7 @@ def _last(array: Array) -> Array:
 
 
 class _Places(NamedTuple):
-    """Constants of the compiled matrices, which are hashable."""
+    """Constants of the compiled matrices. The tuple is hashable."""
 
     steps: int  # K, steps of the integration in a tick
     axes: tuple[int, ...]  # indices of the axes of gusts along which there is wind

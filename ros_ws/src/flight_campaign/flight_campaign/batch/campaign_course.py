@@ -150,8 +150,8 @@ ONE_AT_A_TIME = "flights of many at once do not have it, those of rise-di fly do
 def require_flyable(scenario: Scenario) -> None:
     """Raise ParameterError if a campaign cannot fly an aircraft or a controller.
 
-    A campaign supports the keys of FLOWN and FLOWN_CONTROLLER. Any other key is refused by its name
-    if its value has an effect.
+    A campaign supports the keys of FLOWN and FLOWN_CONTROLLER. If any other key has a value with an
+    effect, the error names this key.
     """
     aircraft = scenario.aircraft
     controller = scenario.controller

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Describe the device on which JAX flies aircraft, and choose settings for its kind and memory."""
+"""Describe the device on which JAX flies aircraft, and choose settings that suit it."""
 
 import logging
 import os
@@ -78,7 +78,10 @@ def chunk_of_device(aircraft: int) -> int:
 
 
 def separate_devices() -> list[dict[str, str]]:
-    """Return environments for processes, so that each process sees another device; [] for a CPU."""
+    """Return the environment of a process for each device, in which it sees only this device.
+
+    Returns [] for a CPU.
+    """
     devices = jax.local_devices()
     platform = devices[0].client.platform_version
     variable = next((VISIBLE[word] for word in VISIBLE if word in platform), None)

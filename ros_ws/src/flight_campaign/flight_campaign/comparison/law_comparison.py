@@ -37,7 +37,7 @@ TURBULENCE_SEED = 3  # seed of a comparison's turbulence, which differs from tha
 
 
 class Scores(NamedTuple):
-    """Scores in a wind of the uncertain aircraft that share a level of uncertainty."""
+    """The scores of all uncertain aircraft of one level of uncertainty, in one wind."""
 
     mean: float  # infinite if an aircraft diverged
     worst: float
@@ -117,7 +117,7 @@ def compare(
 
 
 class _LawStudy(NamedTuple):
-    """The flights that all laws fly."""
+    """The setting of a comparison, with the flights that every law flies."""
 
     benchmark: Benchmark
     flights: Mapping[str, FleetMatrices]  # aircraft of all flights, by wind
@@ -133,7 +133,7 @@ class _LawStudy(NamedTuple):
         objective: str,
         gains: TuningResult,
     ) -> LawResult:
-        """Return the figures of a law with a gain set."""
+        """Return the scores and metrics of a law with a gain set."""
         benchmark = self.benchmark
         params = law.params(as_gains(gains), benchmark.model)
         results = {}
@@ -171,8 +171,8 @@ def _nominal_once(matrices: Sequence[FloatArray]) -> FloatArray:
 def score_cells(result: LawResult) -> list[str]:
     """Return the scores of a law as cells of a table.
 
-    For each wind, the first cell is the score of the nominal aircraft. The next cells are the mean
-    (worst) scores of the levels.
+    For each wind, the first cell is the score of the nominal aircraft. A cell for each level of
+    uncertainty follows, with the mean score and, in parentheses, the worst one.
     """
     cells = []
     for wind, nominal in result.scores.items():

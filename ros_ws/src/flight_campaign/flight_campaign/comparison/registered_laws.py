@@ -27,7 +27,10 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 
 def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:
-    """Return the positive parameters of the law itself, by name, without matrices."""
+    """Return the parameters of the law whose values are all positive, by name.
+
+    Parameters that every controller has, and sections with matrices, are left out.
+    """
     names = (
         name for name in type(controller).model_fields if name not in ControllerConfig.model_fields
     )
@@ -81,9 +84,9 @@ def _value(gain: FloatArray, scalar: bool) -> float | list[float]:
 
 
 def _last(*leaves: Any) -> FloatArray:
-    """Stack a parameter of N candidates, with the candidates in the last axis.
+    """Stack the values of a parameter of N candidates, with the candidates in the last axis.
 
-    If all candidates are equal, the result is (m, 1).
+    If all values are equal, there is only one, with the shape (m, 1) for a vector (m,).
     """
     first = np.asarray(leaves[0], dtype=np.float64)
     if all(np.array_equal(first, leaf) for leaf in leaves):

@@ -126,7 +126,7 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
 
     y, y_m and the law have the same rate, and topics have no delay. One wind is that of the
     scenario, and the other is the turbulence of `turbulence_of` with `turbulence_seed`. Raises
-    ParameterError if a campaign cannot fly the scenario, or if the unit of an output has no score.
+    ParameterError if a campaign cannot fly the scenario, or if an output has no unit in the score.
     """
     require_flyable(scenario)
     scenario = scenario.vary(
@@ -192,9 +192,10 @@ def turbulence_of(scenario: Scenario) -> dict[str, float]:
 
 
 def _courses(scenario: Scenario) -> dict[str, Course]:
-    """Return the courses of a scenario by the model of the feedforward.
+    """Return the courses of a scenario, by the name of the model of their feedforward.
 
-    The controller in the scenario must have the aircraft as this model.
+    They are NONE, AIRCRAFT and INTEGRATORS. The controller of the scenario must have a feedforward
+    with the model of the aircraft.
     """
     course, controller, (airframe, _) = (
         build_course(scenario),
@@ -249,7 +250,7 @@ def benchmark_fleet(
 
 
 class Evaluation(NamedTuple):
-    """The flights of a cost in one wind, and their weights."""
+    """Flights in one wind, and the weight of each flight in the sum of the costs."""
 
     wind: str
     fleet: FleetMatrices
@@ -257,7 +258,7 @@ class Evaluation(NamedTuple):
 
 
 def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
-    """Return the flights for one evaluation of the cost, by wind.
+    """Return, for each wind, the flights for one evaluation of the cost.
 
         cost = sum over the winds of weight (mean over the aircraft with u in time
                                             + mean over those with u late)
@@ -387,7 +388,10 @@ def _best_result(
     evaluation_count: int,
     gains_of: Callable[[FloatArray], Gains],
 ) -> TuningResult:
-    """Return the gains of the seed with the least cost; `best` has cost and logarithms."""
+    """Return the gains of the seed with the least cost.
+
+    `best` has, for each seed, the least cost and the logarithms of its gains.
+    """
     winner = int(np.argmin([value for value, _ in best]))
     gains = _rounded(gains_of(best[winner][1][None]))
     lowest = [round(value, 4) for value, _ in best]
@@ -415,7 +419,7 @@ def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
 
 
 def _lacking(law: Law, objective: Objective, benchmark: Benchmark, gains: Gains) -> FloatArray:
-    """Return the costs that missing margins add for N candidates, (N,)."""
+    """Return the cost that each of N candidates gets for missing margins, (N,)."""
     if objective.requirement is None or not law.has_margins:
         return np.zeros(next(iter(gains.values())).shape[-1])
     margins = nominal_margins(law, gains, benchmark.model)
@@ -434,7 +438,11 @@ def _rounded(gains: Gains) -> dict[str, list[float]]:
 def _after(
     search: Any, point: FloatArray, values: FloatArray, best: tuple[float, FloatArray]
 ) -> tuple[float, FloatArray]:
-    """Give a search its costs, and return the least cost so far with its candidate."""
+    """Tell a search the costs of its candidates, and return the best result so far.
+
+    `point` has the logarithms of each candidate, and `values` the costs. `best` is the least cost
+    before, with the logarithms of its candidate.
+    """
     search.tell(list(point), list(values))
     least = int(np.argmin(values))
     return (float(values[least]), point[least]) if values[least] < best[0] else best
