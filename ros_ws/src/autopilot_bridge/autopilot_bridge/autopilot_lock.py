@@ -52,7 +52,7 @@ class AutopilotLock:
         self._starts.overran(duration_ns)
 
     def check(self, address: str, since_boot_ns: int | None, now_ns: int) -> None:
-        """Refuse a second sender before the first sender is silent.
+        """Refuse a message of a second sender as long as the first one is not silent.
 
         Raises ChannelError, reason "sender". `since_boot_ns` is None for a message without the time
         since boot.
@@ -99,7 +99,7 @@ class AutopilotLock:
         return is_new_sender
 
     def _start(self, since_boot_ns: int, now_ns: int) -> str:
-        """Return a name for the run of the autopilot that sent a message.
+        """Return a name for the run in which the autopilot sent a message.
 
         A run lasts from one boot to the next. If the time since boot continues that of the locked
         run, the result is the name of the locked run. Otherwise it is a new name, made from the

@@ -140,14 +140,15 @@ class Bridge:
         return takeover_ns, takeover_ns
 
     def max_u_age_ns(self) -> int:
-        """Return the age limit of a u, ns. The age counts from the instant of the y in its stamp.
+        """Return the age limit of a u, ns.
 
-        This limit prevents the playback of a log from flying the autopilot.
+        The age counts from the stamp of u, which is the instant of its y. This limit prevents the
+        playback of a log from flying the autopilot.
         """
         return self._max_age_ns + self._max_y_age_ns
 
     def take_u(self, sample: StampedVector, now_ns: int) -> None:
-        """Take u, shape (m,), in the map's order, from the publisher of `u_lock`."""
+        """Take u, shape (m,), in the map's order, from the publisher that `u_lock` admits."""
         self._moves = sample.value != self._u
         self._u = sample.value
 
@@ -161,7 +162,7 @@ class Bridge:
             self.disengage(stuck, now_ns)
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
-        """Take a value of the field of a condition.
+        """Take a new value of the field on which a condition depends.
 
         If the condition does not hold any more, the next step ends an engagement.
         """
@@ -172,7 +173,7 @@ class Bridge:
         self._parameters[name] = value
 
     def take_override(self, name: str, raw: float, now_ns: int) -> None:
-        """Take a value of the field of a pilot override.
+        """Take a new value of the field on which a pilot override depends.
 
         If it is beyond its threshold, the bridge disengages immediately.
         """
@@ -216,7 +217,7 @@ class Bridge:
     def _reason_against_inputs(self, now_ns: int) -> Refusal | None:
         """Say which inputs stay at a limit for longer than their rows allow.
 
-        Then the aircraft does not answer to this input any more. The limits of the law may be
+        The aircraft does not answer to such an input any more. The limits of the law may be
         narrower than those of the map, so a large u that does not change also counts as being at a
         limit.
         """
@@ -333,7 +334,7 @@ class Bridge:
         return joined((joined_faults(self.stale(now_ns) | sources), self._u_timeout(now_ns)))
 
     def _reason_against_u(self) -> Refusal | None:
-        """Say which input is too far from trim."""
+        """Say which input is too far from trim to engage; None if none is."""
         limits = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
         for name, u, limit in zip(self.inputs, self._u, limits, strict=True):
             if abs(u) > limit:
@@ -344,7 +345,10 @@ class Bridge:
         return None
 
     def _reason_against_trim(self, name: str) -> Refusal | None:
-        """Refuse the trim of a captured input if trim plus a limit is outside its field's range."""
+        """Say why the trim of a captured input is refused; None if it is not.
+
+        It is refused if the trim plus a limit of u lies outside of the range of the field.
+        """
         row = self.channel_map.inputs[name]
         trim = self.trim(name)
         (low, high), ends = row.range, (trim + row.lower, trim + row.upper)

@@ -187,10 +187,11 @@ def _turned(message: Any, path: str, attitude: str) -> float:
 
 
 def read_raw(message: Any, path: str, function: str, turned_by: str | None = None) -> float:
-    """Return the raw value of a row.
+    """Return the raw value of a row: `function` of the field at `path`.
 
-    Raises ChannelError, reason "field" if the field is missing, and "finite" if its value is not
-    finite.
+    If `turned_by` is given, it is the path of a quaternion, and the value is the component of the
+    vector that this quaternion rotates from the body to the world. Raises ChannelError, reason
+    "field" if the field is missing, and "finite" if its value is not finite.
     """
     value = get_field(message, path)
     try:

@@ -44,11 +44,11 @@ class Conditions:
         self.watches_transmitter = any(row.transmitter for row in channel_map.conditions.values())
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
-        """Take a value of the field of a condition."""
+        """Take a new value of the field on which a condition depends."""
         self._conditions[name] = Reading(now_ns, raw)
 
     def take_override(self, name: str, raw: float, now_ns: int) -> None:
-        """Take a value of the field of a pilot override."""
+        """Take a new value of the field on which a pilot override depends."""
         self._overrides[name] = Reading(now_ns, raw)
 
     def engage(self, now_ns: int) -> None:

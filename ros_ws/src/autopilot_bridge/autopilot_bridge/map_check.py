@@ -50,9 +50,10 @@ class CheckedRow(NamedTuple):
 
 
 def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
-    """Return the message types of the packages below a folder, with all types they contain.
+    """Return the definitions of the types `kinds`, and of all types that they contain.
 
-    Raises ParameterError if there is no package.
+    They are read from the packages below a folder. Types that no package has are left out. Raises
+    ParameterError if there is no package.
     """
     expected = (
         "a folder with the sources of a message package: package.xml, msg/*.msg and srv/*.srv"
@@ -83,9 +84,10 @@ def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
 
 
 def installed_definitions(kinds: Iterable[str]) -> Types:
-    """Return the message types of the installed packages, and those of MAVLink in pymavlink.
+    """Return the definitions of the types `kinds`, and of all types that they contain.
 
-    Types that are not installed are left out. Raises ParameterError for a type of MAVLink if
+    They come from the installed message packages and, for MAVLink, from pymavlink. Types that are
+    not installed are left out. Raises ParameterError for a type of MAVLink if
     pymavlink is not installed.
     """
     types: dict[str, tuple[Any, Any]] = {}
@@ -129,7 +131,7 @@ def is_known(types: Types, kind: str) -> bool:
 
 
 def _parsed(text: str, kind: str) -> Types:
-    """Return the types in a definition; for a service, those of its request."""
+    """Return the types that the text of a definition contains; for a service, only its request."""
     try:
         if "/srv/" in kind:
             (request,) = get_types_from_msg(REQUEST.split(text)[0], kind).values()

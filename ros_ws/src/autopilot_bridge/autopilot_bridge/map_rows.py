@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Define the rows of a channel map; a row is a channel, a message, a condition or a parameter."""
+"""Define the rows of a channel map: channels, messages, conditions and parameters."""
 
 from collections.abc import Mapping
 from itertools import product
@@ -93,7 +93,10 @@ class MovingRow(Row):
 
     @property
     def motion(self) -> tuple[str, int]:
-        """The output, a key of UNITS, that changes while the channel grows, and with which sign."""
+        """The output, a key of UNITS, that changes while the raw value grows, and its sign.
+
+        The sign is +1 if the output grows, and -1 if it falls.
+        """
         output, sign = MOTIONS[self.positive]
         return output, sign * self.sign
 
@@ -243,7 +246,7 @@ class WatchedRow(Config):
 
 
 class ConditionRow(WatchedRow):
-    """A condition of the engagement: the field must have one of the row's values.
+    """A condition of the engagement: the field must have a value that the row permits.
 
     If the field has another value, the bridge disengages.
     """

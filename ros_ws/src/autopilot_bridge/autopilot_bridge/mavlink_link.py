@@ -200,7 +200,7 @@ class Link:
         return joined((self._clash, second))
 
     def listen(self, name: str) -> deque[MavlinkMessage]:
-        """Return the queue in which messages with a name arrive."""
+        """Return the queue in which the messages called `name` arrive."""
         return self._queues.setdefault(name, deque(maxlen=QUEUE))
 
     def start(self) -> None:
@@ -478,7 +478,7 @@ class Link:
         return True
 
     def _request(self, now: float) -> None:
-        """Request the rates of the messages one after another, and slow rates again.
+        """Request the rates of the messages one by one, and again for messages that are too slow.
 
         The requests cannot be sent together, because an answer does not say to which message it
         belongs.

@@ -46,9 +46,10 @@ class MessageRates:
             rate.take(now)
 
     def step(self, now: float) -> dict[str, float]:
-        """Judge each rate every JUDGED, and return those to request again, Hz by name.
+        """Judge the rate of each message, once in JUDGED s.
 
-        After a pause of the host, the messages that came in the meantime are counted first.
+        Returns the rates that must be requested again, Hz, by name. After a pause of the host,
+        nothing is judged, so that the messages of the pause are counted first.
         """
         elapsed = now - self._last_step
         if elapsed < JUDGED:

@@ -270,7 +270,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return self.simulated.time_ns()
 
     def _arrived_ns(self, arrival: Any, now_ns: int) -> int:
-        """Return the instant of a message without a stamp, by the clock of the stamps."""
+        """Return when a message without a stamp arrived, ns by the clock of the stamps."""
         if not arrival.received_ns:
             return now_ns + self.clock_step_ns()
         return int(

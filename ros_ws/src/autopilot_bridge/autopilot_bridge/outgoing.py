@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Send the messages to an autopilot, and check the fields of its messages, for the bridge node."""
+"""Send the bridge's messages to an autopilot, and check the fields of its messages."""
 
 from typing import Any
 
