@@ -43,8 +43,9 @@ def start_middleware() -> None:
 class Client:
     """A client with a node in the default context.
 
-    With a `parent` it uses the node of the parent. If parent or client is cancelled, the waits of
-    both end. Use the client as a context manager, so that the middleware always shuts down.
+    `parent` is another client, whose node this client uses as well. If one of the two is cancelled,
+    the waits of both end. Use the client as a context manager, so that the middleware always shuts
+    down.
     """
 
     def __init__(

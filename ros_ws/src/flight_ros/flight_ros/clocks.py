@@ -83,7 +83,11 @@ class Peers:
     def receive(
         self, sender: str, sent_ns: int, received_ns: int, reported: Mapping[str, float]
     ) -> None:
-        """Take a message of another node, with its instants by the clocks of both nodes."""
+        """Take a message of another node.
+
+        `sent_ns` is its instant by the clock of the sender, and `received_ns` by the clock of this
+        node. `reported` has the differences that the sender has measured, s, by node.
+        """
         for name, heard_ns in list(self._heard_ns.items()):
             if received_ns - heard_ns > FORGET_NS:
                 self.forget(name)
@@ -126,7 +130,7 @@ class Peers:
 
 
 class PeerClocks:
-    """Measures the clocks of the other nodes over `clocks`."""
+    """Measures the clocks of the other nodes by messages on the topic `clocks`."""
 
     def __init__(self, node: Node, instance: str, refusals: Refusals) -> None:
         self._refusals = refusals
@@ -162,9 +166,9 @@ class PeerClocks:
         return self._peers.clocks()
 
     def sentence_on(self, sender: str) -> str | None:
-        """Return the end of a sentence on a stamp, which says how far its sender's clock differs.
+        """Say how far a sender's clock differs, as the end of a sentence about its stamp.
 
-        Returns None if no difference is known.
+        Returns None if the clock does not differ, or if this is unknown.
         """
         clock = self.clocks().get(sender)
         if clock is None or abs(clock.offset) <= DIFFERS:

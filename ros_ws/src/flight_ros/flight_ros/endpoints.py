@@ -38,7 +38,8 @@ def require_no_publishers(
 ) -> None:
     """Raise ParameterError if a topic already has a publisher.
 
-    `duration`, s, is the time to discover publishers.
+    The topics are watched for `duration`, s, because publishers are not discovered at once.
+    `expected` says in the error what to do.
     """
     end = time.monotonic() + duration
     names = [node.resolve_topic_name(topic) for topic in topics]

@@ -255,9 +255,9 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
 def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, has_begun: bool) -> None:
     """Raise FlightEnded if a lockstep flight would wait for ever.
 
-    This happens if a sample was refused, or if the first sample never comes. `advance_ns` is the
-    instant at which it last advanced. A flight that has begun may wait without limit for a peer
-    that is stopped, for example in a debugger.
+    It would if a sample was refused, or if the first sample never comes. `advance_ns` is the
+    instant at which the flight last advanced. A flight that has begun may wait without limit for a
+    peer that is stopped, for example in a debugger.
     """
     for node in nodes:
         topic = node.awaited_topic()

@@ -159,7 +159,7 @@ class FlightNode(Node, Generic[P]):
         return None
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
-        """Return the level, a sentence and further values for the 1 Hz diagnostics."""
+        """Return the level of the 1 Hz diagnostics, a sentence, and further values by name."""
         return DiagnosticStatus.OK, "running", {}
 
     def close(self) -> None:
@@ -282,7 +282,7 @@ class FlightNode(Node, Generic[P]):
         self.set_parameters_atomically(changes)
 
     def clock_of(self, sender: str) -> str | None:
-        """Return the end of a sentence on a stamp if its sender's clock differs, else None."""
+        """Say how far a sender's clock differs, as `sentence_on` does, else return None."""
         return None if self.clocks is None else self.clocks.sentence_on(sender)
 
     def warn_no_publisher(

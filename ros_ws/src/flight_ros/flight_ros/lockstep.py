@@ -68,5 +68,5 @@ class LockstepInputs:
 
     @property
     def has_y(self) -> bool:
-        """Whether a y waits for the second signal."""
+        """Whether a y has arrived whose step still waits for other inputs."""
         return bool(self._y_due)

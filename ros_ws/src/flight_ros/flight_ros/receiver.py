@@ -321,7 +321,7 @@ class Receiver(Generic[S]):
             self.lock.refresh(sample.sender, now_ns)
 
     def _require_stamp(self, stamp_ns: int, now_ns: int, sender: str) -> None:
-        """Refuse a stamp more than the age limit from the present; without a limit, accept all."""
+        """Refuse a stamp that is farther from the present than the age limit, if there is one."""
         if self._max_age_ns is None:
             return
         max_age_ns = self._max_age_ns()

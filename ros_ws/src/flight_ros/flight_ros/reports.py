@@ -33,7 +33,7 @@ class Report(NamedTuple):
 
 
 def encode(report: Report, name: str) -> bytes:
-    """Return the message of a report; `name` is the name of its status."""
+    """Return the message of a report; `name` becomes the name of its DiagnosticStatus."""
     message = DiagnosticArray()
     message.header.stamp = Time(
         sec=report.stamp_ns // NANOSECONDS, nanosec=report.stamp_ns % NANOSECONDS

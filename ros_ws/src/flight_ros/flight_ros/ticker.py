@@ -109,7 +109,7 @@ class TickTimes:
         self._compute.append(time.monotonic_ns() - (self._begin_ns or 0))
 
     def report(self) -> dict[str, object]:
-        """Return mean, 99th percentile and maximum of the times since the last report, s."""
+        """Return mean, 99th percentile and maximum of both times since the last report, s."""
         report: dict[str, object] = {"missed ticks": self._missed}
         for key, times in (("period", self._periods), ("compute time", self._compute)):
             if times:

@@ -62,7 +62,7 @@ PROFILES = {table.HISTORY: PUBLISH, table.LAST: STATE, table.NOTHING: NEWEST_SAM
 
 
 def offered(topic: table.Topic) -> QoSProfile:
-    """Return the quality of service of a topic's publishers at the highest rate."""
+    """Return the quality of service that publishers of a topic offer at the highest rate."""
     return PROFILES[topic.keeps]
 
 
