@@ -57,10 +57,11 @@ class NetworkClient(Client):
         self._clocks = PeerClocks(self._node, _instance(own_host), self._refused)
 
     def exchange(self, timeout: float) -> tuple[set[str], dict[str, ClockOfPeer]]:
-        """Exchange clocks until each host receives all other hosts, for at most `timeout` s.
+        """Exchange clocks until this host has the clock of every other host.
 
-        Returns the hosts that this host receives. Returns also the clocks of those hosts that
-        receive this host in turn.
+        This takes at most `timeout` s.
+        Returns the hosts whose messages arrive at this host. Returns also the clocks of those
+        hosts at which the messages of this host arrive in turn.
         """
         heard_hosts: set[str] = set()
         clocks: dict[str, ClockOfPeer] = {}

@@ -54,7 +54,7 @@ def is_fleet(name: FilePath) -> bool:
 
 
 class AircraftOfFleet(Config):
-    """An aircraft of a fleet, as the file describes it."""
+    """An aircraft of a fleet, as the file of the fleet describes it."""
 
     scenario: str | None = Field(
         default=None, description="name or path of a scenario; by default that of the fleet"
@@ -74,7 +74,7 @@ class AircraftOfFleet(Config):
 
 
 class FleetConfig(Config):
-    """A fleet, as the file describes it; paths are relative to the folder of the file."""
+    """A fleet, as its file describes it; paths are relative to the folder of this file."""
 
     scenario: str = Field(
         default="osprey_route", description="scenario of the aircraft that name none"
@@ -218,10 +218,10 @@ def _scenario(
 def _nested(
     scenario: Scenario, changes: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """Return changes of whole groups.
+    """Return the changes, completed so that each replaces a whole group.
 
-    If a change is a mapping, it changes only some keys of its group. The other keys of the group
-    are added with their values in the scenario.
+    If a change is a mapping, it changes only some keys of a group. The other keys of the group are
+    added, with their values in the scenario.
     """
 
     def merged(old: Any, new: Any) -> Any:
@@ -279,7 +279,7 @@ class _Flight:
                 self.begin((0.0, 0.0))
 
     def begin(self, start: tuple[float, float]) -> None:
-        """Begin with t = 0 at an instant of the system clock and of the monotonic clock, s.
+        """Set t = 0 of the fleet to `start`, s by the system clock and by the monotonic clock.
 
         In lockstep this has no effect, because the flight has begun already.
         """

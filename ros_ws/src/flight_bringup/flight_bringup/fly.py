@@ -425,10 +425,10 @@ def _is_its_file(scenario: Scenario) -> bool:
 
 
 def as_file(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
-    """Return the scenario with a file from which nodes in the namespace read its parameters.
+    """Return the scenario with a file that nodes in the namespace can read.
 
-    If the scenario is equal to its file, the file is that of `as_flown`. Otherwise it is a new file
-    in the folder of the run. Raises ParameterError.
+    If the scenario equals its file, this is the file of `as_flown`. Otherwise it is a new file in
+    the folder of the run. Raises ParameterError.
     """
     if _is_its_file(scenario):
         return as_flown(scenario, run, namespace)

@@ -177,7 +177,7 @@ def start_instant(lead: float, now: float) -> float:
 
 
 def _airframe(scenario: Scenario) -> ParameterOverrides:
-    """Return the airframe if its path is absolute; else {}.
+    """Return the path of the airframe as an override, if it is absolute; else {}.
 
     The path is absolute if the file lies beside the scenario, in a folder that the nodes do not
     know.
@@ -270,7 +270,7 @@ def _stage_overrides(scenario: Scenario, *, lockstep: bool) -> dict[NodeSpec, Pa
 
 
 def _recording(scenario: Scenario, run: Path, autopilot: Autopilot | None) -> ParameterOverrides:
-    """Return the folder of the recorder, and the topics that not every flight has."""
+    """Return the recorder's parameters: its folder, and topics that not every flight has."""
     further: list[str] = []
     if scenario.guidance is not None:
         further += topics.recorded_with("guidance")
@@ -285,7 +285,10 @@ def _recording(scenario: Scenario, run: Path, autopilot: Autopilot | None) -> Pa
 
 
 def _lockstep_rates(scenario: Scenario) -> dict[NodeSpec, ParameterOverrides]:
-    """Return the rates of the inputs that nodes wait for in lockstep, and the flight's duration."""
+    """Return, for each node, the rates of the inputs that it awaits in lockstep.
+
+    The aircraft also gets the duration of the flight.
+    """
     guidance = scenario.guidance
     control_rate = scenario.controller.rate
     y_rate: ParameterOverrides = {"y_rate": scenario.aircraft.rate}

@@ -89,7 +89,7 @@ class FlightMonitor(Client):
         return self._simulated is None or self._simulated.known()
 
     def ahead(self, lead: float) -> float:
-        """Return how much flight time passes while at least `lead` s pass on the host, s."""
+        """Return the flight time, s, in which at least `lead` s pass on the host."""
         return lead if self._simulated is None else lead * max(self._simulated.speed(), 1.0)
 
     def end_of_clock(self) -> Outcome | None:

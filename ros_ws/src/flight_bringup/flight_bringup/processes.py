@@ -74,7 +74,7 @@ POLL_PERIOD = 0.005  # s, time between two checks while nodes start
 
 
 def end_with_parent() -> list[str]:
-    """Return the words before a command that send it SIGTERM when this process dies.
+    """Return words to put before a command, so that it gets SIGTERM when this process dies.
 
     The list is empty if the host has no setpriv of util-linux.
     """
@@ -93,9 +93,10 @@ def start_instants(lead: float, monitor: "FlightMonitor") -> tuple[float, float]
 
 
 def leave_outcome(run: Path, outcome: Outcome) -> None:
-    """Write the outcome of a flight for the recorder; without a recorder `run` is `Path()`.
+    """Write the outcome of a flight to the folder `run`, where the recorder reads it.
 
-    If the disk is full, only the outcome is missing in the log.
+    Without a recorder, `run` is `Path()`, and nothing is written. If the disk is full, only the
+    outcome is missing in the log.
     """
     if run.name:
         with suppress(OSError, ParameterError):
@@ -371,7 +372,7 @@ class FlightProcesses:
         return self.monitor.end_of_clock()
 
     def pop_end_of_learner(self) -> Outcome | None:
-        """Return how the learner has ended; only once, and None otherwise."""
+        """Return how the learner has ended. Later calls, and calls before, return None."""
         for process in self.processes:
             if process.node is LEARNER and process.popen.poll() is not None:
                 self.processes.remove(process)

@@ -72,7 +72,7 @@ class Flight:
         return self.argument(SIM_TIME) == "true" or self.has_sim_time
 
     def given_to_nodes(self) -> list[str]:
-        """Return what the scope gives to all of its nodes, except their time.
+        """Return what the scope gives to all of its nodes, such as "SetRemap y", except their time.
 
         SetParameter, SetParametersFromFile and SetRemap reach only the nodes that the launch
         starts, and no nodes of another process.
@@ -108,7 +108,10 @@ class Flight:
     def after(
         self, period: float, function: Callable[[LaunchContext], Sequence[Action] | None]
     ) -> TimerAction:
-        """Call a function after a period, s, unless the flight has ended by then."""
+        """Return an action that calls a function after a period, s.
+
+        The function is not called if the flight has ended by then.
+        """
 
         def call(context: LaunchContext) -> list[Action] | None:
             return None if self.is_over else [*(function(context) or ())]

@@ -213,7 +213,10 @@ def by_rise_di(flight: Flight, file: str, *, has_own_time: bool = False) -> list
 def flight_node(
     spec: NodeSpec, scenario: Scenario, overrides: ParameterOverrides, flight: Flight
 ) -> Node:
-    """Return the action of a flight's node, with its section of the scenario and overrides."""
+    """Return the action that starts a node of a flight.
+
+    The node gets its section of the scenario, and then its overrides.
+    """
     return Node(
         package=spec.package,
         executable=spec.executable,
@@ -289,10 +292,10 @@ def say_on_exit(event: ProcessExited, context: LaunchContext, flight: Flight) ->
 def on_state(
     flight: Flight, spec: NodeSpec, state: NodeState, then: Callable[[], Sequence[Action]]
 ) -> Action:
-    """Run the actions of `then` once, when a node of this launch has reached a state.
+    """Return an action that waits until a node has reached a state, and then runs `then` once.
 
-    If the node has reached the state or a later one already, the actions run immediately. This
-    happens if nodes of the user publish the inputs of the node before it starts.
+    If the node of this launch has reached the state or a later one already, `then` runs
+    immediately. This happens if nodes of the user publish the inputs of the node before it starts.
     """
     node = f"{flight.namespace}/{spec.executable}"
     states = [*NodeState]
@@ -374,9 +377,10 @@ def begin_when_matched(
 ) -> list[Action]:
     """Begin the flight once each node is ready and each input has a publisher.
 
-    t = 0 is published on the topic `start`. The flight ends once the log holds y, y_m and u to the
-    end. With rosbag2 it ends once u has the stamp of the end. It ends early if a node is never
-    ready and matched, or if the aircraft `flies` as a node of the stack but takes no u.
+    t = 0 is published on the topic `start`. The flight ends once the log holds y, y_m and u up to
+    `duration`, s. With rosbag2 it ends once u has the stamp of this instant. The flight ends early
+    if a node is never ready and matched. If `flies`, the aircraft is a node of the stack, and the
+    flight also ends early if it takes no u.
     """
     begin = _Begin(flight, nodes, duration, flies=flies)
     return [
@@ -424,7 +428,7 @@ class _Begin:
         return []
 
     def held(self, stamp_ns: int) -> bool:
-        """Return whether a log that is whole up to a stamp holds the flight."""
+        """Note that the log is whole up to a stamp, and return whether this is the whole flight."""
         self._held_ns = stamp_ns
         return self._start_ns > 0 and stamp_ns >= self._start_ns + nanoseconds(self._duration)
 
