@@ -73,7 +73,7 @@ class FlightLink(Protocol):
         """Return the running nodes that can be commanded."""
 
     def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
-        """Return the values of the parameters of a node that are set, out of `names`."""
+        """Return the values of the node's parameters `names`, without those that are not set."""
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> Refusal | None:
         """Set all of these parameters of a node, or none of them."""
@@ -392,9 +392,10 @@ class Control:
     def _apply(
         self, request: Mapping[str, Any], values: Mapping[str, Any], *, undo: bool
     ) -> Refusal | None:
-        """Set new values, or refuse if the parameters differ from those shown on the page.
+        """Set new values of the controller's parameters. Returns why the node refuses them.
 
-        If `undo`, the earlier values are kept, so that this change can be undone.
+        Raises RefusedError if the parameters are no longer those that the page shows. If `undo` is
+        True, the earlier values are kept, so that this change can be undone.
         """
         self._require_simulated()
         self._read()
@@ -414,7 +415,7 @@ class Control:
         return None
 
     def _check(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the margins of the gains in flight with the changes of a request."""
+        """Return the margins that the present gains would have with the changes of a request."""
         if self._assess is None or self._flight.scenario is None:
             return {}
         values = values_by_name(request, "values")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Link a live page that has control to all nodes of a flight, as a ROS 2 client."""
+"""Let a live page control a flight, by a ROS 2 client that talks to the flight's nodes."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -41,7 +41,7 @@ class ControlClient(Client):
         return [name for name in self.NODES if name in running]
 
     def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
-        """Return the values, out of `names`, of a node's parameters and groups that are set."""
+        """Return the values of the node's parameters and groups `names`, if they are set."""
         everything = ListParameters.Request(depth=ListParameters.Request.DEPTH_RECURSIVE)
         declared_names = self._call(
             ListParameters, f"{node}/list_parameters", everything
@@ -86,7 +86,7 @@ class ControlClient(Client):
         return Refusal(f"the controller is {'active' if active else 'inactive'} already")
 
     def send_target(self, values: Mapping[str, float]) -> Refusal | None:
-        """Command guidance, as `rise-di guide` does."""
+        """Send a target to guidance, SI, as `rise-di guide` does."""
         return self._operator().send(values)
 
     def send_route(self, points: Sequence[Sequence[float]]) -> Refusal | None:

@@ -46,7 +46,7 @@ def rms_by_model(
     scenario: Scenario | None,
     proposed_ns: Sequence[int],
 ) -> dict[str, Any]:
-    """Return the headings and rows of a table of the rms measured error for each model.
+    """Return the headings and rows of a table of the measured errors, rms, for each model.
 
     They follow from the ticks of a flight and the stamps at which models were proposed.
     """

@@ -95,7 +95,7 @@ def is_sentences(value: Any) -> bool:
 
 
 def finite_numbers(name: str, value: Any) -> Any:
-    """Return a number or a list of numbers, where null becomes infinity, which means never."""
+    """Return a finite number, or a list of numbers, in which null becomes infinity."""
     if not isinstance(value, list):
         return finite_number(name, value)
     return [math.inf if number is None else finite_number(name, number) for number in value]

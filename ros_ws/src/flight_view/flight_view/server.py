@@ -87,7 +87,8 @@ class Server:
     """The server of flights, which also follows their logs.
 
     A second flight is drawn for comparison, as a ghost. If `fleet` is given, each flight is an
-    aircraft of this fleet, and a further number stands for the places of all aircraft.
+    aircraft of this fleet, and the number after those of the flights stands for the positions of
+    all aircraft.
     """
 
     def __init__(
@@ -187,7 +188,7 @@ class Server:
         return self.answer(flight, query)
 
     def answer(self, flight: Flight | FleetView, query: Mapping[str, str]) -> bytes:
-        """Return the data that a browser lacks at once.
+        """Return at once the data that a browser lacks.
 
         `query` has, by topic, the number of rows that the browser has. Raises HTTPError if a number
         is too long.
@@ -212,9 +213,9 @@ def _epoch(flight: Flight | FleetView) -> str:
 
 
 def _first_rows(flight: Flight | FleetView, query: Mapping[str, str]) -> dict[str, int]:
-    """Return, by topic, the first row that a browser lacks.
+    """Return, by topic, the index of the first row that a browser lacks.
 
-    Raises HTTPError as `Server.answer`.
+    Raises HTTPError as `Server.answer` does.
     """
     is_same_epoch = query.get("epoch") == _epoch(flight)
     rows = {
