@@ -215,7 +215,7 @@ def write_module(
 
 
 def _words_of_vehicle(autopilot: str, scenario: Scenario) -> Mapping[str, str]:
-    """Return the words of the shell to replace for a multicopter; {} for a fixed wing.
+    """Return the replacements of words in the shell for a multicopter; {} for a fixed wing.
 
     A fixed wing has a trim speed. A multicopter has none, and its inputs are torques about the
     axes. Raises ParameterError if the aircraft is neither.

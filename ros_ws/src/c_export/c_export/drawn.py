@@ -386,8 +386,8 @@ def _effector_values(
 ) -> tuple[FloatArray, FloatArray | None]:
     """Allocate the demanded u of many steps, one step in each column.
 
-    Returns the u that the effectors give, and the values of the effectors. Without an allocation,
-    these are the demanded u and None.
+    Returns the u that the effectors give, and their commands. Without an allocation, these are the
+    demanded u and None.
     """
     if params is None or before is None:
         return u, None

@@ -67,7 +67,10 @@ class CController:
         return self._u.copy(), mode
 
     def replay(self, recording: Recording) -> FloatArray:
-        """Return the u of each tick of a log, (T, p), given the recording of `run_recording`."""
+        """Compute every tick of a log in C, and return the u of each tick, (T, p).
+
+        `recording` is the result of `run_recording`.
+        """
         events = recording.events
         ticks = events[events["kind"] == GUARD_TICK]
         before = np.zeros(len(events), dtype=np.int64)  # code of the event before each tick

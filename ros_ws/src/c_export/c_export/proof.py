@@ -272,7 +272,7 @@ def prove(
 
     Every state of the C code is compared with the recorded state of the Python code. `runner`, such
     as qemu, starts the programs of a compiler for another machine. If g++ is installed, a further
-    program counts the operations on reals. It gives the largest number of them in one call.
+    program finds the largest number of operations on reals in one call.
     """
     comparisons: list[Comparison] = []
     with tempfile.TemporaryDirectory(prefix="rise_di_export_") as name:
