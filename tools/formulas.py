@@ -23,7 +23,10 @@ CONVERTER = LatexToMathML(fancy_error=False)
 
 
 def mathml(tex: str, displayed: bool) -> str:
-    r"""Convert a formula to MathML; a \tag becomes its number at the right. Raises LatexError."""
+    r"""Convert a formula to MathML, with the number of its \tag at the right.
+
+    Raises LatexError if the formula is no LaTeX.
+    """
     numbered = rf"\begin{{equation}}{tex}\end{{equation}}" if r"\tag" in tex else tex
     return CONVERTER.convert_with_local_state(numbered, displaystyle=displayed)
 

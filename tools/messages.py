@@ -133,9 +133,9 @@ def closure(package: str, source: Path, names: Sequence[str]) -> set[str]:
 
 
 def copy_of_part(package: str, source: Path, names: Sequence[str], target: Path) -> Path:
-    """Copy a package to `target`, with the named interfaces and what they contain alone.
+    """Copy a package to `target`, with only the named interfaces and those that they contain.
 
-    CMakeLists.txt of the copy does not list the others. Returns `target`.
+    CMakeLists.txt of the copy does not list any other interface. Returns `target`.
     """
     packages = closure(package, source, names)
     shutil.rmtree(target, ignore_errors=True)

@@ -67,7 +67,7 @@ HEAD = ("| parameter | value | meaning |", "|---|---|---|")
 
 
 def page() -> str:
-    """Write the page."""
+    """Return the text of docs/reference/parameters.md."""
     keys = {key: value for key, value, _ in _rows(AircraftConfig)}
     parts = [LEAD, "## Keys of several sections", "", *HEAD]
     parts += [f"| `{key}` | {keys[key]} | {text} |" for key, text in SHARED.items()]
@@ -134,7 +134,7 @@ def _rows(schema: type[Config], prefix: str = "") -> Iterator[tuple[str, str, st
 def _resolved(
     annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})
 ) -> tuple[Any, Mapping[str, Any]]:
-    """Separate a type from its rules and from the alternative None; return both."""
+    """Return the type in an annotation, without the alternative None, and constraints by name."""
     if get_origin(annotation) is Annotated:
         inner, *outer = get_args(annotation)
         return _resolved(

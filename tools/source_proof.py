@@ -153,7 +153,7 @@ def eva(folder: Path, ticks: int) -> Result:
 
 
 def broken_rules(folder: Path) -> set[str]:
-    """Return the rules of MISRA C:2012 that cppcheck finds broken, and other findings by id."""
+    """Return the broken rules of MISRA C:2012, and the ids of the other findings of cppcheck."""
     command = ["cppcheck", "--enable=warning,performance,portability,style", "--std=c99"]
     command += ["--addon=misra", "--quiet", "--template={id}", "rise_di.c", "rise_di_table.c"]
     words = _output(command, folder).split()

@@ -67,7 +67,7 @@ FURTHER = {"guidance": ["/tf"], "controller": ["~transition_event"]}  # topics o
 
 
 def table() -> str:
-    """Write the table of the page."""
+    """Return the table of the topics in Markdown."""
     return "\n".join([*HEAD, *map(_row, TOPICS), *FURTHER_ROWS])
 
 
@@ -78,14 +78,14 @@ def _row(topic: Topic) -> str:
 
 
 def page() -> str:
-    """Write the page with the present table."""
+    """Return the text of docs/topics.md, with the table of the present topics."""
     text = PAGE.read_text(encoding="utf-8")
     begin = text.index("| topic | from -> to |")
     return text[:begin] + table() + text[text.index("\n\n", begin) :]
 
 
 def policy() -> str:
-    """Write the policy."""
+    """Return the access control policy of DDS Security, as XML."""
     root = ElementTree.Element("policy", version="0.2.0")
     enclaves = ElementTree.SubElement(root, "enclaves")
     for node in (*NODES, MONITOR):
