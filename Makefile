@@ -45,7 +45,7 @@ ifdef MOVED
 .PHONY: .venv/.uv .venv/.fly .venv/.messages .venv/.all .venv/.workspace
 endif
 
-.PHONY: fly test test-fast test-sitl mutants check docs pictures pages evidence source-proof foxglove autopilot messages wheel setup setup-all lock clean
+.PHONY: fly test test-fast test-sitl mutants check lint docs pictures pages evidence source-proof foxglove autopilot messages wheel setup setup-all lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS) || { status=$$?; [ $$status -eq $(HOST) ] || exit $$status; }
@@ -56,11 +56,13 @@ test test-fast: export OPENBLAS_NUM_THREADS = 1
 # pytest keeps the rewritten assertions of each file: else every worker rewrites all of them, a third of what collecting takes.
 test test-fast: export PYTHONDONTWRITEBYTECODE =
 
-# Files of tests/ros come first. They wait more than they compute: there is a worker more than processors.
+# Files of tests/ros come first. They wait more than they compute: there is a worker more than processors, and mypy runs beside them.
 # Those that fly in real time and measure it come last, by themselves.
-test: check
-	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),status=0; trap "exit 130" INT; \
+test: $(if $(ARGS),setup-all,lint)
+	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),status=0; types=$$(mktemp); $(BIN)/mypy > $$types 2>&1 & checking=$$!; \
+	  trap "kill $$checking 2> /dev/null; rm -f $$types; exit 130" INT; \
 	  $(XDIST) -n $$(($$(nproc) + 1)) --no-loadscope-reorder -m "not alone" tests/ros tests/nodes tests/docs tests/fuzz tests/pure || status=$$?; \
+	  wait $$checking || status=$$?; cat $$types; rm -f $$types; \
 	  $(BIN)/python -m pytest -m alone tests/ros || status=$$?; exit $$status)
 
 test-fast: .venv/.all .venv/.workspace
@@ -80,10 +82,12 @@ mutants: setup-all
 foxglove autopilot: setup
 	$(INSTALL) --extra $@
 
-check: setup-all
+check: lint
+	$(BIN)/mypy
+
+lint: setup-all
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 
 docs: setup-all
 	$(BIN)/python -m tools.parameters
