@@ -118,6 +118,11 @@ def made_learner(chosen: Scenario) -> Learner:
     return made
 
 
+def found(*parts: Part) -> Any:
+    """An identification with these parts."""
+    return SimpleNamespace(parts=parts, remarks=(), airframe=load_airframe("osprey"))
+
+
 def record_rest(made: Learner) -> None:
     """10 s at rest, with the law of the start."""
     for k in range(1001):
@@ -388,7 +393,7 @@ def test_identification_is_due_where_last_proposal_does_not_fly(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = made_learner(scenario(learn={"updates": [15.0]}))
-    identified = Mock(return_value=SimpleNamespace(parts=()))
+    identified = Mock(return_value=found())
     monkeypatch.setattr(design_learner, "identify_model", identified)
     record_rest(made)
     rough = made.propose(scenario(learn={"updates": [15.0]}).rise_di().digest()).controller
@@ -415,10 +420,10 @@ def test_the_rough_model_flies_until_it_fell_back(monkeypatch: pytest.MonkeyPatc
     assert made.model is None  # nothing is learned
     entry = Entry("B", "q", "elevator", 56.15, 0.1, 0.01, 56.15)
     refused = lateral()._replace(refusal=Refusal("none"))
-    unproven = lateral()._replace(outputs=("q", "V"), entries=(entry,))
+    unproven = lateral()._replace(outputs=("q", "V"), entries=(entry, THRUST))
     learned = unproven._replace(advantage=1.7)
     parts = [(unproven, refused), (learned, refused), (learned, refused)]
-    identified = Mock(side_effect=[SimpleNamespace(parts=each) for each in parts])
+    identified = Mock(side_effect=[found(*each) for each in parts])
     monkeypatch.setattr(design_learner, "identify_model", identified)
     for k in range(1001):
         made.take(k * 10_000_000, np.zeros(4), np.zeros(4), rough.digest())
@@ -460,9 +465,7 @@ def test_refused_part_goes_back_to_the_file_that_predicts_better(
     assert first.controller is not None
     assert ("p", "r") in made._known
     refused = lateral(whiteness=9.0)._replace(advantage=advantage)
-    monkeypatch.setattr(
-        design_learner, "identify_model", lambda *_, **__: SimpleNamespace(parts=(refused,))
-    )
+    monkeypatch.setattr(design_learner, "identify_model", lambda *_, **__: found(refused))
     made._planned.appendleft(0)  # an identification is due
     after = made.propose(first.controller.digest())
     assert (("p", "r") not in made._known) is is_back
@@ -521,10 +524,10 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
         return lateral()._replace(outputs=outputs, entries=entries)
 
     whole = part(NAMES, entry, Entry("B", "p", "elevator", 0.0, 0.3, 0.01, 29.0))
-    apart = (part(("q", "V"), entry), part(("p", "r"), entry))
+    apart = (part(("q", "V"), entry, THRUST), part(("p", "r"), *LATERAL))
     worse_than_file = tuple(each._replace(advantage=-2.0) for each in apart)
     parts = [(whole,), apart, worse_than_file]
-    identified = Mock(side_effect=[SimpleNamespace(parts=each) for each in parts])
+    identified = Mock(side_effect=[found(*each) for each in parts])
     monkeypatch.setattr(design_learner, "identify_model", identified)
     monkeypatch.setattr(made, "_design", lambda *_: SelectedObserver(start, 0.03, 0.6, ONES, 0.0))
     record_rest(made)
@@ -543,6 +546,18 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
     # a model with coupling that predicts worse than the file by two deviations is forgotten
     assert str(made.propose(0).sentence).startswith("no coupling any more: the file predicts")
     assert made.model.matrix_b()[5, 0] == 0.0
+
+
+def test_parts_that_couple_and_fly_by_separate_models_are_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = learner_that_finds(lateral(), monkeypatch)
+    remark = Refusal("coupling: found parts that follow each other's inputs")
+    model = SimpleNamespace(**vars(found(lateral())) | {"remarks": (remark,)})
+    monkeypatch.setattr(design_learner, "identify_model", lambda *_, **__: model)
+    proposal = made.propose(0)
+    assert proposal.controller is not None
+    assert str(proposal.sentence).endswith(f"refused: {remark}")
 
 
 def test_part_that_the_controller_took_back_is_not_proposed_again(
@@ -710,6 +725,8 @@ def test_part_with_coloured_innovations_is_refused_from_the_limit_on(
     )
 
 
+THRUST = Entry("B", "V", "thrust", 6.0, 0.0, 0.29, 6.0)
+"""An effect that the flight has not shown."""
 LATERAL = (
     Entry("B", "p", "aileron", 85.9437, 0.1, 0.05, 85.9437),
     Entry("B", "r", "rudder", 9.74028, -0.2, 0.08, 9.74028),
@@ -729,9 +746,7 @@ def lateral(*, whiteness: float = 1.0, latest: float = 0.0) -> Part:
 def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch, **learn: Any) -> Learner:
     """A learner with a record of 10 s, whose search finds a part."""
     made = made_learner(scenario(learn={"updates": [10.0]} | learn))
-    monkeypatch.setattr(
-        design_learner, "identify_model", lambda *_, **__: SimpleNamespace(parts=(part,))
-    )
+    monkeypatch.setattr(design_learner, "identify_model", lambda *_, **__: found(part))
     record_rest(made)
     return made
 
@@ -870,7 +885,7 @@ def test_late_thrust_costs_the_elevator_no_margin(
     """The loop of V is slow: thrust may be 60 ms late where all inputs may be 30 ms late."""
     entry = Entry("B", "q", "elevator", 56.15, 0.1, 0.01, 56.15)
     part = lateral()._replace(
-        inputs=("elevator", "thrust"), outputs=("q", "V"), entries=(entry,), latest=latest
+        inputs=("elevator", "thrust"), outputs=("q", "V"), entries=(entry, THRUST), latest=latest
     )
     made = learner_that_finds(part, monkeypatch)
     flown = made.propose(0).controller

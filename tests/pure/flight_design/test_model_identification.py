@@ -30,7 +30,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from flight_design.identification import innovation_filters
+from flight_design.identification import innovation_filters, model_identification
 from flight_design.identification.innovation_filters import Actuation, FlightData
 from flight_design.identification.likelihood import Unknown
 from flight_design.identification.likelihood_search import Search
@@ -328,11 +328,11 @@ def test_flight_without_noise_that_is_mostly_at_rest_has_deviations() -> None:
     assert all(0.0 < entry.deviation < 0.3 for entry in model.entries)
 
 
-@pytest.mark.parametrize("rolled_by_alpha", [0.0, 0.2])
-def test_coupled_parts_are_identified_together(tmp_path: Path, rolled_by_alpha: float) -> None:
-    """The elevator rolls this aircraft with a tenth of the effect of the ailerons.
+def coupled_flight(folder: Path, rolled_by_alpha: float) -> tuple[FlightData, dict[str, float]]:
+    """Fly an aircraft whose elevator rolls it with a tenth of the effect of the ailerons.
 
-    Its roll pitches it. If alpha rolls it too, the vertical wind does.
+    Its roll pitches it. If alpha rolls it too, the vertical wind does. Returns the entries that
+    couple, too.
     """
     A = OSPREY.matrix_a()
     B = OSPREY.matrix_b()
@@ -348,13 +348,18 @@ def test_coupled_parts_are_identified_together(tmp_path: Path, rolled_by_alpha: 
     flown = OSPREY.with_matrices(A, B, np.ones((8, 3)))
     vertical = flown.gusts["vertical"] | {"p": -coupled["A[p, alpha]"]}
     flown = flown.model_copy(update={"gusts": flown.gusts | {"vertical": vertical}})
-    airframe = tmp_path / "coupled.yaml"
+    airframe = folder / "coupled.yaml"
     airframe.write_text(as_yaml(flown))
     scenario = servo("turbulence", 0.0, duration=20.0).vary(aircraft={"airframe": str(airframe)})
-    model = identify_model(
-        innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS
-    )
+    return innovation_filters.recording(simulate(scenario), OSPREY), coupled
+
+
+@pytest.mark.parametrize("rolled_by_alpha", [0.0, 0.2])
+def test_coupled_parts_are_identified_together(tmp_path: Path, rolled_by_alpha: float) -> None:
+    recorded, coupled = coupled_flight(tmp_path, rolled_by_alpha)
+    model = identify_model(recorded, OSPREY, ACTUATORS)
     assert model.refusal is None
+    assert model.remarks == ()
     assert [part.outputs for part in model.parts] == [OSPREY.outputs]
     off = {
         entry.name: (
@@ -364,8 +369,22 @@ def test_coupled_parts_are_identified_together(tmp_path: Path, rolled_by_alpha: 
         for entry in model.entries
     }
     assert {name: z for name, z in off.items() if abs(z) > 3.0} == {}
-    assert model.airframe.matrix_b()[row, elevator] == approx(coupled["B[p, elevator]"], rel=0.2)
+    elevator = list(OSPREY.inputs).index("elevator")
+    effect = model.airframe.matrix_b()[OSPREY.index("p"), elevator]
+    assert effect == approx(coupled["B[p, elevator]"], rel=0.2)
     assert "#   B[p, elevator]: " in model_yaml(model, "a flight")
+
+
+def test_parts_that_couple_are_told_where_their_common_model_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded, _ = coupled_flight(tmp_path, 0.0)
+    monkeypatch.setattr(model_identification, "COUPLED_GAIN", 1e9)
+    model = identify_model(recorded, OSPREY, ACTUATORS)
+    assert [part.outputs for part in model.parts] == [("q", "V"), ("p", "r")]
+    (remark,) = map(str, model.remarks)
+    assert remark.startswith("coupling: found parts that follow each other's inputs, but no common")
+    assert remark.endswith("to the log-likelihood, and 1e+09 are needed")
 
 
 def test_lost_samples_are_predicted_over() -> None:

@@ -115,6 +115,7 @@ class Identification(NamedTuple):
     before: Prediction
     after: Prediction
     parts: tuple[Part, ...]
+    remarks: tuple[Refusal, ...] = ()  # what else the record contradicts, such as separate parts
 
     @property
     def entries(self) -> tuple[Entry, ...]:
@@ -196,7 +197,12 @@ class _Study(NamedTuple):
         )
 
     def identification(
-        self, airframe: Airframe, parts: Sequence[Part], first: Innovations, last: Innovations
+        self,
+        airframe: Airframe,
+        parts: Sequence[Part],
+        first: Innovations,
+        last: Innovations,
+        remarks: Iterable[Refusal],
     ) -> Identification:
         """Join the parts to one model, with innovations of the nominal and the identified model."""
         return Identification(
@@ -207,6 +213,7 @@ class _Study(NamedTuple):
             before=prediction(first, self.validating),
             after=prediction(last, self.validating),
             parts=tuple(parts),
+            remarks=tuple(remarks),
         )
 
     def again(
@@ -264,12 +271,12 @@ class _Study(NamedTuple):
         used: NDArray[np.bool_],
         apart: Innovations,
         flown: Airframe | None,
-    ) -> tuple[Fit, Part] | None:
+    ) -> tuple[Fit, Part] | Refusal:
         """Fit the whole aircraft as one part, with entries that couple its parts.
 
-        Returns None unless the innovations of this fit are white, its model may be used, and it
-        predicts better than the parts that were fitted separately. `apart` are the innovations of
-        these parts. The fit also has the innovations of the model in flight, `flown`.
+        Returns a refusal unless the innovations of this fit are white, its model may be used, and
+        it predicts better than the parts that were fitted separately. `apart` are the innovations
+        of these parts. The fit also has the innovations of the model in flight, `flown`.
         """
         search = self.search(model, whole_aircraft(model), coupled=True)
         also = None if flown is None else search.model_errors(flown)
@@ -277,9 +284,19 @@ class _Study(NamedTuple):
         fit = self.again(search, fit, used, flown)
         part = self.part(search, fit)
         gain = part.after.log_likelihood - prediction(apart, self.validating).log_likelihood
-        is_white = part.after.whiteness.max() <= MAX_WHITENESS
-        is_better = gain * self.validating.sum() > COUPLED_GAIN
-        return (fit, part) if is_white and is_better and not part.refusal else None
+        gain *= float(self.validating.sum())
+        white = float(part.after.whiteness.max())
+        reason = str(part.refusal or "")
+        if not reason and white > MAX_WHITENESS:
+            reason = f"its innovations have a whiteness of {white:.3g}, above {MAX_WHITENESS:g}"
+        if not reason and gain <= COUPLED_GAIN:
+            reason = f"it adds {gain:.3g} to the log-likelihood, and {COUPLED_GAIN:g} are needed"
+        if not reason:
+            return fit, part
+        return Refusal(
+            "coupling: found parts that follow each other's inputs, but no common model for them, "
+            f"so each keeps its own: {reason}"
+        )
 
     def advantage(self, flown: Innovations, nominal: Innovations) -> float:
         """Return how much better the model in flight predicts the samples in the mask `later`.
@@ -362,14 +379,17 @@ def identify_model(
         by_flown = search.flying(search.model_errors(coupled), fits)
         z = study.advantage(by_flown, first)
         parts = [part._replace(advantage=z) for part in parts]
+    remarks = list[Refusal]()
     if len(every) > 1 and _follows(fits, every, recorded.u, is_known) > FOLLOWS:
         whole = study.whole(model, fits, used, last, coupled)
-        if whole is not None:
+        if isinstance(whole, Refusal):
+            remarks.append(whole)
+        else:
             fit, part = whole
             parts = [part]
             first = fit.before
             last = fit.after
-    return study.identification(airframe, parts, first, last)
+    return study.identification(airframe, parts, first, last, remarks)
 
 
 def _counter(

@@ -299,7 +299,7 @@ class Learner:
         known = dict(self._known)
         model = self._model
         told = list[str]()
-        refusals = list[Refusal]()
+        refusals = list(identified.remarks)
         tried = list[Entry]()
         is_about_file = self._prior is self._rough
         flies_file = self._design_of_rough is not None
