@@ -19,6 +19,7 @@ from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.outcome import Refusal
 from flight_core.vectors import FloatArray
+from flight_design.identification.entry_units import units
 from flight_design.identification.innovation_filters import (
     DRIFT,
     HOLD,
@@ -45,9 +46,6 @@ MAX_DELAY_ERROR = 4.0
 # Largest ratio of an entry to its nominal value, 1 / (1 - MAX_ERROR): a rough model errs by a
 # factor, up or down.
 MAX_FACTOR = 2.5
-# Unit of an entry that is 0, relative to the largest effect on its row. With it, the prior
-# deviation is 10 % of this effect.
-COUPLING = 0.34
 # least gain of log-likelihood in a span for which a stronger wind is taken: odds of 20 to 1
 CHANGE = 3.0
 # A span whose innovations have a mean square above this multiple of the median is explained by no
@@ -143,30 +141,6 @@ class Fit(NamedTuple):
     by_lag: FloatArray  # (p,) part of each deviation that comes from the lag of y, see `by_lag`
     # innovations of the model in flight, in the winds that fit it best
     flown: Innovations | None = None
-
-
-def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:
-    """Return the units in which the errors of the entries of A and B are counted, SI.
-
-    An entry with the unit 0 is known. The units are the nominal values, except in the rows of
-    angles, where they are 0. If `coupled`, an entry that is 0 gets a unit that follows from its
-    row: COUPLING times the largest effect there. Effects of states are compared for motions of one
-    `size` each. The columns of angles stay 0.
-    """
-    free = model.kinematic[:, None] == 0.0
-    is_dynamic = model.kinematic == 0.0
-    units_A = np.where(free, model.A, 0.0)
-    units_B = np.where(free, model.B, 0.0)
-    if coupled:
-        largest_A = (
-            np.max(np.abs(units_A) * model.size, axis=1, keepdims=True) / model.size * is_dynamic
-        )
-        largest_B = np.max(np.abs(units_B), axis=1, keepdims=True)
-        units_A, units_B = (
-            np.where((part == 0.0) & free, COUPLING * largest, part)
-            for part, largest in ((units_A, largest_A), (units_B, largest_B))
-        )
-    return units_A, units_B
 
 
 def largest_error(entry: Entry) -> float:
@@ -265,12 +239,13 @@ class Likelihood:
         rough = np.zeros(len(self.prior), dtype=bool)
         nominal = np.array([entry.nominal for entry in self.nominal_entries()])
         rough[self._errors] = (deviation > PRIOR) & (nominal != 0.0)
-        self._upper[rough] = self._factor - 1.0
-        self._lower[rough] = 1.0 / self._factor - 1.0
+        self._upper[rough] = np.log(self._factor)
+        self._lower[rough] = -self._upper[rough]
+        self._by_factor = rough[self._errors]
         self.centre = np.zeros(len(self.prior))
         if centre is not None:
             self.centre[self._errors] = centre
-            scale = np.where(nominal != 0.0, 1.0 + centre, 1.0)
+            scale = np.where((nominal != 0.0) & ~self._by_factor, 1.0 + centre, 1.0)
             for bounds in (self._lower, self._upper):
                 bounds[self._errors] = centre + scale * bounds[self._errors]
             self.prior[self._errors] *= scale
@@ -285,6 +260,14 @@ class Likelihood:
         self._lower[self._lag] = 0.0
         self._upper[self._lag] = MAX_DELAY_ERROR
 
+    def relative_errors(self, theta: FloatArray) -> FloatArray:
+        """Return the relative errors of the entries for their parameters theta, (..., entries).
+
+        Both are the same, except for entries whose prior deviation is above PRIOR. A rough file
+        errs by a factor, up or down, so the theta of such an entry is the logarithm of the factor.
+        """
+        return np.where(self._by_factor, np.expm1(theta), theta)
+
     def with_errors(self, thetas: FloatArray) -> NominalModel:
         """Return the models for N thetas, (N, p): A (N, n, n), B (N, n, m), wind (N, n, G).
 
@@ -292,7 +275,8 @@ class Likelihood:
         motion relative to the air. So an entry that is 0 only in the nominal airframe counts too.
         """
         matrices = []
-        parts = np.split(thetas, [np.count_nonzero(self._units[0]), self.count], axis=1)[:2]
+        errors = self.relative_errors(thetas[:, : self.count])
+        parts = np.split(errors, [np.count_nonzero(self._units[0])], axis=1)
         for matrix, unit, part in zip(
             (self._model.A, self._model.B), self._units, parts, strict=True
         ):
@@ -516,22 +500,32 @@ class Likelihood:
             else:
                 value = B[row, inputs.index(entry.column)]
             theta[k] = (value - entry.nominal) / entry.unit
+        rough = np.flatnonzero(self._by_factor)
+        theta[rough] = np.log(np.maximum(1.0 + theta[rough], 1.0 / self._factor))
         return theta
 
     def entries(self, fit: Fit) -> list[Entry]:
         """Return the entries of A and B with their identified errors."""
         # The entries are the first parameters in theta; winds and others follow.
-        errors = zip(
-            self.nominal_entries(), fit.theta.tolist(), fit.deviation.tolist(), strict=False
-        )
+        errors = self.relative_errors(fit.theta[: self.count])
+        deviations = self.in_errors(fit, fit.deviation)
         return [
-            entry._replace(error=error, deviation=deviation) for entry, error, deviation in errors
+            entry._replace(error=error, deviation=deviation)
+            for entry, error, deviation in zip(
+                self.nominal_entries(), errors.tolist(), deviations.tolist(), strict=True
+            )
         ]
+
+    def in_errors(self, fit: Fit, deviation: FloatArray) -> FloatArray:
+        """Convert deviations of theta, (p,), to those of the entries' relative errors."""
+        slope = np.where(self._by_factor, np.exp(fit.theta[: self.count]), 1.0)
+        return slope * deviation[: self.count]
 
     def about_centre(self, entries: Iterable[Entry]) -> list[Entry]:
         """Return entries whose errors and standard deviations are relative to the prior mean."""
         centred = []
-        for entry, centre in zip(entries, self.centre.tolist(), strict=False):
+        centres = self.relative_errors(self.centre[: self.count]).tolist()
+        for entry, centre in zip(entries, centres, strict=True):
             scale = 1.0 + centre if entry.nominal else 1.0
             error = (entry.error - centre) / scale
             centred.append(entry._replace(error=error, deviation=entry.deviation / scale))

@@ -169,7 +169,7 @@ class _Study(NamedTuple):
         entries = search.entries(fit)
         # Behind a filter of y the loop is the same with a weaker effect and a shorter lag. So an
         # effect counts as known if it would be known with the lag.
-        in_phase = np.hypot(by_timing, fit.by_lag[: search.count]).tolist()
+        in_phase = np.hypot(by_timing, search.in_errors(fit, fit.by_lag)).tolist()
         identified = with_entries(self.airframe, entries)
         reasons = (
             self.reason_against_airframe(search.about_centre(entries)),

@@ -19,6 +19,8 @@ MAX_DEVIATION = 0.1
 # Largest relative deviation of a best known effect that an uncertain delay of u may cause. For two
 # such deviations the guarantee must cover a loop gain that is 30 % off.
 MAX_BY_TIMING = 0.15
+# The search has the bound of a rough entry as a logarithm.
+ROUNDING = 1e-9
 
 
 def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
@@ -66,7 +68,7 @@ def at_bound(entries: Iterable[Entry], factor: float = MAX_FACTOR) -> list[Entry
         lower, upper = -MAX_ERROR, largest_error(entry)
         if factor > MAX_FACTOR and entry.nominal:
             lower, upper = 1.0 / factor - 1.0, factor - 1.0
-        if not lower < entry.error < upper:
+        if not lower + ROUNDING < entry.error < upper - ROUNDING:
             found.append(entry)
     return found
 

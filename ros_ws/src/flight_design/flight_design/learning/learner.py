@@ -9,6 +9,7 @@ refused. The controller checks the parameters again when it loads them, and may 
 
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from itertools import chain
 from typing import NamedTuple
 
@@ -31,7 +32,7 @@ from flight_design.identification.model_identification import (
     identify_model,
     with_entries,
 )
-from flight_design.learning.change_test import ANGLE, RECORD, Change, change_test
+from flight_design.learning.change_test import RECORD, Change, change_test
 from flight_design.learning.designs import (
     Design,
     DesignOfFile,
@@ -44,6 +45,7 @@ from flight_design.learning.designs import (
     with_deviations,
     with_flown_channels,
 )
+from flight_design.learning.file_test import AT_BOUND, identified_within
 from flight_design.learning.flight_record import (
     SPREAD,
     FlightRecord,
@@ -53,8 +55,6 @@ from flight_design.learning.flight_record import (
     steady_end,
 )
 from flight_design.learning.part_checks import (
-    DELAY_DEVIATION,
-    LAG_DEVIATION,
     change_sentence,
     effect_sentence,
     entries_of_file,
@@ -76,8 +76,6 @@ from rise_di_controller.learning.learned_channels import (
 from rise_di_controller.learning.proposals import UNVERIFIED
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# number of entries that may lie at a bound: the right model may have one, wrong models have 2 to 6
-AT_BOUND = 1
 # s, shortest record: it has two held-out seconds, and `identify log` requires six
 SHORTEST = 20.0 * TRANSIENT
 # s from a fallback to the next identification, whose record then shows the parameters that fly
@@ -455,18 +453,19 @@ class Learner:
             expected,
         )
         model = None if self._tried is self._rough else self._at_speed(self._tried, ratio)
-        identified = identify_model(
+        identify = partial(
+            identify_model,
             recorded,
             self._at_speed(self._prior, ratio),
             actuation=self._actuation,
             channels=ChannelPairing(self._controller.outputs, self._controller.inputs),
             bound_count=AT_BOUND,
-            unknown=self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE, lag=LAG_DEVIATION),
             flown=model,
             after=seconds(self._tried_ns),
             quick=self._quick,
-            searches_again=True,
         )
+        tests_file = self._prior is self._rough and not self._is_sketch
+        identified, self._believed = identified_within(identify, self._believed, tests=tests_file)
         if not self._has_speeds:
             return identified
         powers = exponents(self._rough, self._thrust)

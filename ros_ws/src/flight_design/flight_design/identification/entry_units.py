@@ -1,0 +1,36 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Give the errors of A and B their units, and with them choose the entries that are identified."""
+
+import numpy as np
+
+from control_laws.nominal_model import NominalModel
+from flight_core.vectors import FloatArray
+
+# Unit of an entry that is 0, relative to the largest effect on its row. With it, the prior
+# deviation is 10 % of this effect.
+COUPLING = 0.34
+
+
+def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:
+    """Return the units in which the errors of the entries of A and B are counted, SI.
+
+    An entry with the unit 0 is known. The units are the nominal values, except in the rows of
+    angles, where they are 0. If `coupled`, an entry that is 0 gets a unit that follows from its
+    row: COUPLING times the largest effect there. Effects of states are compared for motions of one
+    `size` each. The columns of angles stay 0.
+    """
+    free = model.kinematic[:, None] == 0.0
+    is_dynamic = model.kinematic == 0.0
+    units_A = np.where(free, model.A, 0.0)
+    units_B = np.where(free, model.B, 0.0)
+    if coupled:
+        largest_A = (
+            np.max(np.abs(units_A) * model.size, axis=1, keepdims=True) / model.size * is_dynamic
+        )
+        largest_B = np.max(np.abs(units_B), axis=1, keepdims=True)
+        units_A, units_B = (
+            np.where((part == 0.0) & free, COUPLING * largest, part)
+            for part, largest in ((units_A, largest_A), (units_B, largest_B))
+        )
+    return units_A, units_B
