@@ -9,11 +9,13 @@ from functools import cache, partial
 
 import numpy as np
 import pytest
+from pytest import approx
 from scipy import stats
 from tests.pure.flight_design.test_model_identification import (
     ACTUATORS,
     OSPREY,
     flight,
+    identified,
     servo,
     true_errors,
 )
@@ -85,6 +87,22 @@ def test_right_file_keeps_its_deviations(uncertainty: float) -> None:
     model, believed = learned(None, uncertainty)
     assert believed == KNOWN
     assert model.remarks == ()
+
+
+@pytest.mark.parametrize("air", ["turning", "gust"])
+def test_doubt_widens_deviations_and_refuses_nothing(air: str) -> None:
+    recorded = innovation_filters.recording(flight(air, 0.3), OSPREY)
+    doubted = identify_model(recorded, OSPREY, ACTUATORS, is_doubted=True)
+    model = identified(air, 0.3)
+    assert doubted.refusal == model.refusal
+    added = np.array([each for part in doubted.parts for each in part.by_model])
+    before, after = (
+        np.array([entry.deviation for entry in each.entries]) for each in (model, doubted)
+    )
+    assert [entry.error for entry in doubted.entries] == [entry.error for entry in model.entries]
+    assert after == approx(np.hypot(before, added))
+    assert added.max() > 0.01
+    assert furthest_off(doubted) <= furthest_off(model)
 
 
 ROLL = Entry("A", "p", "p", -10.0, 0.0, 0.05, -10.0)

@@ -9,6 +9,7 @@ is held out to validate it. y does not show the scale of alpha or beta, so entri
 this scale stay near their nominal values. No number in this module is specific to an aircraft.
 """
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, count
 from typing import NamedTuple
@@ -99,6 +100,8 @@ class Part(NamedTuple):
     wind: float = 0.0  # level of the wind in most of its spans, relative to moderate turbulence
     # part of each entry's deviation that comes from an uncertain delay
     by_timing: tuple[float, ...] = ()
+    # part of each entry's deviation that is added because the model may be wrong
+    by_model: tuple[float, ...] = ()
     # difference of each entry from that of a second model, by `rates_model.doubted`; () if there is
     # none
     by_motion: tuple[float, ...] = ()
@@ -142,6 +145,7 @@ class _Study(NamedTuple):
     bound_count: int  # number of entries that may lie at a bound
     searches_again: bool
     timing: float | None  # s, deviation of the delay; if None, no doubt is added (`with_doubt`)
+    is_doubted: bool  # whether doubt is added to the deviations that are stated, after all refusals
     step: Callable[[], None]
 
     def search(self, model: NominalModel, block: Block, *, coupled: bool = False) -> Search:
@@ -167,6 +171,11 @@ class _Study(NamedTuple):
         if self.timing is not None:
             fit, by_timing = search.with_doubt(fit, Doubt(self.timing, after.whiteness))
         entries = search.entries(fit)
+        stated = entries
+        if self.is_doubted:
+            doubted, _ = search.with_doubt(fit, Doubt(0.0, after.whiteness))
+            widest = np.maximum(doubted.deviation, fit.deviation)
+            stated = search.entries(fit._replace(deviation=widest))
         # Behind a filter of y the loop is the same with a weaker effect and a shorter lag. So an
         # effect counts as known if it would be known with the lag.
         in_phase = np.hypot(by_timing, search.in_errors(fit, fit.by_lag)).tolist()
@@ -184,7 +193,7 @@ class _Study(NamedTuple):
         return Part(
             inputs=search.names.inputs,
             outputs=outputs,
-            entries=tuple(entries),
+            entries=tuple(stated),
             before=before,
             after=after,
             refusal=next(filter(None, reasons), None),
@@ -194,6 +203,10 @@ class _Study(NamedTuple):
             advantage=0.0 if fit.flown is None else self.advantage(fit.flown, fit.before),
             wind=float(LEVELS[np.bincount(fit.levels).argmax(), 0]),
             by_timing=tuple(by_timing.tolist()),
+            by_model=tuple(
+                math.sqrt(max(wide.deviation**2 - entry.deviation**2, 0.0))
+                for wide, entry in zip(stated, entries, strict=True)
+            ),
         )
 
     def identification(
@@ -320,6 +333,7 @@ def identify_model(
     quick: bool = False,
     searches_again: bool = False,
     timing: float | None = None,
+    is_doubted: bool = False,
 ) -> Identification:
     """Identify the model of a flight. If the model must not be used, the result says why.
 
@@ -342,6 +356,8 @@ def identify_model(
         timing: Standard deviation of the delay in `actuation`, s. If it is given, even as 0, the
             standard deviations of the result also hold for a model that is not right
             (`Search.with_doubt`).
+        is_doubted: Whether the stated deviations also hold for a model that is not right, although
+            it is refused only by those that hold for a right model.
 
     Raises:
         ParameterError: An output does not move.
@@ -365,6 +381,7 @@ def identify_model(
         bound_count=bound_count,
         searches_again=searches_again,
         timing=timing,
+        is_doubted=is_doubted,
         step=_counter(progress, len(every), starts_at_flown=flown is not None),
     )
     searches = [study.search(model, block) for block in every]

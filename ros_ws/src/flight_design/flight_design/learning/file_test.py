@@ -13,6 +13,7 @@ from itertools import chain
 import numpy as np
 from scipy.stats import chi2
 
+from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.outcome import Refusal
 from flight_design.identification.likelihood import PRIOR, Unknown
 from flight_design.identification.model_identification import Identification, Part
@@ -20,6 +21,7 @@ from flight_design.identification.model_quality import MAX_WHITENESS
 from flight_design.identification.model_refusals import (
     at_bound,
     best_known,
+    in_time,
     reason_against_airframe,
 )
 from flight_design.learning.change_test import ANGLE
@@ -77,7 +79,7 @@ def is_contradicted(found: Identification, believed: Unknown) -> bool:
     if any(reason_against_airframe(p.entries, name, AT_BOUND, believed.factor) for p in parts):
         return True
     square = degrees = 0.0
-    for entry in chain.from_iterable(part.entries for part in parts):
+    for entry in chain.from_iterable(map(_if_right, parts)):
         s = believed.error if entry.matrix == "A" else believed.effect
         theta, deviation = entry.error, entry.deviation
         if s > PRIOR:  # the search has the logarithm of the factor
@@ -94,3 +96,8 @@ def _counts(part: Part, factor: float) -> bool:
         and float(np.max(part.after.whiteness)) <= MAX_WHITENESS
         and not at_bound(best_known(part.entries, part.outputs), factor)
     )
+
+
+def _if_right(part: Part) -> list[Entry]:
+    """Return the entries of a part with the deviations that they have if the model is right."""
+    return in_time(part.entries, part.by_model or [0.0] * len(part.entries))

@@ -463,6 +463,7 @@ class Learner:
             flown=model,
             after=seconds(self._tried_ns),
             quick=self._quick,
+            is_doubted=True,
         )
         tests_file = self._prior is self._rough and not self._is_sketch
         identified, self._believed = identified_within(identify, self._believed, tests=tests_file)
