@@ -86,7 +86,8 @@ class PriorConfig(Config):
     )
     off: Annotated[float, Field(ge=0.05, le=1.0)] | None = Field(
         default=None,
-        description="relative standard deviation of the entries; none: 0.29, for +-50 %",
+        description="standard deviation of the entries, relative, or of their logarithms if it is "
+        "above 0.29; none: 0.29, for +-50 %",
     )
     sketch: bool = Field(
         default=False,
