@@ -93,9 +93,10 @@ class MovingRow(Row):
 
     @property
     def motion(self) -> tuple[str, int]:
-        """The output, a key of UNITS, that changes while the raw value grows, and its sign.
+        """The output, a key of UNITS, that changes as the channel grows, and its sign.
 
-        The sign is +1 if the output grows, and -1 if it falls.
+        The sign is +1 if the output grows, and -1 if it falls. `positive` is for a growing raw
+        value, so `sign` is applied to it.
         """
         output, sign = MOTIONS[self.positive]
         return output, sign * self.sign

@@ -35,7 +35,7 @@ class ExcitationParams(NamedTuple):
 class ExcitationState(NamedTuple):
     """State of the excitation between two ticks, each field with the shape (m,)."""
 
-    e: Array  # y - y_m for the log, which this law does not correct
+    e: Array  # y - y_m, only for the log: this law does not correct it
     elapsed: Array  # time since engagement, s, the same for every input
 
 
@@ -165,12 +165,12 @@ class ExcitationConfig(ControllerConfig):
 
     @property
     def duration(self) -> float:
-        """Return the time from engagement to the end of the excitation, s."""
+        """Time from engagement to the end of the excitation, s."""
         return float(self.pause + sum(self._each))
 
     @cached_property
     def _each(self) -> list[float]:
-        """Return the time for each input, including the pause, s."""
+        """Time for each input, including the pause, s."""
         return [
             DOUBLETS * width + period + self.pause
             for width, period in zip(self.width, self.period, strict=True)

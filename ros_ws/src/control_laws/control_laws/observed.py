@@ -63,7 +63,8 @@ def aircraft_design(
 ) -> ObserverDesign:
     """Design observers with the aircraft's model, with weights from the gains of a search.
 
-    The gains are effort, drift (m, N), gust, wind_time (G, N) and loose (1, N) or (n, N).
+    The gains are effort and drift, each (m, N), gust and wind_time, each (G, N), and loose, which
+    is (1, N) or (n, N).
     """
     weights = Weights(*(gains[name].T for name in Weights._fields))
     return aircraft_observer(model, names or unnamed(model), weights)

@@ -200,7 +200,7 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
 
 
 def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chunk:
-    """Fly `size` aircraft from number `first` on at once, and return the first `count` of them."""
+    """Fly `size` aircraft together, from number `first` on, and return the first `count`."""
     from flight_campaign.batch import batch  # noqa: PLC0415 - JAX, which the command needs only for flights
     from flight_campaign.batch.device import turn  # noqa: PLC0415 - as above
     from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - as above

@@ -18,7 +18,7 @@ from flight_campaign.rows import entry_names
 if TYPE_CHECKING:
     import polars as pl
 
-RANKED = 10_000  # number of first aircraft of a case that are ranked: the standard error is 0.01
+RANKED = 10_000  # largest number of aircraft of a case that are ranked: standard error 0.01
 LEAST_RANKED = 10  # least number of aircraft; fewer aircraft show only chance
 CHANCE = 0.05  # share of campaigns in which an entry without effect exceeds the level of chance
 

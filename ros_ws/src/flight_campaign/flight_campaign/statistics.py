@@ -250,7 +250,7 @@ def score_units(
 def score(rms: FloatArray, unit: FloatArray) -> FloatArray:
     """Return the score, which is the sum over the channels of rms / unit, (N,).
 
-    rms has shape (m, N), and unit has shape (m,). With the usual units, a channel adds 1 if its
-    error is 10 mrad/s or 0.1 m/s, and the channel p if it is 20 mrad/s.
+    rms has shape (m, N), and unit has shape (m,). With the usual units, an error of 10 mrad/s or
+    0.1 m/s adds 1 to the score. In the channel p, an error of 20 mrad/s adds 1.
     """
     return np.asarray(np.sum(rms / unit[:, None], axis=0))

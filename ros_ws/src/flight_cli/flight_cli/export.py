@@ -37,7 +37,8 @@ class Export:
 
     The code is compiled. The proof feeds it with flights in one process (with lost samples, faults,
     new parameters, engagement, limits), with random calls and with random steps. It compares every
-    u and every state. Exit status: 0 proved, 1 a bit differs, 2 bad input.
+    u and every state. Exit status: 0 proved, or written with --no-proof; 1 a bit differs; 2 bad
+    input.
     """
 
     scenario: str = argument(

@@ -77,9 +77,9 @@ class Tune:
     if you tuned before, take the one in the folder of that tuning. If the log does not show the
     aircraft, the command says which doublets to fly, and which parameter to set.
 
-    The controller of the scenario and those that are selected for the identified aircraft fly the
-    commands of the scenario on it, in calm air and in gusts. The one with the least errors becomes
-    the module, even if that is the controller that you had.
+    Several controllers then fly the commands of the scenario on the identified aircraft, in calm
+    air and in gusts: that of the scenario, and those that are selected for this aircraft. The one
+    with the least errors becomes the module, even if that is the controller that you had.
 
     Exit status: 0; 1 if an aircraft within the errors of the identification may be unstable, or if
     a result of the C code differs from that of Python in one bit; 2 bad input, a model that is

@@ -88,7 +88,7 @@ class Follower:
         self._path: Path | None = None
         self._scan: Scan | None = None
         self._size = 0  # size of the file at the last check, bytes
-        self._identity = (0, 0)  # device and inode of the file, after something has been read
+        self._identity = (0, 0)  # device and inode of the file; (0, 0) before its scan begins
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, _Channel] = {}
         # records of a packed file that have still to be read

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the matrices of an aircraft against the laws of physics.
 
-They are kinematics, gravity, trim speed, and the sign and the size of a control. The names of the
-states say which quantities they are: V, u, v, w speeds, alpha, beta, theta, phi, psi angles, p, q,
-r angular rates, h a height. The axes are FRD. A state of any other name is not checked, but VT and
-other names for these quantities are refused. Source of the identities: the linear equations of
-motion about straight flight, B. L. Stevens, F. L. Lewis, Aircraft Control and Simulation, 2nd ed.
-(2003), sec. 3.7; B. Etkin, L. D. Reid, Dynamics of Flight, 3rd ed. (1996), eq. (4.9,18).
+The laws are those of kinematics, gravity, trim speed, and the sign and the size of a control. The
+name of a state says which quantity it is: V, u, v, w are speeds; alpha, beta, theta, phi, psi are
+angles; p, q, r are angular rates; h and altitude are heights. The axes are FRD. A state of any
+other name is not checked, but VT and other spellings of these names are refused. Source of the
+identities: the linear equations of motion about straight flight, B. L. Stevens, F. L. Lewis,
+Aircraft Control and Simulation, 2nd ed. (2003), sec. 3.7; B. Etkin, L. D. Reid, Dynamics of
+Flight, 3rd ed. (1996), eq. (4.9,18).
 """
 
 from collections.abc import Iterator, Mapping
@@ -39,10 +40,11 @@ this derivative; None if any state may."""
 # Ranges of accepted fractions of an expected value.
 TURNED = (0.7, 1.02)  # of a value that is multiplied by the cosine of a trim angle of up to 45 deg
 COUPLED = (0.6, 1.35)  # of V0, to which the force of a rate, Z_q or Y_r, is added
-# of the change of lift with speed, where lift equals weight. Compressibility and thrust alter it.
-# Published aircraft have 0.78 to 1.02.
+# Accepted fractions of the change of lift with speed that follows if lift equals weight.
+# Compressibility and thrust alter this change. Published aircraft have 0.78 to 1.02.
 LIFT = (0.3, 2.8)
-# SI, largest accepted entry in the row of an angle for a state that OF_RATES does not list
+# Largest accepted entry, SI, in the row of theta, phi or psi at a state of KINDS that OF_RATES does
+# not list for this row.
 FOREIGN = 0.02
 EXPECTED: Mapping[tuple[str, str], tuple[float, str, tuple[float, float]]] = {
     ("theta", "q"): (1.0, "", TURNED),

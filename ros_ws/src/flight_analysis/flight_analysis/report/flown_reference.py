@@ -3,8 +3,8 @@
 """Check whether the y_m of a flight is that of the scenario.
 
 The error e = y - y_m does not show that the reference model hangs or flies other commands, because
-y follows any y_m. Therefore this module computes y_m again, by the code of the node. It takes the
-commands of the scenario, and the u_m of the log from the first one on:
+y follows any y_m. Therefore this module computes y_m again, by the code of the node. Until the
+first u_m of the log it takes the commands of the scenario, and from then on the u_m of the log:
 
     x_m+ = Phi x_m + Gamma [u_m(t), u_m(t + T/2), u_m(t + T)],  y_m = C x_m      (2)
 

@@ -147,14 +147,13 @@ def attachments_for(
     further: Sequence[Path] = (),
     replaced: Sequence[str] = (),
 ) -> LogAttachments:
-    """Return the attachments of the log of a flight.
+    """Return the attachments of the log of a flight, and write those that are no files yet.
 
     They are the scenario, the airframe or the user's model of JSBSim, every parameter after
-    validation, the `further` files, and the provenance. Attachments that are no files yet are
-    written into the folder of the run. `overrides` are parameters of the scenario's nodes by the
-    name of the node, or None for a flight without nodes. `replaced` names the nodes of the stack
-    that other nodes replaced, and the attachments state this. Raises ParameterError if a file
-    cannot be written.
+    validation, the `further` files, and the provenance. The written ones lie in the folder of the
+    run. `overrides` are parameters of the scenario's nodes by the name of the node, or None for a
+    flight without nodes. `replaced` names the nodes of the stack that other nodes replaced, and the
+    attachments state this. Raises ParameterError if a file cannot be written.
     """
     unflown = {
         name: comment([f"did not fly: {name}; another node took its place"]) for name in replaced
@@ -187,8 +186,8 @@ def read_accounted(
     The signals are named vectors, by topic name without the namespace. The bag, which is the log as
     ROS stores it, comes from this stack or from `ros2 bag record`. It is MCAP, in one or several
     files, compressed or not. A truncated MCAP file is read up to the last complete chunk.
-    `run.tape.account` has the number of samples of each topic, and `run.tape.notes` say what the
-    log lacks. A log without a scenario has no account.
+    In the result, `tape.account` has the number of samples of each topic, and `tape.notes` say what
+    the log lacks. A log without a scenario has no account, unless it was imported.
 
     Args:
         run: Folder of a run, or a file of the bag.
@@ -349,7 +348,8 @@ def _controllers(
 def log_account(recorded: RecordedRun) -> Account | None:
     """Return the account of what a log holds and lacks.
 
-    Returns None if the log has no flight, or no scenario that can be read.
+    Returns None if the log has no flight. An imported log needs no scenario. For any other log,
+    returns None if it has no scenario that can be read.
     """
     if not {*AIRCRAFT_TOPICS} & {*recorded.tape.signals}:
         return None

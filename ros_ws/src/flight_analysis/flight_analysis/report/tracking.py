@@ -196,7 +196,7 @@ def _drag(pair: ErrorPair, i: int, speed: float) -> float:
 
 
 def _most(unit: str) -> float:
-    """Return the largest excuse for noise and wind of an output with this unit, SI."""
+    """Return the upper limit of the excuse, SI, for an output with this unit."""
     return MOST[AIRSPEED] if quantity(unit).dimension == SPEED else MOST_RATE
 
 

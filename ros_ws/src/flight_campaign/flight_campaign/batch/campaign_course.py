@@ -413,9 +413,9 @@ def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _For
 
 
 def _air_angles(wind: FloatArray, airframe: Airframe) -> FloatArray:
-    """Return the contribution of the wind at the ticks, (T, G), to alpha and beta, rad.
+    """Return the alpha and beta that the wind causes at the ticks, rad, by state, (T, n).
 
-    The result has a column for each state, (T, n).
+    `wind` has a column for each axis of the gusts, (T, G). The columns of other states are 0.
     """
     angles = np.zeros((len(wind), len(airframe.states)))
     for place, axis in enumerate(airframe.gusts):

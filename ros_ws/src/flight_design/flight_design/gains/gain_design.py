@@ -242,8 +242,8 @@ def check_gains(
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe. If the
             scenario flies an aircraft of JSBSim, you can name it, as jsbsim:c172p; the model is
             then y_dot = Omega u.
-        scenario: Name, path of a scenario file (.yaml), or a Scenario. If a file has only the
-            section controller, commands, gusts and rate limits are those of osprey_servo.
+        scenario: Name, path of a scenario file (.yaml), or a Scenario. A controller that is alone
+            in its file gets the commands, gusts and rate limits of osprey_servo.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.

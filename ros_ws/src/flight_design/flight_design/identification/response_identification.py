@@ -269,7 +269,7 @@ def _rows(
     layout: Layout,
     span: tuple[int, int],
 ) -> _Rows:
-    """Return the regressors of a span, the samples of y to predict from them, and u."""
+    """Return the regressors of a span, the samples of y that they predict, and u."""
     (t, values), (t_u, u_values), m = (
         _within(y, outputs, span),
         _within(u, inputs, span),

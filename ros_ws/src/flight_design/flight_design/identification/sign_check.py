@@ -341,6 +341,6 @@ def through(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
 
 
 def motion_as_channel_grows(row: OutputRow | InputRow) -> str:
-    """Return how the aircraft moves as the channel grows in SI, also if its raw value falls."""
+    """Return how the aircraft moves as the channel grows, not as its raw value grows."""
     motions = list(MOTIONS)  # each motion stands next to its opposite
     return row.positive if row.sign > 0 else motions[motions.index(row.positive) ^ 1]

@@ -130,8 +130,8 @@ def room_at_home(fence: Fence, motion: Motion, wind: float) -> float:
 
     An aircraft may come over home on any course, and its turn onto the orbit may lead outside of
     the orbit by up to twice the radius of the turn. It flies the better of the turns to the right
-    and to the left. The result is the least clearance over COURSES courses and COURSES directions
-    of a wind of `wind`, m/s. `motion` is that of the aircraft at home.
+    and to the left. The result is the least clearance over COURSES courses, and over COURSES
+    directions of the wind. `wind` is its speed, m/s, and `motion` is that of the aircraft at home.
     """
     angles = np.linspace(0.0, 2.0 * math.pi, COURSES, endpoint=False)
     from_sides = angles if wind else angles[:1]

@@ -102,7 +102,7 @@ def _parts(vector: complex) -> tuple[float, float]:
 def _stop(pose: Mapping[str, float], gains: MulticopterParams) -> complex:
     """Return the place where the aircraft can stop, north + i east, m.
 
-    It lies lead v + v abs(v) / (2 braking) ahead, where v is the velocity.
+    This place lies ahead by lead v + v abs(v) / (2 braking), where v is the velocity.
     """
     v = _velocity(pose)
     return _place(pose) + (gains.lead + abs(v) / (2.0 * gains.braking)) * v

@@ -102,7 +102,7 @@ def read_kml(content: bytes, key: str, line: str | None = None) -> Places:
 
 
 def _outer_elements(kinds: Sequence[tuple[str, Element]], outer: str) -> dict[Element, Element]:
-    """Return, for each element inside an element of the kind `outer`, this enclosing element."""
+    """Map each element inside an element of the kind `outer` to this outer element."""
     outers: dict[Element, Element] = {}
     for kind, element in kinds:
         if kind == outer:

@@ -125,7 +125,7 @@ class Route(NamedTuple):
         return altitude - slope * (distance - along), slope
 
     def joining_altitude(self, leg: int, along: float) -> float:
-        """Return the altitude at which to join a leg at the distance `along` it, m."""
+        """Return the altitude, m, at which to join a leg `along` m after its start."""
         if along or not self.from_altitude:
             return self.profile(leg, along)[0]
         return self.from_altitude[leg]

@@ -33,7 +33,7 @@ class Limits(NamedTuple):
 def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
     """Saturate u, shape (m,): clip it to [lower, upper] and to u_before +- rate dt.
 
-    If u lies inside the limits, it is returned to the last bit. If u_before lies outside new
+    A u inside both ranges is returned without a change of any bit. If u_before lies outside new
     limits, u moves towards them at the rate.
 
     Args:
