@@ -227,6 +227,17 @@ def test_reference_model_of_a_user_is_not_compared_and_that_is_said() -> None:
     assert sum(note.startswith("y_m is not compared with the commands") for note in notes) == 1
 
 
+def test_log_without_a_channel_of_y_m_is_not_compared() -> None:
+    tape = flown("servo")
+    signals = dict(tape.signals)
+    y_m = signals.pop("y_m")
+    assert reference_errors(replace(tape, signals=signals), servo()) is NotCompared.ABSENT
+    signals["y_m"] = Signal(y_m.stamp_ns, y_m.names[:2], y_m.values[:, :2])
+    lacking = replace(tape, signals=signals)
+    assert reference_errors(lacking, servo()) is NotCompared.OTHER_CHANNELS
+    assert reason_not_compared(lacking, servo()) is NotCompared.OTHER_CHANNELS
+
+
 def test_reference_model_of_a_user_flies_no_command_of_the_scenario() -> None:
     """They are not counted, do not split the errors, and nothing settles after them."""
     of_stack = rise_di.summarise(flown("servo"), servo())

@@ -47,8 +47,7 @@ FITTING = 0.5
 """If a user started the node singly, an instant counts as its t = 0 if at least this share of the
 samples is right."""
 
-
-MOST_PATHS = 16
+MOST_HISTORIES = 16
 """Largest number of hypotheses on the order of the u_m. Guidance sends ten u_m within their age
 limit."""
 
@@ -56,7 +55,9 @@ limit."""
 class NotCompared(Enum):
     """The reason why y_m was not compared with the scenario."""
 
+    ABSENT = "the log has no y_m"
     FOREIGN = "y_m is of another reference model than that of the stack"
+    OTHER_CHANNELS = "y_m lacks a channel of the scenario's reference model"
     NO_START = "the log does not hold the start of the reference model"
 
     def note(self) -> str:
@@ -81,28 +82,24 @@ class _Command(NamedTuple):
     attitude: FloatArray | None
 
 
-class _Path(NamedTuple):
-    """A hypothesis on which u_m of the log have acted so far."""
+class _History(NamedTuple):
+    """A hypothesis on which u_m of the log the reference model has received so far."""
 
     reference: Reference
     taken: int  # number of u_m, in order, that have been taken or are too old
 
 
-def reference_errors(tape: Tape, scenario: Scenario) -> ReferenceErrors | NotCompared | None:
+def reference_errors(tape: Tape, scenario: Scenario) -> ReferenceErrors | NotCompared:
     """Compute y_m again, and return the difference of the logged y_m from it.
 
-    Returns the reason if they cannot be compared, or None if the log has no y_m.
+    Returns the reason if they cannot be compared.
     """
-    if "y_m" not in tape or not len(tape["y_m"].stamp_ns):
-        return None
+    if (reason := _reason_in_signal(tape, scenario)) is not None:
+        return reason
     outputs = scenario.reference_model.outputs
-    if not set(outputs) <= set(tape["y_m"].names):
-        return None
-    if not is_sent_by_stack(tape, "y_m"):
-        return NotCompared.FOREIGN
     y_m = np.stack([tape["y_m"][name] for name in outputs], axis=1)
     stamp_ns = tape["y_m"].stamp_ns
-    starts = [tape.start_ns] if _is_planned(tape) else [tape.start_ns, int(stamp_ns[0])]
+    starts = [tape.start_ns] if _has_known_start(tape) else [tape.start_ns, int(stamp_ns[0])]
     errors = []
     for start_ns in dict.fromkeys(starts):
         commands = _commands(tape, outputs, start_ns)
@@ -110,7 +107,7 @@ def reference_errors(tape: Tape, scenario: Scenario) -> ReferenceErrors | NotCom
         errors.append(y_m - expected)
     error = min(errors, key=lambda each: float(np.sum(each**2)))
     is_right = (np.abs(error) <= ROUNDING).all(axis=1)
-    if not _is_planned(tape) and np.mean(is_right) < FITTING:
+    if not _has_known_start(tape) and np.mean(is_right) < FITTING:
         return NotCompared.NO_START
     harmless = [HARMLESS * LEAST.get(name, LEAST_RATE) for name in outputs]
     allowed = np.full(len(outputs), ROUNDING) if _is_whole(tape) else np.array(harmless)
@@ -145,11 +142,26 @@ def reference_shortfalls(tape: Tape, scenario: Scenario) -> list[Shortfall]:
 
 
 def reason_not_compared(tape: Tape, scenario: Scenario) -> NotCompared | None:
-    """Return why y_m cannot be compared with the scenario, or None if it can."""
-    if _is_planned(tape) and is_sent_by_stack(tape, "y_m"):
-        return None
+    """Return why y_m cannot be compared with the scenario, or None if it can.
+
+    y_m is only computed if the log does not tell when t = 0 was.
+    """
+    reason = _reason_in_signal(tape, scenario)
+    if reason is not None or _has_known_start(tape):
+        return reason
     errors = reference_errors(tape, scenario)
     return errors if isinstance(errors, NotCompared) else None
+
+
+def _reason_in_signal(tape: Tape, scenario: Scenario) -> NotCompared | None:
+    """Return why the signal y_m of a log cannot be compared, whatever its values are."""
+    if "y_m" not in tape or not len(tape["y_m"].stamp_ns):
+        return NotCompared.ABSENT
+    if not is_sent_by_stack(tape, "y_m"):
+        return NotCompared.FOREIGN
+    if not set(scenario.reference_model.outputs) <= set(tape["y_m"].names):
+        return NotCompared.OTHER_CHANNELS
+    return None
 
 
 def _is_whole(tape: Tape) -> bool:
@@ -159,8 +171,12 @@ def _is_whole(tape: Tape) -> bool:
     return all(name in tape.recording and tape.recording[name].lost == 0 for name in ("y_m", "u_m"))
 
 
-def _is_planned(tape: Tape) -> bool:
-    """Return whether all nodes of the flight began at the same t = 0."""
+def _has_known_start(tape: Tape) -> bool:
+    """Return whether t = 0 of the tape is t = 0 of the reference model.
+
+    It is in a flight in one process, whose tape has the scenario, and in a flight that was started
+    as a whole, whose log states the duration.
+    """
     return tape.scenario is not None or tape.duration is not None
 
 
@@ -190,63 +206,64 @@ def _computed(
     `y_m` is that of the log, (N, m). It only serves to find between which two samples a u_m
     arrived.
     """
-    paths = [_Path(Reference(parameters), 0)]
+    histories = [_History(Reference(parameters), 0)]
     max_age_ns = nanoseconds(parameters.live.max_age)
-    period_ns = paths[0].reference.period_ns
+    period_ns = histories[0].reference.period_ns
     numbers = np.maximum(np.round(t_ns / period_ns), 0).astype(np.int64).tolist()
     expected = np.zeros_like(y_m)
     before_ns = 0
     for k, number in enumerate(numbers):
         trials = []
-        for path in paths:
-            for trial in _next_paths(path, commands, before_ns, max_age_ns):
+        for history in histories:
+            for trial in _next_histories(history, commands, before_ns, max_age_ns):
                 sample = trial.reference.sample(number)
                 error = float(np.max(np.abs(y_m[k] - sample)))
                 # With its arguments in this order, min turns an error that is NaN into inf.
                 trials.append((min(np.inf, error), sample, trial))
         trials.sort(key=lambda each: each[0])
         least, expected[k], _ = trials[0]
-        # All paths with the right bits are followed, because a path that took a u_m too early only
-        # differs once this u_m differs from the one before. If none has the right bits, those
-        # within ROUNDING count as right.
+        # All histories with the right bits are followed. One that took a u_m too early only differs
+        # once this u_m differs from the one before. If none has the right bits, those within
+        # ROUNDING count as right.
         bound = ROUNDING if 0.0 < least <= ROUNDING else least
-        paths = _distinct([trial for error, _, trial in trials if error <= bound])[:MOST_PATHS]
+        right = [trial for error, _, trial in trials if error <= bound]
+        histories = _distinct(right)[:MOST_HISTORIES]
         before_ns = number * period_ns
     return expected
 
 
-def _next_paths(
-    path: _Path, commands: Sequence[_Command], before_ns: int, max_age_ns: int
-) -> list[_Path]:
-    """Return the paths that can follow a path, which is a possible history of the received u_m.
+def _next_histories(
+    history: _History, commands: Sequence[_Command], before_ns: int, max_age_ns: int
+) -> list[_History]:
+    """Return the histories that can follow a history.
 
     Since `before_ns`, one or more of the next u_m may have arrived. For each of them, there is a
-    path in which it is the newest. In the last path, none has arrived.
+    history in which it is the newest. In the last history, none has arrived.
     """
-    arrived = path.taken
+    arrived = history.taken
     while arrived < len(commands) and commands[arrived].t_ns <= before_ns + AHEAD_NS:
         arrived += 1
-    if arrived == path.taken:
-        return [path]
-    paths = []
-    for count in range(arrived, path.taken, -1):
+    if arrived == history.taken:
+        return [history]
+    histories = []
+    for count in range(arrived, history.taken, -1):
         if commands[count - 1].t_ns < before_ns - max_age_ns:
             break
-        reference = copy.copy(path.reference)
+        reference = copy.copy(history.reference)
         _take(reference, commands[count - 1])
-        paths.append(_Path(reference, count))
-    return [*paths, path]
+        histories.append(_History(reference, count))
+    return [*histories, history]
 
 
-def _distinct(paths: Sequence[_Path]) -> list[_Path]:
-    """Leave out the paths with the same state as a path earlier in the list."""
-    if len(paths) == 1:
-        return list(paths)
-    by_state: dict[tuple[int, bytes, bytes], _Path] = {}
-    for path in paths:
-        reference = path.reference
-        state = (path.taken, reference.x_m.tobytes(), reference.rate().tobytes())
-        by_state.setdefault(state, path)
+def _distinct(histories: Sequence[_History]) -> list[_History]:
+    """Leave out the histories with the same state as a history earlier in the list."""
+    if len(histories) == 1:
+        return list(histories)
+    by_state: dict[tuple[int, bytes, bytes], _History] = {}
+    for history in histories:
+        reference = history.reference
+        state = (history.taken, reference.x_m.tobytes(), reference.rate().tobytes())
+        by_state.setdefault(state, history)
     return list(by_state.values())
 
 
