@@ -232,7 +232,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
         if ages:
             mean = seconds(round(sum(ages) / len(ages)))
             largest = seconds(max(ages))
-            figures = {"age of u mean (s)": f"{mean:.4f}", "age of u max (s)": f"{largest:.4f}"}
+            figures = {
+                channels.AGE_OF_U["mean"]: f"{mean:.4f}",
+                channels.AGE_OF_U["max"]: f"{largest:.4f}",
+            }
         return (
             DiagnosticStatus.OK,
             bounded(f"receiving u from {self._publisher_lock.publisher}"),

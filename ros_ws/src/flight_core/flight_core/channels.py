@@ -28,6 +28,10 @@ ATTITUDE = ("phi", "theta")
 """Channels of u_m after the commands: the bank, and the pitch minus the pitch of level flight, rad.
 The reference model only uses them when u_m ends."""
 
+AGE_OF_U = {"mean": "age of u mean (s)", "max": "age of u max (s)"}
+"""Keys in the diagnostics of the aircraft, by the statistic of the ages of u since the last
+report."""
+
 SIDES = ("down", "up")
 """Beginnings of the channels of `authority`. For example, down.V and up.V are the rates, units/s,
 at which the input can at least decrease and increase V."""
