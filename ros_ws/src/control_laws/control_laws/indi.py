@@ -11,11 +11,10 @@ from control_laws.nominal_model import (
     NominalModel,
     campaign_law,
     filter_gain,
-    saturate_with_excess,
 )
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.law.control_law import ControlLaw, Measurements
-from rise_di_controller.law.saturation import Limits
+from rise_di_controller.law.saturation import Limits, saturate
 from rise_di_controller.params import ControllerConfig
 
 
@@ -64,7 +63,7 @@ def control_law(model: NominalModel) -> ControlLaw:
         position = state.position + a * (measurements.position - state.position)
         nu = measurements.y_m_dot - params.K * (measurements.y - measurements.y_m) - y_dot
         u_free = position + params.share * (inverse @ nu)
-        u, _ = saturate_with_excess(u_free, measurements, dt, limits)
+        u = saturate(u_free, measurements.u_before, dt, limits)
         return IndiState(measurements.y, y_dot, position), u_free, u
 
     return campaign_law(IndiState, engage, limited)

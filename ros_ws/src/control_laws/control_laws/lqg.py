@@ -7,11 +7,11 @@ The observer corrects the trim, and there is no other feedback.
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, saturate_with_excess
+from control_laws.nominal_model import NominalModel
 from flight_core.parameters import require
 from flight_core.vectors import Array, FloatArray
 from rise_di_controller.law.control_law import ControlLaw, Measurements, without_limits
-from rise_di_controller.law.saturation import Limits
+from rise_di_controller.law.saturation import Limits, saturate
 from rise_di_controller.params import ControllerConfig
 
 
@@ -30,7 +30,7 @@ def _limited(
 
     The law adds nothing to u_trim, which already contains u_o of the observer.
     """
-    u, _ = saturate_with_excess(measurements.u_trim, measurements, dt, limits)
+    u = saturate(measurements.u_trim, measurements.u_before, dt, limits)
     return state, measurements.u_trim, u
 
 

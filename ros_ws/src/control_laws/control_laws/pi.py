@@ -11,7 +11,7 @@ from flight_core.fields import Field
 from flight_core.parameters import NonNegatives, Positives, require_length
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.law.control_law import ControlLaw, Measurements, without_limits
-from rise_di_controller.law.saturation import Limits, limited_integral
+from rise_di_controller.law.saturation import Limits, limited_integral, saturate
 from rise_di_controller.params import ControllerConfig
 
 
@@ -71,8 +71,7 @@ def _limited(
         integral_e=limited_integral(state.integral_e, after.integral_e, change, excess)
     )
     u_free = measurements.u_trim + _u(after, params)
-    u, _ = saturate_with_excess(u_free, measurements, dt, limits)
-    return after, u_free, u
+    return after, u_free, saturate(u_free, measurements.u_before, dt, limits)
 
 
 def _retune(state: PiState, old: PiParams, new: PiParams) -> PiState:
