@@ -11,7 +11,7 @@ from flight_analysis.report.html import write_page
 from flight_analysis.report.parameter_rows import NONE, parameter_rows
 from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_log.flight_processes import LOG, ROSOUT
-from flight_log.learning_messages import DIAGNOSTIC_ARRAY, learning_message
+from flight_log.learning_messages import DIAGNOSTIC_ARRAY, OK, learning_message
 from flight_log.log_messages import LogMessage, StoredText, log_messages
 from flight_log.named_vectors import typestore
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_event
@@ -34,7 +34,7 @@ def test_log_tells_warnings_changes_and_learning_of_its_aircraft() -> None:
             topic=PARAMETER_EVENTS, type_name=PARAMETER_EVENT, sent_ns=stamp * SECOND, data=data
         )
 
-    learned = learning_message(7 * SECOND, "model", "flies model 1", warns=False)
+    learned = learning_message(7 * SECOND, "model", "flies model 1", level=OK)
     texts = [
         StoredText(
             topic="/one/learning", type_name=DIAGNOSTIC_ARRAY, sent_ns=7 * SECOND, data=learned

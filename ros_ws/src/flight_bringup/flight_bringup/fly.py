@@ -39,6 +39,7 @@ from flight_core.outcome import (
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal
+from flight_log.learning_messages import OK, WARN
 from flight_log.tape_writer import EXPECTED, TapeWriter
 from rise_di_controller.learning.proposals import Event
 
@@ -350,9 +351,8 @@ def fly_in_process(
     def learned(event: Event) -> None:
         line = f"t = {event.stamp_ns / NANOSECONDS:.2f} s: {event.sentence}"
         with interrupt.deferred():
-            writer.write_learning(
-                event.stamp_ns, event.kind, event.sentence, warns=not event.change
-            )
+            level = OK if event.change else WARN
+            writer.write_learning(event.stamp_ns, event.kind, event.sentence, level=level)
             if event.change:
                 writer.write_changes(event.stamp_ns, f"/{CONTROLLER.executable}", event.change)
             (run / "log").mkdir(exist_ok=True)

@@ -18,8 +18,11 @@ OK = 0
 WARN = 1
 
 
-def learning_message(stamp_ns: int, kind: str, sentence: str, *, warns: bool) -> bytes:
-    """Return a message of the topic LEARNING on an event, as the controller publishes it."""
+def learning_message(stamp_ns: int, kind: str, sentence: str, *, level: int) -> bytes:
+    """Return a message of the topic LEARNING on an event, as the controller publishes it.
+
+    `level` is OK or WARN.
+    """
     store = typestore()
     types = {
         name: store.types[f"diagnostic_msgs/msg/{name}"]
@@ -28,7 +31,7 @@ def learning_message(stamp_ns: int, kind: str, sentence: str, *, warns: bool) ->
     stamp = store.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NANOSECONDS))
     header = store.types["std_msgs/msg/Header"](stamp, "in_process")
     event = types["KeyValue"]("event", json.dumps(kind))
-    status = types["DiagnosticStatus"](WARN if warns else OK, LEARNING, sentence, "", [event])
+    status = types["DiagnosticStatus"](level, LEARNING, sentence, "", [event])
     return bytes(store.serialize_cdr(types["DiagnosticArray"](header, [status]), DIAGNOSTIC_ARRAY))
 
 

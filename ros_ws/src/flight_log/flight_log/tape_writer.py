@@ -85,9 +85,12 @@ class TapeWriter:
             PARAMETER_EVENTS, PARAMETER_EVENT, stamp_ns, parameter_event(stamp_ns, node, changes)
         )
 
-    def write_learning(self, stamp_ns: int, kind: str, sentence: str, *, warns: bool) -> None:
-        """Write what became of a learner's proposal, as a controller would publish it."""
-        message = learning_message(stamp_ns, kind, sentence, warns=warns)
+    def write_learning(self, stamp_ns: int, kind: str, sentence: str, *, level: int) -> None:
+        """Write what became of a learner's proposal, as a controller would publish it.
+
+        `level` is that of the message, OK or WARN of `learning_messages`.
+        """
+        message = learning_message(stamp_ns, kind, sentence, level=level)
         self._write_message(f"/{LEARNING}", DIAGNOSTIC_ARRAY, stamp_ns, message)
 
     def _write_message(self, topic: str, type_name: str, stamp_ns: int, data: bytes) -> None:
