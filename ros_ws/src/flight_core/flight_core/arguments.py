@@ -33,10 +33,11 @@ def as_number(
 
     Raises ParameterError, with the unit, for any other value.
     """
-    bounds = (
-        f"{least:g} or more{', ' * bool(unit)}" if most == math.inf else f"{least:g} to {most:g} "
-    )
-    return float(_bounded(float, value, key, least, most, f"{bounds}{unit}".rstrip()))
+    if most == math.inf:
+        expected = f"{least:g} or more" + (f", {unit}" if unit else "")
+    else:
+        expected = f"{least:g} to {most:g}" + (f" {unit}" if unit else "")
+    return float(_bounded(float, value, key, least, most, expected))
 
 
 def as_count(value: object, key: str, least: int, most: float = math.inf) -> int:
@@ -48,6 +49,10 @@ def as_count(value: object, key: str, least: int, most: float = math.inf) -> int
 def _bounded(
     number: type[float], value: object, key: str, least: float, most: float, expected: str
 ) -> float:
+    """Return the value if it is a `number` from `least` to `most`, or raise ParameterError.
+
+    `expected` says in the refusal what the value should be.
+    """
     problems = Problems()
     number_in_bounds: float = kind_of(number, {"ge": least, "le": most}).read(value, key, problems)
     require(not problems.sentences(), key, short_repr(value), expected)
