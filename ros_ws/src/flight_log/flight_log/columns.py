@@ -34,14 +34,15 @@ class Columns:
     def __init__(self, width: int, expected: int) -> None:
         self.count = 0
         self._width = width
-        self._senders: dict[str, int] = {}  # number of each publisher by its name
-        self._sender: list[NDArray[np.int16]] = []  # number of the publisher of each sample
+        self._number_of_sender: dict[str, int] = {}  # number of each publisher by its name
+        # number of the publisher of each sample, by appended part
+        self._sender_of_rows: list[NDArray[np.int16]] = []
         self._stamp_ns, self._store = self._new(expected)
 
     @property
     def senders(self) -> list[str]:
         """Names of the publishers, in the order of their numbers."""
-        return [*self._senders]
+        return [*self._number_of_sender]
 
     def _new(self, capacity: int) -> tuple[NDArray[np.int64], "_MemoryColumns | _FileColumns"]:
         kind = _FileColumns if 8 * self._width * capacity > IN_MEMORY else _MemoryColumns
@@ -50,8 +51,8 @@ class Columns:
     def append(self, stamp_ns: NDArray[np.int64], rows: FloatArray, sender: str = "") -> None:
         """Append samples of a publisher: stamps (N,) and rows (N, k)."""
         end = self.count + len(rows)
-        number = self._senders.setdefault(sender, len(self._senders))
-        self._sender.append(np.full(len(rows), number, np.int16))
+        number = self._number_of_sender.setdefault(sender, len(self._number_of_sender))
+        self._sender_of_rows.append(np.full(len(rows), number, np.int16))
         if end > len(self._stamp_ns):
             stamps = self._stamp_ns
             store = self._store
@@ -67,7 +68,7 @@ class Columns:
     def signal(self, names: tuple[str, ...]) -> Signal:
         """Return the samples as a signal, in the order of arrival."""
         stamp_ns = self._stamp_ns[: self.count]
-        sender = np.concatenate(self._sender) if len(self._senders) > 1 else None
+        sender = np.concatenate(self._sender_of_rows) if len(self._number_of_sender) > 1 else None
         if isinstance(self._store, _FileColumns):
             return _StoredSignal(
                 stamp_ns=stamp_ns, names=names, sender=sender, store=self._store, first=0
