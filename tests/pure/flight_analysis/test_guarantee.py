@@ -30,7 +30,7 @@ from flight_analysis.linear_loop.structured_value import (
     Scaling,
     bound_at,
     is_below_one,
-    tightened,
+    least_bound,
 )
 from flight_analysis.linear_loop.uncertain_loop import (
     Box,
@@ -161,7 +161,7 @@ def test_bound_of_a_real_product_is_its_closed_form() -> None:
     u = np.array([1.0, -2.0, 0.5, 3.0])
     v = np.array([0.3, 0.2, -4.0, 0.1])
     M = np.outer(u, v).astype(complex)
-    value, scaling = tightened(M, 4, 0.0)
+    value, scaling = least_bound(M, 4, 0.0)
     exact = float(np.abs(u * v).sum())
     assert (1.0 - 1e-12) * exact <= value < 1.003 * exact  # rounding of the eigenvalues
     assert value == approx(float(bound_at(M, scaling)), rel=1e-9)
@@ -170,7 +170,7 @@ def test_bound_of_a_real_product_is_its_closed_form() -> None:
 def test_imaginary_scalar_has_no_real_perturbation() -> None:
     """det(1 - j delta) is never 0 for a real delta: G alone shows it."""
     M = np.array([[2j]])
-    value, _ = tightened(M, 1, 0.05)
+    value, _ = least_bound(M, 1, 0.05)
     assert value < 0.05
 
 
@@ -182,7 +182,7 @@ def test_every_scaling_is_above_corners_of_small_matrices() -> None:
         M = rng.standard_normal((3, 3))
         values = np.linalg.eigvals(M * signs[:, None, :])
         real = np.abs(values[np.abs(values.imag) < 1e-12].real)
-        value, _ = tightened(M.astype(complex), 3, 0.0)
+        value, _ = least_bound(M.astype(complex), 3, 0.0)
         assert value >= real.max(initial=0.0) * (1.0 - 1e-9)
 
 
@@ -206,7 +206,7 @@ def test_bound_is_that_of_slicot() -> None:
         M = rng.standard_normal((6, 6)) + 1j * rng.standard_normal((6, 6))
         kinds = np.array([1, 1, 1, 1, 2, 2])
         expected = slycot.ab13md(M, np.ones(6, int), kinds)[0]
-        value, _ = tightened(M, 4, 0.0)
+        value, _ = least_bound(M, 4, 0.0)
         assert value < 1.005 * expected
 
 
@@ -371,10 +371,10 @@ def test_guarantee_says_what_is_exact_in_every_aircraft() -> None:
 def test_factor_with_a_nan_is_not_inside() -> None:
     """A Cholesky factor of NaN raises nothing, and no comparison with NaN is true."""
     N = np.diag([0.1 + 0.0j, 0.1])
-    assert Centre(np.ones(2), np.zeros(2), np.eye(2)).inside(N, 1.0)
+    assert Centre(np.ones(2), np.zeros(2), np.eye(2)).is_inside(N, 1.0)
     for d, g in ((np.nan, 0.0), (1.0, np.nan)):
-        assert not Centre(np.array([d, 1.0]), np.array([g, 0.0]), np.eye(2)).inside(N, 1.0)
-    assert not Centre(np.ones(2), np.zeros(2), np.eye(2)).inside(N * complex("nan"), 1.0)
+        assert not Centre(np.array([d, 1.0]), np.array([g, 0.0]), np.eye(2)).is_inside(N, 1.0)
+    assert not Centre(np.ones(2), np.zeros(2), np.eye(2)).is_inside(N * complex("nan"), 1.0)
 
 
 def test_search_is_at_or_below_corners() -> None:

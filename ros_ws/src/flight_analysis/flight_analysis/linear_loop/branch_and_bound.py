@@ -18,8 +18,8 @@ from flight_analysis.linear_loop.structured_value import (
     Centre,
     Scaling,
     interval_at,
-    tightened,
-    tightened_at,
+    least_bound,
+    least_bound_at,
 )
 from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
 from flight_core.vectors import FloatArray
@@ -93,7 +93,7 @@ def proof_of(
         # Bound mu of the deviations of this region, scaled to 1, at one frequency.
         scale = np.r_[(1.0 + reserve) * region.half[part.parameters], others]
         M = scale[:, None] * around.response(w, RADIUS)
-        bound, scaling = tightened_at(around, w, M, region.scaling)
+        bound, scaling = least_bound_at(around, w, M, region.scaling)
         interval = interval_at(around, w, scaling, scale) if bound < 1.0 else None
         region = region._replace(scaling=scaling)
         if interval is None:
@@ -117,7 +117,7 @@ def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
 
     Rounding is safe, because any X and G prove a bound. The first `entries` channels are the means
     over a period, and the others the second Legendre coefficients. If g is 0 for all others, the
-    step has only the X and G of the means, from which the other X follow as in `tightened_at`.
+    step has only the X and G of the means, from which the other X follow as in `least_bound_at`.
     """
     count = len(scaling.t) if scaling.g[entries:].any() else entries
     t, g = ([float(f"{x:.{DIGITS}g}") for x in values[:count]] for values in (scaling.t, scaling.g))
@@ -149,7 +149,7 @@ def _levelled(part: Channels, scale: FloatArray) -> Channels:
     worst, level = 0.0, np.zeros(part.late)
     for w in np.pi / part.period * np.geomspace(1e-2, 1.0, LEVELLED):
         M = (scale[:, None] * part.response(w, RADIUS))[np.ix_(rows, rows)]
-        bound, scaling = tightened(M, k, 0.0)
+        bound, scaling = least_bound(M, k, 0.0)
         if bound > worst:
             worst, level = bound, scaling.t[k : k + part.late]
     size = np.ones(len(scale))

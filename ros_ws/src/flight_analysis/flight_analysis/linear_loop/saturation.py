@@ -30,7 +30,7 @@ from flight_analysis.linear_loop.branch_and_bound import (
 )
 from flight_analysis.linear_loop.guarantee import SLACK
 from flight_analysis.linear_loop.loop_margins import LinearLoop
-from flight_analysis.linear_loop.structured_value import Scaling, tightened_at
+from flight_analysis.linear_loop.structured_value import Scaling, least_bound_at
 from flight_analysis.linear_loop.uncertain_loop import (
     Channels,
     ComplexArray,
@@ -359,7 +359,7 @@ def limit_proof(
             # any positive factor of m proves the same, and this one brings m S to the size 1
             factor = 1.0 / abs(m * M[-1, -1])
             channel = _as_complex_channel(M, factor * m)
-        bound, scaling = tightened_at(around, w, channel, region.scaling)
+        bound, scaling = least_bound_at(around, w, channel, region.scaling)
         region = region._replace(scaling=scaling)
         interval = None
         if bound < 1.0:

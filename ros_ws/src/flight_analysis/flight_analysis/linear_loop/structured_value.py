@@ -55,7 +55,7 @@ class Scaling(NamedTuple):
     g: FloatArray
 
 
-def balanced(M: ComplexArray) -> FloatArray:
+def balancing_t(M: ComplexArray) -> FloatArray:
     """Find the t = log(X) / 2 that makes row and column of each channel about equally large.
 
     t has the shape (p,). The method is Osborne's iteration.
@@ -102,14 +102,18 @@ def _form(M: ComplexArray, scaling: Scaling) -> ComplexArray:
     return np.asarray(adjoint @ N + skew + np.conj(np.swapaxes(skew, -1, -2)))
 
 
-def tightened(
-    M: ComplexArray, real: int, target: float, alike: int = 0, near: Scaling | None = None
+def least_bound(
+    M: ComplexArray,
+    real_count: int,
+    target: float,
+    alike_count: int = 0,
+    near: Scaling | None = None,
 ) -> tuple[float, Scaling]:
     """Search for the X and G with the least bound of M, (p, p), and return the bound, X and G.
 
-    The first `real` channels are real, and the next `alike` channels share one factor of X. The
-    search begins at the balanced X, or at `near` if its bound is smaller. `near` has the X and G of
-    a similar matrix.
+    The first `real_count` channels are real, and the next `alike_count` channels share one factor
+    of X. The search begins at the balanced X, or at `near` if its bound is smaller. `near` has the
+    X and G of a similar matrix.
 
     If the bound gets below `target`, the search ends with X and G in the middle of the set that
     reaches the target. The method of centres on the linear matrix inequality
@@ -119,38 +123,39 @@ def tightened(
     minimises -log det F - log det X - sum log(LARGEST_G^2 - g^2) by Newton's method while the level
     falls. Source: S. Boyd, L. El Ghaoui, Linear Algebra and its Applications 188, 1993.
     """
-    t = balanced(M)
-    if alike:
-        t[real : real + alike] = t[real : real + alike].mean()
+    t = balancing_t(M)
+    alike = slice(real_count, real_count + alike_count)
+    if alike_count:
+        t[alike] = t[alike].mean()
     g = np.zeros(len(M))
     if near is not None and bound_at(M, near) <= bound_at(M, Scaling(t, g)):
         t, g = near.t, np.clip(near.g, -LARGEST_G / 2.0, LARGEST_G / 2.0)
     N = np.exp(t)[:, None] * M * np.exp(-t)
     free = np.arange(len(M))
-    free[real : real + alike] = real
-    free[real + alike :] -= max(alike - 1, 0)
-    centre = Centre(np.ones(len(M)), g[:real], np.eye(int(free[-1]) + 1)[free])
+    free[alike] = real_count
+    free[alike.stop :] -= max(alike_count - 1, 0)
+    centre = Centre(np.ones(len(M)), g[:real_count], np.eye(int(free[-1]) + 1)[free])
     goal = target**2
     least = centre.bound(N)
     level = max(1.1 * least, goal)
     for _ in range(LEVELS):
         is_low_enough = level <= goal
         for _ in range(CENTRING):
-            centre, decrement = centre.stepped(N, level)
+            centre, decrement = centre.newton_step(N, level)
             if decrement < CENTRED:
                 break
         least = min(centre.bound(N), level)
         if is_low_enough or level - least < STALLED * least:
             break
         level = max(least + FALL * (level - least), goal)
-    g = np.r_[centre.g / centre.d[:real], np.zeros(len(M) - real)]
-    return float(np.sqrt(max(least, 0.0))), Scaling(t + 0.5 * np.log(centre.d), g)
+    g = np.r_[centre.g / centre.X[:real_count], np.zeros(len(M) - real_count)]
+    return float(np.sqrt(max(least, 0.0))), Scaling(t + 0.5 * np.log(centre.X), g)
 
 
-def tightened_at(
+def least_bound_at(
     part: Channels, w: float, scaled: ComplexArray, near: Scaling | None
 ) -> tuple[float, Scaling]:
-    """Bound a scaled M(w) of a part of the loop, as `tightened` does for the target 1.
+    """Bound a scaled M(w) of a part of the loop, as `least_bound` does for the target 1.
 
     At first the search for X and G has only the channels of the means over a period. The channels
     of the second coefficients get the X that balances their rows and columns. If the bound with
@@ -160,7 +165,7 @@ def tightened_at(
     k = len(part.entries)
     rows = np.r_[0:k, part.uncertain : len(scaled)]
     few = None if near is None else Scaling(near.t[rows], near.g[rows])
-    _, means = tightened(scaled[np.ix_(rows, rows)], k, 1.0, part.late, few)
+    _, means = least_bound(scaled[np.ix_(rows, rows)], k, 1.0, part.late, few)
     second = slice(k, part.uncertain)
     sizes = np.abs(scaled) ** 2 + TINY
     row = sizes[second, rows] @ np.exp(-2.0 * means.t)
@@ -172,68 +177,71 @@ def tightened_at(
     bound = float(bound_at(scaled, scaling))
     if bound < 1.0 or w * part.period < MEANS_UP_TO:
         return bound, scaling
-    return tightened(scaled, part.uncertain, 1.0, part.late, near)
+    return least_bound(scaled, part.uncertain, 1.0, part.late, near)
 
 
 class Centre(NamedTuple):
-    """X and G of the linear matrix inequality, at a step of the search for its centre."""
+    """X and G of the linear matrix inequality, at a step of the search for its centre.
 
-    d: FloatArray  # diagonal of X, (p,)
-    g: FloatArray  # entries of G at the real channels, (real,)
-    free: FloatArray  # map from f free factors to d, (p, f); equal factors share a column
+    They are those of N, so X is 1 at the scalings t with which the search begins.
+    """
+
+    X: FloatArray  # diagonal, (p,)
+    g: FloatArray  # entries of G at the real channels, (real_count,)
+    free: FloatArray  # map from f free factors to X, (p, f); equal factors share a column
 
     def inequality(self, N: ComplexArray, level: float) -> ComplexArray:
         """Compute the matrix F of the inequality, (p, p)."""
         skew = 1j * np.r_[self.g, np.zeros(len(N) - len(self.g))][:, None] * N
-        right = (N.conj().T * self.d) @ N + skew + skew.conj().T
-        return np.asarray(level * np.diag(self.d) - right)
+        right = (N.conj().T * self.X) @ N + skew + skew.conj().T
+        return np.asarray(level * np.diag(self.X) - right)
 
     def bound(self, N: ComplexArray) -> float:
         """Return the least level at which the inequality F > 0 can hold for this X and G."""
-        root = np.sqrt(self.d)
+        root = np.sqrt(self.X)
         return -float(np.linalg.eigvalsh(self.inequality(N, 0.0) / root[:, None] / root)[0])
 
-    def stepped(self, N: ComplexArray, level: float) -> tuple["Centre", float]:
+    def newton_step(self, N: ComplexArray, level: float) -> tuple["Centre", float]:
         """Take a Newton step of X and G, and return the result and the decrement of the step.
 
         The decrement is 0 at the centre.
         """
-        real = len(self.g)
+        real_count = len(self.g)
         P = np.linalg.inv(self.inequality(N, level))
         R = N @ P
         Q = R @ N.conj().T
         room = LARGEST_G**2 - self.g**2
         slope = np.r_[
-            np.diag(Q).real - level * np.diag(P).real - 1.0 / self.d,
-            2.0 * (self.g / room - np.diag(R).imag[:real]),
+            np.diag(Q).real - level * np.diag(P).real - 1.0 / self.X,
+            2.0 * (self.g / room - np.diag(R).imag[:real_count]),
         ]
         sizes = np.abs(R) ** 2
-        dd = level**2 * np.abs(P) ** 2 - level * (sizes + sizes.T) + np.abs(Q) ** 2
-        dg = 2.0 * (level * P * R.T - R * Q.T).imag[:, :real]
-        gg = 2.0 * (Q * P.T - R * R.T).real[:real, :real]
-        dd[np.diag_indices(len(N))] += 1.0 / self.d**2
-        gg[np.diag_indices(real)] += 2.0 * (LARGEST_G**2 + self.g**2) / room**2
+        XX = level**2 * np.abs(P) ** 2 - level * (sizes + sizes.T) + np.abs(Q) ** 2
+        Xg = 2.0 * (level * P * R.T - R * Q.T).imag[:, :real_count]
+        gg = 2.0 * (Q * P.T - R * R.T).real[:real_count, :real_count]
+        XX[np.diag_indices(len(N))] += 1.0 / self.X**2
+        gg[np.diag_indices(real_count)] += 2.0 * (LARGEST_G**2 + self.g**2) / room**2
         free = self.free
-        curvature = np.block([[free.T @ dd @ free, free.T @ dg], [dg.T @ free, gg]])
+        curvature = np.block([[free.T @ XX @ free, free.T @ Xg], [Xg.T @ free, gg]])
         slope = np.r_[slope[: len(N)] @ free, slope[len(N) :]]
-        trace = np.r_[free.sum(axis=0), np.zeros(real)]
+        trace = np.r_[free.sum(axis=0), np.zeros(real_count)]
         down, along = np.linalg.solve(curvature, np.stack([slope, trace], axis=1)).T
         step = (trace @ down) / (trace @ along) * along - down
         decrement = float(np.sqrt(max(-slope @ step, 0.0)))
         for length in LENGTHS:
-            longer = self.moved(length * step)
-            if longer.inside(N, level):
+            longer = self.after(length * step)
+            if longer.is_inside(N, level):
                 return longer, decrement
         return self, 0.0  # no length helps: only rounding is left
 
-    def moved(self, step: FloatArray) -> "Centre":
-        """Move X and G by a step, (p + real,)."""
+    def after(self, step: FloatArray) -> "Centre":
+        """Move X and G by a step, (p + real_count,)."""
         f = self.free.shape[1]
-        return Centre(self.d + self.free @ step[:f], self.g + step[f:], self.free)
+        return Centre(self.X + self.free @ step[:f], self.g + step[f:], self.free)
 
-    def inside(self, N: ComplexArray, level: float) -> bool:
+    def is_inside(self, N: ComplexArray, level: float) -> bool:
         """Return whether the inequality and the limits of X and G hold, and all is finite."""
-        if not (self.d.min() > 0.0 and np.abs(self.g).max(initial=0.0) < LARGEST_G):
+        if not (self.X.min() > 0.0 and np.abs(self.g).max(initial=0.0) < LARGEST_G):
             return False
         F = self.inequality(N, level)
         try:

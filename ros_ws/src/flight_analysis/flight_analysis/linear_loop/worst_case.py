@@ -22,7 +22,7 @@ from flight_analysis.linear_loop.input_margins import (
     schur_form,
 )
 from flight_analysis.linear_loop.input_margins import SLOW as SLOW_TURN
-from flight_analysis.linear_loop.structured_value import balanced
+from flight_analysis.linear_loop.structured_value import balancing_t
 from flight_analysis.linear_loop.uncertain_loop import (
     Box,
     Channels,
@@ -386,7 +386,7 @@ def _slopes(
     # The slopes of the peaks of all inputs, by the singular vectors of the balanced matrix.
     together = []
     for centre, matrix, part in zip((0.0, 0.5), S_at[4 * m :], change[4 * m :], strict=True):
-        t = np.exp(balanced(matrix))[:, None]
+        t = np.exp(balancing_t(matrix))[:, None]
         left, _, right = np.linalg.svd(t * (matrix - centre * np.eye(m)) / t.T)
         turned = t * part / t.T
         together.append(-np.einsum("i,kij,j->k", left[:, 0].conj(), turned, right[0].conj()).real)
