@@ -20,17 +20,52 @@ from flight_core.parameters import ParameterError
 from flight_core.units import ANGLE, ANGULAR_RATE, GRAVITY, LENGTH, SPEED, quantity
 from flight_core.vectors import FloatArray
 
+
+class Kind(NamedTuple):
+    """The kind of a state."""
+
+    dimension: tuple[int, ...]
+    words: str  # the dimension in words, with units as examples
+
+
+class Expected(NamedTuple):
+    """An entry of A that follows from physics."""
+
+    sign: float
+    symbol: str  # size, a key of `_sizes`
+    fractions: tuple[float, float]  # range of accepted fractions of this size
+    may_be_left_out: bool = False  # whether 0 is accepted, too
+
+
+class Effect(NamedTuple):
+    """A motion to which a phrase refers."""
+
+    states: tuple[str, ...]  # possible names of the state that moves
+    sign: float
+
+
+class Control(NamedTuple):
+    """The plausible strength of a control, see `_strengths`."""
+
+    rate: str  # angular rate that it moves
+    flows: tuple[str, ...]  # possible names of the angle of the flow
+    least: float
+    most: float
+
+
 KINDS = {
-    **dict.fromkeys(("V", "u", "v", "w"), (SPEED, "a speed, as m/s, ft/s or kt")),
-    **dict.fromkeys(("alpha", "beta", "theta", "phi", "psi"), (ANGLE, "an angle, as rad or deg")),
-    **dict.fromkeys(("p", "q", "r"), (ANGULAR_RATE, "an angular rate, as rad/s or deg/s")),
-    **dict.fromkeys(("h", "altitude"), (LENGTH, "a height, as m or ft")),
+    **dict.fromkeys(("V", "u", "v", "w"), Kind(SPEED, "a speed, as m/s, ft/s or kt")),
+    **dict.fromkeys(
+        ("alpha", "beta", "theta", "phi", "psi"), Kind(ANGLE, "an angle, as rad or deg")
+    ),
+    **dict.fromkeys(("p", "q", "r"), Kind(ANGULAR_RATE, "an angular rate, as rad/s or deg/s")),
+    **dict.fromkeys(("h", "altitude"), Kind(LENGTH, "a height, as m or ft")),
 }
-"""Dimension of a state, by the names that textbooks use, and the dimension in words."""
+"""Kinds of the states, by the names that textbooks use."""
 OF_RATES = {
-    "theta": "q r phi",
-    "phi": "p q r theta phi",
-    "psi": "q r theta phi",
+    "theta": ("q", "r", "phi"),
+    "phi": ("p", "q", "r", "theta", "phi"),
+    "psi": ("q", "r", "theta", "phi"),
     "h": None,
     "altitude": None,
 }
@@ -46,45 +81,47 @@ LIFT = (0.3, 2.8)
 # Largest accepted entry, SI, in the row of theta, phi or psi at a state of KINDS that OF_RATES does
 # not list for this row.
 FOREIGN = 0.02
-EXPECTED: Mapping[tuple[str, str], tuple[float, str, tuple[float, float]]] = {
-    ("theta", "q"): (1.0, "", TURNED),
-    ("phi", "p"): (1.0, "", TURNED),
-    ("psi", "r"): (1.0, "", (0.95, 1.5)),
-    ("V", "theta"): (-1.0, "g", TURNED),
-    ("u", "theta"): (-1.0, "g", TURNED),
-    ("v", "phi"): (1.0, "g", TURNED),
-    ("beta", "phi"): (1.0, "g/V0", COUPLED),
-    ("w", "q"): (1.0, "V0", COUPLED),
-    ("v", "r"): (-1.0, "V0", COUPLED),
-    ("alpha", "q"): (1.0, "", COUPLED),
-    ("beta", "r"): (-1.0, "", COUPLED),
-    ("alpha", "V"): (-1.0, "2 g/V0^2", LIFT),
-    ("w", "V"): (-1.0, "2 g/V0", LIFT),
-    ("h", "theta"): (1.0, "V0", COUPLED),
-    ("h", "alpha"): (-1.0, "V0", COUPLED),
-    ("h", "w"): (-1.0, "", TURNED),
+EXPECTED: Mapping[tuple[str, str], Expected] = {
+    ("theta", "q"): Expected(1.0, "", TURNED),
+    ("phi", "p"): Expected(1.0, "", TURNED),
+    ("psi", "r"): Expected(1.0, "", (0.95, 1.5)),
+    ("V", "theta"): Expected(-1.0, "g", TURNED),
+    ("u", "theta"): Expected(-1.0, "g", TURNED),
+    ("v", "phi"): Expected(1.0, "g", TURNED),
+    ("beta", "phi"): Expected(1.0, "g/V0", COUPLED),
+    ("w", "q"): Expected(1.0, "V0", COUPLED),
+    ("v", "r"): Expected(-1.0, "V0", COUPLED),
+    ("alpha", "q"): Expected(1.0, "", COUPLED),
+    ("beta", "r"): Expected(-1.0, "", COUPLED),
+    ("alpha", "V"): Expected(-1.0, "2 g/V0^2", LIFT, may_be_left_out=True),
+    ("w", "V"): Expected(-1.0, "2 g/V0", LIFT, may_be_left_out=True),
+    ("h", "theta"): Expected(1.0, "V0", COUPLED),
+    ("h", "alpha"): Expected(-1.0, "V0", COUPLED),
+    ("h", "w"): Expected(-1.0, "", TURNED),
 }
-"""Expected entries of A in straight flight without bank, by row and column: sign, value in SI, and
-the range of accepted fractions of this value."""
+"""Expected entries of A in straight flight without bank, by row and column, SI. A file may leave
+out the change of lift with speed."""
 
+NOSE_UP, NOSE_DOWN = (Effect(("q",), sign) for sign in (1.0, -1.0))
+ROLL_RIGHT, ROLL_LEFT = (Effect(("p",), sign) for sign in (1.0, -1.0))
+NOSE_RIGHT, NOSE_LEFT = (Effect(("r",), sign) for sign in (1.0, -1.0))
+FASTER = Effect(("V", "u"), 1.0)
 EFFECTS = {
-    "nose down": ("q", -1.0), "pitch down": ("q", -1.0), "nose up": ("q", 1.0),
-    "pitch up": ("q", 1.0),
-    "roll right": ("p", 1.0), "right wing down": ("p", 1.0), "roll left": ("p", -1.0),
-    "left wing down": ("p", -1.0),
-    "nose right": ("r", 1.0), "yaw right": ("r", 1.0), "nose left": ("r", -1.0),
-    "yaw left": ("r", -1.0),
-    "more thrust": ("V u", 1.0), "more power": ("V u", 1.0),
+    "nose down": NOSE_DOWN, "pitch down": NOSE_DOWN, "nose up": NOSE_UP, "pitch up": NOSE_UP,
+    "roll right": ROLL_RIGHT, "right wing down": ROLL_RIGHT, "roll left": ROLL_LEFT,
+    "left wing down": ROLL_LEFT,
+    "nose right": NOSE_RIGHT, "yaw right": NOSE_RIGHT, "nose left": NOSE_LEFT,
+    "yaw left": NOSE_LEFT,
+    "more thrust": FASTER, "more power": FASTER,
 }  # fmt: skip
-"""Phrases that `positive` of an input may contain, with the state that the input then moves, and
-the sign of the motion."""
+"""Phrases that `positive` of an input may contain, and the motion that the input then causes."""
 
 CONTROLS = {
-    "elevator": ("q", "alpha w", 0.06, 12.0),
-    "aileron": ("p", "beta v", 0.015, 8.0),
-    "rudder": ("r", "beta v", 0.015, 8.0),
+    "elevator": Control("q", ("alpha", "w"), 0.06, 12.0),
+    "aileron": Control("p", ("beta", "v"), 0.015, 8.0),
+    "rudder": Control("r", ("beta", "v"), 0.015, 8.0),
 }
-"""For each input: the rate that it moves, the angle of the flow, and a range of strengths.
+"""Ranges of the strengths of the control surfaces.
 
 The strength is the effect divided by stiffness plus damping, see `_strengths`. Published aircraft
 have 0.27 to 3.3 for the elevator, 0.04 to 0.93 for the aileron, and 0.04 to 1.1 for the rudder. If
@@ -160,40 +197,44 @@ def _dimensions(model: LinearModel) -> Iterator[Finding]:
             yield Finding(
                 f"states.{name}", name, f"{book_name}: the name by which a state is checked"
             )
-        dimension, words = KINDS.get(name, (None, ""))
-        if dimension is not None and quantity(unit).dimension != dimension:
-            yield Finding(f"states.{name}", unit, words)
+        kind = KINDS.get(name)
+        if kind is not None and quantity(unit).dimension != kind.dimension:
+            yield Finding(f"states.{name}", unit, kind.words)
 
 
 def _entries(model: LinearModel) -> Iterator[Finding]:
     names = list(model.states)
-    V0 = model.speed
-    values = {
-        "": 1.0,
-        "g": GRAVITY,
-        "V0": V0,
-    }
-    if V0 > 0.0:
-        values |= {
-            "g/V0": GRAVITY / V0,
-            "2 g/V0": 2.0 * GRAVITY / V0,
-            "2 g/V0^2": 2.0 * GRAVITY / V0**2,
-        }
-    for (row, column), (sign, symbol, (least, most)) in EXPECTED.items():
+    sizes = _sizes(model.speed)
+    for (row, column), (sign, symbol, (least, most), may_be_left_out) in EXPECTED.items():
         row = "altitude" if row == "h" and "altitude" in names else row  # noqa: PLW2901 - the two names of a height
-        if row not in names or column not in names or (V0 == 0.0 and "V0" in symbol):
+        if row not in names or column not in names or symbol not in sizes:
             continue
         entry = float(model.matrix_a()[names.index(row), names.index(column)])
-        expected = sign * values[symbol]
-        # A multirotor hovers, so its entries have no V0.
-        left_out = entry == 0.0 and (
-            symbol.startswith("2 g") or (symbol == "V0" and not model.angular)
-        )
-        if least <= entry / expected <= most or left_out:
+        expected = sign * sizes[symbol]
+        # An aircraft without control surfaces is a multirotor. Its A holds for hover, where the
+        # terms with V0 vanish.
+        may_be_zero = may_be_left_out or (symbol == "V0" and not model.angular)
+        if least <= entry / expected <= most or (may_be_zero and entry == 0.0):
             continue
         about = f"{'-' if sign < 0.0 else ''}{symbol} = {expected:.4g}" if symbol else f"{sign:.0f}"
-        at_speed = f" at the speed {V0:.4g} m/s" if "V0" in symbol else ""
+        at_speed = f" at the speed {model.speed:.4g} m/s" if "V0" in symbol else ""
         yield Finding("A", f"{row}_dot = {entry:.4g} {column} in SI", about + at_speed)
+
+
+def _sizes(V0: float) -> dict[str, float]:
+    """Return the sizes of expected entries at the speed V0, m/s, SI, by symbol.
+
+    At the speed 0 there are none with V0.
+    """
+    constant = {"": 1.0, "g": GRAVITY}
+    if V0 == 0.0:
+        return constant
+    return constant | {
+        "V0": V0,
+        "g/V0": GRAVITY / V0,
+        "2 g/V0": 2.0 * GRAVITY / V0,
+        "2 g/V0^2": 2.0 * GRAVITY / V0**2,
+    }
 
 
 def _kinematic_rows(model: LinearModel) -> Iterator[Finding]:
@@ -202,11 +243,9 @@ def _kinematic_rows(model: LinearModel) -> Iterator[Finding]:
     for row in (name for name in OF_RATES if name in names):
         i = names.index(row)
         entering = OF_RATES[row]
-        for column in KINDS if entering is not None else ():
-            if column in names and column not in str(entering).split():
-                value = float(model.matrix_a()[i, names.index(column)])
-            else:
-                value = 0.0
+        foreign = () if entering is None else (name for name in KINDS if name not in entering)
+        for column in (name for name in foreign if name in names):
+            value = float(model.matrix_a()[i, names.index(column)])
             if abs(value) > FOREIGN:
                 yield Finding(
                     "A", f"{row}_dot = {value:.4g} {column} in SI", f"no {column} in {row}_dot"
@@ -235,10 +274,12 @@ def _effects(model: LinearModel) -> Iterator[Finding]:
         phrase = next((phrase for phrase in EFFECTS if phrase in text.lower()), None)
         if phrase is None:
             continue
-        rows, sign = EFFECTS[phrase]
-        row = next((row for row in rows.split() if row in names), None)
-        value = 0.0 if row is None else float(model.matrix_b()[names.index(row), k])
-        if row is not None and value * sign <= 0.0:
+        states, sign = EFFECTS[phrase]
+        row = next((state for state in states if state in names), None)
+        if row is None:
+            continue
+        value = float(model.matrix_b()[names.index(row), k])
+        if value * sign <= 0.0:
             yield Finding(
                 f"inputs.{name}",
                 f"{row}_dot = {value:.4g} {name} beside {phrase!r}",
@@ -254,9 +295,11 @@ def _strengths(model: LinearModel) -> Iterator[Finding]:
     """
     names = list(model.states)
     for k, name in enumerate(model.effects):
-        rate, flows, least, most = CONTROLS.get(name, ("", "", 0.0, 0.0))
-        flow = next((state for state in flows.split() if state in names), None)
-        if name not in model.angular or rate not in names or flow is None:
+        if name not in CONTROLS or name not in model.angular:
+            continue
+        rate, flows, least, most = CONTROLS[name]
+        flow = next((state for state in flows if state in names), None)
+        if rate not in names or flow is None:
             continue
         i = names.index(rate)
         j = names.index(flow)
