@@ -17,7 +17,23 @@ from rise_di_controller.law.control_law import ControlLaw, Measurements, without
 from rise_di_controller.law.saturation import Limits, saturate
 from rise_di_controller.params import ControllerConfig
 
-DOUBLETS = 8.0  # total length in widths: doublet 2, gap 1, opposite doublet 4, gap 1
+
+class Pulse(NamedTuple):
+    """A pulse of a doublet, in widths after the begin of the excitation of its input."""
+
+    first: float
+    last: float
+    sign: float
+
+
+# a doublet, a gap of a width, and the opposite doublet at half the frequency
+PULSES = (
+    Pulse(0.0, 1.0, 1.0),
+    Pulse(1.0, 2.0, -1.0),
+    Pulse(3.0, 5.0, -1.0),
+    Pulse(5.0, 7.0, 1.0),
+)
+DOUBLETS = PULSES[-1].last + 1.0  # total length in widths, with a gap at the end
 
 
 class ExcitationParams(NamedTuple):
@@ -44,7 +60,7 @@ def signal(elapsed: Array, params: ExcitationParams) -> Array:
 
     With tau = elapsed - begin, in units of the width w of an input:
 
-        +1 in [0, 1), -1 in [1, 2), -1 in [3, 5), +1 in [5, 7)  two opposite doublets
+        +1 in [0, 1), -1 in [1, 2), -1 in [3, 5), +1 in [5, 7)  two opposite doublets, PULSES
         sum_k part_k sin(2 pi harmonic_k (tau - 8) w / period + phase_k) in [8, 8 + period / w)
             a multisine
 
@@ -56,7 +72,7 @@ def signal(elapsed: Array, params: ExcitationParams) -> Array:
     tau = since / params.width
     zero = 0.0 * tau
     doublets = zero
-    for first, last, sign in ((0, 1, 1.0), (1, 2, -1.0), (3, 5, -1.0), (5, 7, 1.0)):
+    for first, last, sign in PULSES:
         doublets = xp.where((tau >= first) & (tau < last), sign + zero, doublets)
     turns = (since - DOUBLETS * params.width) / params.period
     waves = xp.sum(params.part * xp.sin(2.0 * np.pi * params.harmonic * turns + params.phase), 0)
