@@ -19,13 +19,14 @@ from control_laws.observer_design import (
     extended_state_observer,
 )
 from flight_core.vectors import FloatArray
+from rise_di_controller.extensions.model_sections import ObserverConfig
 from rise_di_controller.extensions.observer import ObserverParams
 from rise_di_controller.law.saturation import Limits
 
-# The defaults of `ObserverConfig`.
-PART = 0.6  # bound of u_o, as a fraction of the limits of u
-WITHIN = 0.1  # s, least time in which u_o goes from 0 to this bound
-FADE = 1.0  # s, time in which u_o fades in after an engagement
+# The defaults of an observer in a file.
+PART, WITHIN, FADE = (
+    float(ObserverConfig.model_fields[name].default) for name in ("part", "within", "fade")
+)
 
 
 def observer_params(
@@ -34,7 +35,7 @@ def observer_params(
     """Return the parameters of an observer that extends a law, from N designs.
 
     `law_params` has the parameters of the law. u_o stays within the fraction `part` of the limits
-    of u.
+    of u, needs WITHIN s or more from 0 to this bound, and fades in for FADE s after an engagement.
     """
 
     def aircraft_last(matrices: FloatArray) -> FloatArray:
