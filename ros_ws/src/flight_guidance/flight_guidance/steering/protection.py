@@ -17,10 +17,18 @@ FLOOR = 1.15
 FASTEST = 1.4
 """Ratio of the largest airspeed to the trim speed if the aircraft has no given limit."""
 
-SHORTFALL = 0.05
-"""Fraction of the trim speed by which V may differ from its command before climb or sink is
-limited. At twice this value the limit is zero."""
+BAND = 0.1
+"""Width of the band below the speed floor, as a fraction of the floor, in which the climb becomes a
+sink. The band above the largest speed is as wide, as a fraction of this speed. The floor of 1.15
+stall speeds therefore leaves 1.035 stall speeds at the lower end of its band."""
 
+LEAST_SHORTFALL = 0.05
+"""Least d of `climb_range`, as a fraction of the trim speed. If V differs from its command by more
+than d, climb or sink is limited. At 2 d the limit is zero."""
+
+BANDWIDTH = 0.4
+"""Largest bandwidth with which a limited climb or sink controls V, rad/s. It is a choice of this
+project."""
 
 LEAST_SPEED = 0.1
 """Least airspeed used as a divisor, m/s. No aircraft flies at it, and a flow from behind counts as
@@ -33,7 +41,7 @@ def forward(speed: Scalar) -> Scalar:
 
 
 def bank_limit(limit: float, stall_speed: float, speed: Scalar) -> Scalar:
-    """Compute the largest bank, rad: min(phi_max, acos((1.1 V_s / V)^2)).
+    """Compute the largest bank, rad: min(phi_max, acos((1.1 V_s / V)^2)), with STALL_MARGIN = 1.1.
 
     The load factor of a level turn is 1 / cos(phi). At a V of 1.1 V_s or less the bank is 0.
     """
@@ -55,20 +63,20 @@ def _share(value: Scalar) -> Scalar:
 def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scalar:
     """Compute the largest climb rate, m/s: ratio climb - (1 - ratio) sink.
 
-    ratio = clip((V - 0.9 V_floor) / (0.1 V_floor), 0, 1). So below the floor the pitch controls the
-    airspeed. At nine tenths of the floor the aircraft sinks at its largest rate.
+    ratio = clip((V - 0.9 V_floor) / (0.1 V_floor), 0, 1), with BAND = 0.1. So below the floor the
+    pitch controls the airspeed. At nine tenths of the floor the aircraft sinks at its largest rate.
     """
-    ratio = _share((speed - 0.9 * floor) / (0.1 * floor))
+    ratio = _share((speed - (1.0 - BAND) * floor) / (BAND * floor))
     return ratio * climb - (1.0 - ratio) * sink
 
 
 def sink_limit(climb: float, sink: float, speed: Scalar, largest: float) -> Scalar:
     """Compute the least climb rate, m/s: (1 - ratio) climb - ratio sink.
 
-    ratio = clip((1.1 V_max - V) / (0.1 V_max), 0, 1). This is the counterpart of `climb_limit`:
-    above the largest airspeed V_max, the pitch controls the airspeed.
+    ratio = clip((1.1 V_max - V) / (0.1 V_max), 0, 1), with BAND = 0.1. This is the counterpart of
+    `climb_limit`: above the largest airspeed V_max, the pitch controls the airspeed.
     """
-    ratio = _share((1.1 * largest - speed) / (0.1 * largest))
+    ratio = _share(((1.0 + BAND) * largest - speed) / (BAND * largest))
     return (1.0 - ratio) * climb - ratio * sink
 
 
@@ -82,10 +90,13 @@ def climb_range(
         least   = -sink clip(2 + shortfall / d, 0, 1),   d = max(0.05 V0, g sink / (0.4 V0))
         largest = climb clip(2 - shortfall / d, 0, 1),   d = max(0.05 V0, g climb / (0.4 V0))
 
-    `shortfall` is the error, and `speed` is V0, m/s. With V_dot = -g climb / V, the second term of
-    d limits the bandwidth with which the climb controls V to 0.4 rad/s.
+    `shortfall` is the error, and `speed` is V0, m/s. The factors are LEAST_SHORTFALL and BANDWIDTH:
+    with V_dot = -g climb / V, the second term of d limits the bandwidth with which the climb
+    controls V.
     """
-    margins = (max(SHORTFALL * speed, GRAVITY * rate / (0.4 * speed)) for rate in (sink, climb))
+    margins = (
+        max(LEAST_SHORTFALL * speed, GRAVITY * rate / (BANDWIDTH * speed)) for rate in (sink, climb)
+    )
     ratios = (sign * shortfall / d for sign, d in zip((-1.0, 1.0), margins, strict=True))
     least, largest = (_share(2.0 - ratio) for ratio in ratios)
     return -sink * least, climb * largest
