@@ -156,13 +156,13 @@ def full_names(remaps: Mapping[str, str]) -> dict[str, str]:
     return {topic: f"/{name.lstrip('/')}" for name, topic in remaps.items()}
 
 
-def stack_topic(channel: Channel, remaps: Mapping[str, str] = {}) -> str:
+def stack_topic(channel: Channel, stack_names: Mapping[str, str] = {}) -> str:
     """Return the full name that a topic of a log has in the stack.
 
-    `remaps` has such names by topic of the log. If it lacks the topic, the name is the one that the
-    log states for the topic before a remap, or else the topic itself.
+    `stack_names` has such names by topic of the log. If it lacks the topic, the name is the one
+    that the log states for the topic before a remap, or else the topic itself.
     """
-    return remaps.get(channel.topic) or channel.metadata.get(BEFORE_REMAP) or channel.topic
+    return stack_names.get(channel.topic) or channel.metadata.get(BEFORE_REMAP) or channel.topic
 
 
 class BagWriter:

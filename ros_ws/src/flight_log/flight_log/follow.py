@@ -62,15 +62,15 @@ class Follower:
 
     The run is the folder of a bag, or an MCAP file. The folder need not have a file yet.
     `rate_of(topic, type_name)` returns the highest rate of messages to read from a topic, Hz. It is
-    infinite for all messages, and 0 for no messages. `remaps` has names of the stack by topic of
-    the log.
+    infinite for all messages, and 0 for no messages. `stack_names` has names of the stack by
+    topic of the log.
     """
 
     def __init__(
         self,
         run: Path,
         rate_of: Callable[[str, str], float],
-        remaps: Mapping[str, str] = {},
+        stack_names: Mapping[str, str] = {},
     ) -> None:
         self.run = run
         self.complete = False  # whether the end of the data has been read
@@ -78,7 +78,7 @@ class Follower:
         # Definitions (ros2msg) of the message types that have occurred, by name.
         self.definitions: dict[str, str] = {}
         self._rate_of = rate_of
-        self._remaps = remaps
+        self._stack_names = stack_names
         self._read_files: list[Path] = []
         self._damaged = 0  # number of damaged records in the files that were read before
         self._pending: deque[Messages | Attachment | Metadata] = deque()
@@ -199,7 +199,7 @@ class Follower:
             elif isinstance(record, Channel) and record.id not in self._channels:
                 is_cdr = record.message_encoding == "cdr"
                 type_name = full_name(self._schemas.get(record.schema_id, "")) if is_cdr else ""
-                topic = stack_topic(record, self._remaps)
+                topic = stack_topic(record, self._stack_names)
                 rate = self._rate_of(topic, type_name)
                 self._channels[record.id] = _Channel(topic, type_name, rate)
 

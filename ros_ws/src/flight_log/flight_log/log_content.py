@@ -368,8 +368,8 @@ class TopicSamples:
 class LogContent:
     """The content of the files of a bag."""
 
-    def __init__(self, remaps: Mapping[str, str]) -> None:
-        self.remaps = remaps
+    def __init__(self, stack_names: Mapping[str, str]) -> None:
+        self.stack_names = stack_names
         self.topics: dict[str, TopicSamples] = {}  # by full topic name
         self.notes: list[str] = []
         self.scenario: StoredFile | None = None
@@ -489,13 +489,13 @@ class LogContent:
         return [*truncated, *self.notes, *losses, *silent, *simulated]
 
 
-def read_content(run: Path, remaps: Mapping[str, str]) -> LogContent:
+def read_content(run: Path, stack_names: Mapping[str, str]) -> LogContent:
     """Read every file of a bag.
 
-    `remaps` has full names of the stack by topic of the log. Raises ParameterError if the path has
-    no log, or if a file cannot be read.
+    `stack_names` has full names of the stack by topic of the log. Raises ParameterError if the path
+    has no log, or if a file cannot be read.
     """
-    log = LogContent(remaps)
+    log = LogContent(stack_names)
     files = log_files(run)
     if is_folder(run):
         for folder in dict.fromkeys(file.parent for file in files):
@@ -545,7 +545,7 @@ def _read_file(file: Path, log: LogContent) -> None:
                     expected = scan.message_counts.get(record.id, 0)
                     type_name = schemas.get(record.schema_id, "")
                     is_cdr = record.message_encoding == "cdr"
-                    topic = stack_topic(record, log.remaps)
+                    topic = stack_topic(record, log.stack_names)
                     log.kinds.setdefault(
                         topic, type_name if is_cdr else f"{type_name} in {record.message_encoding}"
                     )

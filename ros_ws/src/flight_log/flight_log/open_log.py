@@ -177,11 +177,12 @@ def _unpack(file: Path, plain: Path, kind: str) -> None:
         ) from None
 
 
-def log_topics(run: Path, remaps: Mapping[str, str] = {}) -> dict[str, str]:
+def log_topics(run: Path, stack_names: Mapping[str, str] = {}) -> dict[str, str]:
     """Return the types of the topics in a log, by the full name of the topic.
 
-    The type of messages that are not CDR ends with "in ENCODING". If the file has an index, only
-    the index is read. Raises ParameterError for a path without a log.
+    `stack_names` has names of the stack by topic of the log. The type of messages that are not CDR
+    ends with "in ENCODING". If the file has an index, only the index is read. Raises ParameterError
+    for a path without a log.
     """
     topics: dict[str, str] = {}
     for file in log_files(run):
@@ -194,7 +195,7 @@ def log_topics(run: Path, remaps: Mapping[str, str] = {}) -> dict[str, str]:
                     name = schemas.get(record.schema_id, "")
                     encoding = record.message_encoding
                     topics.setdefault(
-                        stack_topic(record, remaps),
+                        stack_topic(record, stack_names),
                         name if encoding == "cdr" else f"{name} in {encoding}",
                     )
                 elif topics and scan.message_counts:
