@@ -115,7 +115,7 @@ class Follower:
     @property
     def backlog(self) -> int:
         """Number of unread bytes of the file. Raises OSError, and ParameterError as `path` does."""
-        position = self._scan.position if isinstance(self._scan, Scan) else 0
+        position = 0 if self._scan is None else self._scan.position
         return 0 if self.path is None else self.path.stat().st_size - position
 
     def skip(self, topics: Container[str]) -> None:
@@ -136,7 +136,7 @@ class Follower:
             if status.st_size == self._size:
                 return
             identity = (status.st_dev, status.st_ino)
-            if not isinstance(self._scan, Scan) or self._scan.position == 0:
+            if self._scan is None or self._scan.position == 0:
                 if (kind := file_kind(path)) in PACKED:
                     yield from self._read_finished(path)
                     continue
