@@ -33,7 +33,7 @@ from flight_core.vectors import FloatArray
 from flight_design.identification.log_import import require_map_of_import
 from flight_design.identification.response_identification import MIN_RATIO
 from flight_design.identification.sign_check import recorded_response
-from flight_log.file_kinds import file_kind
+from flight_log.file_kinds import FileKind, file_kind
 from flight_log.tape_reader import read_run
 from flight_log.vehicle_log import read_vehicle_log
 from flight_view.flight import Flight as View
@@ -1110,7 +1110,7 @@ def test_tlog_behind_the_text_of_a_radio_is_one(flight: Flight, tmp_path: Path) 
     whole = read_vehicle_log(path)
     for text in (b"SiK 2.2 on HM-TRP\r\nBOARD: HM-TRP\r\n", b"\xfd\x00\xff", b"+++OK"):
         (tmp_path / "b.tlog").write_bytes(text + path.read_bytes())
-        assert file_kind(tmp_path / "b.tlog") == "a tlog of MAVLink"
+        assert file_kind(tmp_path / "b.tlog") is FileKind.TLOG
         log = read_vehicle_log(tmp_path / "b.tlog")
         assert_array_equal(log.tables["ATTITUDE"].stamp_ns, whole.tables["ATTITUDE"].stamp_ns)
 

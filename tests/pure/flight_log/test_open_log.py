@@ -141,10 +141,11 @@ def test_path_without_log_names_its_content(command: str, recorded: Path, tmp_pa
     assert refusal(command, str(tmp_path)).startswith(f"{tmp_path}: found no .mcap file, expected")
     (tmp_path / "a.ulg").write_bytes(FOREIGN_FILES["ULog"][0])
     assert "found no .mcap file, but a.ulg, a ULog of PX4" in refusal(command, str(tmp_path))
-    file = str(tmp_path / "a.ulg")
-    mend = f"; rise-di import {file} makes one of it"
-    # A repair takes an MCAP file alone.
-    assert (mend in refusal(command, file)) == (command != "repair")
+    (tmp_path / "b.log").write_text("FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n")
+    for file in (f"{tmp_path}/a.ulg", f"{tmp_path}/b.log"):
+        mend = f"; rise-di import {file} makes one of it"
+        # A repair takes an MCAP file alone.
+        assert (mend in refusal(command, file)) == (command != "repair")
     assert "found no .mcap file, but the folders of runs run" in refusal(
         command, str(recorded.parent)
     )

@@ -17,7 +17,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 
 from flight_core.rates import NANOSECONDS
 from flight_log.bag import stack_topic
-from flight_log.file_kinds import BEGUN, EMPTY, MCAP, PACKED, file_kind
+from flight_log.file_kinds import MCAP_BEGINS, PACKED, FileKind, file_kind
 from flight_log.named_vectors import STAMP, full_name, stamps_of
 from flight_log.open_log import ROSBAG2, open_scan, plain_batches
 from flight_log.rosbag2_metadata import bag_files
@@ -140,12 +140,12 @@ class Follower:
                 if (kind := file_kind(path)) in PACKED:
                     yield from self._read_finished(path)
                     continue
-                if kind not in {MCAP, EMPTY, BEGUN}:
-                    self.fault = f"{path} is {kind}: it does not begin as an MCAP file"
+                if kind not in MCAP_BEGINS:
+                    self.fault = f"{path} is {kind.value}: it does not begin as an MCAP file"
                     return
                 self._scan = Scan(path)
                 self._identity = identity
-                self.complete = self.complete and kind != MCAP
+                self.complete = self.complete and kind is not FileKind.MCAP
             if identity != self._identity or status.st_size < self._scan.position:
                 self.fault = f"{path} was replaced by another file, as rise-di report --repair does"
                 return

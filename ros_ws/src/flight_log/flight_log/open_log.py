@@ -22,14 +22,11 @@ from flight_core.files import is_file, is_folder
 from flight_core.parameters import ParameterError, require
 from flight_log.bag import stack_topic
 from flight_log.file_kinds import (
-    BEGUN,
-    EMPTY,
     IMPORTABLE,
-    LZ4,
-    MCAP,
+    MCAP_BEGINS,
     PACKED,
-    SQLITE,
     ZSTD_MAGIC,
+    FileKind,
     file_kind,
 )
 from flight_log.named_vectors import tables
@@ -60,9 +57,9 @@ def log_files(run: Path) -> list[Path]:
     """
     files = [*bag_files(run), *(bag_files(run / ROSBAG2) if is_folder(run / ROSBAG2) else ())]
     kinds = [file_kind(file) for file in files]
-    is_log = any(kind in (MCAP, *PACKED) for kind in kinds)
-    is_begun = is_folder(run) and bool({EMPTY, BEGUN} & {*kinds})
-    if SQLITE in kinds or not (is_log or is_begun):
+    is_log = any(kind is FileKind.MCAP or kind in PACKED for kind in kinds)
+    is_begun = is_folder(run) and not MCAP_BEGINS.isdisjoint(kinds)
+    if FileKind.SQLITE in kinds or not (is_log or is_begun):
         importable = is_file(run) and {*kinds} & IMPORTABLE
         mend = f"; rise-di import {run} makes one of it" if importable else ""
         found = _what_is_there(run, files, kinds)
@@ -70,12 +67,13 @@ def log_files(run: Path) -> list[Path]:
     return files
 
 
-def _what_is_there(run: Path, files: Sequence[Path], kinds: Sequence[str]) -> str:
+def _what_is_there(run: Path, files: Sequence[Path], kinds: Sequence[FileKind]) -> str:
     """Return the part of a sentence that says what a path without a log contains."""
     if files:
         if is_file(run):
-            return kinds[0]
-        return _some([f"{file.name}, {kind}" for file, kind in zip(files, kinds, strict=True)])
+            return kinds[0].value
+        named = zip(files, kinds, strict=True)
+        return _some([f"{file.name}, {kind.value}" for file, kind in named])
     if not is_folder(run):
         return "no such file or folder"
     content = sorted(run.iterdir())
@@ -85,7 +83,7 @@ def _what_is_there(run: Path, files: Sequence[Path], kinds: Sequence[str]) -> st
         if is_folder(folder) and folder.name != ROSBAG2 and _is_bag(folder)
     ]
     others = [
-        f"{path.name}, {file_kind(path)}"
+        f"{path.name}, {file_kind(path).value}"
         for path in content
         if is_file(path) and path.name != METADATA
     ]
@@ -144,17 +142,18 @@ def open_scan(file: Path) -> Iterator[Scan]:
     with TemporaryDirectory(prefix="rise-di-") as folder:
         plain = Path(folder) / plain_name(file.name)
         _unpack(file, plain, kind)
-        require(file_kind(plain) != SQLITE, str(file), SQLITE, A_RUN)
+        is_sqlite = file_kind(plain) is FileKind.SQLITE
+        require(not is_sqlite, str(file), FileKind.SQLITE.value, A_RUN)
         yield Scan(plain)
 
 
-def _unpack(file: Path, plain: Path, kind: str) -> None:
+def _unpack(file: Path, plain: Path, kind: FileKind) -> None:
     """Unpack the content of a packed file into the file `plain`.
 
     If the file is truncated, only the beginning is written. Raises ParameterError.
     """
     limit = shutil.disk_usage(plain.parent).free // 2
-    open_packed: Any = lz4.frame.open if kind == LZ4 else zstandard.open
+    open_packed: Any = lz4.frame.open if kind is FileKind.LZ4 else zstandard.open
     size = 0
     try:
         with open_packed(file, "rb") as source, plain.open("wb") as target:
@@ -244,6 +243,7 @@ def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
 def require_mcap(file: Path) -> None:
     """Refuse a file that is no MCAP file, and name its kind. An empty file passes."""
     kind = file_kind(file)
+    found = kind.value
     if kind in PACKED and file.name.endswith(PACKED_SUFFIXES):
-        kind += f", which {UNPACK[file.suffix]} unpacks"
-    require(kind in {MCAP, EMPTY, BEGUN}, str(file), kind, "an MCAP file")
+        found += f", which {UNPACK[file.suffix]} unpacks"
+    require(kind in MCAP_BEGINS, str(file), found, "an MCAP file")

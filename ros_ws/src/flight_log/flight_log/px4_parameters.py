@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from flight_core.files import read_file
 from flight_core.parameters import require
-from flight_log.file_kinds import file_kind
+from flight_log.file_kinds import FileKind, file_kind
 from flight_log.vehicle_log import read_foreign_log
 
 DEFAULTS: Mapping[str, float] = MappingProxyType(
@@ -97,7 +97,7 @@ def low_pass_delay(cutoff: float) -> float:
 def _read(path: Path) -> dict[str, float]:
     """Read the parameters of DEFAULTS that are in a file. Raises ParameterError."""
     require(path.is_file(), "px4", f"no file {path}", EXPECTED)
-    if "ULog" in file_kind(path):
+    if file_kind(path) is FileKind.ULOG:
         parameters = read_foreign_log(path).parameters
         values = {name: records[-1].value for name, records in parameters.items()}
     else:

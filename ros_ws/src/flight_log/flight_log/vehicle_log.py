@@ -15,7 +15,7 @@ from pathlib import Path
 from flight_core import isolated
 from flight_core.parameters import ParameterError, require
 from flight_log import vehicle_tables
-from flight_log.file_kinds import file_kind
+from flight_log.file_kinds import FileKind, file_kind
 from flight_log.vehicle_readers import READERS
 from flight_log.vehicle_tables import ANY, Choice, VehicleLog
 
@@ -30,27 +30,23 @@ def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
     """
     require(path.is_file(), str(path), "no such file", EXPECTED)
     kind = file_kind(path)
-    reader_of_kind = next(
-        (reader for word, reader in READERS.items() if f" {word} " in f"{kind} "), None
-    )
-    if reader_of_kind is None:
-        raise ParameterError(f"{path}: found {kind}, expected {EXPECTED}")
+    if kind not in READERS:
+        raise ParameterError(f"{path}: found {kind.value}, expected {EXPECTED}")
     only = "none: the log is of one autopilot"
-    require(choice.system is None or " tlog " in f"{kind} ", "--system", choice.system, only)
+    require(choice.system is None or kind is FileKind.TLOG, "--system", choice.system, only)
     try:
         with _silent():
-            log = reader_of_kind(path, kind, choice)
+            log = READERS[kind](path, kind, choice)
     except ParameterError:
         raise
     except Exception as error:
         # pymavlink raises a bare Exception for a damaged format.
         reason = str(error) or type(error).__name__
         raise ParameterError(
-            f"{path}: found {kind} that cannot be decoded ({reason}), expected {EXPECTED}"
+            f"{path}: found {kind.value} that cannot be decoded ({reason}), expected {EXPECTED}"
         ) from None
-    require(
-        bool(log.tables), str(path), f"{kind} without a message of y or u", "the log of a flight"
-    )
+    found = f"{kind.value} without a message of y or u"
+    require(bool(log.tables), str(path), found, "the log of a flight")
     return log
 
 
@@ -109,7 +105,7 @@ def read_foreign_log(path: Path, choice: Choice = ANY) -> VehicleLog:
         )
     except isolated.IsolatedCallError as error:
         raise ParameterError(
-            f"{path}: found {file_kind(path)} whose decoding {error}, expected {EXPECTED}"
+            f"{path}: found {file_kind(path).value} whose decoding {error}, expected {EXPECTED}"
         ) from None
 
 

@@ -23,7 +23,7 @@ from flight_core.installation import require_package
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
-from flight_log.file_kinds import HEAD_BYTES, tlog_start
+from flight_log.file_kinds import HEAD_BYTES, FileKind, tlog_start
 from flight_log.flown_instance import instances_of_flight, moving_numbers
 from flight_log.log_samples import (
     LARGEST,
@@ -86,7 +86,7 @@ FLAGS: Mapping[str, set[str]] = MappingProxyType(
 airspeed."""
 
 
-def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
+def _read_dataflash(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
     require_package("pymavlink")
     from flight_log.dataflash import Lines, Packets, stamp_us  # noqa: PLC0415 - an extra
 
@@ -95,7 +95,7 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
         name: fields.get(name, set()) | FLAGS.get(name, set()) for name in (*fields, *FLAGS)
     }
     firmwares: dict[str, None] = {}
-    reader = Lines(str(path)) if "text" in kind else Packets(str(path))
+    reader = Lines(str(path)) if kind is FileKind.DATAFLASH_TEXT else Packets(str(path))
     loss = reader.loss()
 
     def samples() -> Iterator[Sample]:
@@ -132,7 +132,7 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
     if (attitude := tables.get("ATT")) is not None:
         attitude.fields["Yaw"][:] = np.remainder(attitude.fields["Yaw"] + 180.0, 360.0) - 180.0
     return VehicleLog(
-        kind=kind + parts,
+        kind=kind.value + parts,
         tables=tables,
         parameters=parameters,
         format=DATAFLASH,
@@ -163,7 +163,7 @@ class Received:
     content: Any
 
 
-def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
+def _read_tlog(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
     require_package("pymavlink")
     from pymavlink import mavutil  # noqa: PLC0415 - an extra
 
@@ -198,7 +198,7 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
     vehicle = "" if mav_type < 0 else MAV_TYPES.get(mav_type, f"vehicle of MAV_TYPE {mav_type}")
     manual = PX4_MANUAL if autopilot == PX4 else 0
     return VehicleLog(
-        kind=kind + parts,
+        kind=kind.value + parts,
         tables=tables,
         parameters=parameters,
         format=TLOG,
@@ -298,7 +298,7 @@ def _dated(messages: list[Received]) -> Iterator[Sample]:
             yield (name, 0), stamp_ns, content
 
 
-def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
+def _read_ulog(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
     require_package("pyulog")
     from pyulog import ULog  # noqa: PLC0415 - an extra
     from pyulog.core import ULogException  # noqa: PLC0415
@@ -312,8 +312,7 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
         log = ULog(UlogContent(messages.content))
     except (ULogException, EOFError) as error:
         raise ValueError(error) from None
-    if log.file_corruption:
-        kind += ", damaged: what can be read"
+    damage = ", damaged: what can be read" if log.file_corruption else ""
     if log.dropouts:
         loss = _with_dropouts(loss, log.dropouts)
     instances: Instances = {}
@@ -344,7 +343,7 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
             attitude.stamp_ns, {**attitude.fields, **_angles(attitude)}
         )
     return VehicleLog(
-        kind=kind,
+        kind=kind.value + damage,
         tables=tables,
         parameters=parameters,
         format=None,
@@ -454,7 +453,12 @@ def _require_short(formats: Mapping[str, Any]) -> None:
             raise ValueError(f"a message {name} of {count(name)} values")
 
 
-READERS: Mapping[str, Callable[[Path, str, Choice], VehicleLog]] = MappingProxyType(
-    {"ULog": _read_ulog, "DataFlash": _read_dataflash, "tlog": _read_tlog}
+READERS: Mapping[FileKind, Callable[[Path, FileKind, Choice], VehicleLog]] = MappingProxyType(
+    {
+        FileKind.ULOG: _read_ulog,
+        FileKind.DATAFLASH: _read_dataflash,
+        FileKind.DATAFLASH_TEXT: _read_dataflash,
+        FileKind.TLOG: _read_tlog,
+    }
 )
-"""Readers by the word in the kind of a file."""
+"""Readers by the kind of a file."""
