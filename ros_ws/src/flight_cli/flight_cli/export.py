@@ -6,6 +6,7 @@ A proof shows that C and Python give the same bits.
 """
 
 from dataclasses import asdict, dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,20 @@ from flight_cli.words import (
     option,
     rare_option,
     scenario_names,
-    values_of,
 )
 from flight_log.tape_reader import read_run
 from rise_di.c_code import Exported
 from rise_di.c_code import export as write_export
 
 DIFFERS = 1
-PROOF = ("duration", "drawn", "seed", "runner")
+
+
+class Target(Enum):
+    """What the code is written as. The value is the argument `autopilot` of the library."""
+
+    C = None
+    PX4 = "px4"
+    ARDUPILOT = "ardupilot"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,22 +94,33 @@ class Export:
 
     def execute(self) -> None:
         """Write the code, prove it, and print the proof."""
-        folders = {None: self.folder, "px4": self.px4, "ardupilot": self.ardupilot}
-        folder_of = {autopilot: path for autopilot, path in folders.items() if path is not None}
-        if len(folder_of) != 1:
+        folders = {
+            Target.C: self.folder,
+            Target.PX4: self.px4,
+            Target.ARDUPILOT: self.ardupilot,
+        }
+        given = [(target, folder) for target, folder in folders.items() if folder is not None]
+        if len(given) != 1:
             raise typer.BadParameter("expected --c FOLDER, --px4 FOLDER or --ardupilot FOLDER")
-        ((autopilot, target),) = folder_of.items()
+        ((target, folder),) = given
         recorded_run = None if self.run is None else read_run(self.run)
         if recorded_run is not None:
             warn_of_lacks(recorded_run)
         with Console(stderr=True, quiet=self.as_json).status("flying and comparing"):
             exported = write_export(
                 self.scenario,
-                target,
-                **values_of(self, *PROOF, "float32", "samples", "rate", "fmu"),
+                folder,
                 run=recorded_run,
+                float32=self.float32,
+                duration=self.duration,
+                drawn=self.drawn,
+                seed=self.seed,
                 compiler=self.compiler or (),
-                autopilot=autopilot,
+                runner=self.runner,
+                fmu=self.fmu,
+                autopilot=target.value,
+                samples=self.samples,
+                rate=self.rate,
                 proof=not self.without_proof,
             )
         if self.as_json:
