@@ -41,12 +41,12 @@ class Cycle(NamedTuple):
 
     @property
     def f_dot(self) -> FloatArray:
-        """Compute BOUND sat(SLOPE e_dot / BOUND), shape (N,)."""
+        """The derivative of f: BOUND sat(SLOPE e_dot / BOUND), shape (N,)."""
         return np.clip(SLOPE * self.e_dot, -BOUND, BOUND)
 
     @property
     def gamma_2(self) -> float:
-        """Compute the smallest gamma_2 of (40) on this flight, 1/s.
+        """The smallest gamma_2 of (40) on this flight, 1/s.
 
         It is the ratio of the integrals of abs(e_dot) and abs(e).
         """
@@ -54,7 +54,7 @@ class Cycle(NamedTuple):
 
     @property
     def multipliers(self) -> FloatArray:
-        """Compute by which two factors a small deviation d of e grows over half a period, (2,).
+        """The two factors by which a small deviation d of e grows over half a period, (2,).
 
         The deviation does not change f, which is a function of time. Between the crossings of e = 0
         it obeys d_ddot + K d_dot + K LAMBDA d = 0. At a crossing d_dot jumps by -2 beta d /

@@ -71,7 +71,7 @@ class Figure(NamedTuple):
 
     @property
     def missed(self) -> bool:
-        """Return whether the value is beyond the limit."""
+        """Whether the value is beyond the limit."""
         return self.value > self.limit
 
 

@@ -48,7 +48,7 @@ class Cell(NamedTuple):
 
     @property
     def figures(self) -> Iterator[evidence.Row]:
-        """Return the rows of evidence."""
+        """The rows of evidence."""
         for law, value in self.values.items():
             yield evidence.row(f"{law}: {self.name}", round(value, 2), self.unit)
 

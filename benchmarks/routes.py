@@ -68,7 +68,7 @@ class Row(NamedTuple):
 
     @property
     def figure(self) -> evidence.Row:
-        """Return the row of evidence: the error of a flown route, or the words of the result.
+        """The row of evidence: the error of a flown route, or the words of the result.
 
         A refusal has no goal. The words of a missed or a lost flight do not meet the goal.
         """

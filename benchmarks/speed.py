@@ -178,12 +178,12 @@ class Driven:
 
     @property
     def round_trips(self) -> list[int]:
-        """Return the times from y sent to u received, ns."""
+        """The times from y sent to u received, ns."""
         return [at - stamp for stamp, at in self.received.items()]
 
     @property
     def answers(self) -> list[float]:
-        """Return the times from the beginning of the tick to u received, ns."""
+        """The times from the beginning of the tick to u received, ns."""
         return [
             at - stamp - 1e9 * self.age[stamp]
             for stamp, at in self.received.items()
@@ -192,7 +192,7 @@ class Driven:
 
     @property
     def cpu_each(self) -> float:
-        """Return the processor time of the process for each answer, us."""
+        """The processor time of the process for each answer, us."""
         return 1e-3 * self.cpu_ns / max(len(self.received), 1)
 
 

@@ -26,7 +26,7 @@ class NodeSpec(NamedTuple):
 
     @property
     def module(self) -> str:
-        """Return the Python module behind the executable."""
+        """The Python module behind the executable."""
         return f"{self.package}.main"
 
 
@@ -76,7 +76,7 @@ class Autopilot(NamedTuple):
 
     @property
     def topics(self) -> list[str]:
-        """Return the topics to record: those of the map, and those of the bridge."""
+        """The topics to record: those of the map, and those of the bridge."""
         return [*self.channel_map.recorded_topics, *topics.recorded_with("bridge")]
 
 

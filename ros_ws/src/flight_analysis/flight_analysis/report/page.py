@@ -86,7 +86,7 @@ class Tile:
 
     @property
     def is_within(self) -> bool:
-        """Return whether the error is within the allowed one."""
+        """Whether the error is within the allowed one."""
         return self.part <= 1.0
 
     @property
@@ -248,17 +248,17 @@ class Page(NamedTuple):
 
     @property
     def has_figures(self) -> bool:
-        """Return whether the page has a figure."""
+        """Whether the page has a figure."""
         return any(isinstance(block, Section) for block in self.shown)
 
     @property
     def has_times(self) -> bool:
-        """Return whether the page has figures over time, which are zoomed together."""
+        """Whether the page has figures over time, which are zoomed together."""
         return any(isinstance(block, Section) and block.over_time for block in self.shown)
 
     @property
     def has_angles(self) -> bool:
-        """Return whether the page can show its angles both in deg and in rad."""
+        """Whether the page can show its angles both in deg and in rad."""
         groups = [
             group for block in self.blocks if isinstance(block, Figures) for group in block.groups
         ]

@@ -87,7 +87,7 @@ class SampleStore:
 
     @property
     def packed(self) -> dict[str, str]:
-        """Return the arrays of a page, by name."""
+        """The arrays of a page, by name."""
         return {name: packed.result() for name, packed in self._packed.items()}
 
     def instants(self, stamp_ns: NDArray[np.int64], start_ns: int, *, steps: bool) -> Instants:
@@ -185,7 +185,7 @@ class PlotContext(NamedTuple):
 
     @property
     def is_comparison(self) -> bool:
-        """Return whether the figures have several flights."""
+        """Whether the figures have several flights."""
         return len(self.runs) > 1
 
 

@@ -62,13 +62,13 @@ class Flight:
 
     @property
     def has_sim_time(self) -> bool:
-        """Return whether SetParameter of the scope gives all nodes the time of /clock."""
+        """Whether SetParameter of the scope gives all nodes the time of /clock."""
         values = dict(each for each in self._given_parameters() if isinstance(each, tuple))
         return values.get(SIM_TIME) is True
 
     @property
     def is_by_clock(self) -> bool:
-        """Return whether the argument `use_sim_time` or SetParameter asks for /clock."""
+        """Whether the argument `use_sim_time` or SetParameter asks for /clock."""
         return self.argument(SIM_TIME) == "true" or self.has_sim_time
 
     def given_to_nodes(self) -> list[str]:
@@ -92,7 +92,7 @@ class Flight:
 
     @property
     def is_over(self) -> bool:
-        """Return whether the flight or the launch has ended."""
+        """Whether the flight or the launch has ended."""
         return self._is_stopped or bool(self.context.is_shutdown)
 
     def argument(self, name: str) -> str:
