@@ -41,7 +41,7 @@ from aircraft_sim.atmosphere.turbulence import MODERATE
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.report.run_folder import write_report
+from flight_analysis.report.run_report import rewrite_report
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.tape import Tape
 from flight_log.bag import LOST_MESSAGES
@@ -223,7 +223,7 @@ def figures(
     time alone, because in lockstep they wait for their inputs.
     """
     begin = time.monotonic()
-    write_report(run)
+    rewrite_report(run)
     write_time = time.monotonic() - begin
     run_read = read_run(run)
     tape = run_read.tape

@@ -25,7 +25,8 @@ from tests.browser import CHROMIUM, Browser
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.run_folder import REPORT, attachments_for, write_report
+from flight_analysis.report.run_folder import REPORT, attachments_for
+from flight_analysis.report.run_report import rewrite_report
 from flight_log.tape_writer import write_run
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
@@ -119,7 +120,7 @@ def report(path: Path, shows: str) -> None:
     """Draw the first screen of the report of the default flight."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
         run = flown(find_scenario(shows), Path(temporary), shows)
-        errors = write_report(run).flight.summary["errors"]
+        errors = rewrite_report(run).flight.summary["errors"]
         figures = json.dumps({name: metrics["whole"]["rms"] for name, metrics in errors.items()})
         with Browser(Path(temporary) / "profile", WIDTH, HEIGHT) as browser:
             browser.call("Emulation.setDeviceMetricsOverride", **SCREEN)

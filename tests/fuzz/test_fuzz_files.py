@@ -25,7 +25,8 @@ from tests.joint_states import JOINT_STATE, vector
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.report.run_folder import read_flight, write_report
+from flight_analysis.report.recorded_flight import read_flight
+from flight_analysis.report.run_report import rewrite_report
 from flight_log.tape_reader import read_run
 
 CORPUS = REPOSITORY / "tests" / "corpus"
@@ -321,4 +322,4 @@ def test_flight_of_any_values_has_summary_or_rejected(
 def test_flight_of_any_values_has_page_or_rejected(
     reported: Report, messages: list[tuple[str, str, bytes]]
 ) -> None:
-    reported(write_report, messages)
+    reported(rewrite_report, messages)

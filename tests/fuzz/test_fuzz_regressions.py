@@ -18,7 +18,8 @@ from tests.joint_states import JOINT_STATE, vector
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.page import script_json
-from flight_analysis.report.run_folder import extract_scenario, read_flight
+from flight_analysis.report.recorded_flight import read_flight
+from flight_analysis.report.run_report import extract_scenario
 from flight_core.files import parse_yaml
 from flight_core.parameters import ParameterError
 from flight_core.text import MAX_LENGTH

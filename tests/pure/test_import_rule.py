@@ -187,7 +187,7 @@ def test_node_loads_nothing_heavy_that_it_does_not_need(node: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["flight_analysis.report.run_folder", "flight_analysis.closed_loop.simulate"]
+    "module", ["flight_analysis.report.run_report", "flight_analysis.closed_loop.simulate"]
 )
 def test_flight_loads_no_library_of_report(module: str) -> None:
     assert not modules_loaded_by(f"import {module}") & {

@@ -29,7 +29,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import error_metrics, sample_times
 from flight_analysis.report.account import Account, account
 from flight_analysis.report.html import write_page
-from flight_analysis.report.run_folder import read_flight
+from flight_analysis.report.recorded_flight import read_flight
 from flight_analysis.report.sample_counts import TopicAccount
 from flight_analysis.report.shortfalls import judge
 from flight_analysis.report.summary import (

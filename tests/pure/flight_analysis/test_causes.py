@@ -25,7 +25,7 @@ from tests.recordings import EPOCH
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.account import account
-from flight_analysis.report.run_folder import read_flight
+from flight_analysis.report.recorded_flight import read_flight
 from flight_bringup.fly import fly_and_report
 from flight_core.outcome import UNKNOWN, End, Outcome, ended_early
 from flight_core.parameters import ParameterError

@@ -18,7 +18,7 @@ from tests.conftest import refusing
 from flight_analysis.closed_loop.replay import recorded_parameters, replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.report.run_folder import write_report
+from flight_analysis.report.run_report import rewrite_report
 from flight_bringup.fly import fly_and_report
 from flight_core.parameter_template import parameter_template
 from flight_log.tape_reader import stored_scenario
@@ -34,7 +34,7 @@ def test_section_of_controller_is_enough(name: str, osprey_gust: Scenario, tmp_p
     parameters = recorded_parameters(stored_scenario(alone))
     assert parameters == osprey_gust.controller
     assert replay(flown.mcap, parameters).equal()
-    result = write_report(flown.mcap.parent, output=tmp_path / "out", scenario=alone)
+    result = rewrite_report(flown.mcap.parent, output=tmp_path / "out", scenario=alone)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["scenario"] is None  # nothing is judged by a model of the aircraft
     expected = flown.flight.summary["errors"]

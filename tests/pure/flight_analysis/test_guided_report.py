@@ -21,7 +21,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report import guided_figures
 from flight_analysis.report.guided import guidance_summary, segments
 from flight_analysis.report.html import write_page
-from flight_analysis.report.run_folder import read_flight
+from flight_analysis.report.recorded_flight import read_flight
 from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray

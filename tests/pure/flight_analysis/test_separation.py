@@ -12,7 +12,7 @@ import pytest
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.report.run_folder import read_flight
+from flight_analysis.report.recorded_flight import read_flight
 from flight_analysis.report.separation import (
     PLACE,
     SEPARATION,

@@ -13,7 +13,7 @@ import pytest
 from tests.conftest import invoke
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report import run_folder
+from flight_analysis.report import run_report
 from flight_bringup.fleet import Fleet
 from flight_bringup.fly import fly_in_process
 from flight_cli import fly, watch
@@ -34,7 +34,7 @@ def flown(folder: Path, monkeypatch: pytest.MonkeyPatch, then: Then = lambda run
     def fly_and_fill(scenario: Scenario, run: Path, *rest: Any) -> Outcome:
         outcome = fly_in_process(scenario, run, *rest)
         then(run)
-        monkeypatch.setattr(run_folder, "write_file", full)
+        monkeypatch.setattr(run_report, "write_file", full)
         return outcome
 
     monkeypatch.setattr(fly, "fly_in_process", fly_and_fill)
@@ -76,7 +76,7 @@ def test_flight_that_ended_before_the_first_sample_has_its_status_beside_a_full_
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fly, "fly_in_process", lambda *_: never_flew("no y"))
-    monkeypatch.setattr(run_folder, "write_file", full)
+    monkeypatch.setattr(run_report, "write_file", full)
     result = fly_one_second(tmp_path)
     assert result.exit_code == STATUS_ENDED_EARLY
     assert "error: never flew: no y, before the first sample" in result.stderr

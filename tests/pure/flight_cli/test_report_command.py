@@ -14,8 +14,10 @@ from tests.conftest import refusing
 
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.report import run_folder
-from flight_analysis.report.run_folder import new_run, read_flight, write_report
+from flight_analysis.report import recorded_flight, run_report
+from flight_analysis.report.recorded_flight import read_flight
+from flight_analysis.report.run_folder import new_run
+from flight_analysis.report.run_report import write_report
 from flight_analysis.report.summary import empty_summary
 from flight_bringup.fly import fly_in_process
 from flight_cli.report import Report
@@ -111,7 +113,7 @@ def test_engagement_shorter_than_sample_leaves_figures_of_flight(
     log = read_run(run)
     instant = int(log.tape["y"].stamp_ns[5]) + 1  # between two samples
     monkeypatch.setattr(
-        run_folder,
+        recorded_flight,
         "read_run",
         lambda *_: log._replace(engagements=[Engagement(instant, instant + 1, "lost")]),
     )
@@ -169,7 +171,7 @@ def test_flight_that_hung_before_y_m_is_told_with_its_cause(
     )
     tape = replace(log.tape, signals={"y": log.tape["y"]}, outcome=UNKNOWN)
     monkeypatch.setattr(
-        run_folder, "read_run", lambda *_: log._replace(tape=tape, messages=messages)
+        run_report, "read_run", lambda *_: log._replace(tape=tape, messages=messages)
     )
     with pytest.raises(typer.Exit) as end:
         Report(runs=[run]).execute()

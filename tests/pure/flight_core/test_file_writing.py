@@ -16,7 +16,8 @@ from typing import Any
 import pytest
 from tests.conftest import refusing
 
-from flight_analysis.report.run_folder import REPORT, SUMMARY, write_report
+from flight_analysis.report.run_folder import REPORT, SUMMARY
+from flight_analysis.report.run_report import rewrite_report, write_report
 from flight_cli.report import Report
 from flight_core.files import replacing, write_file
 from flight_core.outcome import COMPLETED
@@ -138,7 +139,7 @@ def test_dying_report_loses_no_file(run: Path, monkeypatch: pytest.MonkeyPatch, 
         with monkeypatch.context() as patch:
             patch.setattr(name, call)
             try:
-                write_report(run)
+                rewrite_report(run)
             except ParameterError as error:
                 assert "No space left on device" in str(error)  # noqa: PT017 - the last report succeeds
             else:
@@ -161,7 +162,7 @@ def test_report_of_links_writes_nothing_elsewhere(run: Path, tmp_path: Path) -> 
     (run / "osprey_gust.yaml").symlink_to(outside / "dangling")
     (run / SUMMARY).symlink_to(precious)
     (run / REPORT).symlink_to(precious)
-    write_report(run)
+    rewrite_report(run)
     assert files_in(outside) == {"precious": b"precious"}
 
 
@@ -190,5 +191,5 @@ def test_scenario_parsed_before_any_file_written(
     log.write_bytes(content.replace(b"/**/controller:", b"/**/controllex:"))
     before = set(files_in(run))
     with pytest.raises(ParameterError):
-        write_report(run)
+        rewrite_report(run)
     assert set(files_in(run)) == before

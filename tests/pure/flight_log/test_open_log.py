@@ -29,7 +29,7 @@ from tests.recordings import EPOCH, MS
 
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report.run_folder import read_flight
+from flight_analysis.report.recorded_flight import read_flight
 from flight_core.outcome import STATUS_ENDED_EARLY
 from flight_core.parameters import ParameterError
 from flight_log.disk import try_lock

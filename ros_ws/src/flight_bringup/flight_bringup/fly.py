@@ -15,7 +15,8 @@ from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.scenario_library import as_flown, find_scenario, save_scenario
 from flight_analysis.closed_loop.simulate import fly
 from flight_analysis.report.display_units import display_units
-from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
+from flight_analysis.report.run_folder import attachments_for, new_run
+from flight_analysis.report.run_report import FlightResult, write_report
 from flight_bringup.graph import CONTROLLER, Autopilot
 from flight_bringup.interrupt import DeferredInterrupt, handle_signals
 from flight_bringup.processes import (

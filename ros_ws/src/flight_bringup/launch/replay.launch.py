@@ -20,7 +20,8 @@ from launch_ros.substitutions import ExecutableInPackage
 
 from autopilot_bridge.params import maps
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.report.run_folder import extract_scenario, new_run
+from flight_analysis.report.run_folder import new_run
+from flight_analysis.report.run_report import extract_scenario
 from flight_bringup.graph import (
     AIRCRAFT,
     BRIDGE,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from flight_analysis.report.run_folder import (
+from flight_analysis.report.run_report import (
     UnwrittenReportError,
     write_empty_summary,
     write_report,

@@ -15,10 +15,9 @@ from rich.console import Console
 from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops, opposite_signs
 from flight_analysis.closed_loop.scenario_library import find_scenario, with_route
-from flight_analysis.report.run_folder import (
+from flight_analysis.report.run_folder import new_run, remove_empty
+from flight_analysis.report.run_report import (
     UnwrittenReportError,
-    new_run,
-    remove_empty,
     write_empty_summary,
     write_report,
 )

@@ -17,7 +17,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.linear_loop.certificate import certificate
 from flight_analysis.report.display_units import display_units
 from flight_analysis.report.model_spans import errors_by_model
-from flight_analysis.report.run_folder import log_account
+from flight_analysis.report.recorded_flight import log_account
 from flight_analysis.report.summary_rows import stated_deviations
 from flight_analysis.report.tables import model_table
 from flight_cli.log_options import log_namespace, log_scenario, scenario_file, warn_of_lacks

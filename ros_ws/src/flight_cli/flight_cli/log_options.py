@@ -12,7 +12,7 @@ from typing import Any
 
 from flight_analysis.closed_loop.replay import is_controller_alone, recorded_parameters
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
-from flight_analysis.report.run_folder import log_account
+from flight_analysis.report.recorded_flight import log_account
 from flight_cli.words import option, scenario_names, warn
 from flight_core.files import find_file
 from flight_core.parameters import ParameterError, require

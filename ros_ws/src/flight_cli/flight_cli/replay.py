@@ -35,7 +35,7 @@ from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_analysis.metrics import error_metrics
 from flight_analysis.report.flown_models import flown_loops
 from flight_analysis.report.model_spans import parameter_spans
-from flight_analysis.report.run_folder import log_account
+from flight_analysis.report.recorded_flight import log_account
 from flight_analysis.report.sample_counts import WHOLE
 from flight_cli.log_options import REMAP, log_namespace, log_scenario, remaps_of, scenario_file
 from flight_cli.output import LATEST, new_table, print_json, print_table, stdout_for, write_text

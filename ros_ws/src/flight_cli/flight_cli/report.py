@@ -13,8 +13,8 @@ from rich.console import Console
 from flight_analysis.report import comparison
 from flight_analysis.report.export import signal_table
 from flight_analysis.report.paper import WIDTH
+from flight_analysis.report.recorded_flight import UnflownError
 from flight_analysis.report.report import report as write_report
-from flight_analysis.report.run_folder import UnflownError
 from flight_analysis.report.summary import RecordedFlight, labels, taken_over
 from flight_analysis.report.summary_rows import ERROR_COLUMNS
 from flight_cli.log_options import REMAP, log_namespace, log_scenario, remaps_of, scenario_file

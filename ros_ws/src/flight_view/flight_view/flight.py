@@ -22,7 +22,7 @@ from rosbags.serde.errors import SerdeError
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.metrics import known_entries, settling_bands
 from flight_analysis.report.display_units import display_unit
-from flight_analysis.report.run_folder import log_account
+from flight_analysis.report.recorded_flight import log_account
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS

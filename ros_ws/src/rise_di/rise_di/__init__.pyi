@@ -11,9 +11,9 @@ from flight_analysis.linear_loop.loop_margins import LoopMargins, margins
 from flight_analysis.metrics import error_metrics
 from flight_analysis.report.account import best_error_over as best_error
 from flight_analysis.report.data_frame import data_frame
+from flight_analysis.report.recorded_flight import read_accounted as read_run
 from flight_analysis.report.report import Report, report
-from flight_analysis.report.run_folder import FlightResult
-from flight_analysis.report.run_folder import read_accounted as read_run
+from flight_analysis.report.run_report import FlightResult
 from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_bringup.fly import fly_and_report as fly
 from flight_core.fields import Field

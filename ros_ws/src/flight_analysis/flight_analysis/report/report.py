@@ -14,7 +14,8 @@ from typing import NamedTuple
 from flight_analysis.report.export import write_csv, write_parquet, write_png
 from flight_analysis.report.html import write_page
 from flight_analysis.report.paper import WIDTH, write_figure
-from flight_analysis.report.run_folder import read_flight, write_report
+from flight_analysis.report.recorded_flight import read_flight
+from flight_analysis.report.run_report import rewrite_report
 from flight_analysis.report.summary import RecordedFlight
 from flight_core.arguments import FilePath, as_path
 from flight_core.files import writing
@@ -125,7 +126,7 @@ def report(
     read_one = partial(read_flight, namespace=namespace, scenario=scenario, remaps=remaps)
     if is_single:
         folder = None if output is None else as_path(output, "output", "the path of a folder")
-        result = write_report(
+        result = rewrite_report(
             folders[0], output=folder, namespace=namespace, scenario=scenario, remaps=remaps
         )
         page = result.report
