@@ -24,7 +24,7 @@ from aircraft_sim.uncertainty import as_yaml, with_entries
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.linear_loop.guarantee import Unstable, guarantee
+from flight_analysis.linear_loop.guarantee import Unstable, loop_guarantee
 from flight_analysis.linear_loop.loop_margins import (
     LinearLoop,
     scenario_loop,
@@ -116,26 +116,26 @@ def row(name: str, corners: int) -> list[str]:
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
     begin = time.process_time()
-    promise = guarantee(linear)
+    guarantee = loop_guarantee(linear)
     seconds = time.process_time() - begin
-    late = guarantee(linear, LATE)
+    late = loop_guarantee(linear, LATE)
     worst = worst_in_box(linear.nominal, linear.law, linear.loop, box).worst
-    first = promise.unstable
+    first = guarantee.unstable
     flies = scenario is not None and not scenario.aircraft.is_jsbsim and first is not None
     return [
         name,
         str(len(box.names)),
-        f"{100.0 * promise.stable:.1f}",
+        f"{100.0 * guarantee.stable:.1f}",
         _percent(first),
         "" if first is None else f"{first.frequency:.1f}",
-        "" if first is None else f"{100.0 * (first.deviation / promise.stable - 1.0):.1f}",
+        "" if first is None else f"{100.0 * (first.deviation / guarantee.stable - 1.0):.1f}",
         f"{100.0 * late.stable:.1f}",
         _percent(late.unstable),
-        f"{promise.disk_all:.3f}",
+        f"{guarantee.disk_all:.3f}",
         f"{float(worst.disk_all):.3f}",
         f"{seconds:.0f}",
         flight(scenario, first) if flies and scenario is not None and first is not None else "",
-        beyond(linear, promise.stable, corners) if corners else "",
+        beyond(linear, guarantee.stable, corners) if corners else "",
     ]
 
 

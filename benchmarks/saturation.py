@@ -45,24 +45,24 @@ def row(folder: Path, name: str, limited: str, claim: str) -> list[str]:
     for size in SIZES:
         linear = scenario_loop(scenario, scenario.controller, 1, size)
         begin = time.process_time()
-        promise = limit_guarantee(linear, limited, 1.0, CLAIMS[claim])
-        if promise is None:
+        guarantee = limit_guarantee(linear, limited, 1.0, CLAIMS[claim])
+        if guarantee is None:
             continue
         seconds = time.process_time() - begin
         path = folder / f"{name}_{limited}_{claim.split(maxsplit=1)[0]}.json"
-        path.write_text(limit_certificate(linear, promise, {}))
+        path.write_text(limit_certificate(linear, guarantee, {}))
         command = [sys.executable, str(CHECKER), str(path)]
         done = subprocess.run(  # noqa: S603 - ours
             command, capture_output=True, text=True, check=False
         )
         bounds = done.stdout.split()[2] if done.returncode == 0 else done.stderr.strip()
-        steps = sum(len(part["steps"]) for part in promise.proof)
+        steps = sum(len(part["steps"]) for part in guarantee.proof)
         return [
             name,
             limited,
             claim,
             f"{100.0 * size:g}",
-            str(len(promise.multiplier.taps)),
+            str(len(guarantee.multiplier.taps)),
             str(steps),
             f"{path.stat().st_size / 1e3:.0f}",
             f"{seconds:.0f}",

@@ -22,8 +22,8 @@ from tests.pure.flight_analysis.test_certificate import (
     CHECKER,
     Content,
     _checker,
+    guarantee_of,
     loop_of,
-    promise_of,
 )
 
 from aircraft_sim.airframes.airframe import load_airframe
@@ -45,7 +45,7 @@ def servo() -> Content:
     scenario = find_scenario("osprey_servo")
     linear = scenario_loop(scenario, scenario.controller, 1, 0.3)
     sources = certificate_sources(load_airframe("osprey"), scenario)
-    content: Content = json.loads(certificate(linear, promise_of("osprey_servo"), sources.texts))
+    content: Content = json.loads(certificate(linear, guarantee_of("osprey_servo"), sources.texts))
     return content
 
 
@@ -53,7 +53,7 @@ def servo() -> Content:
 def other() -> Content:
     """The certificate of another loop."""
     linear = loop_of("jsbsim_c172p")
-    content: Content = json.loads(certificate(linear, promise_of("jsbsim_c172p"), {}))
+    content: Content = json.loads(certificate(linear, guarantee_of("jsbsim_c172p"), {}))
     return content
 
 

@@ -27,7 +27,7 @@ from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop import guarantee as guarantee_module
 from flight_analysis.linear_loop.certificate import certificate, keep
-from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
+from flight_analysis.linear_loop.guarantee import Guarantee, loop_guarantee
 from flight_analysis.linear_loop.loop_margins import LinearLoop, scenario_loop
 from flight_analysis.linear_loop.uncertain_loop import plants_at
 from rise_di_controller.law.linear_loop import closed_loop
@@ -61,14 +61,14 @@ def loop_of(name: str) -> LinearLoop:
 
 
 @cache
-def promise_of(name: str) -> Guarantee:
-    return guarantee(loop_of(name))
+def guarantee_of(name: str) -> Guarantee:
+    return loop_guarantee(loop_of(name))
 
 
 @pytest.fixture(scope="module")
 def servo() -> Content:
     linear = loop_of("osprey_servo")
-    content: Content = json.loads(certificate(linear, promise_of("osprey_servo"), {}))
+    content: Content = json.loads(certificate(linear, guarantee_of("osprey_servo"), {}))
     return content
 
 
@@ -106,11 +106,11 @@ def test_checker_proves_a_guarantee(name: str, tmp_path: Path) -> None:
     checker refused it.
     """
     linear = loop_of(name)
-    promise = promise_of(name)
-    done = run(json.loads(certificate(linear, promise, {})), tmp_path)
+    guarantee = guarantee_of(name)
+    done = run(json.loads(certificate(linear, guarantee, {})), tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("PROVED")
-    within = np.floor(1e3 * promise.stable) / 10.0
+    within = np.floor(1e3 * guarantee.stable) / 10.0
     assert linear.box is not None
     assert f"{linear.box.names[-1]} (B " in done.stdout
     assert f") {within:g} %" in done.stdout
@@ -368,7 +368,7 @@ def test_export_puts_the_certificate_beside_the_code_of_its_constants(tmp_path: 
     code = tmp_path / "c"
     exported = rise_di.export("osprey_servo", code, proof=False)
     assert not any(path.name == "certificate.json" for path in exported.files)
-    keep(promise_of("osprey_servo"))
+    keep(guarantee_of("osprey_servo"))
     exported = rise_di.export("osprey_servo", code, proof=False)
     assert code / "certificate.json" in exported.files
     content = json.loads((code / "certificate.json").read_text())

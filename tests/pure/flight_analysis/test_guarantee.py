@@ -22,7 +22,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop import branch_and_bound
 from flight_analysis.linear_loop import guarantee as guarantee_module
 from flight_analysis.linear_loop.certificate import keep, kept_guarantee
-from flight_analysis.linear_loop.guarantee import Guarantee, guarantee, quick_guarantee
+from flight_analysis.linear_loop.guarantee import Guarantee, loop_guarantee, quick_guarantee
 from flight_analysis.linear_loop.input_margins import input_margins
 from flight_analysis.linear_loop.loop_margins import LinearLoop, box_of, margins, scenario_loop
 from flight_analysis.linear_loop.structured_value import (
@@ -64,8 +64,8 @@ def boxed(name: str, uncertainty: float = 0.3) -> LinearLoop:
 
 
 @cache
-def servo_promise() -> Guarantee:
-    return guarantee(boxed("osprey_servo"))
+def servo_guarantee() -> Guarantee:
+    return loop_guarantee(boxed("osprey_servo"))
 
 
 @pytest.fixture
@@ -103,13 +103,13 @@ def integrator(k: float, part: float) -> LinearLoop:
 @pytest.mark.parametrize("k", [120.0, 150.0, 180.0])
 def test_gain_of_integrator_may_rise_to_two_over_k_period(k: float) -> None:
     """y+ = (1 - k T (1 + d)) y is unstable from d = 2 / (k T) - 1 on."""
-    promise = guarantee(integrator(k, 0.1))
+    guarantee = loop_guarantee(integrator(k, 0.1))
     limit = 2.0 / (k * PERIOD) - 1.0
     # at most above by the 1e-6 of the limit of stability; below by the level's room of 0.4 %
-    assert 0.99 * limit < promise.stable < limit * (1.0 + 1e-5)
-    assert promise.unstable is not None
-    assert promise.unstable.deviation == approx(limit, rel=1e-2)
-    assert promise.unstable.frequency == approx(np.pi / PERIOD)
+    assert 0.99 * limit < guarantee.stable < limit * (1.0 + 1e-5)
+    assert guarantee.unstable is not None
+    assert guarantee.unstable.deviation == approx(limit, rel=1e-2)
+    assert guarantee.unstable.frequency == approx(np.pi / PERIOD)
 
 
 @pytest.mark.parametrize("most, proved", [(1e3, 10.0 / 3.0), (2.0, 2.0)])
@@ -128,32 +128,32 @@ def test_quick_proof_of_an_unstable_loop_is_none() -> None:
 def test_each_step_of_the_work_is_told() -> None:
     """A size that is proved was tried, so it was told."""
     told: list[str] = []
-    promise = guarantee(integrator(150.0, 0.3), report=told.append)
+    guarantee = loop_guarantee(integrator(150.0, 0.3), report=told.append)
     sizes = [float(text.split()[-2]) for text in told if text.startswith("proving every aircraft")]
-    assert any(abs(size - 100.0 * promise.stable) <= 0.051 for size in sizes)
+    assert any(abs(size - 100.0 * guarantee.stable) <= 0.051 for size in sizes)
     assert told[0] == "searching for an unstable aircraft"
     assert told[-1].startswith("proving the disk margin of ")
 
 
 def test_disk_margin_of_integrator_is_that_of_its_worst_gain() -> None:
     """S - 1/2 at pi / T is 1 / (1 - k T (1 + d) / 2) - 1/2, the largest for the largest gain."""
-    promise = guarantee(integrator(120.0, 0.2))
+    guarantee = loop_guarantee(integrator(120.0, 0.2))
     half = 120.0 * PERIOD * 1.2 / 2.0
     disk = 1.0 / (1.0 / (1.0 - half) - 0.5)
-    assert 0.97 * disk < promise.disk["u"] < disk * (1.0 + 1e-5)
-    assert promise.disk_all == approx(promise.disk["u"], rel=1e-9)
+    assert 0.97 * disk < guarantee.disk["u"] < disk * (1.0 + 1e-5)
+    assert guarantee.disk_all == approx(guarantee.disk["u"], rel=1e-9)
 
 
 def test_unstable_nominal_loop_has_no_guarantee() -> None:
-    promise = guarantee(integrator(250.0, 0.1))
-    assert not promise.holds
-    assert promise.stable == 0.0
-    assert not any(promise.disk.values())
+    guarantee = loop_guarantee(integrator(250.0, 0.1))
+    assert not guarantee.holds
+    assert guarantee.stable == 0.0
+    assert not any(guarantee.disk.values())
 
 
 def test_loop_without_box_is_refused() -> None:
     with refusing("uncertainty: found 0"):
-        guarantee(integrator(100.0, 0.1)._replace(box=None))
+        loop_guarantee(integrator(100.0, 0.1)._replace(box=None))
 
 
 def test_bound_of_a_real_product_is_its_closed_form() -> None:
@@ -253,20 +253,20 @@ def test_channels_of_a_delay_hold_each_constant_delay(late: float) -> None:
 def test_guarantee_with_a_late_input_is_below_each_constant_delay() -> None:
     """The loop of an integrator, u = -k y: no gain of the box and no delay within is unstable."""
     linear = integrator(60.0, 0.1)
-    in_time = guarantee(linear)
-    promise = guarantee(linear, 0.01)
-    assert promise.holds
-    assert promise.stable < in_time.stable
-    assert promise.disk_all < in_time.disk_all
-    assert promise.unstable is not None
+    in_time = loop_guarantee(linear)
+    guarantee = loop_guarantee(linear, 0.01)
+    assert guarantee.holds
+    assert guarantee.stable < in_time.stable
+    assert guarantee.disk_all < in_time.disk_all
+    assert guarantee.unstable is not None
     # z^2 - z + k T (1 + d) of a period of delay: 0.6 (1 + d) = 1
-    assert promise.unstable.deviation == approx(1.0 / 0.6 - 1.0, rel=1e-2)
-    d = np.linspace(-1.0, 1.0, 9)[:, None] * promise.stable / 0.1
+    assert guarantee.unstable.deviation == approx(1.0 / 0.6 - 1.0, rel=1e-2)
+    d = np.linspace(-1.0, 1.0, 9)[:, None] * guarantee.stable / 0.1
     for delay in np.linspace(0.0, 0.01, 9):
         loop = linear.loop._replace(delay=linear.loop.delay + delay)
         assert (radii(linear._replace(loop=loop), d) <= LIMIT).all()
     # the D of what changes in time is one for all frequencies, which leaves a quarter
-    assert promise.stable > promise.unstable.deviation / 1.35
+    assert guarantee.stable > guarantee.unstable.deviation / 1.35
 
 
 def oscillator(law: tuple[float, float]) -> LinearLoop:
@@ -307,9 +307,9 @@ def test_guarantee_with_a_late_input_holds_for_a_delay_that_changes() -> None:
     sequence = (this, before, before, this, before, before, before)
     growth = np.abs(np.linalg.eigvals(np.linalg.multi_dot(sequence))).max()
     assert growth > 1.05
-    assert guarantee(linear, PERIOD).stable == 0.0
+    assert loop_guarantee(linear, PERIOD).stable == 0.0
     # a fifth of the gains leaves the box stable
-    assert guarantee(oscillator((0.1089, 0.000062)), PERIOD).holds
+    assert loop_guarantee(oscillator((0.1089, 0.000062)), PERIOD).holds
 
 
 def test_bound_from_zero_holds_where_a_delay_has_no_effect() -> None:
@@ -319,27 +319,27 @@ def test_bound_from_zero_holds_where_a_delay_has_no_effect() -> None:
     tick 73.6 % is found by a search over delays of 0 or 10 ms.
     """
     c172p = find_scenario("jsbsim_c172p")
-    promise = guarantee(scenario_loop(c172p, c172p.controller, 1, 0.3), 0.01)
-    assert promise.unstable is not None
-    assert promise.unstable.deviation / 1.4 < promise.stable < promise.unstable.deviation
+    guarantee = loop_guarantee(scenario_loop(c172p, c172p.controller, 1, 0.3), 0.01)
+    assert guarantee.unstable is not None
+    assert guarantee.unstable.deviation / 1.4 < guarantee.stable < guarantee.unstable.deviation
 
 
 def test_no_corner_is_unstable_or_has_less_than_guaranteed() -> None:
     linear = boxed("osprey_servo")
     assert linear.box is not None
-    promise = servo_promise()
+    guarantee = servo_guarantee()
     # SLICOT's bound of the whole box is 0.732; an unstable aircraft exists at 0.744
-    assert 0.732 < promise.stable < 0.745
-    assert promise.unstable is not None
+    assert 0.732 < guarantee.stable < 0.745
+    assert guarantee.unstable is not None
     # a slow divergence at 0 rad/s, which a search by abs(z) alone misses
-    assert promise.stable < promise.unstable.deviation < 1.02 * promise.stable
+    assert guarantee.stable < guarantee.unstable.deviation < 1.02 * guarantee.stable
     corners = np.sign(np.random.default_rng(3).standard_normal((2000, len(linear.box.names))))
-    assert (radii(linear, corners * promise.stable / 0.3) <= LIMIT).all()
+    assert (radii(linear, corners * guarantee.stable / 0.3) <= LIMIT).all()
     margins = input_margins(
         plants_at(linear.nominal, linear.box, corners[:40]), linear.law, linear.loop
     )
-    assert (margins.disk >= list(promise.disk.values())).all()
-    assert (margins.disk_all >= promise.disk_all).all()
+    assert (margins.disk >= list(guarantee.disk.values())).all()
+    assert (margins.disk_all >= guarantee.disk_all).all()
 
 
 @pytest.mark.usefixtures("coarse")
@@ -349,22 +349,22 @@ def test_first_unstable_aircraft_is_the_nearest_that_a_search_found() -> None:
     The search that walks by slopes alone had ended at 76.6 %.
     """
     linear = boxed("osprey_observer")
-    promise = guarantee(linear)
-    assert promise.unstable is not None
-    assert promise.unstable.deviation < 0.748
+    guarantee = loop_guarantee(linear)
+    assert guarantee.unstable is not None
+    assert guarantee.unstable.deviation < 0.748
     assert linear.box is not None
-    d = np.array([promise.unstable.entries.get(name, 0.0) for name in linear.box.names])
+    d = np.array([guarantee.unstable.entries.get(name, 0.0) for name in linear.box.names])
     assert radii(linear, (d / linear.box.part)[None])[0] > LIMIT
 
 
 def test_guarantee_says_what_is_exact_in_every_aircraft() -> None:
     """The rows of the angles and gravity are exact, and no more is said than is proved."""
-    text = guarantee_text(servo_promise())
+    text = guarantee_text(servo_guarantee())
     assert "the linear loop is stable for every aircraft within 74." in text[0]
     kinematic = "A[V,theta], A[theta,q], A[beta,phi], A[phi,p], A[phi,r]"
     assert text[1].endswith(f"{kinematic}, lags, delay, period, each entry that is 0")
     assert "no mode grows by more than 1e-6 a tick" in text[1]
-    late = guarantee_text(guarantee(integrator(60.0, 0.1), 0.01))
+    late = guarantee_text(loop_guarantee(integrator(60.0, 0.1), 0.01))
     assert "(no certificate: up to what two coefficients of a period leave out)" in late[0]
 
 
@@ -415,15 +415,15 @@ def test_search_over_two_entries_is_brute_force() -> None:
 def test_report_shows_the_guarantee_that_was_computed_for_its_loop(tmp_path: Path) -> None:
     linear = integrator(150.0, 0.1)
     assert kept_guarantee(linear) is None
-    promise = guarantee(linear)
-    keep(promise._replace(late=0.01))  # a report speaks of u in time
+    guarantee = loop_guarantee(linear)
+    keep(guarantee._replace(late=0.01))  # a report speaks of u in time
     assert kept_guarantee(linear) is None
-    keep(promise)
+    keep(guarantee)
     again = kept_guarantee(linear)
     assert again is not None
-    assert guarantee_text(again) == guarantee_text(promise)
+    assert guarantee_text(again) == guarantee_text(guarantee)
     write_loop_page(tmp_path / "loop.html", "loop", linear)
-    assert guarantee_text(promise)[0] in (tmp_path / "loop.html").read_text()
+    assert guarantee_text(guarantee)[0] in (tmp_path / "loop.html").read_text()
     assert kept_guarantee(integrator(151.0, 0.1)) is None  # another gain
     box = linear.box
     assert box is not None
@@ -450,9 +450,9 @@ def test_command_fails_below_uncertainty_and_writes_unstable_aircraft(tmp_path: 
     assert not margins(find_scenario(str(folder / "farther_scenario.yaml"))).nominal.stable
     result = invoke(*arguments, "--json")
     assert result.exit_code == 1, result.output
-    promise = json.loads(result.stdout)["guarantee"]
-    assert not promise["holds"]
-    assert promise["stable"] < 0.75 > promise["unstable"]["deviation"]
+    guarantee = json.loads(result.stdout)["guarantee"]
+    assert not guarantee["holds"]
+    assert guarantee["stable"] < 0.75 > guarantee["unstable"]["deviation"]
     assert not margins(find_scenario(str(folder / "scenario.yaml"))).nominal.stable
 
 
@@ -463,9 +463,9 @@ def test_frequency_without_proof_leaves_no_guarantee_and_no_error(
     monkeypatch.setattr(branch_and_bound, "interval_at", lambda *_: None)
     monkeypatch.setattr(guarantee_module, "BOXES", 20)
     monkeypatch.setattr(guarantee_module, "FEWER_BOXES", 20)
-    promise = guarantee(integrator(150.0, 0.1))
-    assert promise.stable == 0.0
-    assert not promise.holds
+    guarantee = loop_guarantee(integrator(150.0, 0.1))
+    assert guarantee.stable == 0.0
+    assert not guarantee.holds
 
 
 @pytest.mark.usefixtures("coarse")
@@ -478,6 +478,6 @@ def test_command_bounds_the_effectors_behind_an_allocation() -> None:
     words = ["gains", "guarantee", "x8_elevons", "--scenario", "x8_elevons", "--json"]
     run = invoke(*words, "--samples", "2")
     assert run.exit_code == 1
-    promise = kept_guarantee(boxed("x8_elevons"))  # of the same loop and box
-    assert promise is not None
-    assert json.loads(run.output)["guarantee"]["stable"] == approx(promise.stable)
+    guarantee = kept_guarantee(boxed("x8_elevons"))  # of the same loop and box
+    assert guarantee is not None
+    assert json.loads(run.output)["guarantee"]["stable"] == approx(guarantee.stable)

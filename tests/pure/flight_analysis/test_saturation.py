@@ -38,10 +38,10 @@ def linear_loop(name: str, uncertainty: float) -> LinearLoop:
 
 def certified(name: str, limited: str, uncertainty: float) -> Content:
     linear = linear_loop(name, uncertainty)
-    promise = guarantee_with_limit(linear, limited)
-    assert promise is not None
-    assert promise.holds
-    content: Content = json.loads(limit_certificate(linear, promise, {}))
+    guarantee = guarantee_with_limit(linear, limited)
+    assert guarantee is not None
+    assert guarantee.holds
+    content: Content = json.loads(limit_certificate(linear, guarantee, {}))
     return content
 
 
@@ -259,12 +259,12 @@ def test_command_says_what_holds_and_what_proves_it(
     size: float, slowest: float, sentence: str
 ) -> None:
     multiplier = Multiplier(slowest, np.array([1]), np.array([0.5]))
-    promise = LimitGuarantee("rudder", 0.3, size, multiplier, [])
-    said = limit_text("rudder", promise, "58911e12fa30")
+    guarantee = LimitGuarantee("rudder", 0.3, size, multiplier, [])
+    said = limit_text("rudder", guarantee, "58911e12fa30")
     assert said[0].startswith(f"guarantee: {sentence}")
     assert said[0].endswith("(certificate 58911e12fa30)")
     assert "examples/check_certificate.py proves the certificate" in said[-1]
-    assert promise.holds == (size == 0.3)
+    assert guarantee.holds == (size == 0.3)
 
 
 def test_command_says_that_nothing_holds() -> None:

@@ -210,7 +210,7 @@ def test_jsbsim_has_lags_of_its_own_beside_those_of_the_file() -> None:
     assert any(text.startswith("aircraft.sensors.delay") for text in sentences(late))
 
 
-def promise_of(loop: Any, stable: float = 0.5) -> Guarantee:
+def guarantee_of(loop: Any, stable: float = 0.5) -> Guarantee:
     """A guarantee as if one had been computed."""
     return Guarantee(
         uncertainty=0.3,
@@ -227,7 +227,7 @@ def test_a_guarantee_is_stated_of_the_aircraft_that_it_is_of(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     told = scenario_loop(SERVO, SERVO.controller)
-    keep(promise_of(told))
+    keep(guarantee_of(told))
     assert kept_guarantee(told) is not None
     for changed in (
         with_aircraft(SERVO, "actuators", lag=[0.1] * 4),
@@ -250,12 +250,12 @@ def test_an_aircraft_beyond_the_box_is_named_with_its_deviation() -> None:
     far = SERVO.vary(aircraft={"uncertainty": {"A": 0.9, "seed": 3, "distribution": "corners"}})
     loop = scenario_loop(far, far.controller)
     assert loop.off == approx(0.9)
-    (reason,) = unstated(loop, promise_of(loop))
+    (reason,) = unstated(loop, guarantee_of(loop))
     assert reason == (
         "aircraft.uncertainty: the aircraft is 90.0 % off, the guarantee ends at 50.0 %: none is "
         "stated"
     )
-    assert not unstated(loop._replace(off=0.5), promise_of(loop))
+    assert not unstated(loop._replace(off=0.5), guarantee_of(loop))
 
 
 @pytest.mark.parametrize(

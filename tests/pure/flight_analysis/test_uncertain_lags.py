@@ -17,7 +17,7 @@ from tests.pure.flight_analysis.test_guarantee import LIMIT, PERIOD, integrator,
 from aircraft_sim.uncertainty import UNIFORM, Spread
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.certificate import certificate
-from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
+from flight_analysis.linear_loop.guarantee import Guarantee, loop_guarantee
 from flight_analysis.linear_loop.loop_margins import (
     LEAST_LAG,
     LinearLoop,
@@ -63,11 +63,11 @@ def test_lag_of_integrator_may_rise_to_the_closed_form(gain: float, lag: float) 
 
     limit = -brentq(room, -0.95, 0.0)
     assert 0.1 < limit < 0.9
-    promise = guarantee(uncertain(behind_actuator(gain / PERIOD, lag), 0.1))
+    guarantee = loop_guarantee(uncertain(behind_actuator(gain / PERIOD, lag), 0.1))
     # above by the 1e-6 of the limit of stability at most; below by the level's room of 0.4 %
-    assert 0.99 * limit < promise.stable < limit * (1.0 + 1e-5)
-    assert promise.unstable is not None
-    assert promise.unstable.entries["1/lag[u]"] == approx(-limit, rel=1e-2)
+    assert 0.99 * limit < guarantee.stable < limit * (1.0 + 1e-5)
+    assert guarantee.unstable is not None
+    assert guarantee.unstable.entries["1/lag[u]"] == approx(-limit, rel=1e-2)
 
 
 @pytest.mark.parametrize(("periods", "holds"), [(LEAST_LAG, True), (1.0, False)])
@@ -90,14 +90,14 @@ def test_late_input_behind_an_uncertain_actuator() -> None:
 
     No aircraft within 99 % is, but two coefficients hold a lag up to 80 % alone.
     """
-    promise = guarantee(uncertain(behind_actuator(80.0, 0.03), 0.3), 0.005)
-    assert promise.unstable is None
-    assert promise.stable == approx(0.8)
-    for d in (-promise.stable, 0.0, promise.stable):
+    guarantee = loop_guarantee(uncertain(behind_actuator(80.0, 0.03), 0.3), 0.005)
+    assert guarantee.unstable is None
+    assert guarantee.stable == approx(0.8)
+    for d in (-guarantee.stable, 0.0, guarantee.stable):
         for delay in (0.0, 0.002, 0.005):
             other = behind_actuator(80.0, 0.03 / (1.0 + d), delay)
             assert radii(other, np.zeros((1, 1)))[0] <= LIMIT
-    first = guarantee(uncertain(behind_actuator(70.0, 0.03), 0.3), 0.01).unstable
+    first = loop_guarantee(uncertain(behind_actuator(70.0, 0.03), 0.3), 0.01).unstable
     assert first is not None
     lag = 0.03 / (1.0 + first.entries["1/lag[u]"])
     late, in_time = (behind_actuator(70.0, lag, delay) for delay in (0.01, 0.0))
@@ -126,19 +126,19 @@ def lags() -> LinearLoop:
 
 
 @pytest.fixture(scope="module")
-def promise(lags: LinearLoop) -> Guarantee:
-    return guarantee(lags)
+def guarantee(lags: LinearLoop) -> Guarantee:
+    return loop_guarantee(lags)
 
 
 def test_checker_proves_lags_and_refuses_other_ones(
-    lags: LinearLoop, promise: Guarantee, tmp_path: Path
+    lags: LinearLoop, guarantee: Guarantee, tmp_path: Path
 ) -> None:
-    content = json.loads(certificate(lags, promise, {}))
+    content = json.loads(certificate(lags, guarantee, {}))
     assert content["loop"] == lags.digest
     assert content["states"][-2:] == ["u[elevator]", "u[aileron]"]
     done = run(content, tmp_path)
     assert done.returncode == 0, done.stderr
-    percent = np.floor(1e3 * promise.stable) / 10.0
+    percent = np.floor(1e3 * guarantee.stable) / 10.0
     assert f"1/lag[elevator] {percent:g} %" in done.stdout
     assert f"B[q,elevator] (B 2, 0) {percent:g} %" in done.stdout
     assert "lags [0.02, 0.02, 0.02, 0.1] s" in done.stdout
@@ -158,15 +158,15 @@ def test_checker_proves_lags_and_refuses_other_ones(
     assert "actuators behind the others" in run(unnamed, tmp_path).stderr
 
 
-def test_no_corner_with_exact_lags_is_unstable(lags: LinearLoop, promise: Guarantee) -> None:
+def test_no_corner_with_exact_lags_is_unstable(lags: LinearLoop, guarantee: Guarantee) -> None:
     """500 corners of A, B and the lags at the guarantee; the first unstable one beyond is one."""
     assert lags.box is not None
-    assert promise.unstable is not None
+    assert guarantee.unstable is not None
     # without the lags it is 0.742
-    assert 0.6 < promise.stable < promise.unstable.deviation < 1.1 * promise.stable
+    assert 0.6 < guarantee.stable < guarantee.unstable.deviation < 1.1 * guarantee.stable
     signs = np.sign(np.random.default_rng(3).standard_normal((500, len(lags.box.names))))
-    assert (exact_radii(lags, signs * promise.stable / 0.3) <= LIMIT).all()
-    first = np.array([promise.unstable.entries.get(name, 0.0) for name in lags.box.names])
+    assert (exact_radii(lags, signs * guarantee.stable / 0.3) <= LIMIT).all()
+    first = np.array([guarantee.unstable.entries.get(name, 0.0) for name in lags.box.names])
     assert exact_radii(lags, first[None] / lags.box.part)[0] > LIMIT
 
 

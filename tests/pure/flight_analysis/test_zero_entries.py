@@ -20,7 +20,7 @@ from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import Spread, row_sizes, sampled_matrices, with_entries
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.certificate import certificate, keep, kept_guarantee
-from flight_analysis.linear_loop.guarantee import guarantee, zeros_alone
+from flight_analysis.linear_loop.guarantee import loop_guarantee, zeros_alone
 from flight_analysis.linear_loop.loop_margins import LinearLoop, box_of, scenario_loop
 from flight_analysis.linear_loop.uncertain_loop import plants_at
 from flight_analysis.report.margin_figures import guarantee_text
@@ -73,7 +73,7 @@ def with_zero(part: float = 0.3, zero: float = 0.1) -> LinearLoop:
 @pytest.fixture(scope="module")
 def content() -> Content:
     linear = with_zero()
-    content: Content = json.loads(certificate(linear, guarantee(linear), {}))
+    content: Content = json.loads(certificate(linear, loop_guarantee(linear), {}))
     return content
 
 
@@ -135,8 +135,8 @@ def test_zero_alone_goes_up_to_the_closed_form() -> None:
 def test_kept_guarantee_says_how_far_zeros_go_alone() -> None:
     linear = integrator(K, 0.3)
     far = zeros_alone(with_zero(part=0.0, zero=1.0))
-    promise = guarantee(linear)._replace(zeros_alone=far)
-    keep(promise)
+    guarantee = loop_guarantee(linear)._replace(zeros_alone=far)
+    keep(guarantee)
     kept = kept_guarantee(linear)
     assert kept is not None
     assert kept.zeros_alone == far
@@ -145,12 +145,12 @@ def test_kept_guarantee_says_how_far_zeros_go_alone() -> None:
 
 def test_zero_and_entry_go_in_proportion() -> None:
     """Unstable from a = K (1 - d) on, with d = 0.3 s and a = 4 s: s = 20 / 10."""
-    promise = guarantee(with_zero())
+    guarantee = loop_guarantee(with_zero())
     size = K / (0.1 * ROW + 0.3 * K)
-    assert promise.stable == approx(0.3 * size, rel=0.02)
-    assert promise.zeros == approx(0.1 * size, rel=0.02)
-    assert promise.zeros == approx(promise.stable / 3.0)
-    said = guarantee_text(promise)
+    assert guarantee.stable == approx(0.3 * size, rel=0.02)
+    assert guarantee.zeros == approx(0.1 * size, rel=0.02)
+    assert guarantee.zeros == approx(guarantee.stable / 3.0)
+    said = guarantee_text(guarantee)
     assert "entries that are 0 within 19." in said[0]
     assert said[1].endswith("each other entry that is 0")
 

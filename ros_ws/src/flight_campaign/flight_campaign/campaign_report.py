@@ -107,14 +107,14 @@ def write_results(campaign: MonteCarlo) -> tuple[dict[str, Any], MetricTable]:
     with writing("", campaign.folder, "a folder and a disk that can"):
         cases = []
         for case, (tally, loop_margins) in enumerate(zip(tallies, margins, strict=True)):
-            promise = campaign.guarantee(case)
+            guarantee = campaign.guarantee(case)
             cases.append(
                 {
                     "factor": definition.factor(case),
                     **tally.summary(),
                     "fly_again": _write_worst(campaign, case, tally),
                     "margins": None if loop_margins is None else margins_as_json(loop_margins),
-                    "guarantee": None if promise is None else promise.as_json(),
+                    "guarantee": None if guarantee is None else guarantee.as_json(),
                     "influence": _influence(campaign, case, tally),
                 }
             )
@@ -262,9 +262,9 @@ def _guarantees(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Me
     """Return a table of the guarantees that were computed for the loops of the cases."""
     rows = []
     for label, case in zip(labels, cases, strict=True):
-        promise = case["guarantee"]
-        first = None if promise is None else promise["unstable"]
-        cells = [None if promise is None else promise["stable"]]
+        guarantee = case["guarantee"]
+        first = None if guarantee is None else guarantee["unstable"]
+        cells = [None if guarantee is None else guarantee["stable"]]
         cells.append(None if first is None else first["deviation"])
         rows.append([label, *(NO_VALUE if x is None else f"{100.0 * x:.1f}" for x in cells)])
     heads = ("stable for every aircraft within, %", "first unstable aircraft found, %")

@@ -274,7 +274,7 @@ class Check(_Gains):
         return check_gains(self.airframe, self.scenario, **words, entries=entries)
 
     def _exit_if_loop_fails(self, sets: GainSets) -> None:
-        if not loop_verdict(sets.first, sets.promise).holds:
+        if not loop_verdict(sets.first, sets.guarantee).holds:
             raise typer.Exit(LOOP_FAILS)
 
 
@@ -326,11 +326,13 @@ class Guarantee(Check):
             if self.saturation is not None:
                 self._bound_limited(answer, loop)
                 return
-            promise = proved(answer, self.late, status.update)
-            lines = write_certificate(self.certificate, loop, promise, self.airframe, self.scenario)
-            lines += write_unstable(self.worst, promise, self.airframe, self.scenario)
+            guarantee = proved(answer, self.late, status.update)
+            lines = write_certificate(
+                self.certificate, loop, guarantee, self.airframe, self.scenario
+            )
+            lines += write_unstable(self.worst, guarantee, self.airframe, self.scenario)
         name = Path(self.scenario).stem
-        sets = GainSets({"scenario": answer}, checked=name, promise=promise)
+        sets = GainSets({"scenario": answer}, checked=name, guarantee=guarantee)
         self._show(sets, lines, {"certificate": self.certificate})
         self._exit_if_loop_fails(sets)
 
@@ -338,15 +340,15 @@ class Guarantee(Check):
         """Prove the guarantee for a loop in which one input saturates, write and print it."""
         name = self.saturation or ""
         require_linear(loop)
-        promise = guarantee_with_limit(loop, name)
-        lines = limit_text(name, promise, loop.digest[:NAMED])
+        guarantee = guarantee_with_limit(loop, name)
+        lines = limit_text(name, guarantee, loop.digest[:NAMED])
         lines += write_limit_certificate(
-            self.certificate, loop, promise, self.airframe, self.scenario
+            self.certificate, loop, guarantee, self.airframe, self.scenario
         )
-        sets = GainSets({"scenario": answer}, checked=Path(self.scenario).stem, limited=promise)
+        sets = GainSets({"scenario": answer}, checked=Path(self.scenario).stem, limited=guarantee)
         self._show(sets, lines, {"certificate": self.certificate})
         self._exit_if_loop_fails(sets)
-        if promise is None or not promise.holds:
+        if guarantee is None or not guarantee.holds:
             raise typer.Exit(LOOP_FAILS)
 
 

@@ -16,7 +16,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop import certificate as certificates
 from flight_analysis.linear_loop.certificate import keep, unstated
 from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN
-from flight_analysis.linear_loop.guarantee import LARGEST, Guarantee, guarantee, zeros_alone
+from flight_analysis.linear_loop.guarantee import LARGEST, Guarantee, loop_guarantee, zeros_alone
 from flight_analysis.linear_loop.input_margins import disk_gain, disk_phase
 from flight_analysis.linear_loop.loop_margins import LinearLoop
 from flight_analysis.linear_loop.told import Standing
@@ -82,14 +82,14 @@ def proved(
     """
     loop = answer.loop_with_box()
     require_linear(loop)
-    promise = guarantee(loop, late, report)
+    guarantee = loop_guarantee(loop, late, report)
     if not answer.study.spread.zeros:
         report("proving how far the entries that are 0 in the file may go")
         zeros = answer.study._replace(uncertainty=0.0, spread=Spread(zeros=1.0))
         alone = zeros_alone(loop_with_box(zeros, answer.controller), late)
-        promise = promise._replace(zeros_alone=alone)
-    keep(promise)
-    return promise
+        guarantee = guarantee._replace(zeros_alone=alone)
+    keep(guarantee)
+    return guarantee
 
 
 def require_linear(loop: LinearLoop) -> None:
@@ -100,7 +100,7 @@ def require_linear(loop: LinearLoop) -> None:
 
 
 def write_certificate(
-    path: Path | None, loop: LinearLoop, promise: Guarantee, airframe: str, scenario: str
+    path: Path | None, loop: LinearLoop, guarantee: Guarantee, airframe: str, scenario: str
 ) -> list[str]:
     """Write the certificate of a guarantee, if a path is given.
 
@@ -110,10 +110,10 @@ def write_certificate(
         return []
     facts = "; ".join(each.fact for each in loop.differences)
     found = f"no stable box ({facts})" if facts else "no stable box"
-    require(promise.stable > 0.0, "--certificate", found, "a loop with a guarantee")
+    require(guarantee.stable > 0.0, "--certificate", found, "a loop with a guarantee")
     frame = airframe_to_check(airframe, scenario_to_check(scenario))
     sources = certificate_sources(frame, scenario)
-    write_text("certificate", path, certificates.certificate(loop, promise, sources.texts))
+    write_text("certificate", path, certificates.certificate(loop, guarantee, sources.texts))
     return [f"certificate without constants: {sources.without}"] if sources.without else []
 
 
@@ -129,7 +129,7 @@ def _require_worst(folder: Path | None, airframe: str, scenario: str) -> None:
 
 
 def write_unstable(
-    folder: Path | None, promise: Guarantee, airframe: str, scenario: str
+    folder: Path | None, guarantee: Guarantee, airframe: str, scenario: str
 ) -> list[str]:
     """Write the unstable aircraft nearest to the nominal one, if a folder is given.
 
@@ -141,19 +141,19 @@ def write_unstable(
         return []
     base = find_scenario(scenario)
     frame = load_airframe(airframe)
-    require(promise.unstable is not None, "worst", "no unstable aircraft", "a loop that has one")
-    assert promise.unstable is not None  # noqa: S101 - for mypy
+    require(guarantee.unstable is not None, "worst", "no unstable aircraft", "a loop that has one")
+    assert guarantee.unstable is not None  # noqa: S101 - for mypy
     names = zip(base.controller.inputs, base.controller.lag, strict=True)
     declared = {f"1/lag[{name}]": lag for name, lag in names}
     own = [f"1/{name}" for name in published(base)]
-    others = [name for name in promise.unstable.entries if name in {*declared} - {*own}]
+    others = [name for name in guarantee.unstable.entries if name in {*declared} - {*own}]
     require(not others, "worst", ", ".join(others), f"lags of the actuators of {base.name} alone")
     with writing("--worst", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
-    least_unstable = promise.unstable.deviation
+    least_unstable = guarantee.unstable.deviation
     lines = []
     for factor, prefix in ((1.0, ""), (min(FARTHER, LARGEST / least_unstable), "farther_")):
-        entries = {name: factor * value for name, value in promise.unstable.entries.items()}
+        entries = {name: factor * value for name, value in guarantee.unstable.entries.items()}
         path = folder / f"{prefix}airframe.yaml"
         matrices = {name: value for name, value in entries.items() if name not in declared}
         write_text("worst", path, LICENCE + as_yaml(with_entries(frame, matrices)))
@@ -167,17 +167,17 @@ def write_unstable(
         flight = folder / f"{prefix}scenario.yaml"
         write_text("worst", flight, scenario_yaml(varied))
         deviation = factor * least_unstable
-        place = "inside" if deviation <= promise.uncertainty else "outside"
+        place = "inside" if deviation <= guarantee.uncertainty else "outside"
         far = math.ceil(1e3 * deviation) / 10.0
         lines.append(
             f"unstable aircraft: {display_path(flight)}, {far:.1f} % off, "
-            f"{place} the {100.0 * promise.uncertainty:g} % of --uncertainty"
+            f"{place} the {100.0 * guarantee.uncertainty:g} % of --uncertainty"
         )
     return lines
 
 
 def show_guarantee(
-    console: Console, promise: Guarantee | None, checked: GainAssessment[ControllerConfig]
+    console: Console, guarantee: Guarantee | None, checked: GainAssessment[ControllerConfig]
 ) -> None:
     """Print how the aircraft differs from what the controller was told, and what is proved.
 
@@ -185,22 +185,22 @@ def show_guarantee(
     """
     for difference in checked.study.differences:
         say(console, difference)
-    if promise is None:
+    if guarantee is None:
         return
-    for line in guarantee_text(promise):
+    for line in guarantee_text(guarantee):
         say(console, line)
     study = checked.study
-    for reason in unstated(checked.loop_with_box(), promise):
+    for reason in unstated(checked.loop_with_box(), guarantee):
         say(console, reason)
     if {*study.spread.entries.values()} - {study.uncertainty}:
         say(console, "percentages: of the largest deviation, with the others in proportion")
     margins = checked.margins
-    if not promise.holds or margins is None or margins.worst is None:
+    if not guarantee.holds or margins is None or margins.worst is None:
         return
     heads = ("input", "disk", "phase\ndeg", "gain\ndB", "worst found,\ndisk")
-    title = f"\nDisk margins of every aircraft within +-{100 * promise.uncertainty:g} %"
+    title = f"\nDisk margins of every aircraft within +-{100 * guarantee.uncertainty:g} %"
     table = new_table(title, heads, left_aligned=("input",))
-    for name, disk, least in guarantee_rows(promise, margins):
+    for name, disk, least in guarantee_rows(guarantee, margins):
         size = np.array(disk)
         values = (np.degrees(disk_phase(size)), decibels(disk_gain(size)), least)
         table.add_row(

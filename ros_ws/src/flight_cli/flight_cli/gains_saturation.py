@@ -38,7 +38,7 @@ def require_saturation(
 def write_limit_certificate(
     path: Path | None,
     loop: LinearLoop,
-    promise: LimitGuarantee | None,
+    guarantee: LimitGuarantee | None,
     airframe: str,
     scenario: str,
 ) -> list[str]:
@@ -48,30 +48,30 @@ def write_limit_certificate(
     """
     if path is None:
         return []
-    require(promise is not None, "--certificate", "no guarantee for any box", "one")
-    assert promise is not None  # noqa: S101 - for mypy
+    require(guarantee is not None, "--certificate", "no guarantee for any box", "one")
+    assert guarantee is not None  # noqa: S101 - for mypy
     frame = airframe_to_check(airframe, scenario_to_check(scenario))
     sources = certificate_sources(frame, scenario)
-    write_text("certificate", path, limit_certificate(loop, promise, sources.texts))
+    write_text("certificate", path, limit_certificate(loop, guarantee, sources.texts))
     return [f"certificate without constants: {sources.without}"] if sources.without else []
 
 
-def limit_text(name: str, promise: LimitGuarantee | None, certificate: str) -> list[str]:
+def limit_text(name: str, guarantee: LimitGuarantee | None, certificate: str) -> list[str]:
     """Write in sentences what is guaranteed for a loop in which one input saturates."""
-    if promise is None:
+    if guarantee is None:
         least = f"{100.0 * TRIED[-1]:g} % of this box"
         return [f"guarantee: none with any limits of {name}: no taps prove as much as {least}"]
-    within = f"for every aircraft within {proved_percent(promise.size)}"
-    if promise.zeros:
-        within += f", entries that are 0 within {proved_percent(promise.zeros)} of their rows"
+    within = f"for every aircraft within {proved_percent(guarantee.size)}"
+    if guarantee.zeros:
+        within += f", entries that are 0 within {proved_percent(guarantee.zeros)} of their rows"
     limits = f"with any limits of {name}"
     sampled = (
         "found at samples of the frequency: examples/check_certificate.py proves the certificate"
     )
-    if promise.settles:
+    if guarantee.settles:
         settles = f"the loop settles {within}, {limits} around where it settles"
         return [f"guarantee: {settles} (certificate {certificate})", sampled]
-    period = 2.0 * math.pi / promise.multiplier.slowest
+    period = 2.0 * math.pi / guarantee.multiplier.slowest
     periodic = f"no motion is periodic up to {period:.0f} s {within}, {limits}"
     return [
         f"guarantee: {periodic} (certificate {certificate})",

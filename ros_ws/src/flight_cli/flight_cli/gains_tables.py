@@ -63,7 +63,7 @@ class GainSets(NamedTuple):
     answers: dict[str, Assessment]
     selection: Selection | None = None
     checked: str = ""  # name of the scenario that was checked, if any
-    promise: Guarantee | None = None
+    guarantee: Guarantee | None = None
     limited: LimitGuarantee | None = None
 
     @property
@@ -90,7 +90,7 @@ class GainSets(NamedTuple):
 def show_gains(console: Console, sets: GainSets) -> None:
     """Print gains, margins, guarantee and verdicts, and for a selection its trade-off."""
     _show_margins(console, sets.study, sets.titles)
-    show_guarantee(console, sets.promise, sets.first)
+    show_guarantee(console, sets.guarantee, sets.first)
     _show_verdicts(console, sets)
     selection = sets.selection
     if (
@@ -161,7 +161,7 @@ def _show_verdicts(console: Console, result: GainSets) -> None:
         if getattr(first, part):
             print_table(console, _condition_table(answers, part, heading))
         for name, answer in answers.items():
-            verdict = VERDICTS[part](answer, result.promise)
+            verdict = VERDICTS[part](answer, result.guarantee)
             if verdict.sentence:
                 say(console, f"{name}: {verdict.sentence}", "bold" if part == "loop" else "")
     if first.theorem and (marginal := marginal_sentence([airframe_facts(first.study.airframe)])):
@@ -269,7 +269,7 @@ def _stable_speed_ratio(study: Study, answer: Assessment) -> float | None:
 def gains_as_json(result: GainSets, seed: int) -> dict[str, Any]:
     """Return the study, gain sets with conditions, and the guarantee, if any, for JSON."""
     study = result.study
-    promise = result.promise
+    guarantee = result.guarantee
     inputs = list(study.airframe.inputs)
     return {
         "airframe": study.airframe.name,
@@ -281,16 +281,16 @@ def gains_as_json(result: GainSets, seed: int) -> dict[str, Any]:
         "slew_calm": dict(zip(inputs, study.slew_undisturbed.tolist(), strict=True)),
         "checked": result.checked or None,
         **{
-            name: _assessment_as_json(study, answer, promise)
+            name: _assessment_as_json(study, answer, guarantee)
             for name, answer in result.answers.items()
         },
-        **({} if promise is None else {"guarantee": promise.as_json()}),
+        **({} if guarantee is None else {"guarantee": guarantee.as_json()}),
         **({} if result.limited is None else {"saturation": result.limited.as_json()}),
     }
 
 
 def _assessment_as_json(
-    study: Study, answer: Assessment, promise: Guarantee | None
+    study: Study, answer: Assessment, guarantee: Guarantee | None
 ) -> dict[str, Any]:
     outputs = answer.controller.outputs
     bounds = None
@@ -303,7 +303,7 @@ def _assessment_as_json(
         for part in HEADINGS
         for condition in getattr(answer, part)
     ]
-    verdicts = {part: verdict(answer, promise) for part, verdict in VERDICTS.items()}
+    verdicts = {part: verdict(answer, guarantee) for part, verdict in VERDICTS.items()}
     return {
         "verdicts": {
             part: verdict._asdict() for part, verdict in verdicts.items() if verdict.sentence

@@ -25,9 +25,9 @@ class Verdict(NamedTuple):
     sentence: str
 
 
-def loop_verdict(answer: GainAssessment[Any], promise: Guarantee | None) -> Verdict:
+def loop_verdict(answer: GainAssessment[Any], guarantee: Guarantee | None) -> Verdict:
     """Judge whether a loop is stable with the required margins and the required guarantee."""
-    is_guaranteed = promise is None or promise.holds
+    is_guaranteed = guarantee is None or guarantee.holds
     holds = answer.is_stable and not failing(answer.loop) and is_guaranteed
     margins = answer.margins
     if margins is None:
@@ -48,8 +48,8 @@ def loop_verdict(answer: GainAssessment[Any], promise: Guarantee | None) -> Verd
             f"with the margins asked of it: at least {phase:.0f} deg of phase in each input, and "
             f"a delay margin of {milliseconds(margins.delay)}"
         )
-    if promise is not None:
-        within = f"within {100.0 * promise.uncertainty:g} %"
+    if guarantee is not None:
+        within = f"within {100.0 * guarantee.uncertainty:g} %"
         clauses.append(
             f"as every aircraft {within} is, which is guaranteed"
             if is_guaranteed

@@ -94,14 +94,14 @@ class Replay:
             _write_csv(self.csv, result, parameters.inputs)
         account = log_account(recorded_run)
         expected_ticks = None if account is None else account.topics["internals"].expected
-        promise, differences = (None, ()) if others is not None else _claims_of(recorded_run)
+        guarantee, differences = (None, ()) if others is not None else _claims_of(recorded_run)
         answer = Shown(
             result,
             parameters.inputs,
             ticks=max(len(result.number), expected_ticks or 0),
             open_loop=others is not None,
             guided=guidance_replay,
-            promise=promise if result.equal() else None,
+            guarantee=guarantee if result.equal() else None,
             differences=differences if result.equal() else (),
         )
         lacks = () if account is None else account.notes()
@@ -124,7 +124,7 @@ class Shown(NamedTuple):
     ticks: int  # number of ticks that were flown; the log may lack some
     open_loop: bool  # whether u was computed with other parameters
     guided: GuidanceReplay | None
-    promise: Guarantee | None  # guarantee that was kept for the loop of the flight, if any
+    guarantee: Guarantee | None  # guarantee that was kept for the loop of the flight, if any
     differences: tuple[str, ...] = ()  # how the aircraft differs from what the controller knew
 
     def notes(self) -> list[str]:
@@ -168,8 +168,8 @@ def _claims_of(run: RecordedRun) -> tuple[Guarantee | None, tuple[str, ...]]:
         return None, ()
     scenario = recorded_scenario(run)
     flown = flown_loops(tape, scenario, (), later_aircraft(run, scenario))
-    promise = kept_guarantee(flown.loops[0].loop) if flown.loops else None
-    return promise, flown.sentences
+    guarantee = kept_guarantee(flown.loops[0].loop) if flown.loops else None
+    return guarantee, flown.sentences
 
 
 def _show_guidance(replay_of_guidance: GuidanceReplay) -> None:
@@ -238,8 +238,8 @@ def _show(answer: Shown, notes: Sequence[str]) -> None:
         _show_guidance(answer.guided)
     for sentence in answer.differences:
         console.print(sentence)
-    if answer.promise is not None:
-        console.print(guarantee_text(answer.promise)[0])
+    if answer.guarantee is not None:
+        console.print(guarantee_text(answer.guarantee)[0])
 
 
 def _count_by_group(result: ReplayResult) -> dict[str, int]:
@@ -296,7 +296,7 @@ def _as_json(answer: Shown, notes: Sequence[str], settings: list[str]) -> dict[s
         "expected": answer.ticks,
         "guidance": None if replay_of_guidance is None else _guidance_as_json(replay_of_guidance),
         "differences": list(answer.differences),
-        "guarantee": None if answer.promise is None else answer.promise.as_json(),
+        "guarantee": None if answer.guarantee is None else answer.guarantee.as_json(),
     }
 
 

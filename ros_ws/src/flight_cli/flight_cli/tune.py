@@ -21,7 +21,7 @@ from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import Spread, as_yaml
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
+from flight_analysis.linear_loop.guarantee import Guarantee, loop_guarantee
 from flight_analysis.linear_loop.loop_margins import margins
 from flight_analysis.report.page import page_html
 from flight_analysis.report.run_folder import remove_empty
@@ -142,7 +142,7 @@ class Tune:
         files = {"airframe": folder / "airframe.yaml", "scenario": scenario, "page": page}
         for name, path in files.items():
             say(console, f"{name}: {display_path(path)}")
-        if not tuned.promise.holds or (exported.proof is not None and not exported.proof.holds):
+        if not tuned.guarantee.holds or (exported.proof is not None and not exported.proof.holds):
             raise typer.Exit(UNPROVED)
 
     def _target(self) -> tuple[str, Path]:
@@ -208,13 +208,13 @@ class Tune:
         best = best_of(found, accept=self.accept)
         say(console, f"best: {best.name}; bounding every aircraft within the errors")
         with console.status("checking the gains on uncertain airframes") as status:
-            promise = _promise(best.scenario, airframe, entries, status.update)
+            guarantee = _guarantee(best.scenario, airframe, entries, status.update)
         own = own_loop(of_log.taken.parameters, best.scenario, autopilot)
         return Tuned(
             identification=identification,
             best=best,
             candidates=found,
-            promise=promise,
+            guarantee=guarantee,
             margins=margins(best.scenario, SAMPLES, LEAST, spread=Spread(entries)),
             own=None if own is None else OwnFlight.of(own, selectors),
         )
@@ -277,7 +277,7 @@ def _with_lead(controller: RiseDiConfig) -> RiseDiConfig:
     return controller.model_copy(update={"feedforward": feedforward})
 
 
-def _promise(
+def _guarantee(
     scenario: Scenario,
     airframe: Airframe,
     entries: Mapping[str, float],
@@ -290,7 +290,7 @@ def _promise(
     answer = check_gains(
         airframe, scenario, uncertainty=LEAST, samples=SAMPLES, entries=entries, as_told=True
     )
-    return guarantee(answer.loop_with_box(), report=report)
+    return loop_guarantee(answer.loop_with_box(), report=report)
 
 
 def _identified(

@@ -82,7 +82,7 @@ class Tuned(NamedTuple):
     identification: Identification
     best: Candidate
     candidates: Sequence[Candidate]  # the first is that of the scenario
-    promise: Guarantee
+    guarantee: Guarantee
     margins: LoopMargins  # margins of the best candidate
     own: OwnFlight | None  # None if the log lacks the autopilot's parameters
 
@@ -121,10 +121,10 @@ def verdict(tuned: Tuned) -> list[str]:
     return sentences
 
 
-def guaranteed(promise: Guarantee) -> str:
+def guaranteed(guarantee: Guarantee) -> str:
     """Return a sentence on how many standard deviations of A and B the guarantee covers."""
-    holds = "every aircraft is stable" if promise.holds else "an aircraft may be unstable"
-    covered = 2.0 * promise.stable / promise.uncertainty
+    holds = "every aircraft is stable" if guarantee.holds else "an aircraft may be unstable"
+    covered = 2.0 * guarantee.stable / guarantee.uncertainty
     return (
         f"A and B within twice their stated deviations: {holds} by the guarantee, which covers "
         f"{covered:.2g} of them"
@@ -143,8 +143,8 @@ def show_tuning(console: Console, tuned: Tuned) -> None:
     for row in error_rows(tuned):
         table.add_row(*row)
     print_table(console, table)
-    certificate = tuned.promise.certificate
-    for sentence in (*verdict(tuned), guaranteed(tuned.promise)):
+    certificate = tuned.guarantee.certificate
+    for sentence in (*verdict(tuned), guaranteed(tuned.guarantee)):
         say(console, sentence)
     if certificate:
         say(console, f"certificate {certificate}")
@@ -181,13 +181,13 @@ def tuning_page(tuned: Tuned, log: str, autopilot: str) -> Page:
         "and air that rolls with 0.5 rad/s rms. "
         f"{'. '.join(verdict(tuned))}. The autopilot's own loop: {own}",
     )
-    law = margin_table(tuned.margins, tuned.promise)
+    law = margin_table(tuned.margins, tuned.guarantee)
     tables = [entries, errors, law._replace(caption="Margins of the module")]
     if tuned.own is not None:
         own_margins = margin_table(tuned.own.margins)
         tables.append(own_margins._replace(caption="Margins of the own loop"))
     return Page(
         title=f"Tuning of {identification.airframe.name} from {log}",
-        lines=[guaranteed(tuned.promise), *STEPS[autopilot]],
+        lines=[guaranteed(tuned.guarantee), *STEPS[autopilot]],
         blocks=[Figures(groups=[TableGroup(tables)])],
     )

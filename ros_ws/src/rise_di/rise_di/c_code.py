@@ -231,13 +231,13 @@ def _certified(scenario: Scenario, constants: Path) -> tuple[str, str] | None:
     if scenario.aircraft.is_jsbsim or is_literal(scenario.controller):
         return None
     loop = scenario_loop(scenario, scenario.controller, 1)
-    promise = kept_guarantee(loop)
-    if promise is None or not promise.stable:
+    guarantee = kept_guarantee(loop)
+    if guarantee is None or not guarantee.stable:
         return None
     frame = load_airframe(scenario.aircraft.airframe)
     sources = certificate_sources(frame, scenario).texts | {"constants": constants.read_text()}
-    stated = f"{CERTIFICATE}: {guarantee_text(promise)[0]}\n"
-    return certificate(loop, promise, sources), stated
+    stated = f"{CERTIFICATE}: {guarantee_text(guarantee)[0]}\n"
+    return certificate(loop, guarantee, sources), stated
 
 
 def _write(

@@ -130,8 +130,8 @@ def learned_sample(
         f"deviation.{entry.name}": abs(entry.unit) * entry.deviation for entry in output_entries
     }
     digest = 0 if proposal.controller is None else proposal.controller.digest()
-    promise = NO_GUARANTEE if proposal.guarantee is None else proposal.guarantee()
-    kept = (digest, promise.deviations, int(promise.loop[:LOOP_DIGITS], 16))
+    guarantee = NO_GUARANTEE if proposal.guarantee is None else proposal.guarantee()
+    kept = (digest, guarantee.deviations, int(guarantee.loop[:LOOP_DIGITS], 16))
     channels |= dict(zip(GUARANTEE, map(float, kept), strict=True))
     return Learned(tuple(channels), np.array(list(channels.values())))
 

@@ -115,7 +115,7 @@ class Guarantee(NamedTuple):
         return content
 
 
-def guarantee(
+def loop_guarantee(
     linear: LinearLoop, late: float = 0.0, report: Callable[[str], None] = lambda _: None
 ) -> Guarantee:
     """Compute the guarantee for the box of a loop.
@@ -147,13 +147,13 @@ def guarantee(
     proved, proof = _proved(
         parts, min(size, most), disks=False, exact=exact, reserve=reserve, show=show
     )
-    promise = none._replace(
+    guarantee = none._replace(
         stable=largest * proved, unstable=first, proof=proof, zeros=box.largest_zero * proved
     )
-    if not promise.holds:
-        return promise
+    if not guarantee.holds:
+        return guarantee
     disks, disk_all = _disks(linear, uncertain, late, report)
-    return promise._replace(disk=disks, disk_all=disk_all)
+    return guarantee._replace(disk=disks, disk_all=disk_all)
 
 
 def _none(linear: LinearLoop, late: float) -> Guarantee:

@@ -134,9 +134,9 @@ def guarantee_with_limit(linear: LinearLoop, name: str) -> LimitGuarantee | None
     """
     for part in TRIED:
         for slowest in (0.0, SLOWEST):
-            promise = limit_guarantee(linear, name, part, slowest)
-            if promise is not None:
-                return promise
+            guarantee = limit_guarantee(linear, name, part, slowest)
+            if guarantee is not None:
+                return guarantee
     return None
 
 

@@ -79,10 +79,10 @@ def _margin_card(margins: LoopMargins, command: str) -> Card:
     )
 
 
-def _guarantee_card(promise: Guarantee | None, command: str) -> Card:
+def _guarantee_card(guarantee: Guarantee | None, command: str) -> Card:
     """Return the card that says what is guaranteed if the aircraft differs from its file."""
     title = "Guarantee"
-    if promise is None:
+    if guarantee is None:
         return Card(
             title=title,
             sentences=[
@@ -90,19 +90,19 @@ def _guarantee_card(promise: Guarantee | None, command: str) -> Card:
             ],
             step=Step(sentence="Compute one:", command=command),
         )
-    if promise.stable == 0.0:
-        return Card(title=title, sentences=guarantee_text(promise))
-    late = f", and u up to {1e3 * promise.late:g} ms late" if promise.late else ""
-    lags = ("lags",) if promise.has_exact_lags else ()
-    exact = ", ".join((*promise.exact, *lags, "delay", "period"))
-    first = promise.unstable
+    if guarantee.stable == 0.0:
+        return Card(title=title, sentences=guarantee_text(guarantee))
+    late = f", and u up to {1e3 * guarantee.late:g} ms late" if guarantee.late else ""
+    lags = ("lags",) if guarantee.has_exact_lags else ()
+    exact = ", ".join((*guarantee.exact, *lags, "delay", "period"))
+    first = guarantee.unstable
     found = (
         "No unstable aircraft was found within 99 %."
         if first is None
         else f"The first unstable aircraft that was found has entries that differ by "
         f"{found_percent(first.deviation)}."
     )
-    alone = promise.zeros_alone
+    alone = guarantee.zeros_alone
     zeros = (
         "."
         if alone is None
@@ -113,7 +113,7 @@ def _guarantee_card(promise: Guarantee | None, command: str) -> Card:
         (
             "The numbers of the aircraft's model, A and B, may be wrong: the linear loop is proved "
             f"stable for every aircraft whose entries differ by up to "
-            f"{proved_percent(promise.stable)} from those of the file{late}."
+            f"{proved_percent(guarantee.stable)} from those of the file{late}."
         ),
         found,
         (
@@ -125,8 +125,8 @@ def _guarantee_card(promise: Guarantee | None, command: str) -> Card:
         sentence="Write the proof, which another program checks:",
         command=f"{command} --certificate certificate.json",
     )
-    if promise.certificate:
-        sentences.append(f"Its certificate is {promise.certificate}.")
+    if guarantee.certificate:
+        sentences.append(f"Its certificate is {guarantee.certificate}.")
     return Card(title=title, sentences=sentences, step=step, words=("linear loop",))
 
 

@@ -151,14 +151,14 @@ def modes_text(margins: LoopMargins) -> str:
 
 
 def margin_table(
-    margins: LoopMargins, promise: Guarantee | None = None, differences: Sequence[str] = ()
+    margins: LoopMargins, guarantee: Guarantee | None = None, differences: Sequence[str] = ()
 ) -> MetricTable:
     """Return the table of the margins of a flight's loop, with the guarantee for this loop.
 
     `differences` are sentences on how the aircraft differs from what the controller was told.
     """
     sentences = [*differences, modes_text(margins)]
-    sentences += [] if promise is None else guarantee_text(promise)
+    sentences += [] if guarantee is None else guarantee_text(guarantee)
     return MetricTable(
         "Margins of the linear loop",
         MARGIN_COLUMNS,
@@ -224,33 +224,35 @@ def _aircraft_as_json(margins: Margins, inputs: Sequence[str]) -> dict[str, Any]
     return {"inputs": by_input, "all": together, "damping": float(margins.damping)}
 
 
-def guarantee_text(promise: Guarantee) -> list[str]:
+def guarantee_text(guarantee: Guarantee) -> list[str]:
     """Return a guarantee as sentences, which define stability and name the exact entries."""
-    if promise.stable == 0.0:
+    if guarantee.stable == 0.0:
         return ["guarantee: none, not even the aircraft of the file is proved stable"]
-    late = f", u up to {1e3 * promise.late:g} ms late" if promise.late else ""
+    late = f", u up to {1e3 * guarantee.late:g} ms late" if guarantee.late else ""
     name = "no certificate: up to what two coefficients of a period leave out"
-    if promise.certificate:
-        name = f"certificate {promise.certificate}"
-    lags = "lags, " if promise.has_exact_lags else ""
+    if guarantee.certificate:
+        name = f"certificate {guarantee.certificate}"
+    lags = "lags, " if guarantee.has_exact_lags else ""
     zero = "each entry that is 0"
-    within = f"the linear loop is stable for every aircraft within {proved_percent(promise.stable)}"
-    if promise.zeros:
+    within = (
+        f"the linear loop is stable for every aircraft within {proved_percent(guarantee.stable)}"
+    )
+    if guarantee.zeros:
         zero = "each other entry that is 0"
-        within += f", entries that are 0 within {proved_percent(promise.zeros)} of their rows"
-    exact = ", ".join((*promise.exact, f"{lags}delay, period, {zero}"))
+        within += f", entries that are 0 within {proved_percent(guarantee.zeros)} of their rows"
+    exact = ", ".join((*guarantee.exact, f"{lags}delay, period, {zero}"))
     lines = [
         f"guarantee: {within}{late} ({name})",
         f"stable: no mode grows by more than 1e-6 a tick; exact in every aircraft: {exact}",
-        _first_found(promise.unstable),
+        _first_found(guarantee.unstable),
     ]
-    if (alone := promise.zeros_alone) is not None:
+    if (alone := guarantee.zeros_alone) is not None:
         lines.append(
             f"entries that are 0, beside exact others: stable within {proved_percent(alone.stable)}"
             f" of their rows (no certificate without --zeros); {_first_found(alone.unstable)}"
         )
-    if not promise.holds:
-        percent = 100.0 * promise.uncertainty
+    if not guarantee.holds:
+        percent = 100.0 * guarantee.uncertainty
         lines.append(
             f"an aircraft within {percent:g} % may be unstable: no disk margin is guaranteed"
         )
@@ -274,16 +276,16 @@ def _first_found(first: Unstable | None) -> str:
     return f"the first unstable aircraft found: {place}"
 
 
-def guarantee_rows(promise: Guarantee, margins: LoopMargins) -> list[tuple[str, float, float]]:
+def guarantee_rows(guarantee: Guarantee, margins: LoopMargins) -> list[tuple[str, float, float]]:
     """Return a row for each input, and one for ALL_INPUTS at the end.
 
     A row has the input, the guaranteed disk margin, and the least disk margin that was found.
     """
     worst = margins.worst
-    least_disks = [math.nan] * (len(promise.disk) + 1)
+    least_disks = [math.nan] * (len(guarantee.disk) + 1)
     if worst is not None:
         least_disks = [*worst.disk.tolist(), float(worst.disk_all)]
-    disks = promise.disk | {ALL_INPUTS: promise.disk_all}
+    disks = guarantee.disk | {ALL_INPUTS: guarantee.disk_all}
     return list(zip(disks.keys(), disks.values(), least_disks, strict=True))
 
 

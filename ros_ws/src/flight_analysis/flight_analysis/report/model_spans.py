@@ -115,7 +115,7 @@ def errors_by_model(tape: Tape) -> list[ModelSpan]:
         stop = float(t[-1]) if span is names[-1] else span.stop
         in_span = (t >= span.start) & (t < stop) & is_engaged
         rms = {name: error_metrics(error[name][in_span]).rms for name in error.names}
-        promise = kept.get(span.digest)
+        guarantee = kept.get(span.digest)
         if in_span.any():
             spans.append(
                 ModelSpan(
@@ -124,8 +124,8 @@ def errors_by_model(tape: Tape) -> list[ModelSpan]:
                     start=span.start,
                     stop=stop,
                     rms=rms,
-                    stable=None if promise is None else promise.stable,
-                    loop="" if promise is None else promise.loop,
+                    stable=None if guarantee is None else guarantee.stable,
+                    loop="" if guarantee is None else guarantee.loop,
                 )
             )
     return spans

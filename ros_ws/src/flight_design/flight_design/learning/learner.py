@@ -259,13 +259,13 @@ class Learner:
         price_text = self._adopt(verdict.model, verdict.known, self._dead)
         refused = [f"refused: {refusal}" for refusal in verdict.refusals]
         told = sentences(*left_out, *verdict.sentences, price_text, *refused)
-        promise = None
+        guarantee = None
         if not self._quick:
             unlearned = max(self._believed.error, self._believed.effect)
             known = tuple(self._known.values())
             self.proposed_loop = LearnedLoop(self._last, self._model, known, unlearned)
-            promise = self.proposed_loop.guarantee
-        return LearnerResult(self._last, told, promise)
+            guarantee = self.proposed_loop.guarantee
+        return LearnerResult(self._last, told, guarantee)
 
     def _damaged(self, changes: Sequence[Change], end_ns: int) -> LearnerResult:
         """Decide on parts that have changed; a part with a dead input flies without it at once.
