@@ -312,6 +312,15 @@ def test_guarantee_with_a_late_input_holds_for_a_delay_that_changes() -> None:
     assert loop_guarantee(oscillator((0.1089, 0.000062)), PERIOD).holds
 
 
+def test_size_between_two_gaps_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sizes up to 0.7 of the least unstable one can be proved: gaps of 0.32 and 0.64 say 0.61."""
+    monkeypatch.setattr(
+        guarantee_module, "_proof", lambda _, size, *__, **___: [] if size <= 0.7 else None
+    )
+    proved, _ = guarantee_module._proved([], 1.0, disks=False)
+    assert 0.69 < proved <= 0.7
+
+
 def test_bound_from_zero_holds_where_a_delay_has_no_effect() -> None:
     """At 0 rad/s a constant delay changes nothing: the scaling of 0 is silent on its channels.
 

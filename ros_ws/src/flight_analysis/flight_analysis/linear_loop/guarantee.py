@@ -38,6 +38,7 @@ CONFIRMED = 10  # number of such steps that are tried
 # size to prove. If a proof succeeds with the first of GAPS, FINER_GAPS are tried as well.
 GAPS = (0.08, 0.16, 0.32, 0.64, 1.28, 2.56)
 FINER_GAPS = (0.04, 0.02, 0.01, 0.005)
+HALVINGS = 3  # how often the distance of two of GAPS is halved
 BOXES = 1500  # largest number of steps of a proof for the first gap
 FEWER_BOXES = 300  # largest number of steps for the other gaps, and for disks
 # The proved deviations are larger than the stated ones by this fraction. It covers the coefficients
@@ -311,25 +312,37 @@ def _proved(
     The size is a factor on the deviations of the box. If `disks` is True, it is the size of the
     disks instead, and the deviations cover the whole box. The result is 0 if no size is proved.
     `least` is a size that a search has found too large. If `exact` is True, `least` itself may be
-    provable, and is tried first. `show` gets each size before its proof is tried.
+    provable, and is tried first. Without `finer_gaps` the first proof is the last one. `show` gets
+    each size before its proof is tried.
     """
+
+    def proof_at(gap: float, most: int) -> list[dict[str, Any]] | None:
+        size = least / (1.0 + gap)
+        show(size)
+        return _proof(parts, size, most, disks=disks, reserve=reserve)
+
+    failed = 0.0
     for proved in (*(0.0,) * exact, *GAPS):
-        most = FEWER_BOXES if disks or proved > GAPS[0] else BOXES
-        show(least / (1.0 + proved))
-        proof = _proof(parts, least / (1.0 + proved), most, disks=disks, reserve=reserve)
+        proof = proof_at(proved, FEWER_BOXES if disks or proved > GAPS[0] else BOXES)
         if proof is not None:
             break
+        failed = proved
     else:
         return 0.0, []
     for finer in finer_gaps if proved == GAPS[0] else ():
         if sum(len(part["steps"]) for part in proof) > FEWER_BOXES:
             break
-        size = least / (1.0 + finer)
-        show(size)
-        tighter = _proof(parts, size, FEWER_BOXES, disks=disks, reserve=reserve)
+        tighter = proof_at(finer, FEWER_BOXES)
         if tighter is None:
             break
         proof, proved = tighter, finer
+    for _ in range(HALVINGS if finer_gaps and proved > GAPS[0] else 0):
+        between = (failed + proved) / 2.0
+        tighter = proof_at(between, FEWER_BOXES)
+        if tighter is None:
+            failed = between
+        else:
+            proof, proved = tighter, between
     return least / (1.0 + proved), proof
 
 
