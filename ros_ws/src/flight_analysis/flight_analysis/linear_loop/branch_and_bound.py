@@ -24,7 +24,8 @@ from flight_analysis.linear_loop.structured_value import (
 from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
 from flight_core.vectors import FloatArray
 
-LEVELLED = 8  # number of frequencies at which `_levelled` looks for the worst one
+LEVELLED = 8  # number of frequencies at which `levels_of` looks for the worst one
+LATE = 1.01  # size to which a late u is proved: it covers the coefficients that are left out
 DIGITS = 5  # significant digits of X and G in a step of a proof
 
 
@@ -67,7 +68,8 @@ def proof_of(
     """Find the steps that prove the loop stable, or return None if `most` steps are too few.
 
     The proof holds for all abs(d_i) <= size, for delays that change from tick to tick within their
-    range, and for complex disks of size `disk` in the channels `part.disks`. It starts from d = 0,
+    range if `levelled` has scaled their channels, and for complex disks of size `disk` in the
+    channels `part.disks`. It starts from d = 0,
     where the loop is stable, and shows that no aircraft of the box has a mode on abs(z) = RADIUS.
     The eigenvalues move continuously over the box, so none of them can leave the circle. Each
     region is proved for half widths that are larger by the fraction `reserve`.
@@ -80,8 +82,7 @@ def proof_of(
     highest = np.pi / part.period
     narrowest = NARROWEST * highest
     half = np.full(len(part.entries), size)
-    others = np.r_[np.ones(part.late), np.full(len(part.D) - part.uncertain - part.late, disk)]
-    part = _levelled(part, np.r_[half[part.parameters], others])
+    others = _sizes(part, size, disk)[part.uncertain :]
     regions = [Region(centre=np.zeros(len(half)), half=half, low=0.0, high=highest)]
     steps: list[dict[str, Any]] = []
     while regions and len(steps) < most:
@@ -107,20 +108,23 @@ def proof_of(
             begin, end = interval
             low = region.low if begin - region.low <= narrowest else begin
             high = region.high if region.high - end <= narrowest else end
-            steps.append({"low": low, "high": high} | _as_step(scaling, len(part.entries)))
+            steps.append({"low": low, "high": high} | _as_step(scaling, part))
             regions += region.outside(low, high)
     return None if regions else steps
 
 
-def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
-    """Round the scalings X and G, and return them as `t` and `g` of a step.
+def _as_step(scaling: Scaling, part: Channels) -> dict[str, list[float]]:
+    """Round the scalings X and G, and return those of the entries as `t` and `g` of a step.
 
-    Rounding is safe, because any X and G prove a bound. The first `entries` channels are the means
-    over a period, and the others the second Legendre coefficients. If g is 0 for all others, the
-    step has only the X and G of the means, from which the other X follow as in `least_bound_at`.
+    Rounding is safe, because any X and G prove a bound. If the X and G of the second Legendre
+    coefficients follow from those of the means over a period, as in `least_bound_at`, the step has
+    only the X and G of the means. A factor of all X proves the same: that of a delay becomes 1.
     """
-    count = len(scaling.t) if scaling.g[entries:].any() else entries
-    t, g = ([float(f"{x:.{DIGITS}g}") for x in values[:count]] for values in (scaling.t, scaling.g))
+    k = len(part.entries)
+    count = part.uncertain if scaling.g[k:].any() else k
+    delay = scaling.t[part.uncertain] if part.late else 0.0
+    values = (scaling.t[:count] - delay, scaling.g[:count])
+    t, g = ([float(f"{x:.{DIGITS}g}") for x in each] for each in values)
     return {"t": t, "g": g}
 
 
@@ -135,25 +139,37 @@ def frequency_in(region: Region, highest: float) -> float:
     return highest if region.high == highest else float(np.sqrt(region.low * region.high))
 
 
-def _levelled(part: Channels, scale: FloatArray) -> Channels:
-    """Scale the channels of a late u so that, at the worst frequency, X is equal in all of them.
+def _sizes(part: Channels, size: float, disk: float) -> FloatArray:
+    """Return the largest deviation of each channel."""
+    late, disks = len(part.late), len(part.D) - part.disks.start
+    return np.repeat([size, LATE, disk], [part.uncertain, late, disks])
 
-    A delay can change from tick to tick. So the channels of the delay must have the same X at all
-    frequencies, up to a common factor.
+
+def levels_of(part: Channels, size: float, disk: float) -> FloatArray:
+    """Return t = log(X) / 2 of the channels of a late u at the worst frequency, rounded.
+
+    The mean is 0. A delay can change from tick to tick, so its channels must have the same X at all
+    frequencies, up to a common factor. The coefficients of a block share theirs.
     """
-    if not part.late:
-        return part
+    k, late = len(part.entries), len(part.late)
+    scale = _sizes(part, size, disk)
     # the means over a period are enough to find the ratios of X between these channels
-    k = len(part.entries)
     rows = np.r_[0:k, part.uncertain : len(scale)]
-    worst, level = 0.0, np.zeros(part.late)
+    factors = np.arange(len(rows))
+    factors[k + late // 2 : k + late] = factors[k : k + late // 2]
+    worst, level = 0.0, np.zeros(late)
     for w in np.pi / part.period * np.geomspace(1e-2, 1.0, LEVELLED):
         M = (scale[:, None] * part.response(w, RADIUS))[np.ix_(rows, rows)]
-        bound, scaling = least_bound(M, k, 0.0)
+        bound, scaling = least_bound(M, k, 0.0, factors)
         if bound > worst:
-            worst, level = bound, scaling.t[k : k + part.late]
-    size = np.ones(len(scale))
-    size[part.uncertain : part.uncertain + part.late] = np.exp(level - level.mean())
+            worst, level = bound, scaling.t[k : k + late]
+    return np.array([float(f"{x:.{DIGITS}g}") for x in level - level.mean()])
+
+
+def levelled(part: Channels, levels: FloatArray) -> Channels:
+    """Scale the channels of a late u by `levels_of`, so that X is equal in all of them."""
+    size = np.ones(len(part.D))
+    size[part.uncertain : part.disks.start] = np.exp(levels)
     rows = size[:, None]
     return part._replace(W=part.W / size, Z=rows * part.Z, D=rows * part.D / size)
 

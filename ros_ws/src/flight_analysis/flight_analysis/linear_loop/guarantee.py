@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flight_analysis.linear_loop.branch_and_bound import proof_of
+from flight_analysis.linear_loop.branch_and_bound import levelled, levels_of, proof_of
 from flight_analysis.linear_loop.loop_margins import LAG_ENTRY, MOST_OF_LAG, LinearLoop
 from flight_analysis.linear_loop.structured_value import RADIUS
 from flight_analysis.linear_loop.uncertain_loop import (
@@ -88,7 +88,8 @@ class Guarantee(NamedTuple):
     # entries deviate by up to `stable`; 0 if such entries stay 0
     zeros: float = 0.0
     zeros_alone: Zeros | None = None  # how far zeros go if the others are exact, if computed
-    # "entries" and "steps" of each strongly connected part of the loop, as in `proof_of`
+    # "entries" and "steps" of each strongly connected part of the loop, as in `proof_of`, and if u
+    # is late "levels": places of its channels as in `Channels.late`, with those of `levels_of`
     proof: Sequence[dict[str, Any]] = ()
 
     @property
@@ -358,11 +359,16 @@ def _proof(
     whole = size if reserve else (1.0 + SLACK) * size
     for part in parts:
         deviation, disk = (1.0, size) if disks else (whole, 0.0)
-        steps = proof_of(part, deviation, disk, most, reserve)
+        levels = levels_of(part, deviation, disk) if part.late else np.zeros(0)
+        steps = proof_of(levelled(part, levels), deviation, disk, most, reserve)
         if steps is None:
             return None
         most -= len(steps)
-        proof.append({"entries": list(part.entries), "steps": steps})
+        proved: dict[str, Any] = {"entries": list(part.entries), "steps": steps}
+        if part.late:
+            half = len(part.late) // 2
+            proved["levels"] = list(zip(part.late[:half], levels[:half].tolist(), strict=True))
+        proof.append(proved)
     return proof
 
 

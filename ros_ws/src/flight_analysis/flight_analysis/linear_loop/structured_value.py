@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
+from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray, IntArray
 from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import SPECTRAL_RADIUS_TOLERANCE
 
@@ -55,22 +55,24 @@ class Scaling(NamedTuple):
     g: FloatArray
 
 
-def balancing_t(M: ComplexArray) -> FloatArray:
-    """Find the t = log(X) / 2 that makes row and column of each channel about equally large.
+def balancing_t(M: ComplexArray, share: FloatArray | None = None) -> FloatArray:
+    """Find the t = log(X) / 2 that makes row and column of each factor of X about equally large.
 
-    t has the shape (p,). The method is Osborne's iteration.
+    t has the shape (p,). `share` maps the factors of X to the channels, (p, f); each channel has
+    its own if it is not given. The method is Osborne's iteration.
     """
-    t = np.zeros(len(M))
-    sizes = np.abs(M) ** 2
+    share = np.eye(len(M)) if share is None else share
+    t = np.zeros(share.shape[1])
+    sizes = share.T @ np.abs(M) ** 2 @ share
     np.fill_diagonal(sizes, 0.0)
     least = 1e-18 * sizes.sum() + 1e-300
     for _ in range(BALANCE_ROUNDS):
-        for i in range(len(M)):
+        for i in range(len(t)):
             factor = np.sqrt((sizes[i].sum() + least) / (sizes[:, i].sum() + least))
             sizes[i] /= factor
             sizes[:, i] *= factor
             t[i] -= 0.5 * np.log(factor)
-    return t
+    return np.asarray(share @ t)
 
 
 def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
@@ -106,14 +108,14 @@ def least_bound(
     M: ComplexArray,
     real_count: int,
     target: float,
-    alike_count: int = 0,
+    factors: IntArray | None = None,
     near: Scaling | None = None,
 ) -> tuple[float, Scaling]:
     """Search for the X and G with the least bound of M, (p, p), and return the bound, X and G.
 
-    The first `real_count` channels are real, and the next `alike_count` channels share one factor
-    of X. The search begins at the balanced X, or at `near` if its bound is smaller. `near` has the
-    X and G of a similar matrix.
+    The first `real_count` channels are real. Channels that have the same number in `factors`, (p,),
+    share one factor of X. The search begins at the balanced X, or at `near` if its bound is
+    smaller. `near` has the X and G of a similar matrix.
 
     If the bound gets below `target`, the search ends with X and G in the middle of the set that
     reaches the target. The method of centres on the linear matrix inequality
@@ -123,18 +125,14 @@ def least_bound(
     minimises -log det F - log det X - sum log(LARGEST_G^2 - g^2) by Newton's method while the level
     falls. Source: S. Boyd, L. El Ghaoui, Linear Algebra and its Applications 188, 1993.
     """
-    t = balancing_t(M)
-    alike = slice(real_count, real_count + alike_count)
-    if alike_count:
-        t[alike] = t[alike].mean()
+    number = np.arange(len(M)) if factors is None else np.unique(factors, return_inverse=True)[1]
+    share = np.eye(int(number.max()) + 1)[number]
+    t = balancing_t(M, share)
     g = np.zeros(len(M))
     if near is not None and bound_at(M, near) <= bound_at(M, Scaling(t, g)):
         t, g = near.t, np.clip(near.g, -LARGEST_G / 2.0, LARGEST_G / 2.0)
     N = np.exp(t)[:, None] * M * np.exp(-t)
-    free = np.arange(len(M))
-    free[alike] = real_count
-    free[alike.stop :] -= max(alike_count - 1, 0)
-    centre = Centre(np.ones(len(M)), g[:real_count], np.eye(int(free[-1]) + 1)[free])
+    centre = Centre(np.ones(len(M)), g[:real_count], share)
     goal = target**2
     least = centre.bound(N)
     level = max(1.1 * least, goal)
@@ -165,7 +163,10 @@ def least_bound_at(
     k = len(part.entries)
     rows = np.r_[0:k, part.uncertain : len(scaled)]
     few = None if near is None else Scaling(near.t[rows], near.g[rows])
-    _, means = least_bound(scaled[np.ix_(rows, rows)], k, 1.0, part.late, few)
+    # all channels of a delay share a factor: `levels_of` has scaled them
+    factors = np.arange(len(scaled))
+    factors[part.uncertain : part.disks.start] = part.uncertain
+    _, means = least_bound(scaled[np.ix_(rows, rows)], k, 1.0, factors[rows], few)
     second = slice(k, part.uncertain)
     sizes = np.abs(scaled) ** 2 + TINY
     row = sizes[second, rows] @ np.exp(-2.0 * means.t)
@@ -177,7 +178,7 @@ def least_bound_at(
     bound = float(bound_at(scaled, scaling))
     if bound < 1.0 or w * part.period < MEANS_UP_TO:
         return bound, scaling
-    return least_bound(scaled, part.uncertain, 1.0, part.late, near)
+    return least_bound(scaled, part.uncertain, 1.0, factors, near)
 
 
 class Centre(NamedTuple):

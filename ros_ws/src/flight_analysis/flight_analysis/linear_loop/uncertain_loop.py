@@ -11,13 +11,15 @@ Their error is of the order of (T p)^4, for a period T and an eigenvalue p. Sour
 loop: T. Chen, B. Francis, "Optimal Sampled-Data Control Systems", chapter 10.
 
 u can be late by an unknown time from 0 to `late`, s, which differs from tick to tick and from input
-to input. At each instant the newest u that has arrived acts. The input of a period then changes by
+to input. At each instant the newest u that has arrived acts. Where the period of a u begins at
+s = 0, the input then changes by
 
-    w_0 + w_1 ROOT (2 s - 1),  w_0 = -sum_j a_j v_j,  w_1 = sum_j ROOT b_j v_j
+    -sum_j (1 + e_j(s)) / 2 v_j,  v_j = u_k-j - u_k-j-1
 
-with v_j = u_k-j - u_k-j-1. For a shift by j + f periods, 0 <= f < 1, a_i = 1 for i < j, a_j = f,
-b_j = f (1 - f), and all further coefficients are 0. Each coefficient is the middle of its range
-plus a real d, which can change from tick to tick. These channels therefore have one X for all
+over the first p_j of the period, p_j = min(late / T - j, 1). e_j is 1 until u_k-j arrives, and -1
+from then on. The middle, e_j = 0, belongs to the loop. e_j v_j is a function over p_j whose root
+mean square is abs(v_j), whatever e_j is: all its Legendre coefficients together are one channel
+that reads v_j, a full block of size 1. It can change from tick to tick, so it has one X for all
 frequencies, and G = 0.
 """
 
@@ -99,9 +101,10 @@ class Channels(NamedTuple):
     D: FloatArray
     entries: tuple[int, ...]  # indices of the entries in the box
     period: float  # s
-    # Number of the channels of a delay. The channels of w_0 come first, then the channels of w_1.
-    # Both groups are ordered by j, with the m inputs for each j.
-    late: int = 0
+    # Places of the channels of a delay among those of the whole loop: the means of e_j v_j, then
+    # their second coefficients, which read nothing because a block has one row. Both groups are
+    # ordered by j, with the m inputs for each j.
+    late: tuple[int, ...] = ()
 
     @property
     def uncertain(self) -> int:
@@ -116,7 +119,7 @@ class Channels(NamedTuple):
     @property
     def disks(self) -> slice:
         """Indices of the channels that belong to disks."""
-        return slice(self.uncertain + self.late, None)
+        return slice(self.uncertain + len(self.late), None)
 
     def some(self, channels: IntArray) -> "Channels":
         """Return the same loop with only some of its channels."""
@@ -232,8 +235,8 @@ def _blocks(D: FloatArray, V: FloatArray) -> FloatArray:
 def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int) -> Channels:
     """Add the channels of a delay to a loop with n states of the aircraft and k entries.
 
-    The nominal delay of the loop becomes the middle of the range of each coefficient. `ramps` is
-    the motion that w_1 causes. The states of the loop are followed by the c states that the w_1 of
+    The loop becomes that of e_j = 0. `ramps` is the motion that an input causes which rises over
+    the period. The states of the loop are followed by the c states that the rising inputs of
     earlier ticks need, and then by u of earlier ticks.
     """
     E, U, K = exact.W[:, : exact.uncertain], exact.W[:, exact.disks], exact.Z[exact.disks]
@@ -249,22 +252,22 @@ def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int
     now = np.hstack([K, np.zeros((m, c + width))])
     before = np.eye(width, q + c + width, q + c)
     shifted = np.vstack([now, before[:-m]])
-    # The channels of a delay read the change of u from tick to tick, scaled by their half ranges.
-    halves = np.minimum(parts, 0.5)
-    sizes = np.repeat([parts / 2.0, ROOT / 2.0 * halves * (1.0 - halves)], m, axis=1)
-    Z = np.vstack([size[:, None] * (shifted - before) for size in sizes])
-    V = np.zeros((2 * width, m))
-    V[:m] = np.diag(sizes[0, :m])
-    V[width : width + m] = np.diag(sizes[1, :m])
-    # Each channel acts as a constant u, or as a ramp over the period.
+    # The channels of a delay read the change of u from tick to tick.
+    Z = np.vstack([shifted - before, np.zeros((width, q + c + width))])
+    V = np.eye(2 * width, m)
+    # Coefficients over p_j act as a constant u and as a ramp over the whole period.
     held = np.vstack([U, np.zeros((c + width, m))])
     ramp = np.zeros((q + c + width, m))
     ramp[np.r_[0 : n + m, q : q + c]] = ramps.B[rows]
-    W = np.hstack([-held] * ticks + [ramp] * ticks)
     to_z = exact.D[: exact.uncertain]
-    D = np.hstack([-to_z[:, exact.disks]] * ticks + [_coefficients(ramps.B, n, k)] * ticks)
-    # Build the loop with the additional states and with the coefficients in the middle of their
-    # ranges.
+
+    def over_parts(held: FloatArray, ramp: FloatArray) -> FloatArray:
+        means = [ROOT * p * (1.0 - p) / 2.0 * ramp - p / 2.0 * held for p in parts]
+        return np.hstack([*means, *(-p * p / 2.0 * ramp for p in parts)])
+
+    W = over_parts(held, ramp)
+    D = over_parts(to_z[:, exact.disks], _coefficients(ramps.B, n, k))
+    # Build the loop with the additional states and with e_j = 0: the mean of 1 + e_j is 1.
     A = np.zeros((q + c + width, q + c + width))
     A[:q, :q] = exact.A
     A[: n + m, q : q + c] = effect[rows[: n + m]]
@@ -280,7 +283,7 @@ def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int
         W=np.hstack([np.vstack([E, np.zeros((c + width, E.shape[1]))]), W, U]),
         Z=np.vstack([np.hstack(reach) + D @ Z, Z, now]),
         D=_blocks(through, np.vstack([to_z[:, exact.disks] + D @ V, V])),
-        late=2 * width,
+        late=tuple(range(2 * width)),
     )
 
 
@@ -321,7 +324,7 @@ def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
     m = len(loop.D) - p
     c = len(inputs)
     # Find which nodes are coupled at some frequencies. A node is an entry, a late input or a disk.
-    late = np.tile(k + np.arange(m), every.late // m)
+    late = np.tile(k + np.arange(m), len(every.late) // m)
     at = np.pi / loop.period * np.array(PATTERN_PARTS)
     sizes = np.abs(every.response(at, 1.0 + 1e-6)).max(axis=0)
     wide = sizes > NO_COUPLING * np.sqrt(np.outer(sizes.max(axis=1), sizes.max(axis=0)) + 1e-300)
@@ -337,8 +340,8 @@ def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
         if looped and (not inputs or nodes[-1] >= k + m):
             channels = np.flatnonzero(np.isin(node, nodes))
             entries = tuple(nodes[nodes < k].tolist())
-            count_late = int(np.isin(late, nodes).sum())
-            parts.append(_reduced(every, channels)._replace(entries=entries, late=count_late))
+            places = tuple(np.flatnonzero(np.isin(late, nodes)).tolist())
+            parts.append(_reduced(every, channels)._replace(entries=entries, late=places))
     return parts
 
 
