@@ -34,6 +34,15 @@ is then what a step proves. N_d are the rows of z in N = diag(exp(t), 1) half M_
 exp(-s)), whose last row is a. `slowest` is the lowest frequency of the proof. From 0 it proves at
 abs(z) = SETTLING < 1 that every motion settles, since the modes outside are the integrators: they
 are at 1 for each d and move no u. From above 0 it proves at abs(z) = 1 that no motion is periodic.
+
+A file with the member `late` has inputs that are late by 0 to `time`, s, each by another time at
+each tick. The newest u that has arrived acts. If that of a tick begins to act at s = 0 in time, the
+input is less by (1 + e_j(s)) / 2 v_j over the first p_j = min(time / T - j, 1) of a period for each
+j, with v_j = u_-j - u_-j-1, and e_j is 1 or -1. The loop is that of e_j = 0. Each e_j v_j over a
+segment of the period is a channel whose row is v_j, and whose columns are its values at the nodes
+of Gauss: a full block of size 1. It changes in time, so it has g = 0 and the t of the file in each
+step. Then the gain from all e_j v_j to all v_j, scaled by exp(t), is below 1 for each d on abs(z) =
+RADIUS. By small gain no motion grows by more than RADIUS a tick, whatever e_j is.
 """
 
 import hashlib
@@ -76,6 +85,15 @@ not covered: entries that are 0 without a line above, limits and rates of the in
     the width of the softened sign, filters of sensors, actuators of another order, limits and
     fade-in of an observer, motion beyond the linear equations, other lags and delays, a late or
     missed tick, a schedule, deviations that change in time"""
+
+COVERED_WITH_LATE = """\
+covered: deviations constant in time, in the linear loop with this period, delay and lags, in which
+    the newest u that has arrived acts, however late within this time each u comes; no motion grows
+    by more than 1e-6 a tick
+not covered: entries that are 0 without a line above, limits and rates of the inputs, errors beyond
+    the width of the softened sign, filters of sensors, actuators of another order, limits and
+    fade-in of an observer, motion beyond the linear equations, other lags, later or missing u, a
+    late y or tick, a schedule, deviations that change in time"""
 
 COVERED_WITH_LIMIT = """\
 covered: deviations constant in time, in the loop with this period, delay and lags that is linear
@@ -142,11 +160,12 @@ FIELDS: dict[str, Any] = {
         "lags": Numbers(("h",), -1000.0, 1000.0),
         "taps": Numbers(("h",), 0.0, 1.0),
     },
+    "late": {"time": Numbers((), 1e-6, 1.0), "t": Numbers(("l", "m"), -100.0, 100.0)},
     "loop": HEX,
     "digest": HEX,
 }
-OPTIONAL = {"airframe", "scenario", "constants", "limit", "zeros"}
-MOST_OF = {"q": 512, "h": 1000, "steps": 50_000, "ticks": 100}
+OPTIONAL = {"airframe", "scenario", "constants", "limit", "late", "zeros"}
+MOST_OF = {"q": 512, "h": 1000, "l": 10, "steps": 50_000, "ticks": 100}
 STEP = {"low": (0.0, 1e5), "high": (0.0, 1e5), "t": (-100.0, 100.0), "g": (-1e9, 1e9)}
 LIMITED_STEP = STEP | {"s": (-100.0, 100.0)}
 
@@ -169,23 +188,41 @@ class Limit(NamedTuple):
         return complex(1.0 - self.taps @ np.exp(-1j * self.lags * turn))
 
 
+class Late(NamedTuple):
+    """The channels of inputs that are late."""
+
+    inputs: Array  # of each channel
+    t: Array
+    rest: Array  # norm of what each of these inputs adds to the rest of each z, beside the channels
+
+
+class Segment(NamedTuple):
+    """A part of a period in which the u of one tick acts, if it is in time."""
+
+    begin: float
+    end: float
+    tick: int  # how many ticks before
+    parts: list[float]  # p_j of each j that may be late here
+
+
 class Loop(NamedTuple):
     """[[A, W, V], [Z, D, V_z], [S, 0]]: states, channels, and the rest at the nodes of Gauss.
 
-    If an input is cut off, its channel is the first one.
+    If an input is cut off, its channel is the first one. The channels of late inputs are the last.
     """
 
     big: Array
     K: Array  # squares of its norm from entry to entry
     states: int
     period: float
+    late: Late
     radius: float = RADIUS
     limit: Limit | None = None
 
     @property
     def channels(self) -> slice:
         """The rows and columns of w and z."""
-        size = (self.limit is not None) + TERMS * len(self.K)
+        size = (self.limit is not None) + TERMS * len(self.K) + len(self.late.t)
         return slice(self.states, self.states + size)
 
 
@@ -386,83 +423,188 @@ def exponential(M: Array) -> Array:
     return np.linalg.matrix_power(total, 2**k)
 
 
+def parts_late(file: dict[str, Any]) -> list[float]:
+    """Return p_j of a certificate: in how much of a period u of j ticks before may still act.
+
+    Raises ValueError.
+    """
+    if "late" not in file:
+        return []
+    require("limit" not in file, "late", "a limit", "none beside it")
+    periods = float(file["late"]["time"] / file["period"])
+    count, rows = int(np.ceil(periods - 1e-9)), len(file["late"]["t"])
+    require(rows == count, "late t", rows, f"a row for each of {count} periods")
+    return [min(periods - j, 1.0) for j in range(count)]
+
+
+def segments_of(split: float, ticks: int, parts: list[float]) -> list[Segment]:
+    """Return the segments of a period at whose `split` the u of `ticks` before begins to act."""
+    ends = [split + p - turn for p in parts for turn in (0.0, 1.0)]
+    cuts = np.unique(np.round(np.clip([0.0, split, 1.0, *ends], 0.0, 1.0), 12))
+    segments = []
+    for begin, end in zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True):
+        middle = (begin + end) / 2.0
+        late = [p for p in parts if p > (middle - split) % 1.0]
+        segments.append(Segment(begin, end, ticks + int(middle < split), late))
+    return segments
+
+
+class Motion(NamedTuple):
+    """Aircraft and actuators within a period, x' = motion x + drive u + E w, z = F x + G u."""
+
+    chain: Array  # T times motion, and below it what integrates powers of the time
+    drive: Array
+    E: Array
+    F: Array
+    G: Array
+    T: float
+
+    def over(self, s: float) -> list[Array]:
+        """Return X(s) = exp(motion T s), then int X(s - r) r^j / j! dr over r from 0 to s."""
+        size = len(self.drive)
+        return np.split(exponential(self.chain * s)[:size], TERMS + 1, axis=1)
+
+    def after(self, s: float, x: Array, u: Array) -> Array:
+        """Return x behind a part s of a period in which u is held."""
+        X = self.over(s)
+        return np.asarray(X[0] @ x + self.T * X[1] @ self.drive @ u)
+
+    def struck(self, s: float, by: Array) -> Array:
+        """Return x at the end and the coefficients of z by an impulse at s."""
+        Y = self.over(1.0 - s)
+        to_z = [sum((-1) ** j * p.deriv(j)(1.0) * Y[j + 1] for j in range(TERMS)) for p in BASIS]
+        z = [self.F @ integral @ by for integral in to_z]
+        return np.asarray(self.T * np.vstack([Y[0] @ by, *z]))
+
+    def pushed(self, s: float) -> Array:
+        """Return what `struck` does for an impulse of u, which acts on z at once too."""
+        direct = [p(s) * self.G for p in BASIS]
+        return np.asarray(self.struck(s, self.drive) + np.vstack([0.0 * self.drive, *direct]))
+
+    def read(self, s: float) -> list[Array]:
+        """Return z at s by the coefficients of w."""
+        Y = self.over(s)
+        drives = [sum(p.deriv(j)(0.0) * Y[j + 1] for j in range(TERMS)) for p in BASIS]
+        return [self.T * self.F @ integral @ self.E for integral in drives]
+
+    def kernel(self, by: Array) -> Array:
+        """Return squares of the norm of the motion within a period, from entry to entry."""
+        kernel = np.array([self.T * self.F @ self.over((1.0 + s) / 2.0)[0] @ by for s in GAUSS])
+        return np.asarray(np.einsum("s,skc->kc", WEIGHTS * (1.0 - GAUSS) / 4.0, kernel**2))
+
+
+def motion_of(file: dict[str, Any]) -> Motion:
+    """Return the motion of aircraft and actuators from the numbers of a certificate."""
+    A, B, E, F, G, lag = (file[key] for key in [*"ABEFG", "lag"])
+    T, (n, m), k, has_lag = float(file["period"]), B.shape, E.shape[1], lag > 0.0
+    rate = np.diag(1.0 / np.where(has_lag, lag, 1.0))
+    chain = np.kron(np.eye(TERMS + 1, k=1), np.eye(n + m))
+    chain[: n + m, : n + m] = T * np.block([[A, B * has_lag], [np.zeros((m, n)), -rate]])
+    return Motion(
+        chain=chain,
+        drive=np.vstack([B * ~has_lag, rate * has_lag]),
+        E=np.vstack([E, np.zeros((m, k))]),
+        F=np.hstack([F, G * has_lag]),
+        G=G * ~has_lag,
+        T=T,
+    )
+
+
 def loop_of(file: dict[str, Any]) -> Loop:
     """Return the motion over a period from the numbers of a certificate."""
-    A, B, C, E, F, G, lag = (file[key] for key in [*"ABCEFG", "lag"])
-    law, T, (n, m), k = file["law"], float(file["period"]), B.shape, E.shape[1]
-    limit = limit_of(file)
+    C, law, T, motion = file["C"], file["law"], float(file["period"]), motion_of(file)
+    (size, m), k = motion.drive.shape, len(motion.F)
+    limit, parts = limit_of(file), parts_late(file)
     one = int(limit is not None)
-    size, has_lag = n + m, lag > 0.0
-    rate = np.diag(1.0 / np.where(has_lag, lag, 1.0))
-    drive = np.vstack([B * ~has_lag, rate * has_lag])
-    E, F, G = np.vstack([E, np.zeros((m, k))]), np.hstack([F, G * has_lag]), G * ~has_lag
-    chain = np.kron(np.eye(TERMS + 1, k=1), np.eye(size))
-    chain[:size, :size] = T * np.block([[A, B * has_lag], [np.zeros((m, n)), -rate]])
-
-    def over(s: float) -> list[Array]:
-        """Return X(s) = exp(motion T s), then int X(s - r) r^j / j! dr over r from 0 to s."""
-        return np.split(exponential(chain * s)[:size], TERMS + 1, axis=1)
-
     # The states are aircraft and actuators, u of earlier ticks, the newest first, and the law.
     ticks = int(np.floor(file["delay"] / T + 1e-9))
-    split = max(file["delay"] / T - ticks, 0.0)
-    kept, own = (ticks + 1) * m, len(law["A"])
-    states, channels = size + kept + own, TERMS * k
+    segments = segments_of(max(file["delay"] / T - ticks, 0.0), ticks, parts)
+    kept, own = (ticks + 1 + len(parts)) * m, len(law["A"])
+    states = size + kept + own
     # What is cut off follows the states, and the channels follow it.
     cut = np.zeros((m, 0)) if limit is None else -np.eye(m)[:, [limit.place]]
     u_now = np.hstack([law["D"] @ C, np.zeros((m, m + kept)), law["C"], cut])
     inputs = np.vstack([u_now, np.eye(states + one)[size : size + kept]])
-    new, old = inputs[ticks * m :][:m], inputs[(ticks + 1) * m :][:m]
-    X, first = over(split), np.eye(size, states + one)
-    second = X[0] @ first + T * X[1] @ drive @ old
-    nodes = np.r_[split * (GAUSS + 1) / 2, split + (1 - split) * (GAUSS + 1) / 2]
-    weights = np.r_[split * WEIGHTS, (1 - split) * WEIGHTS] / 2
-    reads, ends = [], []
-    for s in nodes:  # z at s by (zeta, w), and (x, z) at the end by an impulse of w at s
-        Y = over(s)
-        X, x, u = (over(s - split), second, new) if s >= split else (Y, first, old)
-        drives = [sum(p.deriv(j)(0.0) * Y[j + 1] for j in range(TERMS)) for p in BASIS]
-        free = F @ (X[0] @ x + T * X[1] @ drive @ u) + G @ u
-        reads.append(np.hstack([free, *(T * F @ integral @ E for integral in drives)]))
-        Y = over(1.0 - s)
-        to_z = [sum((-1) ** j * p.deriv(j)(1.0) * Y[j + 1] for j in range(TERMS)) for p in BASIS]
-        ends.append(T * np.vstack([Y[0] @ E, *(F @ integral @ E for integral in to_z)]))
-    values, root = np.array([p(nodes) for p in BASIS]), np.sqrt(weights)[:, None, None]
+    x = np.eye(size, states + one)
+    reads, ends, nodes, weights = [], [], [], []
+    rows, columns = [np.zeros((0, states + one))], [np.zeros((size + TERMS * k, 0))]
+    for begin, end, tick, late in segments:
+        us = inputs.reshape(-1, m, states + one)[tick:]
+        changes = us[: len(late)] - us[1 : len(late) + 1]
+        u = us[0] - changes.sum(axis=0) / 2.0
+        here, weight = begin + (end - begin) * (GAUSS + 1) / 2, (end - begin) * WEIGHTS / 2
+        for s in here:  # z at s by (zeta, w), and (x, z) at the end by an impulse of w at s
+            free = motion.F @ motion.after(s - begin, x, u) + motion.G @ u
+            reads.append(np.hstack([free, *motion.read(s)]))
+            ends.append(motion.struck(s, motion.E))
+        for p, change in zip(late, changes, strict=True):
+            by_u = np.array([motion.pushed(s) for s in here])
+            by_e = np.einsum("s,sai->ais", -0.5 * np.sqrt(weight * p), by_u)
+            columns.append(by_e.reshape(len(by_e), -1))
+            rows.append(np.kron(np.sqrt((end - begin) / p) * change, np.eye(len(here), 1)))
+        x = motion.after(end - begin, x, u)
+        nodes += here.tolist()
+        weights += weight.tolist()
+    Z_late, W_late = np.vstack(rows), np.hstack(columns)
+    values, root = np.array([p(np.array(nodes)) for p in BASIS]), np.sqrt(weights)[:, None, None]
     ZD, WV = (np.einsum("is,s,sab->iab", values, weights, f) for f in (reads, ends))
-    S = (root * (reads - np.einsum("is,iab->sab", values, ZD))).reshape(-1, states + one + channels)
+    S = (root * (reads - np.einsum("is,iab->sab", values, ZD))).reshape(len(nodes) * k, -1)
     V = np.hstack(list(root * (ends - np.einsum("is,iab->sab", values, WV))))
-    kernel = np.array([T * F @ over((1.0 + s) / 2.0)[0] @ E for s in GAUSS])
-    K = np.einsum("s,skc->kc", WEIGHTS * (1.0 - GAUSS) / 4.0, kernel**2)
-    X = over(1.0 - split)
-    motion = X[0] @ second + T * X[1] @ drive @ new
     still = np.zeros((own, one))
     law_motion = np.hstack([law["B"] @ C, np.zeros((own, m + kept)), law["A"], still])
-    A = np.vstack([motion, inputs[:kept], law_motion])
-    WV = np.pad(np.hstack([*WV[:, :size], V[:size]]), ((0, kept + own), (0, 0)))
-    acts = np.pad(-cut.T @ u_now, ((0, 0), (0, WV.shape[1])))
-    none = np.zeros((len(S), V.shape[1]))
-    big = np.block([[A, WV], [acts], [np.vstack(list(ZD)), V[size:]], [S, none]])
-    return Loop(big, K, states, T, RADIUS if limit is None else limit.radius, limit)
+    A = np.vstack([x, inputs[:kept], law_motion])
+    W = np.hstack([*WV[:, :size], W_late[:size], V[:size]])
+    z = np.hstack([np.vstack(list(ZD)), W_late[size:], V[size:]])
+    # What follows the columns of each row is 0.
+    blocks = [np.hstack([A, np.pad(W, ((0, kept + own), (0, 0)))]), -cut.T @ u_now, z, Z_late, S]
+    wide = [np.pad(rows, ((0, 0), (0, z.shape[1] - rows.shape[1]))) for rows in blocks]
+    return Loop(
+        big=np.vstack(wide),
+        K=motion.kernel(motion.E),
+        states=states,
+        period=T,
+        late=late_of(file, segments, motion.kernel(motion.drive) ** 0.5 + np.abs(motion.G)),
+        radius=RADIUS if limit is None else limit.radius,
+        limit=limit,
+    )
+
+
+def late_of(file: dict[str, Any], segments: list[Segment], by_u: Array) -> Late:
+    """Return the channels of late inputs. An input adds `by_u` times its norm to the rest of z."""
+    parts = parts_late(file)
+    if not parts:
+        return Late(np.zeros(0, dtype=int), np.zeros(0), np.zeros((len(by_u), 0)))
+    t = file["late"]["t"]
+    each = [row for segment in segments for row in t[: len(segment.parts)]]
+    sizes = np.sqrt(np.array(parts) @ np.exp(-2.0 * t)) / 2.0
+    inputs = np.tile(np.arange(t.shape[1]), len(each))
+    count = len(GAUSS)
+    return Late(np.repeat(inputs, count), np.repeat(np.ravel(each), count), by_u * sizes)
 
 
 def parts_of(loop: Loop) -> list[tuple[tuple[int, ...], Loop]]:
     """Return the strongly connected parts and their entries: these have the modes of the loop."""
-    n, k, one = loop.states, len(loop.K), int(loop.limit is not None)
-    total = n + one + k
-    # of each row and column: the state, or the number of states + what is cut off + the entry
-    each = np.arange(n + one, total)
-    node = np.r_[0 : n + one, np.tile(each, (len(loop.big) - n - one) // k)]
+    n, k, one, late = loop.states, len(loop.K), int(loop.limit is not None), loop.late
+    # of each row and column: the state, or the number of states + what is cut off + the entry, or
+    # the late input behind these
+    first, behind = n + one, n + one + k
+    total = behind + late.rest.shape[1]
+    each = np.arange(first, behind)
+    rest = (len(loop.big) - loop.channels.stop) // k
+    node = np.r_[0:first, np.tile(each, TERMS), behind + late.inputs, np.tile(each, rest)]
     reach = np.eye(total)
     np.add.at(reach, (node[:, None], node[None]), np.abs(loop.big) > 0.0)
-    reach[n + one :, n + one :] += loop.K
+    reach[first:behind, first:] += np.hstack([loop.K, late.rest])
     for _ in range(int(np.ceil(np.log2(total)))):
         reach = (reach @ reach > 0.0).astype(float)
     parts = []
     for member in np.unique(reach * reach.T > 0.0, axis=0):
-        rows, entries = np.flatnonzero(member[node]), np.flatnonzero(member[n + one :])
+        rows, entries = np.flatnonzero(member[node]), np.flatnonzero(member[first:behind])
         big, K = loop.big[np.ix_(rows, rows)], loop.K[np.ix_(entries, entries)]
-        limit = loop.limit if member[n : n + one].any() else None
-        part = loop._replace(big=big, K=K, states=int(member[:n].sum()), limit=limit)
+        limit = loop.limit if member[n:first].any() else None
+        is_here, added = member[behind + late.inputs], late.rest[entries][:, member[behind:]]
+        own = Late(late.inputs[is_here], late.t[is_here], added)
+        part = loop._replace(big=big, K=K, states=int(member[:n].sum()), limit=limit, late=own)
         parts.append((tuple(entries.tolist()), part))
     return parts
 
@@ -544,6 +686,7 @@ class System(NamedTuple):
     gy_by_v: float
     rest_by_w: float
     rest_by_v: float
+    rest_by_late: float
     gain: float  # exp(-s) of the limited input
 
 
@@ -552,17 +695,23 @@ def system_of(
 ) -> System:
     """Return the system of a step. If t lacks coefficients, they balance those before them."""
     n, k, known = part.states, len(part.K), len(step["t"])
-    one, p, w = int(part.limit is not None), TERMS * k, part.channels
-    rest, c = slice(w.stop, None), np.r_[np.zeros(one), np.tile(middle, TERMS)]
+    one, p, w, late = int(part.limit is not None), TERMS * k, part.channels, part.late
+    still = np.zeros(len(late.t))
+    rest, c = slice(w.stop, None), np.r_[np.zeros(one), np.tile(middle, TERMS), still]
     around = closed(part.big[: w.stop], w, c)
     (A, W, V), (Z, D, y) = (np.split(side, [n, w.stop], axis=1) for side in (around[:n], around[w]))
-    wide = np.r_[np.ones(one), np.tile(half, TERMS)][:, None]
+    wide = np.r_[np.ones(one), np.tile(half, TERMS), still + 1.0][:, None]
     R = np.linalg.inv(part.radius * np.exp(1j * frequency * part.period) * np.eye(n) - A)
     sizes = (np.abs(wide * (Z @ R @ W + D)) ** 2 + 1e-30)[one:, one:]
-    t, g = (np.r_[step[key], np.zeros(p - known)] for key in "tg")
+    t, g = (
+        np.r_[step[key], np.zeros(p - known), last]
+        for key, last in zip("tg", (late.t, still), strict=True)
+    )
     for i in range(known, p, k):
-        to = (np.exp(t[:i]) * (1.0 + np.abs(g[:i]))) ** 2 @ sizes[:i, i : i + k]
-        t[i : i + k] = np.log(to / (sizes[i : i + k, :i] @ np.exp(-2.0 * t[:i]))) / 4.0
+        before = np.r_[0:i, p : len(t)]
+        to = (np.exp(t[before]) * (1.0 + np.abs(g[before]))) ** 2 @ sizes[before, i : i + k]
+        out = sizes[i : i + k, before] @ np.exp(-2.0 * t[before])
+        t[i : i + k] = np.log(to / out) / 4.0
     # Balance the coefficients that t lacks against all others, channel by channel (Osborne).
     np.fill_diagonal(sizes, 1e-30)
     weight = (1.0 + np.abs(g)) ** 2
@@ -570,7 +719,7 @@ def system_of(
         into = (weight * np.exp(2.0 * t)) @ sizes[:, i]
         t[i] = np.log(into / (sizes[i] @ np.exp(-2.0 * t))) / 4.0
     # v of an entry is scaled as its last coefficient, and is at most `most` times the rest of z.
-    most, last = np.abs(middle) + half, np.exp(t[-k:])
+    most, last = np.abs(middle) + half, np.exp(t[p - k : p])
     s = np.full(one, step.get("s", 0.0))
     out, scale = np.exp(np.r_[0.0 * s, t]), np.exp(np.r_[s, t])
     nodes = (len(part.big) - w.stop) // k
@@ -594,10 +743,11 @@ def system_of(
         S=np.array(np.linalg.qr(by_x, "r")),
         S_w=by_x.T @ by_w,
         g=g,
-        y_by_v=[norm(rows) for rows in np.split(y, TERMS)],
+        y_by_v=[norm(rows) for rows in np.split(y[:p], TERMS)],
         gy_by_v=norm(g[:, None] * y),
         rest_by_w=norm(by_w),
         rest_by_v=rest_by_v,
+        rest_by_late=norm((most * last)[:, None] * late.rest),
         gain=float(np.exp(-s[0])) if one else 0.0,
     )
 
@@ -612,7 +762,7 @@ def is_positive(X: Array) -> bool:
 
 def is_proved(system: System, part: Loop, w: float, x: float) -> bool:
     """Return whether the box has no mode at any frequency from w - x to w + x."""
-    A, W, V, Z, D, S, S_w, g, y_by_v, gy_by_v, rest_by_w, rest_by_v, gain = system
+    A, W, V, Z, D, S, S_w, g, y_by_v, gy_by_v, rest_by_w, rest_by_v, rest_by_late, gain = system
     (n, p), period = W.shape, part.period
     one = p - len(g)
     z, delta = part.radius * np.exp(1j * w * period), part.radius * x * period
@@ -646,7 +796,7 @@ def is_proved(system: System, part: Loop, w: float, x: float) -> bool:
     if not loop_gain < 0.9:
         return False
     square = norm(S @ right) ** 2 + 2.0 * float((S_w * right.real).sum()) + rest_by_w**2
-    rest = (square**0.5 + sum(moved(S @ R))) / (1.0 - loop_gain)
+    rest = (square**0.5 + sum(moved(S @ R)) + rest_by_late) / (1.0 - loop_gain)
     y_by_x = norm(left @ V) + norm(left) * (delta * x_by_v + 2.0 * error * norm(V))
     N = D + Z @ right
     N_d, left_d = N[one:], left[one:]
@@ -654,7 +804,8 @@ def is_proved(system: System, part: Loop, w: float, x: float) -> bool:
     if part.limit is not None:
         Y = np.r_[gain * part.limit.at(w * period), Y]
     added = (norm(np.array(y_by_v)) + y_by_x) * rest
-    N_y = sum(norm(rows) * y for rows, y in zip(np.split(N_d, TERMS), y_by_v, strict=True))
+    by_term = np.split(N_d[: TERMS * len(part.K)], TERMS)
+    N_y = sum(norm(rows) * y for rows, y in zip(by_term, y_by_v, strict=True))
     H_added = (N_y + gy_by_v + (norm(N_d) + np.abs(Y).max()) * y_by_x) * rest
     gram, skew = adjoint(N_d) @ N_d, Y[:, None] * N
     H_left = adjoint(N_d) @ left_d + Y[:, None] * left
@@ -987,6 +1138,8 @@ def check(file: dict[str, Any]) -> int:
         if slowest and not entries and not is_single and not is_stable(motion, SETTLING):
             raise ValueError("a part without entries may oscillate")
         require(part.limit is None or len(entries) > 0, "limit", "no entry", "a part with entries")
+        is_late = len(part.late.t) > 0 and part.states > 0
+        require(not is_late or len(entries) > 0, "late", "no entry", "parts with entries")
         if entries and (
             part.big[part.states :, part.states :].any() or part.states or part.K.any()
         ):
@@ -1040,7 +1193,12 @@ def report_of(file: dict[str, Any], count: int) -> str:
     lines.append(f"law: {law}")
     lags = ", ".join(f"{lag:g}" for lag in file["lag"])
     lines.append(f"period {file['period']:g} s, delay {file['delay']:g} s, lags [{lags}] s")
-    return "\n".join([*lines, COVERED_WITH_LIMIT if "limit" in file else COVERED])
+    covered = COVERED_WITH_LIMIT if "limit" in file else COVERED
+    if "late" in file:
+        time = np.floor(1e6 * file["late"]["time"] + 1e-6) / 1e6
+        lines.append(f"late: each input by 0 to {time:g} s, by another time at each tick")
+        covered = COVERED_WITH_LATE
+    return "\n".join([*lines, covered])
 
 
 def main() -> int:

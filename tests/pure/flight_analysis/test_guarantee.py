@@ -377,7 +377,7 @@ def test_guarantee_says_what_is_exact_in_every_aircraft() -> None:
     assert text[1].endswith(f"{kinematic}, lags, delay, period, each entry that is 0")
     assert "no mode grows by more than 1e-6 a tick" in text[1]
     late = guarantee_text(loop_guarantee(integrator(60.0, 0.1), 0.01))
-    assert "(no certificate: up to what two coefficients of a period leave out)" in late[0]
+    assert ", u up to 10 ms late (certificate " in late[0]
 
 
 def test_factor_with_a_nan_is_not_inside() -> None:

@@ -60,10 +60,6 @@ def require_guarantee(
     as_number(late, "late", 0.0, MAX_DELAY_MARGIN, "s")
     if controller_alone(scenario) is not None:
         require(worst is None, "worst", f"no aircraft in {scenario}", "a scenario that flies one")
-    is_certified = certificate is not None
-    require(
-        late == 0.0 or not is_certified, "certificate", f"--late {late:g} beside it", "u in time"
-    )
     # These checks come before the proof, which can take minutes.
     _require_worst(worst, airframe, scenario)
     if certificate is not None:

@@ -36,17 +36,28 @@ def certificate(linear: LinearLoop, guarantee: Guarantee, sources: Mapping[str, 
 
     Args:
         linear: The loop, with the box of the guarantee. The size of this box does not matter.
-        guarantee: The guarantee of this loop, computed for a u that is never late.
+        guarantee: The guarantee of this loop.
         sources: The files from which the loop was built, by name: SHA-256 of the airframe and of
             the scenario, and the text of the exported constants.
 
     Raises:
-        ParameterError: Nothing is proved, or u can be late. For a late u, the checker has no bound
-            for the coefficients that are left out.
+        ParameterError: Nothing is proved, or u can be late in a part of the loop in which all
+            entries are exact.
     """
     require(guarantee.stable > 0.0, "certificate", "no stable box", "a loop with a guarantee")
-    require(guarantee.late == 0.0, "certificate", f"u up to {guarantee.late:g} s late", "u in time")
-    return _text(linear, guarantee.stable, {**sources, "parts": guarantee.proof})
+    parts = [{key: part[key] for key in ("entries", "steps")} for part in guarantee.proof]
+    proof: dict[str, Any] = {**sources, "parts": parts}
+    if guarantee.late:
+        expected = "an entry that deviates in each part with a late u"
+        exact = "a part with exact entries alone"
+        require(all(part["entries"] for part in parts), "certificate", exact, expected)
+        m = len(linear.inputs)
+        t = np.zeros((math.ceil(guarantee.late / linear.loop.period - 1e-9), m))
+        for part in guarantee.proof:
+            for place, level in part.get("levels", []):
+                t[divmod(place, m)] = level
+        proof["late"] = {"time": guarantee.late, "t": t}
+    return _text(linear, guarantee.stable, proof)
 
 
 def limit_certificate(

@@ -99,8 +99,8 @@ class Guarantee(NamedTuple):
 
     @property
     def certificate(self) -> str:
-        """Name of the certificate, or "" if u is late or nothing is proved."""
-        return self.loop[:NAMED] if self.stable and not self.late else ""
+        """Name of the certificate, or "" if nothing is proved."""
+        return self.loop[:NAMED] if self.stable else ""
 
     def as_json(self) -> dict[str, Any]:
         """Return everything except the proof."""

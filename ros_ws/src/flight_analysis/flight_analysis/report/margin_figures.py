@@ -229,9 +229,6 @@ def guarantee_text(guarantee: Guarantee) -> list[str]:
     if guarantee.stable == 0.0:
         return ["guarantee: none, not even the aircraft of the file is proved stable"]
     late = f", u up to {1e3 * guarantee.late:g} ms late" if guarantee.late else ""
-    name = "no certificate: up to what two coefficients of a period leave out"
-    if guarantee.certificate:
-        name = f"certificate {guarantee.certificate}"
     lags = "lags, " if guarantee.has_exact_lags else ""
     zero = "each entry that is 0"
     within = (
@@ -242,7 +239,7 @@ def guarantee_text(guarantee: Guarantee) -> list[str]:
         within += f", entries that are 0 within {proved_percent(guarantee.zeros)} of their rows"
     exact = ", ".join((*guarantee.exact, f"{lags}delay, period, {zero}"))
     lines = [
-        f"guarantee: {within}{late} ({name})",
+        f"guarantee: {within}{late} (certificate {promise.certificate})",
         f"stable: no mode grows by more than 1e-6 a tick; exact in every aircraft: {exact}",
         _first_found(guarantee.unstable),
     ]
