@@ -52,7 +52,7 @@ HEADINGS = (
     "its frequency, rad/s",
     "gap, %",
     "the same with u up to 10 ms late, another time at each tick, %",
-    "first found at a constant delay, %",
+    "first found with such a u, %",
     "guaranteed disk margin of all inputs within 30 %",
     "least found",
     "processor time, s",

@@ -17,7 +17,8 @@ from tests.pure.flight_analysis.test_certificate import Content, _checker, loop_
 
 from flight_analysis.linear_loop import guarantee as guarantee_module
 from flight_analysis.linear_loop.certificate import certificate
-from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
+from flight_analysis.linear_loop.guarantee import Guarantee, loop_guarantee
+from flight_analysis.linear_loop.late_sequences import nearest_leaving, ticks_of
 from flight_analysis.linear_loop.loop_margins import LinearLoop
 from flight_analysis.linear_loop.structured_value import RADIUS
 from flight_analysis.linear_loop.uncertain_loop import plants_at
@@ -27,6 +28,8 @@ from rise_di_controller.law.linear_loop import LinearPlant, closed_loop
 pytestmark = pytest.mark.slow
 
 LATE = 0.01  # s, a period
+CORNER = np.array([-1, 1, 1, -1, -1, 1, 1, -1, *[0] * 9, -1, -1, -1, -1, 1, 0, 0, 0, 0])
+"""Signs of an aircraft that a delay of all inputs by 10 ms makes unstable from 59.9 % on."""
 
 
 @pytest.fixture(scope="module")
@@ -35,26 +38,26 @@ def observer() -> LinearLoop:
 
 
 @pytest.fixture(scope="module")
-def promise(observer: LinearLoop) -> Guarantee:
+def guarantee(observer: LinearLoop) -> Guarantee:
     """What is proved for a fifth less than what is unstable: without disks and finer steps."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(guarantee_module, "GAPS", (0.2,))
         patch.setattr(guarantee_module, "HALVINGS", 0)
-        return guarantee(observer, LATE)
+        return loop_guarantee(observer, LATE)
 
 
 @pytest.fixture(scope="module")
-def content(observer: LinearLoop, promise: Guarantee) -> Content:
-    found: Content = json.loads(certificate(observer, promise, {}))
+def content(observer: LinearLoop, guarantee: Guarantee) -> Content:
+    found: Content = json.loads(certificate(observer, guarantee, {}))
     return found
 
 
 def test_checker_proves_a_guarantee_with_a_late_u(
-    content: Content, promise: Guarantee, tmp_path: Path
+    content: Content, guarantee: Guarantee, tmp_path: Path
 ) -> None:
     done = run(content, tmp_path)
     assert done.returncode == 0, done.stderr
-    assert f") {np.floor(1e3 * promise.stable) / 10.0:g} %" in done.stdout
+    assert f") {np.floor(1e3 * guarantee.stable) / 10.0:g} %" in done.stdout
     assert "late: each input by 0 to 0.01 s, by another time at each tick" in done.stdout
     assert "the newest u that has arrived acts" in done.stdout
 
@@ -159,12 +162,12 @@ def test_altered_certificate_with_a_late_u_is_refused(
 
 
 def test_part_with_exact_entries_alone_has_no_certificate(
-    observer: LinearLoop, promise: Guarantee
+    observer: LinearLoop, guarantee: Guarantee
 ) -> None:
     """The checker proves steps of boxes: a part without entries has none."""
-    proof = [*promise.proof, {"entries": [], "steps": [], "levels": [(0, 0.0)]}]
+    proof = [*guarantee.proof, {"entries": [], "steps": [], "levels": [(0, 0.0)]}]
     with pytest.raises(ValueError, match="a part with exact entries alone"):
-        certificate(observer, promise._replace(proof=proof), {})
+        certificate(observer, guarantee._replace(proof=proof), {})
 
 
 class Ticks:
@@ -206,18 +209,17 @@ class Ticks:
 
 
 def test_sequences_of_delays_inside_a_certificate_are_stable_and_one_outside_leaves(
-    observer: LinearLoop, promise: Guarantee
+    observer: LinearLoop, guarantee: Guarantee
 ) -> None:
     """A search found the sequence, of an aircraft that each constant delay leaves stable."""
     rng, box = np.random.default_rng(6), observer.box
     assert box is not None
     for _ in range(300):
-        d = promise.stable / box.largest * np.sign(rng.standard_normal(len(box.names)))
+        d = guarantee.stable / box.largest * np.sign(rng.standard_normal(len(box.names)))
         ticks = Ticks(plants_at(observer.nominal, box, d), observer)
         sequence = rng.random((int(rng.integers(1, 9)), 4)) < rng.random()
         assert ticks.growth(sequence) <= RADIUS ** len(sequence)
-    signs = np.array([-1, 1, 1, -1, -1, 1, 1, -1, *[0] * 9, -1, -1, -1, -1, 1, 0, 0, 0, 0])
-    aircraft = plants_at(observer.nominal, box, 0.59 / box.largest * signs)
+    aircraft = plants_at(observer.nominal, box, 0.59 / box.largest * CORNER)
     leaving = np.zeros((23, 4), dtype=np.bool_)
     leaving[:, 0] = [late == "1" for late in "11011111011111011110111"]
     leaving[[5, 11], 3] = True
@@ -228,3 +230,38 @@ def test_sequences_of_delays_inside_a_certificate_are_stable_and_one_outside_lea
     for delay in np.linspace(0.0, LATE, 5):
         exact = closed_loop(aircraft, observer.law, observer.loop, np.full(4, delay))
         assert np.abs(np.linalg.eigvals(exact)).max() <= RADIUS
+
+
+@pytest.mark.parametrize(("delay", "late"), [(0.0, 0.01), (0.003, 0.01), (0.017, 0.006)])
+def test_ticks_of_the_search_are_the_exact_loop(
+    delay: float, late: float, observer: LinearLoop
+) -> None:
+    """A choice that stays is a constant delay of some inputs."""
+    timing = observer.loop._replace(delay=delay)
+    ticks = ticks_of(observer.nominal, observer.law, timing, late)
+    assert len(ticks.maps) == 16
+    for choice in (0, 1, 6, 15):
+        extra = np.array([late * (choice >> i & 1) for i in range(4)], dtype=np.float64)
+        modes = np.linalg.eigvals(closed_loop(observer.nominal, observer.law, timing, extra))
+        found = np.linalg.eigvals(ticks.maps[choice])
+        for mode in modes[(np.abs(modes) > 0.3) & (np.abs(modes - 1.0) > 1e-3)]:
+            assert np.abs(found - mode).min() == approx(0.0, abs=1e-9)
+
+
+def test_search_finds_a_sequence_that_leaves_below_each_constant_delay(
+    observer: LinearLoop,
+) -> None:
+    """It leaves by exponentials of another hand, and a little nearer it is stable again."""
+    box = observer.box
+    assert box is not None
+    d = 0.599 / box.largest * CORNER
+    found = nearest_leaving(observer.nominal, observer.law, observer.loop, box, LATE, d)
+    assert found is not None
+    assert np.abs(found.d).max() * box.largest < 0.585
+    sequence = np.array(found.late)
+    ticks = Ticks(plants_at(observer.nominal, box, found.d), observer)
+    assert ticks.growth(sequence) > RADIUS ** len(sequence)
+    nearer = Ticks(plants_at(observer.nominal, box, 0.98 * found.d), observer)
+    assert nearer.growth(sequence) <= RADIUS ** len(sequence)
+    constant = np.array([[False] * 4, [True] * 4])
+    assert all(ticks.growth(delay[None]) <= RADIUS for delay in constant)

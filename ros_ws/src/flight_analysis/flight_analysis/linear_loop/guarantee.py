@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.linear_loop.branch_and_bound import levelled, levels_of, proof_of
+from flight_analysis.linear_loop.late_sequences import nearest_leaving
 from flight_analysis.linear_loop.loop_margins import LAG_ENTRY, MOST_OF_LAG, LinearLoop
 from flight_analysis.linear_loop.structured_value import RADIUS
 from flight_analysis.linear_loop.uncertain_loop import (
@@ -38,6 +39,7 @@ CONFIRMED = 10  # number of such steps that are tried
 # size to prove. If a proof succeeds with the first of GAPS, FINER_GAPS are tried as well.
 GAPS = (0.08, 0.16, 0.32, 0.64, 1.28, 2.56)
 FINER_GAPS = (0.04, 0.02, 0.01, 0.005)
+ATTACKED = 4  # number of unstable aircraft from which a search for sequences of delays starts
 HALVINGS = 3  # how often the distance of two of GAPS is halved
 BOXES = 1500  # largest number of steps of a proof for the first gap
 FEWER_BOXES = 300  # largest number of steps for the other gaps, and for disks
@@ -58,6 +60,9 @@ class Unstable(NamedTuple):
     frequency: float  # rad/s
     # relative deviation of each entry; an entry that is 0 in the file is given as a part of its row
     entries: dict[str, float]
+    # in which inputs u is late by the whole time, tick by tick, if this sequence, repeated, makes
+    # the aircraft unstable and no constant delay that was tried does
+    late: tuple[tuple[bool, ...], ...] = ()
 
 
 class Zeros(NamedTuple):
@@ -135,7 +140,12 @@ def loop_guarantee(
         return none
     uncertain = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
     report("searching for an unstable aircraft")
-    first = _first_unstable(linear, late, LARGEST / float(box.part.max()))
+    found = _unstable(linear, late, LARGEST / float(box.part.max()))
+    if 0.0 < late <= linear.loop.period:
+        report("searching for a sequence of delays that makes an aircraft unstable")
+        for each in found[:ATTACKED]:
+            found.append(_leaving(linear, late, each, _nearest(found)))
+    first = _nearest(found)
     size = 1.0 / float(box.part.max()) if first is None else first.deviation / largest
     # beyond MOST_OF_LAG nothing can be proved for a lag
     most = MOST_OF_LAG / float(box.part[is_lag].max()) if is_lag.any() else np.inf
@@ -220,7 +230,7 @@ def _quick(
     """Return the size that is proved, the unstable aircraft that deviates least, and the proof."""
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
-    first = _first_unstable(linear, late, LARGEST * most, quick=True)
+    first = _nearest(_unstable(linear, late, LARGEST * most, quick=True))
     size = most if first is None else first.deviation / box.largest
     parts = parts_of(uncertain_loop(linear.nominal, linear.law, linear.loop, box, late))
     proved, proof = _proved(parts, size, disks=False, exact=first is None, finer_gaps=())
@@ -251,13 +261,15 @@ def _loops(linear: LinearLoop, late: float) -> list[LoopTiming]:
     return [loop._replace(delay=loop.delay + extra) for extra in sorted({0.0, late})]
 
 
-def _first_unstable(
-    linear: LinearLoop, late: float, largest: float, *, quick: bool = False
-) -> Unstable | None:
-    """Search for unstable aircraft up to a size of the box, and return the one that deviates least.
+def _nearest(found: Sequence[Unstable]) -> Unstable | None:
+    """Return the aircraft that deviates least, or None if there is none."""
+    return min(found, key=lambda unstable: unstable.deviation, default=None)
 
-    Returns None if the search finds none.
-    """
+
+def _unstable(
+    linear: LinearLoop, late: float, largest: float, *, quick: bool = False
+) -> list[Unstable]:
+    """Search for unstable aircraft up to a size of the box. Those that deviate least come first."""
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
     found = []
@@ -266,7 +278,27 @@ def _first_unstable(
         for part in parts_of(uncertain_loop(linear.nominal, linear.law, loop, box)):
             unstable = first_unstable(part, len(box.names), largest, quick=quick)
             found += [_confirmed(delayed, d) for d in unstable]
-    return min(filter(None, found), key=lambda unstable: unstable.deviation, default=None)
+    return sorted(filter(None, found), key=lambda unstable: unstable.deviation)
+
+
+def _leaving(
+    linear: LinearLoop, late: float, known: Unstable, nearest: Unstable | None
+) -> Unstable:
+    """Return an aircraft that a sequence of delays makes unstable, or the known one.
+
+    It lies in the direction of the known one and is nearer than `nearest`.
+    """
+    assert nearest is not None  # noqa: S101 - the known one is found
+    box = linear.box
+    assert box is not None  # noqa: S101 - for mypy
+    parts = np.array([known.entries.get(name, 0.0) for name in box.names])
+    d = np.divide(parts, box.part, out=np.zeros(len(parts)), where=box.part > 0.0)
+    d *= nearest.deviation / known.deviation
+    found = nearest_leaving(linear.nominal, linear.law, linear.loop, box, late, d)
+    if found is None:
+        return known
+    frequency = found.frequency / linear.loop.period
+    return _as_unstable(box, found.d, frequency)._replace(late=found.late)
 
 
 def _disks(
@@ -386,11 +418,14 @@ def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:
         worst = z[int(np.argmax(np.abs(z)))]
         if abs(worst) > RADIUS:
             turn = abs(np.angle(worst))
-            parts = d * box.part
-            entries = {
-                name: float(part) for name, part in zip(box.names, parts, strict=True) if part
-            }
-            deviation = float(np.abs(d).max()) * box.largest
-            return Unstable(deviation, turn / linear.loop.period, entries)
+            return _as_unstable(box, d, turn / linear.loop.period)
         d = EXACT * d
     return None
+
+
+def _as_unstable(box: Box, d: FloatArray, frequency: float) -> Unstable:
+    """Return the unstable aircraft with deviations d."""
+    entries = {
+        name: float(part) for name, part in zip(box.names, d * box.part, strict=True) if part
+    }
+    return Unstable(float(np.abs(d).max()) * box.largest, frequency, entries)

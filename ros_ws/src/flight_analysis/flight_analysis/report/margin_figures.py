@@ -239,7 +239,7 @@ def guarantee_text(guarantee: Guarantee) -> list[str]:
         within += f", entries that are 0 within {proved_percent(guarantee.zeros)} of their rows"
     exact = ", ".join((*guarantee.exact, f"{lags}delay, period, {zero}"))
     lines = [
-        f"guarantee: {within}{late} (certificate {promise.certificate})",
+        f"guarantee: {within}{late} (certificate {guarantee.certificate})",
         f"stable: no mode grows by more than 1e-6 a tick; exact in every aircraft: {exact}",
         _first_found(guarantee.unstable),
     ]
@@ -270,7 +270,8 @@ def _first_found(first: Unstable | None) -> str:
     if first is None:
         return "no unstable aircraft found within 99 %"
     place = f"at {found_percent(first.deviation)} ({first.frequency:.2g} rad/s)"
-    return f"the first unstable aircraft found: {place}"
+    sequence = f", u late in a sequence of {len(first.late)} ticks" if first.late else ""
+    return f"the first unstable aircraft found: {place}{sequence}"
 
 
 def guarantee_rows(guarantee: Guarantee, margins: LoopMargins) -> list[tuple[str, float, float]]:
