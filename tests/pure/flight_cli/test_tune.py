@@ -23,8 +23,10 @@ from tests.vehicle_logs import write_dataflash, write_ulog
 from aircraft_sim.airframes.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_cli.cli import application
 from flight_cli.tune_candidates import Candidate, best_of
+from flight_cli.tune_page import guaranteed
 from flight_core.vectors import FloatArray
 from flight_design.identification.own_loop import own_loop
 from flight_design.identification.rates_model import banking
@@ -431,3 +433,13 @@ def test_gains_of_arduplane_are_an_angle_of_45_deg_at_full_torque(ratio: float) 
     assert approx([ratio**2] * 2) == loop.I
     del parameters["RLL_RATE_P"]
     assert own_loop(parameters, scenario, "ardupilot") is None
+
+
+def test_deviations_that_are_covered_are_rounded_down() -> None:
+    """1.98 of 2 standard deviations are no 2 that are proved."""
+    guarantee = Guarantee(
+        uncertainty=0.5, stable=0.495, unstable=None, disk={}, disk_all=0.0, loop=""
+    )
+    sentence = guaranteed(guarantee)
+    assert "an aircraft may be unstable" in sentence
+    assert sentence.endswith("which covers 1.9 of them")

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Show the results of `rise-di tune`: the aircraft, the controllers, and what to do next."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -124,10 +125,11 @@ def verdict(tuned: Tuned) -> list[str]:
 def guaranteed(guarantee: Guarantee) -> str:
     """Return a sentence on how many standard deviations of A and B the guarantee covers."""
     holds = "every aircraft is stable" if guarantee.holds else "an aircraft may be unstable"
-    covered = 2.0 * guarantee.stable / guarantee.uncertainty
+    # Rounded down, because more is not proved.
+    covered = math.floor(20.0 * guarantee.stable / guarantee.uncertainty) / 10.0
     return (
         f"A and B within twice their stated deviations: {holds} by the guarantee, which covers "
-        f"{covered:.2g} of them"
+        f"{covered:g} of them"
     )
 
 
