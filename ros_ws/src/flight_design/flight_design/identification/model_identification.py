@@ -368,7 +368,6 @@ def identify_model(
     _require_motion(airframe.outputs, recorded.y[is_known])
     validating = is_known & held_out(len(recorded.t), span_length(recorded))
     used = is_known & ~validating
-    later = is_known & (recorded.t > after)
     every = blocks(model)
     study = _Study(
         recorded=recorded,
@@ -376,7 +375,7 @@ def identify_model(
         delay=actuation.delay,
         unknown=unknown,
         validating=validating,
-        later=later,
+        later=is_known & (recorded.t > after),
         channels=channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs)),
         bound_count=bound_count,
         searches_again=searches_again,
