@@ -135,11 +135,15 @@ def test_zero_alone_goes_up_to_the_closed_form() -> None:
 def test_kept_guarantee_says_how_far_zeros_go_alone() -> None:
     linear = integrator(K, 0.3)
     far = zeros_alone(with_zero(part=0.0, zero=1.0))
-    guarantee = loop_guarantee(linear)._replace(zeros_alone=far)
+    assert far is not None
+    assert far.unstable is not None
+    late = far.unstable._replace(late=((True,), (False,)))
+    guarantee = loop_guarantee(linear)._replace(zeros_alone=far, unstable=late)
     keep(guarantee)
     kept = kept_guarantee(linear)
     assert kept is not None
     assert kept.zeros_alone == far
+    assert kept.unstable == late
     assert "entries that are 0, beside exact others: stable within 4" in guarantee_text(kept)[-1]
 
 

@@ -28,7 +28,7 @@ from flight_analysis.linear_loop.told import Standing
 from flight_core.files import write_file
 from flight_core.parameters import require
 
-BOUND = 5  # version of the method by which this stack bounds a loop
+BOUND = 6  # version of the method by which this stack bounds a loop
 
 
 def certificate(linear: LinearLoop, guarantee: Guarantee, sources: Mapping[str, str]) -> str:
@@ -150,7 +150,10 @@ def _kept(linear: LinearLoop) -> Guarantee | None:
 
 
 def _unstable(content: dict[str, Any] | None) -> Unstable | None:
-    return None if content is None else Unstable(**content)
+    if content is None:
+        return None
+    late = tuple(map(tuple, content["late"]))
+    return Unstable(**(content | {"late": late}))
 
 
 def _path(loop: str) -> Path:
