@@ -18,20 +18,17 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from benchmarks.tune_bounds import SCENARIO, write_airplanes
 
-from aircraft_sim.airframes.airframe import Airframe, load_airframe
-from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.loop_margins import margins, scenario_loop
 from flight_core.vectors import FloatArray
 from flight_design.gains.gain_design import check_gains, select_gains
 from flight_design.gains.linear_error import TURBULENT, Air, air_response
-from flight_design.identification.rates_model import banking
 from flight_log.px4_parameters import low_pass_delay
 from rise_di_controller.law.linear_loop import LinearPlant
 
-SCENARIO = "examples/px4_airplane/rates.yaml"
 INERTIAS = (
     {"p": 1.0, "q": 1.0, "r": 1.0},
     {"p": 1.3, "q": 0.9, "r": 1.5},
@@ -51,15 +48,6 @@ CUTOFF = 40.0  # Hz, of the gyro's filter in PX4
 DELAY_MARGIN = 0.01  # s, as in rates_observer.yaml
 LEAST = 0.05  # relative deviation of each entry of the uncertain aircraft, as in `rise-di tune`
 SAMPLES = 60
-
-
-def airplane(nominal: Airframe, inertias: dict[str, float]) -> Airframe:
-    """Return the airplane with other inertias."""
-    A, B = nominal.matrix_a(), nominal.matrix_b()
-    for name, factor in inertias.items():
-        A[nominal.index(name)] /= factor
-        B[nominal.index(name)] /= factor
-    return nominal.with_matrices(A, B, np.ones((len(A), len(nominal.gusts))))
 
 
 def wind_effects(A: FloatArray, states: list[str], speed: float) -> FloatArray:
@@ -95,10 +83,8 @@ def errors(scenario: Scenario, aircraft: Path, speed: float) -> dict[str, float]
 def row(inertias: dict[str, float], weights: Path, folder: Path) -> list[str]:
     """Return a row of the table."""
     shipped = find_scenario(SCENARIO)
-    frame = airplane(load_airframe(shipped.aircraft.airframe), inertias)
     path, banked = folder / "airplane.yaml", folder / "with_bank.yaml"
-    path.write_text(as_yaml(frame), "utf-8")
-    banked.write_text(as_yaml(banking(frame)), "utf-8")
+    frame = write_airplanes(path, banked, inertias)
     controller = shipped.rise_di()
     no_lag = [0.0] * len(controller.inputs)
     scenario = shipped.vary(

@@ -18,7 +18,7 @@ import csv
 import math
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,11 +74,16 @@ def variations() -> Iterator[Variation]:
         yield Variation(name, (1.0, 1.0, factor), has_bank=False)
 
 
-def write_airplanes(rates: Path, with_bank: Path) -> Airframe:
-    """Write the airplane without and with the bank angle as a state, and return the first."""
+def write_airplanes(
+    rates: Path, with_bank: Path, inertias: Mapping[str, float] = INERTIAS
+) -> Airframe:
+    """Write the airplane without and with the bank angle as a state, and return the first.
+
+    `inertias` has factors on the inertias of the simulator's airplane, by rate.
+    """
     nominal = load_airframe(rise_di.find_scenario(SCENARIO).aircraft.airframe)
     A, B = nominal.matrix_a(), nominal.matrix_b()
-    for name, factor in INERTIAS.items():
+    for name, factor in inertias.items():
         A[nominal.index(name)] /= factor
         B[nominal.index(name)] /= factor
     airplane = nominal.with_matrices(A, B, np.ones((len(A), len(nominal.gusts))))
