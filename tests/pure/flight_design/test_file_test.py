@@ -102,7 +102,6 @@ def test_doubt_widens_deviations_and_refuses_nothing(air: str) -> None:
     assert [entry.error for entry in doubted.entries] == [entry.error for entry in model.entries]
     assert after == approx(np.hypot(before, added))
     assert added.max() > 0.01
-    assert furthest_off(doubted) <= furthest_off(model)
 
 
 ROLL = Entry("A", "p", "p", -10.0, 0.0, 0.05, -10.0)
