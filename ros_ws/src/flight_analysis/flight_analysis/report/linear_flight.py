@@ -336,29 +336,31 @@ def _flight(
     """
     plant, law, loop = parts
     n, m = plant.B.shape
-    by_tick = sampled_plant(plant, loop, np.zeros(m))
-    _, step = zero_order_hold(plant.A, np.eye(n), loop.period)
-    drive = np.zeros((len(ticks), len(by_tick.A)))
-    drive[:, :n] = d @ step.T
+    delay = np.zeros(m)
+    motion = closed_loop(plant, law, loop, delay)
+    by_tick = sampled_plant(plant, loop, delay)
+    size = len(by_tick.A)
     # Vanes add columns to y. These columns have neither noise nor y_m.
     vanes = len(by_tick.C) - m
     shift = np.concatenate([noise - y_m, np.zeros((len(ticks), vanes))], axis=1)
-    probe = None if probed is None else probed.guard().probe
-    x = np.zeros(len(by_tick.A))
-    x[:n] = np.linalg.pinv(plant.C[:m]) @ (e_0 + y_m[0])
-    z = np.zeros(law.A.shape[-1])
-    e = np.zeros((len(ticks), m))
-    u = np.zeros((len(ticks), m))
-    for k, t in enumerate(ticks):
-        y = by_tick.C @ x
-        e[k] = y[:m] - y_m[k]
-        measured = y + shift[k]
-        u[k] = law.C @ z + law.D @ measured
-        z = law.A @ z + law.B @ measured
-        if probe is not None:
-            u[k] += probe.at(tape.start_ns + round(t * NANOSECONDS))
-        x = by_tick.A @ x + by_tick.B @ u[k] + drive[k]
-    return _LinearFlight(e, u)
+    # What enters does not depend on the state, so all of it is known before the flight.
+    probing = np.zeros((len(ticks), m))
+    if probed is not None and (probe := probed.guard().probe) is not None:
+        probing[:] = [probe.at(tape.start_ns + round(t * NANOSECONDS)) for t in ticks]
+    entering = np.zeros((len(ticks), len(motion)))
+    _, step = zero_order_hold(plant.A, np.eye(n), loop.period)
+    entering[:, :n] = d @ step.T
+    entering[:, :size] += (shift @ law.D.T + probing) @ by_tick.B.T
+    entering[:, size:] = shift @ law.B.T
+    state = np.zeros(len(motion))
+    state[:n] = np.linalg.pinv(plant.C[:m]) @ (e_0 + y_m[0])
+    states = np.zeros((len(ticks), len(motion)))
+    for k in range(len(ticks)):
+        states[k] = state
+        state = motion.dot(state) + entering[k]
+    y = states[:, :size] @ by_tick.C.T
+    u = states[:, size:] @ law.C.T + (y + shift) @ law.D.T + probing
+    return _LinearFlight(y[:, :m] - y_m, u)
 
 
 def _at(tape: Tape, topic: str, name: str, ticks: FloatArray) -> FloatArray:
