@@ -171,10 +171,14 @@ def select(
     if len(names) != len(values):
         raise ChannelError("length", f"{len(names)} names for {len(values)} values")
     vector = np.asarray(values, dtype=np.float64)[_places(tuple(channels), tuple(names))]
-    # For few channels, this loop takes a third of the time of np.isfinite.
-    if not all(map(math.isfinite, vector.tolist())):
+    if not is_finite(vector):
         raise ChannelError("finite", f"{', '.join(channels)} = {vector.tolist()} is not finite")
     return vector
+
+
+def is_finite(vector: FloatArray) -> bool:
+    """Return whether all values of a vector are finite, in a third of NumPy's time for a few."""
+    return all(map(math.isfinite, vector.tolist()))
 
 
 def selection_matrix(channels: Sequence[str], names: Sequence[str]) -> FloatArray:

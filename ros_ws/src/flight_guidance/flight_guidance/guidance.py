@@ -20,6 +20,7 @@ from flight_core.vectors import (
     ChannelError,
     FloatArray,
     StampedVector,
+    is_finite,
     require_newer,
     require_not_future,
 )
@@ -456,7 +457,7 @@ class Guidance:
         state, commands = step(self._state, inputs, self.route, self._params)
         log = self._row(inputs, state, commands, now_ns)
         output = u_m(state)
-        if not np.isfinite(np.append(log, output)).all():
+        if not (is_finite(log) and is_finite(output)):
             raise ArithmeticError("a value that is not finite")
         notices = self._notices.take(
             seconds(t_ns), dict(zip(self.names, log.tolist(), strict=True))

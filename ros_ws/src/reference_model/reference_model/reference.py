@@ -5,12 +5,14 @@
 The node and the simulation in a single process use it.
 """
 
+import math
+
 import numpy as np
 
 from flight_core.failures import Failures, sentence
 from flight_core.outcome import Refusal
 from flight_core.rates import period_ns, seconds
-from flight_core.vectors import FloatArray, require_newer
+from flight_core.vectors import FloatArray, is_finite, require_newer
 from reference_model import live, model
 from reference_model.command import command
 from reference_model.live import Live
@@ -113,7 +115,7 @@ class Reference:
         with np.errstate(over="ignore", invalid="ignore"):
             x_m = model.step(self._x_m, u_m, self._stepper)
         attitude = () if after is None or after.attitude is None else after.attitude
-        if not np.isfinite([*x_m, *applied, *attitude]).all():
+        if not (is_finite(x_m) and is_finite(applied) and all(map(math.isfinite, attitude))):
             raise ArithmeticError("a value that is not finite")
         return x_m, applied, after
 

@@ -24,7 +24,7 @@ import numpy as np
 from flight_core.failsafe import failsafe_scale
 from flight_core.modes import Mode
 from flight_core.rates import seconds
-from flight_core.vectors import Array, FloatArray, StampedVector
+from flight_core.vectors import Array, FloatArray, StampedVector, is_finite
 from rise_di_controller.extensions import feedforward
 from rise_di_controller.extensions.allocation import Allocation, allocate, limits_of_effectors
 from rise_di_controller.extensions.feedforward import FeedforwardState, Nominal
@@ -419,7 +419,7 @@ def _fresh_reference(
     if not y_m or max(abs(now_ns - sample.stamp_ns) for sample in (y, y_m[-1])) > guard.max_age_ns:
         return None
     reference = align(y_m, y.stamp_ns, guard.period_ns)
-    return None if reference is None or not np.isfinite(y.value + reference).all() else reference
+    return None if reference is None or not is_finite(y.value + reference) else reference
 
 
 def _engaged(
@@ -464,7 +464,7 @@ def _is_finite(state: ControllerState) -> bool:
         arrays.append(state.effectors)
     if state.feedforward is not None:
         arrays += [state.feedforward.x, state.feedforward.u, state.feedforward.u_0]
-    return bool(np.isfinite(np.concatenate(arrays)).all())
+    return is_finite(np.concatenate(arrays))
 
 
 def _readings(reading: FloatArray, before: VaneReadings | None) -> FloatArray:
