@@ -68,11 +68,11 @@ def after(tape: Tape, seconds: float) -> FloatArray:
 
 
 def test_heading_altitude_and_airspeed_reached_and_held() -> None:
-    tape = simulate(calm(45.0, program=program(heading=math.pi / 2.0, altitude=20.0, V=27.0)))
+    tape = simulate(calm(32.0, program=program(heading=math.pi / 2.0, altitude=20.0, V=27.0)))
     psi, altitude, V, phi = channels(
         tape["guidance"], "pose.psi", "pose.altitude", "y.V", "pose.phi"
     )
-    end = after(tape, 40.0)
+    end = after(tape, 28.0)
     assert np.degrees(np.abs(psi[end] - math.pi / 2.0).max()) < 1.0
     assert np.abs(altitude[end] - 20.0).max() < 0.5
     assert np.abs(V[end] - 2.0).max() < 0.1
@@ -84,14 +84,14 @@ def test_heading_altitude_and_airspeed_reached_and_held() -> None:
 
 def test_route_flown_and_ends_in_orbit() -> None:
     """A short route is flown leg by leg."""
-    points = {"north": [0.0, 400.0, 400.0], "east": [0.0, 0.0, 400.0], "altitude": [0.0, 0.0, 10.0]}
-    tape = simulate(calm(60.0, route=points))
+    points = {"north": [0.0, 300.0, 300.0], "east": [0.0, 0.0, 300.0], "altitude": [0.0, 0.0, 6.0]}
+    tape = simulate(calm(30.0, route=points))
     leg, xtrack, altitude = channels(tape["guidance"], "leg", "xtrack", "pose.altitude")
     assert np.unique(leg).tolist() == [0.0, 1.0, 2.0, 3.0]
     assert (np.diff(leg) >= 0.0).all()
     # 0.35 s of flight, the acceptance of a route in calm air
     assert np.abs(xtrack[leg < 3.0]).max() < 0.35 * 25.0
-    assert altitude[-1] == approx(10.0, abs=1.0)
+    assert altitude[-1] == approx(6.0, abs=1.0)
 
 
 def test_line_captured_without_overshoot() -> None:
@@ -105,8 +105,8 @@ def test_flying_wing_without_rudder_flies_route() -> None:
     """The X8 has elevons and a throttle: r follows the bank."""
     wing = find_scenario("x8_elevons").vary(
         flight={"duration": 32.0},
-        aircraft={"kinematics": "euler", "gusts": {}},
-        reference_model={"pulses": {}, "live": {"speed": 18.0}},
+        aircraft={"kinematics": "euler", "gusts": {}, "rate": 100.0, "step": 0.005},
+        reference_model={"rate": 100.0, "pulses": {}, "live": {"speed": 18.0}},
         guidance={},
     )
     places = ((0.0, 0.0), (225.0, 0.0), (225.0, 225.0), (0.0, 225.0))
@@ -120,7 +120,7 @@ def test_flying_wing_without_rudder_flies_route() -> None:
 
 
 def test_lost_aileron_is_found_without_a_learner() -> None:
-    orbit = calm(40.0, program=program(north=0.0, east=400.0, radius=400.0))
+    orbit = calm(30.0, program=program(north=0.0, east=400.0, radius=400.0))
     actuators = orbit.aircraft.actuators.model_dump() | {"faults": ["aileron lost 4"]}
     # An osprey off by up to 30 %, which else banks by 21 deg from then on.
     weaker = {"A": 0.3, "B": 0.3, "seed": 7, "number": 2}
@@ -129,7 +129,7 @@ def test_lost_aileron_is_found_without_a_learner() -> None:
     begin = tape.time("guidance")[ignored == 0.0][0]
     assert 4.0 < begin < 12.0  # after 2 s of the largest roll rate, and the turn before
     # 1.6 times the largest bank of 10 deg, and 1 deg
-    assert np.degrees(np.abs(phi[after(tape, 25.0)]).max()) < 17.0
+    assert np.degrees(np.abs(phi[after(tape, 22.0)]).max()) < 17.0
 
 
 def test_small_corner_flown_with_small_bank() -> None:
@@ -498,11 +498,11 @@ def test_route_received_in_flight_is_logged(tmp_path: Path) -> None:
 
 
 def test_loiters_are_flown_on_their_side() -> None:
-    """Half a turn to the left, then the last orbit to the right."""
-    centres = [(500.0, 0.0), (500.0, 500.0)]
+    """Half a turn to the left, then a quarter of the last orbit to the right."""
+    centres = [(350.0, 0.0), (150.0, -320.0)]
     waypoints = [Waypoint(0.0, 0.0, 0.0), *(Waypoint(*centre, 0.0) for centre in centres)]
     waypoints[1] = waypoints[1]._replace(turns=0.5, left=True)
-    tape = simulate(with_route(ROUTE, waypoints).vary(flight={"duration": 100.0}))
+    tape = simulate(with_route(ROUTE, waypoints).vary(flight={"duration": 60.0}))
     log = tape["guidance"]
     legs = np.interp(tape["pose"].stamp_ns, log.stamp_ns, log["leg"])
     turns = []
@@ -512,7 +512,7 @@ def test_loiters_are_flown_on_their_side() -> None:
         turns.append(float(flown[-1] - flown[0]) / (2.0 * math.pi))
     # The aircraft flies on at the first tangent after the half turn.
     assert -1.5 < turns[0] < -0.4
-    assert turns[1] > 0.4
+    assert turns[1] > 0.25
     # On circles the path is held within half a second of flight, but for the roll into them.
     assert np.percentile(np.abs(log["xtrack"][log["leg"] % 2 == 1]), 95.0) < 12.5
 
@@ -561,12 +561,12 @@ def test_bad_words_of_command_line_are_one_sentence(words: list[str], sentence: 
 def test_steep_climb_slows_and_keeps_airspeed() -> None:
     """A climb beyond the throttle becomes slower, and the airspeed stays."""
     # An engine that has lost most of its power gives 0.3 m/s^2 in place of 3.
-    weak = calm(40.0, program=program(climb=2.5)).vary(
+    weak = calm(30.0, program=program(climb=2.5)).vary(
         aircraft={"actuators": {"upper": [0.5, 0.05, 0.5, 0.5]}}
     )
     tape = simulate(weak)
     V, limited, climb = (
-        channel[after(tape, 25.0)]
+        channel[after(tape, 24.0)]
         for channel in channels(tape["guidance"], "y.V", "limited.climb", "pose.climb")
     )
     assert limited.all()
