@@ -62,7 +62,7 @@ def aircraft() -> AircraftConfig:
     servo = find_scenario("osprey_servo")
     sensors = servo.aircraft.sensors.model_dump() | {"delay": DELAY}
     return servo.vary(
-        aircraft={"gusts": {}, "rate": 100.0, "step": 0.005, "sensors": sensors}
+        aircraft={"gusts": {}, "rate": 100.0, "step": 0.01, "sensors": sensors}
     ).aircraft
 
 
@@ -232,12 +232,8 @@ class Known(NamedTuple):
         params = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller
         t = np.arange(0.0, 14.0, 0.001)
         arrays = params.law_params()
-        u = np.array(
-            [
-                (arrays.amplitude * excitation.signal(instant, arrays))[0]
-                for instant in np.floor(t / 0.01 + 1e-9) * 0.01
-            ]
-        )
+        ticks = [(arrays.amplitude * excitation.signal(k, arrays))[0] for k in t[::10]]
+        u = np.repeat(ticks, 10)
         v = np.zeros_like(t)
         z = np.zeros_like(t)
         y = np.zeros_like(t)
@@ -412,7 +408,7 @@ def test_quadrotor_identified_and_flown_without_a_name_of_a_fixed_wing(tmp_path:
     def flown(name: str, airframe: str, scenario: str) -> Tape:
         scenario_of_flight = loaded(tmp_path, name, airframe, scenario)
         sensors = {"noise": [0.02, 0.05, 0.02, 0.01], "delay": 0.04}
-        real = {"airframe": frame, "rate": 100.0, "step": 0.005, "sensors": sensors}
+        real = {"airframe": frame, "rate": 100.0, "step": 0.01, "sensors": sensors}
         return simulate(
             replace(scenario_of_flight, aircraft=AircraftConfig.validate_mapping(real, "aircraft"))
         )
