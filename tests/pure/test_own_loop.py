@@ -240,15 +240,15 @@ def test_aircraft_beyond_its_bounds_terminates_with_an_observation_within_them()
 def test_example_trains_a_policy() -> None:
     """Each generation draws about the best of the one before: the mean return of the best rises."""
     process = subprocess.run(
-        [sys.executable, REPOSITORY / "examples/gymnasium/cross_entropy.py", "3"],
+        [sys.executable, REPOSITORY / "examples/gymnasium/cross_entropy.py", "2"],
         capture_output=True,
         text=True,
         check=True,
     )
     lines = process.stdout.splitlines()
-    scores = [[float(x) for x in re.findall(r"-[0-9.]+", line)] for line in lines[:3]]
+    scores = [[float(x) for x in re.findall(r"-[0-9.]+", line)] for line in lines[:2]]
     # The worst that the fleet may do is to leave u at 0.
-    assert scores[2][0] > scores[0][0] > scores[0][1]
+    assert scores[1][0] > scores[0][0] > scores[0][1]
 
 
 def test_environment_under_law_flies_as_simulation(flown: Tape) -> None:

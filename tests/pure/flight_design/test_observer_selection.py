@@ -52,9 +52,19 @@ SIZE = np.array([0.1, 0.1, 0.1, 1.0])
 SHIPPED = ("osprey_observer", "osprey_turbulence")
 
 
-FLOWN = SERVO.vary(aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0})
-"""osprey_servo with y at the rate of the law and steps of 5 ms: half of the time of the shipped
-one."""
+FLOWN = SERVO.vary(
+    flight={"duration": 30.0},
+    aircraft={
+        "rate": 100.0,
+        "step": 0.005,
+        "gusts": {
+            "vertical": {"start": 14.0, "speed": 10.12, "length": 15.24},
+            "lateral": {"start": 20.0, "speed": 4.0, "length": 15.24},
+        },
+    },
+    reference_model={"rate": 100.0},
+)
+"""osprey_servo with y at the rate of the law and steps of 5 ms, and its gusts within 30 s."""
 
 
 def with_observer(controller: RiseDiConfig) -> Scenario:

@@ -263,9 +263,14 @@ def test_linear_error_of_a_ramp_is_the_closed_form() -> None:
 def test_trade_predicts_the_flight() -> None:
     # Linear, without noise, and u* of the nominal airframe: within 5 % of the rms of a flight
     # without noise
-    selection = select_gains("osprey", "osprey_servo", samples=2)
+    short = SERVO.vary(
+        flight={"duration": 20.0},
+        aircraft={"sensors": {}, "rate": 100.0, "step": 0.005},
+        reference_model={"rate": 100.0},
+    )
+    selection = select_gains("osprey", short, samples=2)
     (row,) = trade(selection, (45.0,))
-    tape = simulate(SERVO.vary(aircraft={"sensors": {}}, controller=selection.chosen))
+    tape = simulate(short.vary(controller=selection.chosen))
     _, error = best_error(tape)
     rms = [error_metrics(error[name]).rms for name in selection.chosen.outputs]
     np.testing.assert_allclose(row.rms, rms, rtol=0.05)
