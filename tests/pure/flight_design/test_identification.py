@@ -29,14 +29,23 @@ from flight_design.identification.jsbsim_identification import (
     slowest_trim,
     with_sideslip_held,
 )
-from flight_design.identification.manoeuvre import ManoeuvreResult, manoeuvre_result
+from flight_design.identification.manoeuvre import ManoeuvreResult, fly_all, manoeuvre_result
 
 pytestmark = pytest.mark.slow
+
+Progress = Callable[[str], None]
 
 
 @pytest.fixture(scope="module")
 def cessna() -> IdentifiedAircraft:
-    return identify_jsbsim("c172p", 46.3, 1219.2)
+    """The c172p, with 20 s of each of its three flights of a minute."""
+
+    def fly_briefly(scenario: Scenario, progress: Progress) -> dict[str, ManoeuvreResult]:
+        return fly_all(scenario.vary(flight={"duration": 20.0}), progress)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jsbsim_identification, "fly_all", fly_briefly)
+        return identify_jsbsim("c172p", 46.3, 1219.2)
 
 
 def test_signs_and_pairing_of_aircraft_found(cessna: IdentifiedAircraft) -> None:
@@ -65,9 +74,10 @@ def test_margins_are_those_of_the_linear_aircraft(cessna: IdentifiedAircraft) ->
 
 def test_aircraft_whose_sideslip_diverges_has_gains(monkeypatch: pytest.MonkeyPatch) -> None:
     # sideslip of the f15 grows while p and r are held, outside Assumption 3: guidance flies it
-    def calm(scenario: Scenario, progress: Callable[[str], None]) -> dict[str, ManoeuvreResult]:
-        """The first of the three flights of a minute."""
-        return {"calm": manoeuvre_result(simulate(scenario.vary(aircraft={"gusts": {}})))}
+    def calm(scenario: Scenario, progress: Progress) -> dict[str, ManoeuvreResult]:
+        """20 s of the first of the three flights of a minute."""
+        brief = scenario.vary(flight={"duration": 20.0}, aircraft={"gusts": {}})
+        return {"calm": manoeuvre_result(simulate(brief))}
 
     monkeypatch.setattr(jsbsim_identification, "fly_all", calm)
     # JSBSim searches for the trims that do not exist for 45 s of processor
