@@ -144,19 +144,26 @@ EXCITATION = {  # half a minute in all
 }  # fmt: skip
 
 
-def flown(controller: dict[str, Any], duration: float, seed: int, wind: float) -> Tape:
-    """The osprey under a controller, y stamped when it arrives and u when it is computed."""
+@pytest.fixture(scope="module")
+def experiment() -> Tape:
+    """The osprey in an experiment, y stamped when it arrives and u when it is computed."""
     base = find_scenario("osprey_servo")
     shared = {
         key: getattr(base.controller, key)
         for key in ("outputs", "inputs", "D", "input_scale", "lag", "lower", "upper")
     }
-    turbulence = {"altitude": 100.0, "wind": wind, "seed": seed}
-    sensors = {"noise": base.aircraft.sensors.noise, "delay": DELAY, "seed": seed}
-    values = shared | LOOP | controller
-    aircraft = {"rate": 100.0, "gusts": {}, "turbulence": turbulence, "sensors": sensors}
+    turbulence = {"altitude": 100.0, "wind": 15.4, "seed": 1}
+    sensors = {"noise": base.aircraft.sensors.noise, "delay": DELAY, "seed": 1}
+    values = shared | LOOP | EXCITATION
+    aircraft = {
+        "rate": 100.0,
+        "step": 0.005,
+        "gusts": {},
+        "turbulence": turbulence,
+        "sensors": sensors,
+    }
     flight = base.vary(
-        flight={"duration": duration}, aircraft=aircraft, reference_model={"rate": 100.0}
+        flight={"duration": 36.0}, aircraft=aircraft, reference_model={"rate": 100.0}
     )
     flight = replace(flight, controller=AnyLaw.validate_mapping(values, "controller"))
     tape = simulate(flight)
@@ -179,11 +186,6 @@ def turned(signal: Signal, name: str) -> Signal:
     )
 
 
-@pytest.fixture(scope="module")
-def experiment() -> Tape:
-    return flown(EXCITATION, 36.0, seed=1, wind=15.4)
-
-
 def test_an_experiment_in_turbulence_shows_every_sign(experiment: Tape) -> None:
     check = check_osprey(load_map("ardupilot"), measured=response(experiment, None))
     assert not check.contradictions
@@ -194,7 +196,7 @@ def test_an_experiment_in_turbulence_shows_every_sign(experiment: Tape) -> None:
     assert (np.abs(np.log2(responses / [channel.effect for channel in check.channels])) < 1.0).all()
 
 
-@pytest.mark.parametrize("topic, k", [("u", 0), ("u", 1), ("y", 2), ("y", 3)])
+@pytest.mark.parametrize("topic, k", [("u", 0), ("y", 3)])
 def test_each_wrong_sign_found_in_experiment(experiment: Tape, topic: str, k: int) -> None:
     name = {"u": INPUTS, "y": OUTPUTS}[topic][k]
     wrong = Tape({**experiment.signals, topic: turned(experiment[topic], name)})
@@ -216,8 +218,10 @@ def test_flight_under_guidance_refused_since_commands_follow_y(tmp_path: Path) -
         recorded_response(tmp_path / "run", OUTPUTS, INPUTS)
 
 
-def test_flight_that_does_not_show_sign_says_which_input_to_excite() -> None:
-    tape = flown(EXCITATION | {"amplitude": [0.04, 0.04, 0.0, 0.2]}, 36.0, seed=1, wind=15.4)
+def test_flight_that_does_not_show_sign_says_which_input_to_excite(experiment: Tape) -> None:
+    u = experiment["u"]
+    at_trim = replace(u, values=u.values * [name != "rudder" for name in u.names])
+    tape = Tape({**experiment.signals, "u": at_trim})
     check = check_osprey(load_map("ardupilot"), measured=response(tape, None))
     assert not check.contradictions
     assert len(check.uncertain) == 1

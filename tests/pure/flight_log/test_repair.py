@@ -152,7 +152,7 @@ def test_changed_bytes_never_cause_traceback_or_false_messages(recorded: Path, r
     content = file.read_bytes()
     repaired = 0
     data = {(topic, bytes_) for topic, _, bytes_ in messages(recorded)}
-    for _ in range(40):
+    for _ in range(20):
         damaged = bytearray(content)
         for position in generator.integers(0, len(content), 3):
             damaged[position] ^= 1 << generator.integers(0, 8)
@@ -164,7 +164,7 @@ def test_changed_bytes_never_cause_traceback_or_false_messages(recorded: Path, r
         if done.files[0].damaged is not None:
             repaired += 1
             assert {(topic, bytes_) for topic, _, bytes_ in messages(run)} <= data
-    assert repaired > 10
+    assert repaired > 5
 
 
 def test_link_in_folder_is_not_followed(run: Path, tmp_path: Path) -> None:
