@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Generator, Iterator
 from contextlib import AbstractContextManager
 from inspect import iscoroutinefunction, signature
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,9 @@ few = settings(
 )
 """Deterministic examples of fuzzing. benchmarks/fuzz.py does long searches."""
 
+_NUMBERS = count()
+"""Of the tests that this process has run."""
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
@@ -52,9 +56,13 @@ def _empty_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a test computes is kept in a folder of its own."""
-    monkeypatch.setenv("XDG_CACHE_HOME", f"{tmp_path}-caches")
+def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What a test computes is kept in a folder of its own, which few tests need: none is made."""
+    before = os.environ["XDG_CACHE_HOME"]
+    folder = tmp_path_factory.getbasetemp() / f"caches-{next(_NUMBERS)}"
+    os.environ["XDG_CACHE_HOME"] = str(folder)
+    yield
+    os.environ["XDG_CACHE_HOME"] = before
 
 
 def refusing(sentence: str) -> AbstractContextManager[pytest.ExceptionInfo[ParameterError]]:

@@ -7,6 +7,7 @@ SLICOT is an independent program where installed.
 
 import itertools
 import json
+import os
 import re
 from functools import cache
 from pathlib import Path
@@ -444,7 +445,7 @@ def test_report_shows_the_guarantee_that_was_computed_for_its_loop(tmp_path: Pat
     skewed = box._replace(G=box.G * np.linspace(1.0, 2.0, len(box.G))[:, None] + 1.0)
     assert kept_guarantee(linear._replace(box=skewed)) is None  # other aircraft
     assert kept_guarantee(linear._replace(box=None)) is None
-    (file,) = Path(f"{tmp_path}-caches", "rise-di", "guarantees").iterdir()
+    (file,) = Path(os.environ["XDG_CACHE_HOME"], "rise-di", "guarantees").iterdir()
     file.write_text("{")
     assert kept_guarantee(linear) is None
 
