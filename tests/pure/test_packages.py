@@ -144,11 +144,11 @@ def test_pytest_runs_the_tests_of_a_package() -> None:
     """In its folder, with the arguments of `colcon test`."""
     command = [sys.executable, "-m", "pytest", "-o", "cache_dir=cache", "--collect-only", "-qq"]
     done = subprocess.run(
-        command, cwd=SOURCES / "flight_core", capture_output=True, text=True, check=False
+        command, cwd=SOURCES / "flight_recorder", capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout
     assert set(re.findall(r"test_\w+\.py", done.stdout)) == {
-        path.name for path in files_of("flight_core")
+        path.name for path in files_of("flight_recorder")
     }
 
 

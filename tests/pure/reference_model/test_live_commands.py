@@ -129,7 +129,10 @@ def test_in_lockstep_u_m_comes_at_instants_of_reference() -> None:
 
 AIRCRAFT: dict[str, tuple[Any, float]] = {
     "osprey": (
-        lambda: find_scenario("osprey_servo").vary(aircraft={"kinematics": "euler", "gusts": {}}),
+        lambda: find_scenario("osprey_servo").vary(
+            aircraft={"kinematics": "euler", "gusts": {}, "rate": 100.0, "step": 0.005},
+            reference_model={"rate": 100.0},
+        ),
         35.0,
     ),
     "c172p": (lambda: find_scenario("jsbsim_c172p").vary(aircraft={"gusts": {}}), 30.0),
