@@ -110,6 +110,23 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     return Flown(run, lines, learned)
 
 
+class Taught(NamedTuple):
+    """What `rise-di learn` makes of the log of that flight."""
+
+    output: str
+    model: Path
+    certificate: Path
+
+
+@pytest.fixture(scope="module")
+def taught(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> Taught:
+    folder = tmp_path_factory.mktemp("taught")
+    model, certificate = folder / "model.yaml", folder / "learned.json"
+    result = invoke("learn", flown.run, "--write", model, "--certificate", certificate)
+    assert result.exit_code == 0, result.output
+    return Taught(" ".join(result.output.split()), model, certificate)
+
+
 def made_learner(chosen: Scenario) -> Learner:
     make = learner(chosen)
     assert make is not None
@@ -212,17 +229,14 @@ def test_feedforward_goes_on_in_the_turn_that_was_commanded_before_the_switch(fl
 
 
 def test_log_teaches_what_flight_taught_and_model_starts_next_flight(
-    flown: Flown, tmp_path: Path
+    flown: Flown, taught: Taught
 ) -> None:
-    model = tmp_path / "model.yaml"
-    result = invoke("learn", flown.run, "--write", model)
-    assert result.exit_code == 0, result.output
-    assert flown.lines[-1].partition(" flies ")[2] in " ".join(result.output.split())
-    B = load_airframe(model).matrix_b()
+    assert flown.lines[-1].partition(" flies ")[2] in taught.output
+    B = load_airframe(taught.model).matrix_b()
     of_file = load_airframe("osprey").matrix_b()
     found = {entry.name: entry.error for entry in flown.learner.identification.entries}  # type: ignore[union-attr]
     assert B[2, 0] / of_file[2, 0] - 1.0 == approx(found["B[q, elevator]"])
-    assert learner(scenario(learn={"prior": {"file": str(model)}})) is not None
+    assert learner(scenario(learn={"prior": {"file": str(taught.model)}})) is not None
     with refusing(
         r"^controller\.learn\.prior\.file: found an airframe with another name, expected a "
         r"model of"
@@ -267,16 +281,13 @@ def test_log_has_the_guarantee_of_the_model_that_flies(flown: Flown) -> None:
 
 
 def test_certificate_of_the_learned_model_is_proved_and_an_altered_one_is_refused(
-    flown: Flown, tmp_path: Path
+    flown: Flown, taught: Taught, tmp_path: Path
 ) -> None:
     """Its loop is the one that the log names, and its constants are those of an export."""
-    path = tmp_path / "learned.json"
-    result = invoke("learn", flown.run, "--certificate", path)
-    assert result.exit_code == 0, result.output
     rows = read_run(flown.run).tape["learned"]
     within = f"{np.floor(10.0 * rows[GUARANTEE[1]][1]) / 10.0:.1f} stated deviations of the model"
-    assert f"stable for every aircraft within {within}" in " ".join(result.output.split())
-    content = json.loads(path.read_text())
+    assert f"stable for every aircraft within {within}" in taught.output
+    content = json.loads(taught.certificate.read_text())
     assert int(content["loop"][:12], 16) == rows[GUARANTEE[2]][1]
     constants = tmp_path / "c" / "rise_di_parameters.h"
     rise_di.export(flown.run / "learn.yaml", tmp_path / "c", run=flown.run, proof=False)
