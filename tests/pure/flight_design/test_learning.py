@@ -917,7 +917,8 @@ def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_la
     With the margin of the start alone the loop is unstable from the first model on.
     """
     actuators = scenario().aircraft.actuators.model_dump() | {"delay": 0.04}
-    late = scenario().vary(aircraft={"actuators": actuators}, flight={"duration": 26.0})
+    learn = {"updates": [11.0, 16.0, 21.0], "latency": 0.0, "check": 20.0}
+    late = scenario(learn=learn).vary(aircraft={"actuators": actuators}, flight={"duration": 23.0})
     learned = made_learner(late)
     tape = simulate(late, learn=lambda _: learned)
     alone = simulate(late.vary(controller={"learn": None}))
@@ -932,7 +933,7 @@ def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_la
         plant_of(true, flown), linear_law(flown.tuned_law(), 4, 0.01), loop, np.zeros(4)
     )
     units = np.array([0.01, 0.1, 0.02, 0.01])
-    assert np.sum(error(tape, SWITCH, 26.0) / units) < np.sum(error(alone, SWITCH, 26.0) / units)
+    assert np.sum(error(tape, SWITCH, 23.0) / units) < np.sum(error(alone, SWITCH, 23.0) / units)
 
 
 ONES = np.ones(4)
