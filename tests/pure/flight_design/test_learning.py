@@ -10,7 +10,9 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 from unittest.mock import Mock
@@ -25,10 +27,10 @@ from tests.pure.flight_analysis.test_certificate import signed
 
 import rise_di
 from aircraft_sim.airframes.airframe import Airframe, load_airframe
-from flight_analysis.closed_loop.learning_loop import GUARANTEE, Entry, LearnerResult
+from flight_analysis.closed_loop.learning_loop import GUARANTEE, Entry, Learn, LearnerResult
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.replay_ticks import vary
-from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.linear_loop.loop_margins import linear_loop, loop_margins
@@ -127,10 +129,19 @@ def taught(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> Taught:
     return Taught(" ".join(result.output.split()), model, certificate)
 
 
-def made_learner(chosen: Scenario) -> Learner:
-    make = learner(chosen)
+@cache
+def maker(text: str) -> Learn:
+    """What makes the learners of a scenario: they share the design for the rough model."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "scenario.yaml"
+        path.write_text(text)
+        make = learner(find_scenario(str(path)))
     assert make is not None
-    made = make(chosen.rise_di())
+    return make
+
+
+def made_learner(chosen: Scenario) -> Learner:
+    made = maker(scenario_yaml(chosen))(chosen.rise_di())
     assert isinstance(made, Learner)
     return made
 
@@ -320,16 +331,24 @@ def test_page_says_within_which_deviations_the_last_model_is_stable(
     assert "stable within (deviations)" in page
 
 
-def test_log_teaches_with_other_settings(flown: Flown) -> None:
+def test_log_teaches_with_other_settings(flown: Flown, monkeypatch: pytest.MonkeyPatch) -> None:
     """The flight has other parameters than what this learner proposes.
 
     The learner knows no refusal, and identifies once a window.
     """
+    proven = flown.learner.identification
+    assert proven is not None
+    unproven_parts = tuple(part._replace(advantage=0.0) for part in proven.parts)
+    identified = Mock(side_effect=[proven._replace(parts=unproven_parts), proven])
+    monkeypatch.setattr(design_learner, "identify_model", identified)
     result = invoke("learn", flown.run, "--set", "controller.learn.updates=[10,20]")
+    assert result.exit_code == 0, result.output
     first, second = (line for line in result.output.splitlines() if line.startswith("t ="))
-    unproven = "t = 10.00 s: no model: q and V: a first model, which later seconds have to prove"
+    unproven = "t = 10.00 s: no model: q and V: a first model, which later seconds have to"
     assert first.startswith(unproven), result.output
     assert second.startswith("t = 20.00 s: B["), result.output
+    lengths = [len(call.args[0].t) for call in identified.call_args_list]
+    assert lengths == [1001, 2001]  # of the record
 
 
 def test_last_model_of_a_run_is_exported_without_learn(flown: Flown, tmp_path: Path) -> None:
@@ -575,6 +594,9 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(
     flown: Flown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(design_learner, "change_test", lambda *arguments: [])
+    # Each identification finds what the flight found.
+    identification = flown.learner.identification
+    monkeypatch.setattr(design_learner, "identify_model", lambda *_, **__: identification)
     start = scenario().rise_di()
     model = start
     for change in parameter_changes(flown.run, "/controller", RiseDiConfig.model_fields):
