@@ -111,7 +111,8 @@ def kinematics(x: Array, params: EulerKinematics) -> Array:
         p + xp.tan(theta) * (q * sine + r * cosine),
         q * cosine - r * sine,
     ]
-    return params.into @ (xp.stack(rates) - params.linear @ x)
+    # For a single aircraft, `asarray` takes a fifth of the time of `stack`.
+    return params.into @ (xp.asarray(rates) - params.linear @ x)
 
 
 def f_time(t: Any, wind: Array, params: Aircraft) -> Array:

@@ -46,15 +46,22 @@ class Fence(NamedTuple):
     radius: float = 0.0  # m, radius of the orbit round home
 
 
+@lru_cache(maxsize=64)
+def _edges(zone: Zone) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the edges of a polygon, as `_border` does, (M,) each."""
+    start_north = np.array(zone.north)
+    start_east = np.array(zone.east)
+    edge_north = np.roll(start_north, -1) - start_north
+    edge_east = np.roll(start_east, -1) - start_east
+    return start_north, start_east, edge_north, edge_east
+
+
 def inside(zone: Zone, north: Array, east: Array) -> Array:
     """Return the distance from the border of a zone, m, positive in the polygon or circle."""
     xp = array_namespace(north)
     if zone.radius:
         return zone.radius - xp.hypot(north - zone.north[0], east - zone.east[0])
-    start_north = np.array(zone.north)
-    start_east = np.array(zone.east)
-    edge_north = np.roll(start_north, -1) - start_north
-    edge_east = np.roll(start_east, -1) - start_east
+    start_north, start_east, edge_north, edge_east = _edges(zone)
     distance = _distance(start_north, start_east, edge_north, edge_east, north, east)
     x = north[..., None] - start_north
     y = east[..., None] - start_east
