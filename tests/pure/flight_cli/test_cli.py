@@ -14,7 +14,7 @@ from importlib.metadata import version
 from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import pytest
 import typer
@@ -26,6 +26,7 @@ from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_cli import cli
 from flight_cli.cli import COMMANDS, VERBS, application
 from flight_cli.scenarios import first_sentences
+from flight_core.parameters import ParameterError
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow
@@ -130,8 +131,8 @@ def test_report_is_one_page_that_needs_no_network(
 
 
 def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
-    process = rise_di("fly", "--in-process", "--duration", "1", "--json", cwd=tmp_path)
-    assert json.loads(process.stdout)["duration"] == 1.0
+    process = rise_di("fly", "--in-process", "--duration", "0.5", "--json", cwd=tmp_path)
+    assert json.loads(process.stdout)["duration"] == 0.5
     assert process.stderr == ""
 
 
@@ -174,6 +175,8 @@ def test_flight_with_set_parameters_has_them_in_its_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    no_design = Mock(side_effect=ParameterError("the design is not the subject"))
+    monkeypatch.setattr("flight_design.learning.scenario_learner.selected_observer", no_design)
     settings = (
         "--set",
         "controller.k_g=2.5",
@@ -213,11 +216,11 @@ def test_command_whose_python_package_is_missing_says_what_installs_it(tmp_path:
     assert "Traceback" not in process.stderr
 
 
-@pytest.mark.parametrize("command", ["campaign", "compare"])
 def test_device_that_jax_lacks_is_one_sentence_without_a_folder(
-    command: str, tmp_path: Path
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = [sys.executable, "-m", "flight_cli.cli", command, "osprey_servo", "--aircraft", "1"]
+    """JAX says so in a process that has not found its devices yet; `compare` asks it too."""
+    words = [sys.executable, "-m", "flight_cli.cli", "campaign", "osprey_servo", "--aircraft", "1"]
     environment = {**os.environ, "JAX_PLATFORMS": "nonsense"}
     process = subprocess.run(
         words, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment
@@ -225,6 +228,10 @@ def test_device_that_jax_lacks_is_one_sentence_without_a_folder(
     assert process.returncode == 2
     assert process.stderr.splitlines()[-1].startswith("error: JAX_PLATFORMS: found 'nonsense' (")
     assert "Traceback" not in process.stderr
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("flight_campaign.batch.device.is_cpu", Mock(side_effect=RuntimeError))
+    compared = said("compare", "osprey_servo", "--aircraft", "1")
+    assert compared.stderr.startswith("error: JAX_PLATFORMS: found '")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -407,9 +414,11 @@ def test_help_is_found_by_each_usual_word(words: str, same: str) -> None:
         assert said("help", "fly").stdout == expected.stdout
 
 
-def test_quiet_flight_prints_its_headline_alone(tmp_path: Path) -> None:
-    words = ("fly", "osprey_gust", "--in-process", "--duration", "1", "-q")
-    process = rise_di(*words, cwd=tmp_path)
+def test_quiet_flight_prints_its_headline_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    process = said("fly", "osprey_gust", "--in-process", "--duration", "0.5", "-q")
     assert process.stdout == "completed\n", process.stderr
     assert process.stderr == ""
 

@@ -523,7 +523,7 @@ def test_gains_for_actuators_without_lag_say_from_which_delay_on_they_chatter() 
         """Part of the steps of thrust that go back on the step before."""
         actuators = {"lag": lags, "delay": delay}
         flight = simulate(
-            find_scenario("osprey_servo", duration=4.0).vary(
+            find_scenario("osprey_servo", duration=2.5).vary(
                 controller=chosen.chosen,
                 reference_model={"rate": 1000.0},
                 aircraft={**fastest, "actuators": actuators},

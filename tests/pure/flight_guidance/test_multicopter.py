@@ -111,13 +111,14 @@ def test_square_at_3_m_per_s_stays_on_its_lines_and_replays_to_the_bit(
 
 
 def test_wait_hovers_at_its_waypoint_for_its_time_and_the_flight_goes_on() -> None:
-    scenario, tape = flight(24.0, route=ROUTE | {"wait": [0, 4, 0, 0, 0]})
+    scenario, tape = flight(19.0, route=ROUTE | {"wait": [0, 4, 0, 0, 0]})
     log = tape["guidance"]
     beside = np.hypot(log["pose.north"] - 20.0, log["pose.east"])
     hovers = (log["leg"] == 1) & (log["loitered"] > 0.0)
     assert np.ptp(tape.time("guidance")[hovers]) == approx(4.0, abs=0.05)
     assert np.max(beside[hovers]) < 1.5  # within 0.5 s of flight at 3 m/s, where the time begins
-    assert all(leg.result == "flown" for leg in flown_legs(tape)[:3])
+    assert [leg.result for leg in flown_legs(tape)[:2]] == ["flown"] * 2
+    assert log["leg"][-1] > 1
     assert replay_guidance(tape, scenario.guidance).equal()
 
 
@@ -133,7 +134,7 @@ def test_attitude_heading_and_climb_are_held_apart() -> None:
 def test_fence_is_kept_and_home_reached() -> None:
     zone = {"north": [-10, 30, 30, -10], "east": [-10, -10, 30, 30]}
     program = commanded(course=0.4, V=4.0)
-    _, tape = flight(30.0, program=program, fence={"field": zone})
+    _, tape = flight(22.0, program=program, fence={"field": zone})
     log = tape["guidance"]
     assert np.min(log["fence.clearance"]) > 0.5  # MARGIN of flight at 1 m/s
     assert np.hypot(log["pose.north"], log["pose.east"])[-1] < 2.0
