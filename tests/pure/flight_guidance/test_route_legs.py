@@ -393,7 +393,7 @@ def circling(
     return log
 
 
-@pytest.mark.parametrize("turns, wait", [(2.0, 1.0), (0.0, 60.0)])
+@pytest.mark.parametrize("turns, wait", [(2.0, 0.0), (0.0, 60.0), (0.5, 60.0)])
 def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
     """The route goes on to the north.
 
