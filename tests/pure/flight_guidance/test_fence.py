@@ -83,6 +83,23 @@ def test_clearance_of_several_zones() -> None:
     assert at((SQUARE, hole), (0.0, 0.0), (20.0, 0.0)) == approx([10.0, -10.0])
 
 
+def motion(north: float, east: float, course: float = 0.0, phi: float = 0.0, **of: Any) -> Motion:
+    """Of an osprey in a bank `phi`, in calm air if `of` has no wind."""
+    x, y, bank = np.array([north, east, phi])
+    calm_motion = Motion(
+        north=x,
+        east=y,
+        phi=bank,
+        heading=course,
+        speed=25.0,
+        wind=(0.0, 0.0),
+        bank=math.radians(30.0),
+        roll_rate=0.35,
+        lag=0.4,
+    )
+    return calm_motion._replace(**of)
+
+
 EDGE_NORTH = Zone((-2000.0, 500.0, 500.0, -2000.0), (-3000.0, -3000.0, 3000.0, 3000.0))
 EDGE_EAST = Zone((-3000.0, 3000.0, 3000.0, -3000.0), (-2000.0, -2000.0, 500.0, 500.0))
 
@@ -102,21 +119,10 @@ def test_predicted_turn_is_arc_with_drift(edge: Zone, course: float, wind: float
     north = math.cos(course)
     east = math.sin(course)
     for side, name in ((1.0, 0), (-1.0, 1)):
-        phi = np.float64(side * bank)
         air = (wind * north, wind * east)
-        motion = Motion(
-            north=np.float64(0.0),
-            east=np.float64(0.0),
-            phi=phi,
-            heading=course,
-            speed=speed,
-            wind=air,
-            bank=bank,
-            roll_rate=1e9,
-            lag=0.0,
-        )
+        turning = motion(0.0, 0.0, course, side * bank, wind=air, roll_rate=1e9, lag=0.0)
         # Home is far behind. 64 points of the trapezoidal rule: 0.3 m.
-        turns = turn_clearance(Fence((edge,), (-1900.0 * north, -1900.0 * east)), motion)
+        turns = turn_clearance(Fence((edge,), (-1900.0 * north, -1900.0 * east)), turning)
         assert float(turns[name]) == approx(500.0 - ahead, abs=0.3)
 
 
@@ -136,20 +142,10 @@ def test_predicted_turn_drifts_with_wind_across(side: float, wind: float) -> Non
     edge = Zone(
         (-4000.0, 4000.0, 4000.0, -4000.0), (-side * 6000.0, -side * 6000.0, side * gap, side * gap)
     )
-    phi = np.float64(side * bank)
-    motion = Motion(
-        north=np.float64(0.0),
-        east=np.float64(0.0),
-        phi=phi,
-        heading=0.0,
-        speed=speed,
-        wind=(0.0, side * wind),
-        bank=bank,
-        roll_rate=1e9,
-        lag=0.0,
-    )
+    air = (0.0, side * wind)
+    turning = motion(0.0, 0.0, phi=side * bank, wind=air, roll_rate=1e9, lag=0.0)
     # Home is beyond the nearest point.
-    right, left = turn_clearance(Fence((edge,), (-3000.0, -side * 5500.0)), motion)
+    right, left = turn_clearance(Fence((edge,), (-3000.0, -side * 5500.0)), turning)
     assert float(right if side > 0.0 else left) == approx(nearest, abs=0.5)
 
 
@@ -169,18 +165,8 @@ def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None
     # The bank to the other side turns by 10 deg before.
     bearing = math.radians(15.0) if phi == 0.0 else math.radians(4.0)
     home = (900.0, side * 900.0 * math.tan(bearing))
-    motion = Motion(
-        north=np.float64(0.0),
-        east=np.float64(0.0),
-        phi=np.float64(side * phi),
-        heading=0.0,
-        speed=speed,
-        wind=(0.0, 0.0),
-        bank=bank,
-        roll_rate=roll_rate,
-        lag=lag,
-    )
-    right, left = turn_clearance(Fence((edge,), home), motion)
+    turning = motion(0.0, 0.0, phi=side * phi, lag=lag)
+    right, left = turn_clearance(Fence((edge,), home), turning)
     rolled = lag + (bank - phi) / roll_rate
     longest = (
         lag
@@ -190,22 +176,6 @@ def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None
     ahead = 1000.0 - float(right if side > 0.0 else left)
     slowed = 0.97  # the cosine of the course on the way, at least
     assert slowed * speed * rolled < ahead < speed * (rolled + longest / 63.0)
-
-
-def motion(north: float, east: float, course: float = 0.0) -> Motion:
-    """Of an osprey with level wings in calm air."""
-    x, y, phi = np.array([north, east, 0.0])
-    return Motion(
-        north=x,
-        east=y,
-        phi=phi,
-        heading=course,
-        speed=25.0,
-        wind=(0.0, 0.0),
-        bank=math.radians(30.0),
-        roll_rate=0.35,
-        lag=0.4,
-    )
 
 
 def test_turn_begins_at_last_moment() -> None:
@@ -272,18 +242,10 @@ def test_aircraft_outside_flies_home_in_wind(name: str) -> None:
         v_east = speed * np.sin(psi) + wind[1]
         course = np.arctan2(v_east, v_north)
         ground_speed = np.hypot(v_north, v_east)
-        motion = Motion(
-            north=north,
-            east=east,
-            phi=phi,
-            heading=psi,
-            speed=np.full(4, speed),
-            wind=(wind[0], wind[1]),
-            bank=np.full(4, bank),
-            roll_rate=0.35,
-            lag=0.4,
+        moving = motion(0.0, 0.0)._replace(
+            north=north, east=east, phi=phi, heading=psi, wind=(wind[0], wind[1])
         )
-        escape = last_safe_turn(fence, action, motion)
+        escape = last_safe_turn(fence, action, moving)
         action = np.asarray(escape.action)
         has_left |= has_been_inside & (escape.clearance < 0.0)
         has_been_inside |= escape.clearance >= 0.0
