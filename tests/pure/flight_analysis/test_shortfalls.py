@@ -79,26 +79,23 @@ def test_healthy_flight_is_completed() -> None:
     assert healthy().outcome == COMPLETED
 
 
-EFFECTORS = ("elevator", "thrust", "aileron", "rudder")
-KINDS = (
-    *("stuck 5", "lost 5", "hard_over 5 lower", "hard_over 5 upper"),
-    *("weak 5 0.7", "weak 5 0.3", "weak 5 -1", "slow 5 0.3", "loose 5 0.05"),
+# those nearest to the limit, on both sides and of each effector, and a loop that diverges
+EFFECTOR_FAULTS = (
+    *("elevator lost 5", "elevator loose 5 0.05", "thrust weak 5 0.7", "rudder stuck 5"),
+    *("aileron weak 5 0.3", "aileron slow 5 0.3", "aileron loose 5 0.05", "rudder weak 5 -1"),
 )
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("effector", EFFECTORS)
-def test_effector_fault_is_told_by_its_error(effector: str, kind: str) -> None:
+@pytest.mark.parametrize("fault", EFFECTOR_FAULTS)
+def test_effector_fault_is_told_by_its_error(fault: str) -> None:
     """Between 1.5 and 3 times the error of a healthy flight either is right."""
-    if effector == "thrust":
-        kind = kind.replace("lost", "failed")  # the word of an engine
-    tape = rise_di.simulate(with_faults(servo(), f"{effector} {kind}"))
+    tape = rise_di.simulate(with_faults(servo(), fault))
     times = times_healthy(tape)
     if tape.outcome.status == 0:
         assert times < 3.0
     else:
         assert times > 1.5
-        assert tape.outcome.end is not End.COMPLETED or tape.outcome.shortfalls[0].figures
+        assert tape.outcome.shortfalls[0].figures
 
 
 def test_effector_without_a_task_may_be_stuck() -> None:
@@ -109,17 +106,15 @@ def test_effector_without_a_task_may_be_stuck() -> None:
     assert rise_di.simulate(with_faults(calm, "aileron stuck 5")).outcome == COMPLETED
 
 
-@pytest.mark.parametrize("fault", ["throttle failed 5", "elevator stuck 5", "elevator stuck 10"])
-def test_airspeed_of_another_simulator_is_told(fault: str) -> None:
-    """The stuck elevator leaves the pulses of q unflown, and the aircraft 150 m lower.
+def test_airspeed_of_another_simulator_is_told() -> None:
+    """After 10 s the elevator sticks at its trim.
 
-    After 10 s it stands at its trim. The aircraft then climbs by 5 deg where nobody asks it to, and
-    V, whose command stands still, is off by 0.6 m/s: 0.1 m/s without the fault.
+    The aircraft then climbs by 5 deg where nobody asks it to, and V, whose command stands still, is
+    off by 0.6 m/s: 0.1 m/s without the fault.
     """
     c172p = find_scenario("jsbsim_c172p", duration=30.0)
-    (shortfall,) = rise_di.simulate(with_faults(c172p, fault)).outcome.shortfalls
+    (shortfall,) = rise_di.simulate(with_faults(c172p, "elevator stuck 10")).outcome.shortfalls
     assert (shortfall.aim, shortfall.figures["output"]) == (Aim.ERROR, "V")
-    assert rise_di.simulate(c172p).outcome == COMPLETED
 
 
 def test_airspeed_in_turbulence_of_another_simulator_is_allowed_for() -> None:
@@ -141,19 +136,6 @@ def test_unknown_drag_in_wind_is_allowed_for() -> None:
     assert rise_di.simulate(light).outcome == COMPLETED
 
 
-NOISY = {"p of 0.3": (2, 0.3), "p of 1.5": (2, 1.5), "q of 0.3": (0, 0.3), "r of 0.3": (3, 0.3)}
-
-
-@pytest.mark.parametrize(("output", "noise"), NOISY.values(), ids=NOISY)
-def test_aircraft_that_shakes_by_its_noise_is_told(output: int, noise: float) -> None:
-    """The actuators cannot follow the law: 9 to 47 rad/s rms asked of 5.2 rad/s."""
-    noises = list(servo().aircraft.sensors.noise)
-    noises[output] = noise
-    outcome = rise_di.simulate(servo().vary(aircraft={"sensors": {"noise": noises}})).outcome
-    assert outcome.status == 4
-    assert {shortfall.aim for shortfall in outcome.shortfalls} == {Aim.ERROR}
-
-
 def test_noise_beyond_that_of_the_file_is_a_fault() -> None:
     """Somebody sets the noise of p in flight: the log has it, the sensor is not declared to."""
     noises = list(servo().aircraft.sensors.noise)
@@ -165,18 +147,21 @@ def test_noise_beyond_that_of_the_file_is_a_fault() -> None:
 
 
 STORMS: dict[str, dict[str, object]] = {
+    # the actuators cannot follow the law: 9 rad/s rms asked of 5.2 rad/s
+    "noise of p": {"sensors": {"noise": [0.0017, 0.03, 0.3, 0.0017]}},
     "gust of 40 m/s": {"gusts": {"vertical": {"start": 10.0, "speed": 40.0, "length": 15.0}}},
     "train of gusts": {
         "gusts": {"lateral": {"start": 3.0, "speed": 8.0, "length": 15.0, "every": 1.3}}
     },
-    "sine on q": {"sines": {"q": {"amplitude": 10.0, "frequency": 12.0}}},
-    "sine on p": {"sines": {"p": {"amplitude": 60.0, "frequency": 6.0}}},
+    "head wind that the thrust cannot hold": {
+        "gusts": {"longitudinal": {"start": 4.0, "speed": 25.0, "length": 200.0}}
+    },
 }
 
 
 @pytest.mark.parametrize("storm", STORMS.values(), ids=STORMS)
-def test_aircraft_that_a_storm_shakes_is_told(storm: dict[str, object]) -> None:
-    """By more than 3 deg/s rms, twice what severe turbulence leaves."""
+def test_aircraft_that_noise_or_wind_shakes_is_told(storm: dict[str, object]) -> None:
+    """By more than 3 deg/s rms, twice what severe turbulence leaves, or V by more than 2 m/s."""
     outcome = rise_di.simulate(servo().vary(aircraft=storm)).outcome
     assert {shortfall.aim for shortfall in outcome.shortfalls} == {Aim.ERROR}
 
@@ -235,18 +220,9 @@ def value(change: Callable[[FloatArray], FloatArray]) -> Sample:
     return sample
 
 
-def stamp(by: float) -> Sample:
-    """A step of the clock of y, s, at FAULT."""
-
-    def sample(t: float, y: StampedVector) -> StampedVector:
-        return y._replace(stamp_ns=y.stamp_ns + round(by * 1e9)) if t >= FAULT else y
-
-    return sample
-
-
-def not_a_number(y: FloatArray) -> FloatArray:
-    y[0] = np.nan
-    return y
+def ahead(t: float, y: StampedVector) -> StampedVector:
+    """A step of the clock of y by 1 s at FAULT."""
+    return y._replace(stamp_ns=y.stamp_ns + 10**9) if t >= FAULT else y
 
 
 def swapped(y: FloatArray) -> FloatArray:
@@ -255,13 +231,10 @@ def swapped(y: FloatArray) -> FloatArray:
 
 
 SENSORS: dict[str, Sample] = {
-    "q is not a number": value(not_a_number),
     "channels swapped": value(swapped),
-    "q with the other sign": value(lambda y: y * [-1.0, 1.0, 1.0, 1.0]),
     "q off by 0.3 rad/s": value(lambda y: y + np.array([0.3, 0.0, 0.0, 0.0])),
     "V off by 5 m/s": value(lambda y: y + np.array([0.0, 5.0, 0.0, 0.0])),
-    "stamps 1 s ahead": stamp(1.0),
-    "stamps 1 s late": stamp(-1.0),
+    "stamps 1 s ahead": ahead,
     "no y": lambda t, y: y if t < FAULT else None,
 }
 
@@ -357,21 +330,9 @@ def test_late_loop_is_told_with_its_cycle() -> None:
     assert any("a cycle of " in shortfall.sentence for shortfall in outcome.shortfalls)
 
 
-@pytest.mark.parametrize("speed", [14.0, 20.0])
-def test_stronger_microburst_has_no_better_status(speed: float) -> None:
-    """Beyond what the thrust can hold: V is off by 5 m/s, or the aircraft is on the ground."""
-    burst = find_scenario("osprey_microburst")
-    section = burst.aircraft.microburst
-    assert section is not None
-    strong = section.model_dump() | {"speed": speed}
-    # a fifth of the samples, for a test in a fifth of the time
-    coarse = {"microburst": strong, "rate": 100.0, "step": 0.005}
-    tape = rise_di.simulate(burst.vary(aircraft=coarse, reference_model={"rate": 100.0}))
-    assert tape.outcome.status in {3, 4}
-
-
-def test_landing_does_not_swallow_what_else_was_short() -> None:
-    """A touch on the first leg, in a log of half of the flight, far from the zone."""
+@cache
+def on_first_leg() -> tuple[Tape, Scenario]:
+    """Five seconds of a route with a landing at its second waypoint, far from the zone."""
     route = {
         "north": [0.0, 1500.0, 3000.0, 4500.0, 6000.0],
         "east": [0.0, 300.0, 300.0, 300.0, 300.0],
@@ -379,7 +340,12 @@ def test_landing_does_not_swallow_what_else_was_short() -> None:
     }
     box = {"north": [2900.0, 3100.0, 3100.0, 2900.0], "east": [290.0, 290.0, 310.0, 310.0]}
     scenario = calm_osprey(5.0, route=route, landing={"waypoint": 2}, touchdown=box)
-    tape = rise_di.simulate(scenario)
+    return rise_di.simulate(scenario), scenario
+
+
+def test_landing_does_not_swallow_what_else_was_short() -> None:
+    """A touch on the first leg, in a log of half of the flight, far from the zone."""
+    tape, scenario = on_first_leg()
     half = WHOLE._replace(lacks=("u 250 of 501 samples",))
     outcome = judge(Outcome(End.LANDED, "osprey landed at t = 5 s"), tape, scenario, half)
     aims = [shortfall.aim for shortfall in outcome.shortfalls]
@@ -394,19 +360,15 @@ def test_landing_does_not_swallow_what_else_was_short() -> None:
 
 
 def test_flight_below_its_ground_is_told() -> None:
-    """A landing whose aircraft has no ground flies on."""
-    route = {
-        "north": [0.0, 800.0, 1500.0, 2500.0],
-        "east": [0.0, 0.0, 0.0, 0.0],
-        "altitude": [0.0, -40.0, 0.0, 0.0],
-    }
-    through = calm_osprey(42.0, route=route, landing={"waypoint": 1})
-    outcome = rise_di.simulate(through).outcome
+    """Two seconds at up to 70 m, 10 m below the touch-down of its landing."""
+    tape, scenario = on_first_leg()
+    truth = tape["truth"]
+    values = truth.values.copy()
+    values[100:300, truth.names.index("pose.altitude")] = np.linspace(-61.0, -70.0, 200)
+    signals = dict(tape.signals) | {"truth": Signal(truth.stamp_ns, truth.names, values)}
+    outcome = judge(COMPLETED, replace(tape, signals=signals), scenario, WHOLE)
     (below,) = [each for each in outcome.shortfalls if each.aim is Aim.GROUND]
-    assert below.figures["below_s"] > 1.0
-    shear = {"law": "power", "ground": -40.0, "reference": 20.0, "exponent": 0.14}
-    with_ground = through.vary(aircraft={"shear": shear})
-    assert rise_di.simulate(with_ground).outcome.end is End.LANDED
+    assert below.figures == pytest.approx({"below_s": 2.0, "deepest_m": 10.0})
 
 
 def test_error_before_a_late_engagement_hides_nothing() -> None:
@@ -426,23 +388,13 @@ def test_error_before_a_late_engagement_hides_nothing() -> None:
     assert rise_di.simulate(short, control=Late).outcome.status == 4
 
 
-@pytest.mark.parametrize(
-    "section",
-    [
-        {"bias": [0.0, 5.0, 0.0, 0.0]},
-        {"bias": [0.3, 0.0, 0.0, 0.0]},
-        {"drift": [0.0, 2.0, 0.0, 0.0]},
-    ],
-    ids=["bias of V", "bias of q", "drift of V"],
-)
-def test_bias_of_a_sensor_is_no_noise(section: dict[str, list[float]]) -> None:
-    assert rise_di.simulate(servo().vary(aircraft={"sensors": section})).outcome.status == 4
+def test_drift_of_a_sensor_is_no_noise() -> None:
+    drifting = servo().vary(aircraft={"sensors": {"drift": [0.0, 2.0, 0.0, 0.0]}})
+    assert rise_di.simulate(drifting).outcome.status == 4
 
 
 def test_lost_samples_of_a_sensor_are_no_shortfall() -> None:
-    lossy = find_scenario("osprey_servo", duration=10.0).vary(
-        aircraft={"sensors": {"dropout": 0.2}}
-    )
+    lossy = servo().vary(flight={"duration": 10.0}, aircraft={"sensors": {"dropout": 0.2}})
     assert rise_di.simulate(lossy).outcome == COMPLETED
 
 
