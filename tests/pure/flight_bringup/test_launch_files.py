@@ -226,11 +226,12 @@ def every(kind: type[T], actions: Sequence[Any]) -> list[T]:
     return [action for action in actions if isinstance(action, kind)]
 
 
-@pytest.fixture
-def short(osprey_gust: Scenario, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def short(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recorded flight of half a second."""
     tape = simulate(osprey_gust.vary(flight={"duration": 0.5}))
-    return write_run(tape, tmp_path / "log", LogAttachments(osprey_gust.path)).parent
+    folder = tmp_path_factory.mktemp("short") / "log"
+    return write_run(tape, folder, LogAttachments(osprey_gust.path)).parent
 
 
 CASES: tuple[tuple[str, dict[str, str], tuple[str, ...], tuple[str, ...]], ...] = (
@@ -391,21 +392,17 @@ def test_nodes_start_in_order_with_parameters_that_they_have(case: Case) -> None
         NODES[executable].validate_mapping(section | given_to_node, executable)
 
 
-@pytest.mark.parametrize("status", [0, 3, -9])
-@pytest.mark.parametrize("number", range(5))
-def test_end_of_any_node_ends_launch_with_error(
-    number: int, status: int, case: Case, tmp_path: Path
-) -> None:
-    actions, context, first, then = case
+@pytest.mark.parametrize("number", [0, -1], ids=["first stage", "last stage"])
+def test_end_of_any_node_ends_launch_with_error(number: int, case: Case, tmp_path: Path) -> None:
+    """With status 0 too: no node ends before the flight does."""
+    actions, context, first, _ = case
     left = [file.read_text() for file in tmp_path.glob("runs/2*/outcome")]
     assert left == ([INTERRUPTED.text()] if "recorder" in first else [])  # the outcome of Ctrl-C
     processes = {**nodes(actions), **nodes(all_ready(actions, context))}
-    if number >= len(processes):
-        pytest.skip(f"this launch file starts {len(first + then)} nodes")
     executable, node = [*processes.items()][number]
     assert node.on_exit is not None
     with pytest.raises(RuntimeError, match=f"{executable}-1 ended before the flight did"):
-        node.on_exit(ProcessExited(f"{executable}-1", status), context)
+        node.on_exit(ProcessExited(f"{executable}-1", 0), context)
     if "recorder" in first:
         text = next(tmp_path.glob("runs/2*/outcome")).read_text()
         sentence = ended_early(f"{executable}-1 ended before the flight did")
