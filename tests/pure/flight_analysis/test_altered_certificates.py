@@ -29,7 +29,8 @@ from tests.pure.flight_analysis.test_certificate import (
 from aircraft_sim.airframes.airframe import load_airframe
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.certificate import certificate
-from flight_analysis.linear_loop.loop_margins import scenario_loop
+from flight_analysis.linear_loop.guarantee import Guarantee, loop_guarantee
+from flight_analysis.linear_loop.loop_margins import LinearLoop, scenario_loop
 from rise_di.c_code import certificate_sources
 
 pytestmark = pytest.mark.slow
@@ -40,13 +41,20 @@ TOP = math.pi / 0.01  # rad/s, the highest frequency of a loop of 100 Hz
 LINE = "a line of an export"
 
 
+def servo_loop() -> LinearLoop:
+    scenario = find_scenario("osprey_servo")
+    return scenario_loop(scenario, scenario.controller, 1, 0.3)
+
+
+def certified(guarantee: Guarantee) -> Content:
+    sources = certificate_sources(load_airframe("osprey"), find_scenario("osprey_servo"))
+    content: Content = json.loads(certificate(servo_loop(), guarantee, sources.texts))
+    return content
+
+
 @pytest.fixture(scope="module")
 def servo() -> Content:
-    scenario = find_scenario("osprey_servo")
-    linear = scenario_loop(scenario, scenario.controller, 1, 0.3)
-    sources = certificate_sources(load_airframe("osprey"), scenario)
-    content: Content = json.loads(certificate(linear, guarantee_of("osprey_servo"), sources.texts))
-    return content
+    return certified(guarantee_of("osprey_servo"))
 
 
 @pytest.fixture(scope="module")
@@ -154,14 +162,6 @@ def one_step(t: float = 0.0, g: float = 0.0) -> Alter:
     return alter
 
 
-def one_g_in_each_step(content: Content) -> None:
-    content["size"] = 10.0
-    for part in content["parts"]:
-        for step in part["steps"]:
-            if "g" in step:
-                step["g"][0] = NAN
-
-
 def without_entry(content: Content) -> None:
     """A box without one of its entries: smaller, and true."""
     i = content["names"].index("A[q,alpha]")
@@ -266,13 +266,7 @@ REFUSED: dict[str, tuple[Alter, str]] = {
     "other outputs": (times(0.0, "C"), "d = 0, is not stable"),
     "a later u": (put(0.053, "delay"), NOT_FOUND),
     "without balance": (both(put(10.0, "size"), one_step()), NOT_FOUND),
-    "a t without end": (both(put(10.0, "size"), one_step(t=NAN)), "NaN"),
-    "300 % by a NaN of g": (both(put(10.0, "size"), one_step(g=NAN)), "NaN"),
-    "300 % by an infinite g": (both(put(10.0, "size"), one_step(g=INF)), "Infinity"),
-    "300 % by a huge g": (both(put(10.0, "size"), one_step(g=1e200)), RANGE),
     "300 % by the largest g": (both(put(10.0, "size"), one_step(g=1e9)), NOT_FOUND),
-    "a million times by a NaN": (both(put(1e6, "size"), one_step(g=NAN)), "NaN"),
-    "a NaN in each step": (one_g_in_each_step, "NaN"),
     # the entries and their names
     "parts doubled": (put([0.6] * 26, "part"), "nothing or all exact"),
     "tiny parts": (times(1e-7, "part"), "expected"),
@@ -313,10 +307,11 @@ REFUSED: dict[str, tuple[Alter, str]] = {
     "an allocation of zeros": (times(0.0, "T"), "expected"),
     "an allocation twice as large": (times(2.0, "T"), "expected"),
     # types and ranges
-    **{f"t of {v}": (put(v, *STEP, "t", 3), "NaN|Inf|" + RANGE) for v in (NAN, INF, 1e308, -1e308)},
-    **{f"g of {v}": (put(v, *STEP, "g", 3), "NaN|Inf|" + RANGE) for v in (NAN, INF, 1e308, -1e308)},
-    **{f"size of {v}": (put(v, "size"), "NaN|Inf|" + RANGE) for v in (NAN, INF, 1e308, -1e308)},
-    **{f"size of {v}": (put(v, "size"), RANGE) for v in (0.0, -2.47, True, "2.4", None, [2.4])},
+    "t of NaN": (put(NAN, *STEP, "t", 3), "NaN"),
+    "t of -1e308": (put(-1e308, *STEP, "t", 3), RANGE),
+    "g of Infinity": (put(INF, *STEP, "g", 3), "Infinity"),
+    "g of 1e308": (put(1e308, *STEP, "g", 3), RANGE),
+    **{f"size of {v}": (put(v, "size"), RANGE) for v in (0.0, 1e308, True, "2.4", None, [2.4])},
     "size and parts negative": (both(times(-1.0, "size"), times(-1.0, "part")), RANGE),
     "low of NaN": (put(NAN, *STEP, "low"), "NaN"),
     "low below 0": (first(low=-5.0, high=0.0, t=[0.0] * 13, g=[0.0] * 13), RANGE),
@@ -486,19 +481,21 @@ def _leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [leaf for key, inner in items for leaf in _leaves(inner, (*path, key))]
 
 
+@pytest.mark.usefixtures("coarse")
 def test_no_mutation_of_a_leaf_proves_another_claim(
-    servo: Content, verdict: Callable[..., tuple[int, str]]
+    verdict: Callable[..., tuple[int, str]],
 ) -> None:
-    """Of 150 leaves, drawn by member so that the few beside the steps have their turn.
+    """Of 60 leaves, drawn by member so that the few beside the steps have their turn.
 
     A mutation is refused, or the claim is word for word that of the certificate as it is.
     """
+    servo = certified(loop_guarantee(servo_loop()))
     _, claim = verdict(signed(servo))
     claim = claim.split("\n", 1)[1]
     rng = np.random.default_rng(7)
     members = {key: _leaves(value, (key,)) for key, value in servo.items()}
     values: list[Any] = [NAN, INF, -INF, True, None, "1", "", [], {}, 10**30, 1e308, 5e-324, -1e20]
-    for _ in range(150):
+    for _ in range(60):
         leaves = members[list(members)[rng.integers(len(members))]]
         place = leaves[rng.integers(len(leaves))]
         content = copy.deepcopy(servo)

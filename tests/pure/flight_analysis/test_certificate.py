@@ -25,7 +25,6 @@ import rise_di
 from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.linear_loop import guarantee as guarantee_module
 from flight_analysis.linear_loop.certificate import certificate, keep
 from flight_analysis.linear_loop.guarantee import Guarantee, loop_guarantee
 from flight_analysis.linear_loop.loop_margins import LinearLoop, scenario_loop
@@ -72,13 +71,6 @@ def servo() -> Content:
     return content
 
 
-@pytest.fixture
-def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Prove half of what is unstable, and no disks: for tests of what is done with a guarantee."""
-    monkeypatch.setattr(guarantee_module, "GAPS", (1.28,))
-    monkeypatch.setattr(guarantee_module, "FEWER_BOXES", 2)
-
-
 def signed(content: Content) -> Content:
     """The content with the name and the digest that it has."""
     rest = {key: value for key, value in content.items() if key != "digest"}
@@ -98,7 +90,7 @@ def run(content: Content, folder: Path, *words: str) -> subprocess.CompletedProc
     return subprocess.CompletedProcess(command, status, out.getvalue(), error.getvalue())
 
 
-@pytest.mark.parametrize("name", ["osprey_servo", "osprey_observer", "jsbsim_c172p"])
+@pytest.mark.parametrize("name", ["osprey_servo", "jsbsim_c172p"])
 def test_checker_proves_a_guarantee(name: str, tmp_path: Path) -> None:
     """The size is the guarantee's.
 
@@ -379,6 +371,7 @@ def test_export_puts_the_certificate_beside_the_code_of_its_constants(tmp_path: 
     assert "holds other constants" in run(content, tmp_path, str(header)).stderr
 
 
+@pytest.mark.usefixtures("coarse")
 def test_command_certifies_an_aircraft_of_jsbsim_or_refuses_before_the_work(
     tmp_path: Path,
 ) -> None:
