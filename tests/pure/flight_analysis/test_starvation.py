@@ -32,7 +32,11 @@ STARVED: Spans = tuple((start, start + 0.3) for start in np.arange(1.0, 20.0, 0.
 
 
 def servo(*faults: str) -> Scenario:
-    scenario = find_scenario("osprey_servo").vary(flight={"duration": T})
+    scenario = find_scenario("osprey_servo").vary(
+        flight={"duration": T},
+        aircraft={"rate": 100.0, "step": 0.005},
+        reference_model={"rate": 100.0},
+    )
     actuators = scenario.aircraft.actuators.model_dump() | {"faults": list(faults)}
     return scenario.vary(aircraft={"actuators": actuators})
 

@@ -39,7 +39,7 @@ def probed(duration: float, *faults: str) -> Scenario:
     still = calm.reference_model.model_copy(update={"pulses": {}, "coordinated_turn": None})
     return calm.vary(
         reference_model=still, controller=with_probe(), aircraft={"actuators": {"faults": faults}}
-    )
+    ).vary(aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0})
 
 
 @cache
@@ -68,8 +68,8 @@ def test_healthy_surfaces_are_not_called_stuck_in_commands_and_gusts() -> None:
     tape = simulate(
         find_scenario("osprey_servo", 48.0).vary(
             controller=with_probe(),
-            aircraft={"rate": 200.0, "step": 0.005},
-            reference_model={"rate": 200.0},
+            aircraft={"rate": 100.0, "step": 0.005},
+            reference_model={"rate": 100.0},
         )
     )
     assert len(tape["effects"].values) > 80
