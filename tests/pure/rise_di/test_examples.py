@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 import rise_di
+from flight_analysis.closed_loop.simulate import simulate
+from rise_di import own_airframe
 
 pytestmark = pytest.mark.slow
 
@@ -66,6 +68,12 @@ def test_every_function_has_an_example() -> None:
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_the_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    # of a new airframe: one size of the commands, no samples, and two seconds of flight
+    monkeypatch.setattr(
+        own_airframe, "simulate", lambda each: simulate(each.vary(flight={"duration": 2.0}))
+    )
+    monkeypatch.setattr(own_airframe, "SIZES", (0.125,))
+    monkeypatch.setattr(own_airframe, "SAMPLES", 0)
     text = inspect.getdoc(PUBLIC[name]) or ""
     names = {"rise_di": rise_di, "np": np}
     example = doctest.DocTestParser().get_doctest(text, names, name, None, None)
