@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands and the Python of the tutorials run page by page, each in an empty folder.
 
-They run as they stand but for their length: campaigns of two aircraft, two samples of margins,
-flights of two seconds, or three in Python. So do the notebooks. They run in the process of the
-tests, which imports the stack once.
+They run as they stand but for their length: campaigns of two aircraft, a value of a sweep, two
+samples of margins, a trade of one phase margin, flights of two seconds, or three in Python. So do
+the notebooks. They run in the process of the tests, which imports the stack once.
 """
 
 import json
@@ -15,11 +15,18 @@ import shlex
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import pytest
 from tests.conftest import REPOSITORY, invoke
 from tools import parameters
+
+from flight_analysis.closed_loop.simulate import simulate
+from flight_cli import gains_tables
+from flight_design.gains.trade import trade
+from flight_design.identification import manoeuvre
+from rise_di import own_airframe
 
 PAGES = [
     REPOSITORY / "docs" / "get-started.md",
@@ -117,11 +124,24 @@ def run_python(text: str) -> None:
 SHORTER = (
     (r"(--aircraft|--samples) \d+", r"\1 2"),
     (r"--duration \d+", "--duration 2"),
+    (r"(--sweep \S+=)[\d.,]+", r"\g<1>2"),
     (r"(rise-di fly \S+ --in-process)(?! --duration)", r"\1 --duration 2"),
     (r"duration=\d+\.0", "duration=3.0"),
     (r"rise_di\.simulate\((\w+)\)", r'rise_di.simulate(\1.vary(flight={"duration": 3.0}))'),
     (r"range\(6\)", "range(2)"),  # aircraft of a notebook
 )
+
+
+@pytest.fixture(autouse=True)
+def _shorter_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorten what no option of a command does."""
+    for module in (manoeuvre, own_airframe):
+        monkeypatch.setattr(
+            module, "simulate", lambda each: simulate(each.vary(flight={"duration": 2.0}))
+        )
+    monkeypatch.setattr(gains_tables, "trade", partial(trade, phase_margins=(45.0,)))
+    monkeypatch.setattr(own_airframe, "SIZES", (0.125,))
+    monkeypatch.setattr(own_airframe, "SAMPLES", 0)
 
 
 def shortened(text: str) -> str:
