@@ -265,6 +265,11 @@ REFUSED: dict[str, tuple[Alter, str]] = {
     "a law with the wrong sign in a small box": (steered_backwards, "d = 0, is not stable"),
     "other outputs": (times(0.0, "C"), "d = 0, is not stable"),
     "a later u": (put(0.053, "delay"), NOT_FOUND),
+    "a faster law": (
+        both(drop("constants"), times(1.5, "law", "C"), times(1.5, "law", "D")), NOT_FOUND
+    ),
+    "slower actuators": (times(3.0, "lag"), NOT_FOUND),
+    "a step that goes on": (times(2.0, "parts", 1, "steps", 56, "high"), NOT_FOUND),
     "without balance": (both(put(10.0, "size"), one_step()), NOT_FOUND),
     "300 % by the largest g": (both(put(10.0, "size"), one_step(g=1e9)), NOT_FOUND),
     # the entries and their names

@@ -3,7 +3,6 @@
 """Entries that are 0 in the file: their rows, their box, their guarantee and their certificate."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import pytest
 from pytest import approx
 from scipy.linalg import expm
 from tests.conftest import invoke, refusing
+from tests.pure.flight_analysis.test_altered_certificates import Alter, drop, put, times
 from tests.pure.flight_analysis.test_certificate import Content, run, signed
 from tests.pure.flight_analysis.test_guarantee import integrator
 
@@ -194,44 +194,20 @@ def test_checker_proves_zeros_and_says_them_as_numbers(content: Content, tmp_pat
     assert "exact in every aircraft: no entry, and each other 0" in done.stdout
 
 
-def _unmarked(content: Content) -> None:
-    del content["zeros"]
-
-
-def _marked_entry(content: Content) -> None:
-    content["zeros"] = ["A[y,y]", "B[y,u]"]
-
-
-def _unknown(content: Content) -> None:
-    content["zeros"] = ["A[y,y]", "A[x,x]"]
-
-
-def _no_zero(content: Content) -> None:
-    content["A"] = [[-1.0]]
-
-
-def _wider(content: Content) -> None:
-    content["F"][1] = [1.05 * content["F"][1][0]]
-
-
-def _without_part(content: Content) -> None:
-    content["part"][1] = 0.0
-
-
 @pytest.mark.parametrize(
     ("alter", "reason"),
     [
-        (_unmarked, "A[y,y]: found"),
-        (_marked_entry, "B[y,u]: found 1.0, expected 0"),
-        (_unknown, "expected some of the names"),
-        (_no_zero, "A[y,y]: found -1.0, expected 0"),
-        (_wider, "not proved"),
-        (_without_part, "A[y,y]: found"),
+        (drop("zeros"), "A[y,y]: found"),
+        (put(["A[y,y]", "B[y,u]"], "zeros"), "B[y,u]: found 1.0, expected 0"),
+        (put(["A[y,y]", "A[x,x]"], "zeros"), "expected some of the names"),
+        (put([[-1.0]], "A"), "A[y,y]: found -1.0, expected 0"),
+        (times(1.05, "F", 1), "not proved"),
+        (put(0.0, "part", 1), "A[y,y]: found"),
     ],
-    ids=lambda value: getattr(value, "__name__", ""),
+    ids=["unmarked", "marked entry", "unknown", "no zero", "wider", "without part"],
 )
 def test_altered_zero_is_refused(
-    alter: Callable[[Content], None], reason: str, content: Content, tmp_path: Path
+    alter: Alter, reason: str, content: Content, tmp_path: Path
 ) -> None:
     altered = json.loads(json.dumps(content))
     alter(altered)
