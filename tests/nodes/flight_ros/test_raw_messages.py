@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from tests.conftest import few
@@ -201,7 +201,7 @@ def test_short_messages_end_nothing_and_are_counted_as_refused(attack: Attack) -
         assert topics <= refused, node.get_name()
 
 
-@few
+@settings(few, max_examples=15)
 @given(st.lists(payloads() | st.binary(max_size=40) | st.sampled_from(CORPUS), max_size=20))
 def test_no_bytes_end_a_node_or_a_command(attack: Attack, bodies: list[bytes]) -> None:
     attack.send(*bodies, attack.now())

@@ -343,7 +343,7 @@ def test_effects_at_another_speed_are_reduced_to_the_trim_speed() -> None:
         },
     )
     ticks = simulate(scenario.vary(controller={"learn": None}))["internals"]
-    learner = Learner(scenario.rise_di(), OSPREY, no_design, quick=True)
+    learner = Learner(scenario.rise_di(), OSPREY, no_design)
     for stamp_ns, y, u in zip(
         ticks.stamp_ns.tolist(), ticks.group("y").values, ticks.group("u").values, strict=True
     ):
