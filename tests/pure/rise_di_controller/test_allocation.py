@@ -176,7 +176,9 @@ def test_a_flight_with_an_allocation_at_its_stops_tracks_and_replays_to_the_bit(
     """
     stop = [0.01, 0.5, 0.3, 0.3]
     scenario = find_scenario("osprey_servo", 10.0).vary(
-        controller=mixed(lower=[-value for value in stop], upper=stop, slew=[1.0, 1.0, 1.0, 1.0])
+        controller=mixed(lower=[-value for value in stop], upper=stop, slew=[1.0, 1.0, 1.0, 1.0]),
+        aircraft={"rate": 100.0, "step": 0.005},
+        reference_model={"rate": 100.0},
     )
     tape = simulate(scenario)
     assert tape.outcome.status == 0
