@@ -343,6 +343,18 @@ def on_first_leg() -> tuple[Tape, Scenario]:
     return rise_di.simulate(scenario), scenario
 
 
+def test_microburst_that_the_thrust_cannot_hold_is_told() -> None:
+    """A guided flight with nonlinear kinematics: V is off by 5 m/s."""
+    burst = find_scenario("osprey_microburst")
+    section = burst.aircraft.microburst
+    assert section is not None
+    strong = section.model_dump() | {"speed": 14.0}
+    # a fifth of the samples, for a test in a fifth of the time
+    coarse = {"microburst": strong, "rate": 100.0, "step": 0.005}
+    tape = rise_di.simulate(burst.vary(aircraft=coarse, reference_model={"rate": 100.0}))
+    assert tape.outcome.status in {3, 4}
+
+
 def test_landing_does_not_swallow_what_else_was_short() -> None:
     """A touch on the first leg, in a log of half of the flight, far from the zone."""
     tape, scenario = on_first_leg()
