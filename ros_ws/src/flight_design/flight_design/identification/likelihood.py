@@ -34,6 +34,8 @@ from flight_design.identification.innovation_filters import (
     delayed,
     filter_bank,
 )
+from flight_design.identification.normalised import Normalised, normalised
+from flight_design.identification.servo_model import behind_servos
 from flight_design.identification.spans import held_out, span_length
 
 PRIOR = 0.29  # standard deviation of a relative error before the flight: uniform within +-50 %
@@ -65,28 +67,6 @@ class Innovations(NamedTuple):
     log_likelihood: FloatArray
 
 
-class Normalised(NamedTuple):
-    """Innovations of N models over a recording, with their normalised values."""
-
-    r: FloatArray  # (N, T, m) in units of y, NaN where y is lost
-    e: FloatArray  # (N, T, m) innovations whose covariance is I if the model is right
-    half_log_det: FloatArray  # (N, T) half the logarithm of the determinant of the covariance of r
-
-
-def normalised(r: FloatArray, covariance: FloatArray, place: NDArray[np.int64]) -> Normalised:
-    """Normalise innovations r, (N, T, m), by covariances (N, levels, m, m).
-
-    `place`, (T,), is the index of each sample's level in the covariances.
-    """
-    root = np.linalg.cholesky(covariance)
-    inverse = np.linalg.inv(root)
-    half_log_det = np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
-    e = np.empty_like(r)
-    for k in np.unique(place).tolist():
-        e[:, place == k] = r[:, place == k] @ np.swapaxes(inverse[:, k], -1, -2)
-    return Normalised(r, e, half_log_det[:, place])
-
-
 class Models(NamedTuple):
     """The filters of N models, and their inputs."""
 
@@ -111,6 +91,9 @@ class Unknown(NamedTuple):
     drift: float = DRIFT  # sizes/s per root s, noise of the disturbances
     has_hidden_rows: bool = True  # whether the rows of states that are no outputs are identified
     lag: float = 0.0  # s, deviation of the lag of a filter of first order through which y comes
+    # deviation of the logarithm of an actuator's lag; if it and `delay` are above 0, the actuator
+    # may also be of second order
+    servo: float = 0.0
 
     @property
     def factor(self) -> float:
@@ -131,14 +114,15 @@ class Fit(NamedTuple):
 
     theta: FloatArray
     """(p,) relative errors of the uncertain entries of A, then of B; logarithms of the strengths of
-    the winds; then, if they are identified, the shear, the angles at the beginning, the lag of y
-    and the errors of the delays, in units of their deviations."""
+    the winds; then, if they are identified, the shear, the angles at the beginning, the lag of y,
+    the logarithms of the lags of the actuators, their inertias, and the errors of the delays, in
+    units of their deviations."""
     deviation: FloatArray  # (p,) standard deviations of theta after the flight
     before: Innovations  # innovations of the nominal model in the winds of this fit
     after: Innovations  # innovations of the identified model
     levels: NDArray[np.int64]  # (spans,) levels of the wind with the identified model
     late_deviation: FloatArray  # s, standard deviation of the delay of each input with the lag of y
-    by_lag: FloatArray  # (p,) part of each deviation that comes from the lag of y, see `by_lag`
+    by_lag: FloatArray  # (p,) part of each deviation that comes from the lags, see `by_lag`
     # innovations of the model in flight, in the winds that fit it best
     flown: Innovations | None = None
 
@@ -185,6 +169,7 @@ class Likelihood:
         self._delay = np.broadcast_to(delay, len(block.inputs)) / recorded.period
         self._delay_deviation = unknown.delay / recorded.period
         self._lag_deviation = unknown.lag
+        self._servo_deviation = unknown.servo
         self._drift = unknown.drift
         angles = np.flatnonzero(block.restricted(model).gravity.any(axis=0))
         self._angles = angles if unknown.angle else angles[:0]
@@ -226,9 +211,9 @@ class Likelihood:
         shear_prior = np.full(len(SHEARED) * self._is_sheared, SHEAR_PRIOR)
         begin_prior = np.ones(len(self._angles))
         lag_prior = np.ones(1 if self._lag_deviation else 0)
-        self.prior = np.concatenate(
-            [deviation, wind_prior, shear_prior, begin_prior, lag_prior, delay_prior]
-        )
+        servo_prior = np.ones(2 * len(self._block.inputs) if self._servo_deviation else 0)
+        others = [wind_prior, shear_prior, begin_prior, lag_prior, servo_prior, delay_prior]
+        self.prior = np.concatenate([deviation, *others])
         self._errors = np.arange(len(self.prior)) < len(deviation)
         self._upper = MAX_ERROR / PRIOR * self.prior
         self._lower = -self._upper
@@ -257,8 +242,12 @@ class Likelihood:
         self._shear = slice(self._winds.stop, self._winds.stop + len(shear_prior))
         self._begin = slice(self._shear.stop, self._shear.stop + len(self._angles))
         self._lag = slice(self._begin.stop, self._begin.stop + len(lag_prior))
-        self._lower[self._lag] = 0.0
-        self._upper[self._lag] = MAX_DELAY_ERROR
+        middle = self._lag.stop + len(servo_prior) // 2
+        self._servo = slice(self._lag.stop, middle)
+        self._inertia = slice(middle, self._lag.stop + len(servo_prior))
+        self._lower[self._servo] = -MAX_DELAY_ERROR
+        self._lower[self._lag] = self._lower[self._inertia] = 0.0
+        self._upper[self._lag.start : self._inertia.stop] = MAX_DELAY_ERROR
 
     def relative_errors(self, theta: FloatArray) -> FloatArray:
         """Return the relative errors of the entries for their parameters theta, (..., entries).
@@ -321,8 +310,17 @@ class Likelihood:
         if not self._delay_deviation:
             return Models(bank, levels, begin, self._delayed(self._delay))
         periods = self._delay + self._delay_deviation * thetas[:, self._late]
-        late = {row: self._delayed(np.array(row)) for row in set(map(tuple, periods.tolist()))}
-        return Models(bank, levels, begin, np.array([late[tuple(row)] for row in periods.tolist()]))
+        inertia = thetas[:, self._inertia] if self._servo_deviation else np.zeros(periods.shape)
+        servo = self._servo_lag(thetas), inertia
+        u = behind_servos(self._u, periods, self._period, self._model.lag, *servo)
+        return Models(bank, levels, begin, u)
+
+    def _servo_lag(self, thetas: FloatArray) -> FloatArray:
+        """Return the lags of the actuators for N thetas, s, (N, m)."""
+        if not self._servo_deviation:
+            return np.tile(self._model.lag, (len(thetas), 1))
+        factor = np.exp(self._servo_deviation * thetas[:, self._servo])
+        return np.asarray(self._model.lag * factor)
 
     def _delayed(self, periods: FloatArray) -> FloatArray:
         """Return u, (T, m), with each input delayed by its number of periods, (m,)."""
@@ -332,14 +330,16 @@ class Likelihood:
     def delays(self, fit: Fit) -> tuple[FloatArray, FloatArray]:
         """Return the delays of the inputs, s, and their standard deviations, (m,) each.
 
-        A delay includes the lag of y, because a loop is late by both.
+        A delay includes the lag of y, and what the lag of the actuator exceeds the known one,
+        because a loop is late by all of them.
         """
         late = self._period * self._delay
         if self._delay_deviation:
             late = late + self._period * self._delay_deviation * fit.theta[self._late]
+        late = late + self._servo_lag(fit.theta[None])[0] - self._model.lag
         return late + self._lag_deviation * np.sum(fit.theta[self._lag]), fit.late_deviation
 
-    def late_deviation(self, covariance: FloatArray) -> FloatArray:
+    def late_deviation(self, theta: FloatArray, covariance: FloatArray) -> FloatArray:
         """Return the standard deviations of `delays`, s, from the covariance of theta, (p, p)."""
         m = len(self._delay)
         size = np.zeros((m, len(self.prior)))
@@ -347,18 +347,21 @@ class Likelihood:
         size[:, self._late] = (
             self._period * self._delay_deviation * np.eye(m)[:, : len(self.prior[self._late])]
         )
+        if self._servo_deviation:
+            size[:, self._servo] = self._servo_deviation * np.diag(self._servo_lag(theta[None])[0])
         return np.asarray(np.sqrt(np.einsum("ip,pq,iq->i", size, covariance, size)))
 
     def by_lag(self, covariance: FloatArray) -> FloatArray:
-        """Return the part of each standard deviation of theta that the lag of y causes, (p,).
+        """Return the part of each standard deviation of theta that the lags cause, (p,).
 
-        `covariance` is that of theta. If the lag were known, the variances would be smaller by the
-        squares of these parts.
+        They are the lag of y and those of the actuators, with their inertias. `covariance` is that
+        of theta. If the lags were known, the variances would be smaller by the squares of these
+        parts.
         """
-        if not self._lag_deviation:
-            return np.zeros(len(self.prior))
-        lag = self._lag.start
-        return np.asarray(np.abs(covariance[:, lag]) / np.sqrt(covariance[lag, lag]))
+        lags = slice(self._lag.start, self._inertia.stop)
+        shared = covariance[:, lags]
+        by_lags = np.linalg.solve(covariance[lags, lags], shared.T)
+        return np.asarray(np.sqrt(np.sum(shared.T * by_lags, axis=0)))
 
     def levels(self, theta: FloatArray) -> NDArray[np.int64]:
         """Return the best level of the wind in each span, (spans,), for the parameters theta, (p,).
@@ -474,14 +477,16 @@ class Likelihood:
     def named(self) -> list[str]:
         """Return the names of the parameters theta, (p,).
 
-        Their order is entries, winds, shears, angles, lag, delays.
+        Their order is entries, winds, shears, angles, lag, servos, delays.
         """
         angles = [self.names.states[k] for k in self._angles]
         names = [entry.name for entry in self.nominal_entries()]
         shears = [f"shear of {name}" for name in SHEARED * self._is_sheared]
         delays = [f"delay of {name}" for name in self.names.inputs]
         lag = ["lag of y"] if self._lag_deviation else []
-        others = [*self.names.winds, *shears, *angles, *lag, *delays]
+        servo = [f"{kind} of {name}" for kind in ("lag", "inertia") for name in self.names.inputs]
+        servo = servo if self._servo_deviation else []
+        others = [*self.names.winds, *shears, *angles, *lag, *servo, *delays]
         return names + others[: len(self.prior) - len(names)]
 
     def model_errors(self, airframe: Airframe) -> FloatArray:

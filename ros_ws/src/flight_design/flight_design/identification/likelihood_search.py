@@ -168,7 +168,7 @@ class Search(Likelihood):
             before=beside(0.0),
             after=after,
             levels=best.levels,
-            late_deviation=self.late_deviation(covariance),
+            late_deviation=self.late_deviation(theta, covariance),
             by_lag=self.by_lag(covariance),
             flown=by_flown,
         )
@@ -198,13 +198,13 @@ class Search(Likelihood):
         ]
 
     def _lagging(self, theta: FloatArray) -> FloatArray:
-        """Return theta, (p,), clipped to the bounds, with a lag of y of one standard deviation.
+        """Return theta, (p,), clipped to the bounds, with a lag of y and inertias of the actuators.
 
-        From a lag of 0, the search would explain a filter of y by a delay of u, and end there. But
-        a lag of y predicts better.
+        Each of them is one standard deviation. From 0 the search would explain a filter of y or a
+        slow servo by a delay of u, and end there. But they predict better.
         """
         begin = self._within(theta)
-        begin[self._lag] = 1.0
+        begin[self._lag] = begin[self._inertia] = 1.0
         return begin
 
     def _within(self, theta: FloatArray) -> FloatArray:
@@ -218,10 +218,12 @@ class Search(Likelihood):
 
         These steps use the flight averaged over the shortest lag. `levels` gives the level of each
         span. If it is None, theta decides the levels. `winds` says whether the strengths of the
-        winds are free.
+        winds are free. The lags of the actuators are not: beside free delays and inertias, the
+        first long steps would set them to anything.
         """
         free = np.ones(len(theta), dtype=bool)
         free[self._winds] = winds
+        free[self._servo] = False
         coarse = self.coarse
         fitted = coarse.fitted()
         for _ in range(START_STEPS):

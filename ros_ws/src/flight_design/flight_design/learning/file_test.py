@@ -25,7 +25,7 @@ from flight_design.identification.model_refusals import (
     reason_against_airframe,
 )
 from flight_design.learning.change_test import ANGLE
-from flight_design.learning.part_checks import DELAY_DEVIATION, LAG_DEVIATION
+from flight_design.learning.part_checks import DELAY_DEVIATION, LAG_DEVIATION, SERVO_DEVIATION
 
 # number of entries that may lie at a bound: the right model may have one, wrong models have 2 to 6
 AT_BOUND = 1
@@ -46,7 +46,9 @@ def identified_within(
     """
 
     def found_with(deviations: Unknown) -> Identification:
-        unknown = deviations._replace(delay=DELAY_DEVIATION, angle=ANGLE, lag=LAG_DEVIATION)
+        unknown = deviations._replace(
+            delay=DELAY_DEVIATION, angle=ANGLE, lag=LAG_DEVIATION, servo=SERVO_DEVIATION
+        )
         return identify(unknown=unknown, searches_again=not tests)
 
     found = found_with(believed)
