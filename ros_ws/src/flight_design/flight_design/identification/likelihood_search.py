@@ -65,6 +65,8 @@ class Doubt(NamedTuple):
 
     timing: float  # s, standard deviation of the delay of u, which is not identified
     whiteness: FloatArray  # (m,) `whiteness` of the innovations of the held-out samples
+    # whether a block of the log counts by how far theta moves without it
+    leaves_out: bool = False
 
 
 class Search(Likelihood):
@@ -329,24 +331,25 @@ class Search(Likelihood):
 
         H is the Hessian. J has the derivatives by theta of the innovations e, divided by their rms.
         If the model were right, M would be J J'. Here M is the larger of two matrices. The first
-        sums the outer products of J e over blocks of the log. The second is J J' times the
-        whiteness of each output, as in Birge's ratio. s is the change of theta with the delay of u,
-        and j is the derivative of e by this delay. Sources: H. White, Econometrica 50(1), 1982; R.
-        T. Birge, Phys. Rev. 40(2), 1932; S. F. Schmidt, Advances in Control Systems 3, 1966, for a
-        delay that is not estimated.
+        sums the outer products of J e over blocks of the log. With `leaves_out`, the J e of block k
+        is (I - J_k J_k' H^-1)^-1 J_k e_k: theta without this block is off by H^-1 times it. A few
+        gusts hold most of what a log shows, and the fit follows their own errors. The second is J
+        J' times the whiteness of each output, as in Birge's ratio. s is the change of theta with
+        the delay of u, and j is the derivative of e by this delay. Sources: H. White, Econometrica
+        50(1), 1982; J. G. MacKinnon, H. White, J. Econometrics 29(3), 1985, for a block left out;
+        R. T. Birge, Phys. Rev. 40(2), 1932; S. F. Schmidt, Advances in Control Systems 3, 1966, for
+        a delay that is not estimated.
 
         Returns the fit, and how much of each entry's standard deviation the delay causes, (p - G,).
         """
         theta, used = fit.theta, self.fitted()
         slopes = self._slopes(theta, fit.levels, used, np.ones(len(theta), dtype=bool))
         before = np.diag(self.prior**-2)
-        inverse = np.linalg.inv(slopes.J @ slopes.J.T + before)
+        inverse: FloatArray = np.asarray(np.linalg.inv(slopes.J @ slopes.J.T + before), float)
         by_output = slopes.J.reshape(len(theta), *slopes.e.shape)
         coloured = (by_output * np.sqrt(np.maximum(doubt.whiteness, 1.0))).reshape(slopes.J.shape)
-        scores = np.einsum("psm,sm->sp", by_output, slopes.e)
         places = np.flatnonzero(used) // round(BLOCK / self._period)
-        sums = np.array([scores[places == k].sum(axis=0) for k in np.unique(places)])
-        sums -= sums.mean(axis=0)
+        sums = self._block_scores(by_output, slopes.e, places, inverse * doubt.leaves_out)
         middles = (coloured @ coloured.T, sums.T @ sums * len(sums) / max(len(sums) - 1, 1))
         spread = [np.diag(inverse @ (middle + before) @ inverse) for middle in middles]
         models = self.models(theta[None], fit.levels)
@@ -358,6 +361,22 @@ class Search(Likelihood):
         j = (e_later - e) / np.sqrt(np.mean(e**2, axis=0)) / LATER
         late = np.abs(doubt.timing * inverse @ (slopes.J @ j.ravel()))
         return fit._replace(deviation=np.sqrt(np.maximum(*spread) + late**2)), late[: self.count]
+
+    @staticmethod
+    def _block_scores(
+        by_output: FloatArray, e: FloatArray, places: NDArray[np.int64], inverse: FloatArray
+    ) -> FloatArray:
+        """Return (I - J_k J_k' H^-1)^-1 J_k e_k of each block k less their mean, (blocks, p).
+
+        `places` has the block of each sample, and `inverse` is H^-1, or 0 for J_k e_k itself.
+        """
+        scores = []
+        for k in np.unique(places):
+            J = by_output[:, places == k].reshape(len(inverse), -1)
+            without = np.eye(len(inverse)) - J @ J.T @ inverse
+            scores.append(np.linalg.solve(without, J @ e[places == k].ravel()))
+        sums = np.asarray(scores, float)
+        return np.asarray(sums - sums.mean(axis=0))
 
     def flying(self, flown: FloatArray, parts: Iterable[tuple[Likelihood, Fit]]) -> Innovations:
         """Return the innovations of the model that flies, whose theta is `flown`, (p,).

@@ -173,7 +173,7 @@ class _Study(NamedTuple):
         entries = search.entries(fit)
         stated = entries
         if self.is_doubted:
-            doubted, _ = search.with_doubt(fit, Doubt(0.0, after.whiteness))
+            doubted, _ = search.with_doubt(fit, Doubt(0.0, after.whiteness, leaves_out=True))
             widest = np.maximum(doubted.deviation, fit.deviation)
             stated = search.entries(fit._replace(deviation=widest))
         # Behind a filter of y the loop is the same with a weaker effect and a shorter lag. So an
