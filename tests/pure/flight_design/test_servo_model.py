@@ -126,3 +126,9 @@ def test_entries_are_within_their_deviations_behind_servos_of_second_order(
     for seconds in (15.0, DURATION):
         assert largest(seconds, SERVO_DEVIATION) < MOST_OFF
     assert largest(DURATION, 0.0) > MOST_OFF
+
+
+def test_actuator_without_a_lag_passes_u_on() -> None:
+    u = np.array([0.0, 1.0, -1.0])
+    assert_array_equal(behind_servo(u, 0.01, 0.0, 0.0, 1.0), u)
+    assert np.isfinite(behind_servo(u, 0.01, 1e-4, 1e-4, 1.0)).all()

@@ -51,9 +51,9 @@ def behind_servo(
         inertia lag^2 p_ddot + servo_lag p_dot + p = u
 
     `lag` is that of the first-order actuator, s. The servo is at rest at the first u. Without an
-    inertia it is of first order.
+    inertia it is of first order. An actuator without a lag has no inertia either.
     """
-    if inertia == 0.0 and servo_lag == lag:
+    if lag == 0.0 or (inertia == 0.0 and servo_lag == lag):
         return u
     square = max(inertia, LEAST_INERTIA) * lag**2
     motion = np.array([[0.0, 1.0], [-1.0 / square, -servo_lag / square]])
