@@ -52,7 +52,6 @@ float64 y_m_offset       # [s] of the newest y_m after y
 float32 rate             # [Hz] of the samples of the rates, measured; 0: not yet
 """
 
-# PX4 logs these topics instead of its default topics, each with its least interval in ms.
 TOPICS = """rise_di_status
 vehicle_angular_velocity
 vehicle_torque_setpoint
@@ -115,8 +114,9 @@ vehicle_magnetometer 200
 vehicle_status
 wind 1000
 """
-"""Topics of the module and of `tune`, logged at every sample, and the topics that PX4 1.16 logs by
-default (logged_topics.cpp). If the file lacked the latter, the log would lack them."""
+"""Topics that PX4 logs instead of its default topics, with the least interval in ms, if any. The
+topics of the module and of `tune` come first. The default topics of PX4 1.16 (logged_topics.cpp)
+follow, because the log would lack them otherwise."""
 
 PX4 = {
     "logger_topics.txt": TOPICS,

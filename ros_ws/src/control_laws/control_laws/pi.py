@@ -77,7 +77,7 @@ def _limited(
 def _retune(state: PiState, old: PiParams, new: PiParams) -> PiState:
     """Return the state for new parameters, without a jump of u (bumpless transfer).
 
-    u stays the same because e_0 changes. The integral could not do this, because Lambda may be 0.
+    e_0 is chosen so that u stays the same. The integral cannot serve, because Lambda may be 0.
     """
     start_error = -new.D * _u(state, old) / (new.input_scale * new.K)
     return state._replace(e_0=state.e + new.Lambda * state.integral_e - start_error)

@@ -65,8 +65,8 @@ SEARCH_TIMEOUT = 300.0  # s for a learner in lockstep; a search takes 5 s of a c
 READY_TIMEOUT = 20.0  # s
 NO_CLOCK = "/clock: no message of a simulator"
 FIRST_Y = 20.0  # s for which a bridge waits for the first y of its autopilot
-# share of the duration to which a shorter flight limits FIRST_Y, so that the bridge ends first and
-# says why
+# Largest share of the duration for which a bridge waits for the first y. So in a short flight the
+# bridge still ends before the flight does, and says why.
 BEFORE_END = 0.8
 FIRST_U = 5.0  # s, longest time from t = 0 until the aircraft takes its first u
 LOG_TIMEOUT = 5.0  # s without a change of the log, after the duration

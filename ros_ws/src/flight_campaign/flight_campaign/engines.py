@@ -101,7 +101,8 @@ def dask(
 
     The chunks of a dead worker run again. If a scheduler is lost and comes back within RECONNECT,
     the lost chunks are sent to it again. On a host with GPUs, each process has a different GPU.
-    With `on_devices` False, no process has a GPU, because single flights need cores.
+    If `on_devices` is False, no process has a GPU, and by default there is one for each core. This
+    suits aircraft that fly one by one, because such flights run on cores.
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:

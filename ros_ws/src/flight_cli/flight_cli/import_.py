@@ -38,8 +38,8 @@ class Import:
 
     By default it takes the longest stretch in the air. If u comes from the sticks, this stretch
     must be in MANUAL. `check --run`, `identify bridge`, `report` and `watch` read the bag. u is the
-    deviation from the median of the stretch, and `commands` is the whole command. With --scenario,
-    the log is that of a module of export --px4, and `replay` computes each of its ticks again.
+    deviation from the median of the stretch, and `commands` is the whole command. --scenario is for
+    the log of a flight of export --px4. `replay` can then compute each of its ticks again.
 
     Exit status: 0, or 2 bad input.
     """

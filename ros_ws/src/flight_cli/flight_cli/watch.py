@@ -113,7 +113,7 @@ class Watch:
             serve(flights, ports, _announce, fleet=self.fleet)
 
     def _require_one_view(self) -> None:
-        """Raise ParameterError if options contradict each other."""
+        """Raise ParameterError if options contradict each other or the number of runs."""
         runs = len(self.run or ())
         controlled = self.control or self.real
         require(
@@ -140,7 +140,7 @@ class Watch:
 
 
 def _in_progress(runs: Path) -> list[Path]:
-    """Return the runs that are being recorded, by name. Raises ParameterError if there are none."""
+    """Return the runs in recording, the oldest first. Raises ParameterError if there are none."""
     recording = runs_in_recording(runs)[::-1]
     require(bool(recording), f"--fleet: {runs}", "no run in recording", "each RUN by its name")
     return recording

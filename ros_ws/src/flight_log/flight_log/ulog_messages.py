@@ -24,8 +24,7 @@ LEAST = MappingProxyType(
 LARGEST = 10_000  # bytes of the largest message (pyulog, core.py)
 # place of the offsets of appended parts in the message FLAGS
 APPENDED = slice(HEAD + MESSAGE.size + 16, HEAD + MESSAGE.size + 40)
-# bytes; if fewer than this follow the last message, they count as a cut message, and the log as
-# whole
+# bytes. Fewer than this after the last message are a message that was cut short, and no loss.
 TAIL = 528
 
 

@@ -5,7 +5,7 @@
 The names of the message are the channels, the positions are the values, and the stamp is the
 instant of the sample. The channels are constant during a flight. So the bytes of a message are laid
 out once, and each sample changes only the stamp and the values. This is several times faster than
-the serialisation by the middleware. It also repeats every byte, while the middleware leaves
+the serialisation by the middleware. The other bytes also stay the same, while the middleware leaves
 uninitialised memory between two strings.
 """
 

@@ -87,7 +87,7 @@ class Ticker:
 class TickTimes:
     """Periods and compute times of the ticks since the last report.
 
-    It also counts the missed ticks.
+    It also counts the missed ticks since the start.
     """
 
     def __init__(self) -> None:
@@ -109,7 +109,10 @@ class TickTimes:
         self._compute.append(time.monotonic_ns() - (self._begin_ns or 0))
 
     def report(self) -> dict[str, object]:
-        """Return mean, 99th percentile and maximum of both times since the last report, s."""
+        """Return the missed ticks, and mean, 99th percentile and maximum of both times, s.
+
+        The next report begins with no times.
+        """
         report: dict[str, object] = {"missed ticks": self._missed}
         for key, times in (("period", self._periods), ("compute time", self._compute)):
             if times:

@@ -103,7 +103,7 @@ def new_airframe(
             unit of length, `length`.
 
     Returns:
-        The paths of the files, the airframe, and a note on the source.
+        The paths of the files, the airframe, a note on the source, and the shortfall of the flight.
 
     Raises:
         ParameterError: The model contradicts physics, or a file cannot be written.
@@ -193,10 +193,11 @@ def _pairing_sentence(airframe: Airframe) -> str | None:
 def _flying(
     airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequence[float]
 ) -> tuple[str, Refusal | None]:
-    """Return the text of a scenario whose gains are selected so that its flight ends as planned.
+    """Return the text of a scenario with commands so small that its flight ends as planned.
 
-    The flight must stay clear of the end stops. If there is no such flight, the scenario has the
-    smallest commands, and the second result says what is wrong with its flight. `trial` is the file
+    Its gains are selected for these commands. The flight must stay clear of the end stops. If there
+    is no such flight, the scenario has the smallest commands, and the second result says what is
+    wrong with its flight. `trial` is the file
     of the airframe for the trial flights. `files` are the paths of airframe and scenario that the
     text names.
     """

@@ -270,9 +270,10 @@ class RiseDiConfig(ControllerConfig):
             )
 
     def _check_schedule(self, schedule: ScheduleConfig) -> None:
-        """Check that a schedule has V, another output, and models below and above the trim speed.
+        """Check that the outputs suit a schedule, and that it has models at two speeds.
 
-        At both speeds, feedforward and observer need models.
+        The outputs must be V and at least one other. A controller with a feedforward or an observer
+        needs a model below the trim speed and one above it.
         """
         followed = "V" in self.outputs and len(self.outputs) > 1
         require(

@@ -132,15 +132,13 @@ def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
 
 
 def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatArray, FloatArray]:
-    """Return the deviations x, (n,), and u, (p,), of the trim at `ratio` times V0, SI.
-
-    They are deviations from the trim at V0.
+    """Return by how much x, (n,), and u, (p,), in trim change from V0 to `ratio` times V0, SI.
 
         (A + gravity) dx + B du = 0
 
     In level flight dx consists of the step dV and of dalpha = dtheta, and the other states keep
-    their values. The ratio is reached from 1 in TRIM_STEPS steps. In each of them A and B are those
-    of the airspeed, and du is the smallest solution if several inputs can serve. Raises as
+    their values. The airspeed changes in TRIM_STEPS steps. Each step takes A, gravity and B at its
+    middle airspeed. If several inputs can keep the trim, du is the smallest solution. Raises as
     `exponents` does.
     """
     names = list(airframe.states)

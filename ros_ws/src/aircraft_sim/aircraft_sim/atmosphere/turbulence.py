@@ -127,13 +127,13 @@ def filters(
         Phi_u = sigma^2 2T/pi / (1 + (T omega)^2)
         Phi_v = sigma^2 T/pi (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2,  Phi_w alike
 
-    In a step, z becomes transition z plus noise with the covariance spread spread'. For v and w
-    these matrices follow from h = a dt. For u they have only the first entry:
+    In a step, z+ = F z + S n, with n normal and of unit variance. F is `transition`, and S is
+    `spread`. For v and w these matrices follow from h = a dt. For u they have only the first entry:
 
-        transition = exp(-h) [[1, 0], [h, 1]],  spread spread' = [[g_1, g_2/2], [g_2/2, g_3/2]]
+        F = exp(-h) [[1, 0], [h, 1]],  S S' = [[g_1, g_2/2], [g_2/2, g_3/2]]
 
-    Here g_k = gammainc(k, 2h), from the integrals of 2 s^(k-1) exp(-2s) from 0 to h. The product
-    stationary stationary' is this covariance for h = inf.
+    Here g_k = gammainc(k, 2h), from the integrals of 2 s^(k-1) exp(-2s) from 0 to h. `stationary`
+    is S for h = inf.
 
     `airspeed` is V0, m/s, and `dt` is in s. `axes` are the required axes as indices in AXES and
     then ROTARY. `span` is b, m, for the rotary gusts, which `_with_rotary` adds. Source:

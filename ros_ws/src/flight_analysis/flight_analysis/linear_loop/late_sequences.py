@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Search for aircraft that a periodic sequence of delays makes unstable.
 
-u of each tick and input is either in time or late by the whole of a time, at most a period. At each
-instant the newest u that has arrived acts. Over a tick, from the instant at which a u in time would
-arrive, the motion is one of 2^m matrices, which are exact. A sequence of them leaves if a mode of
-their product is outside the circle.
+u of each tick and input is either in time or late by `late`, which is at most a period. At each
+instant the newest u that has arrived acts. A tick begins when a u in time would arrive. Over a tick
+the motion is exactly one of 2^m matrices, for m inputs. A sequence of them leaves if a mode of
+their product grows, that is, lies outside the unit circle.
 
 With x_k and p_k, the right and left eigenvectors of the product carried to tick k, another matrix M
 in this tick changes the mode to p_k+1 M x_k / (p_k+1 x_k+1), to first order. So the best choice of
@@ -33,9 +33,10 @@ ROUNDS = 12  # largest number of rounds of the ascent
 GAIN = 1e-9  # a choice helps if the mode grows by more than this fraction
 # A mode is too slow for a delay if u changes by less than this fraction in a tick.
 SLOW = 0.03
-AT_ONE = 1e-3  # modes as near to 1 are integrators
+AT_ONE = 1e-3  # a mode counts as an integrator if it is at most this far from 1
 STEP = 0.005  # fraction by which the size of a box falls from one attack to the next
-STEPS = 60  # largest number of attacks from one aircraft: it may leave even without a deviation
+# Largest number of attacks. It ends the search if every aircraft, down to the nominal one, leaves.
+STEPS = 60
 COUPLED = 1e-12  # smallest entry of a matrix that couples two states
 
 

@@ -97,7 +97,10 @@ def _common_trim(scenarios: Sequence[Scenario]) -> dict[str, str]:
 
 
 def _tracks(flights: Sequence[RecordedFlight], colours: Mapping[str, str]) -> list[Section]:
-    """Return the ground tracks of the guided flights, if there are any."""
+    """Return the ground tracks of the guided flights, over the routes of the first of them.
+
+    The list is empty if no flight is guided.
+    """
     guided = {
         label: flight
         for label, flight in zip(colours, flights, strict=True)

@@ -98,7 +98,10 @@ def plain_number(value: float, digits: int = 2) -> str:
 
 
 def unlike_numbers(first: float, second: float) -> tuple[str, str]:
-    """Return two numbers as texts, with the fewest digits, from 2 to 6, that tell them apart."""
+    """Return two numbers as texts, with the fewest digits that tell them apart.
+
+    Each has at least 2 digits, and at most 6 even if the texts are then the same.
+    """
     for digits in range(2, 7):
         texts = (plain_number(first, digits), plain_number(second, digits))
         if texts[0] != texts[1]:

@@ -169,8 +169,8 @@ def study_airframe(
 
     The first airframe is the published one, the others are uncertain airframes.
 
-    The ideal control keeps y on y_m. The state is x = P y_m + N eta. Here eta are the coordinates
-    of the state apart from the outputs (`output_coordinates`). Then
+    The ideal control keeps y on y_m. The state is x = P y_m + N eta. Here eta = H' x are the
+    coordinates of the state apart from the outputs (`output_coordinates`). Then
 
         eta_dot = H' (I - B Omega^-1 C) (A x + f(x, t)) + H' B Omega^-1 y_m_dot
             the zero dynamics, eta(0) = 0

@@ -93,7 +93,8 @@ def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air)
     noise = noise_input * air.noise
     covariance, transition = _turbulent(matrix, blown, noise, loop.period, air)
     variance = np.einsum("ij,jk,ik->i", C, covariance[:n, :n], C)
-    # rows of u = K z + D v with the noise v, and of u one tick later
+    # u = K z + D v with the noise v. `after` is the covariance of z one tick later with u, and
+    # twice `step` is the mean square of the change of u in a tick.
     K = np.hstack([law.D @ C_sampled, law.C, law.D @ air.reading])
     direct = law.D * air.noise
     after = transition @ covariance @ K.T

@@ -16,12 +16,10 @@ from flight_core.tape import Tape
 
 RATE = 200.0  # Hz, of y and y_m
 HEIGHTS = {"q": 0.05, "V": 2.0, "p": 0.15, "r": 0.05}
-"""Heights of the outputs in the manoeuvre, SI. In these units the outputs are paired with the
+"""Heights of the pulses of the outputs, SI. In these units the outputs are paired with the
 inputs. An aircraft flies if its errors in calm air are below them."""
-# speed of the gust, m/s, downwards, and its length in m to the peak, 100 ft; FAR/CS 25.341 has 30
-# to 350 ft
-GUST_SPEED = 5.0
-GUST_LENGTH = 30.48
+GUST_SPEED = 5.0  # m/s, downwards
+GUST_LENGTH = 30.48  # m, 100 ft to the peak; FAR/CS 25.341 has 30 to 350 ft
 TURN = math.pi / 2.0  # rad
 CLIMB = 100.0  # m. With guidance, a turn and a climb are commanded in place of the pulses.
 # s, instants at which the turn and the climb begin

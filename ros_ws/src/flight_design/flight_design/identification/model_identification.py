@@ -349,15 +349,15 @@ def identify_model(
         flown: The model in flight. It is one more start of the search, and its advantage over the
             nominal model is computed.
         after: The advantage counts only samples after this flight time, s.
-        quick: Whether the search begins with a single start. It suffices if the air is the same in
-            every span, and if the model that is found may be used.
+        quick: Whether a single start is tried first. Its result is kept if the air is alike in the
+            spans, and if the model that is found may be used. Otherwise more starts follow.
         searches_again: Whether a part with too many entries of A at their bounds is searched again,
             around the result of the first search.
         timing: Standard deviation of the delay in `actuation`, s. If it is given, even as 0, the
             standard deviations of the result also hold for a model that is not right
             (`Search.with_doubt`).
-        is_doubted: Whether the stated deviations also hold for a model that is not right, although
-            it is refused only by those that hold for a right model.
+        is_doubted: Whether the stated deviations also hold for a model that is not right. The
+            refusals still use the deviations that hold only for a right model.
 
     Raises:
         ParameterError: An output does not move.

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learn in the air: identify A and B from the last seconds of a flight, check them, and design.
 
-A log is identified in the same way (`model_identification.identify_model`), from a rough airframe.
-The design is an observer and a feedforward. If a check fails, a sentence says why the model is
-refused. The controller checks the parameters again when it loads them, and may refuse them.
+The identification begins with a rough airframe. It is the function that also identifies a log,
+`model_identification.identify_model`. The design is an observer and a feedforward. If a check
+fails, a sentence says why the model is refused. The controller checks the parameters again when it
+loads them, and may refuse them.
 """
 
 from collections import deque
