@@ -787,10 +787,17 @@ def test_workers_of_a_local_cluster_have_devices_of_their_own_and_a_killed_one_r
 
     # A function in a function, so that the workers do not import this file.
     def device_of(job: engines.Job) -> str:
-        if job == (5,) and not killed.exists():
+        if job == (0,) and not killed.exists():
             killed.touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        return os.environ["CUDA_VISIBLE_DEVICES"]
+        name = os.environ["CUDA_VISIBLE_DEVICES"]
+        # A job takes no time: one worker would do all of them before the killed one is back.
+        while not killed.exists():
+            time.sleep(0.01)
+        (tmp_path / f"device {name}").touch()
+        while len(list(tmp_path.glob("device *"))) < 2:
+            time.sleep(0.01)
+        return name
 
     monkeypatch.setattr(engines, "_separate_devices", two_devices)
     devices = list(engines.dask()(device_of, [(k,) for k in range(12)]))
