@@ -679,17 +679,31 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> list[object]:
     return figures(invoke("campaign", *new(200, "--runs", str(runs)), "--json").stdout)
 
 
+def part_of_campaign(folder: Path, number: signal.Signals) -> tuple[Path, int, str]:
+    """Folder, status and output of a campaign of 10 chunks that a signal ends after the first."""
+    stopped = command(*new(200, "--runs", "part", "--workers", "1"), cwd=folder)
+    part = wait_for_chunks(folder / "part", 1, stopped)
+    stopped.send_signal(number)
+    output = "".join(stopped.communicate())
+    assert 1 <= len(list((part / CHUNKS).glob("*.parquet"))) < 10, output
+    return part, stopped.returncode, output
+
+
 def test_campaign_ended_by_ctrl_c_resumes_to_figures_of_uninterrupted_one(
     whole: list[object], tmp_path: Path
 ) -> None:
-    stopped = command(*new(200, "--runs", "part", "--workers", "1"), cwd=tmp_path)
-    folder = wait_for_chunks(tmp_path / "part", 1, stopped)
-    stopped.send_signal(signal.SIGINT)
-    output, errors = stopped.communicate()
-    assert stopped.returncode == 130, errors
-    assert "Traceback" not in errors
-    assert f"continue with: rise-di campaign {folder.relative_to(tmp_path)}" in output + errors
-    assert 1 <= len(list((folder / CHUNKS).glob("*.parquet"))) < 10
+    folder, status, output = part_of_campaign(tmp_path, signal.SIGINT)
+    assert status == 130, output
+    assert "Traceback" not in output
+    assert f"continue with: rise-di campaign {folder.relative_to(tmp_path)}" in output
+    assert figures(invoke("campaign", str(folder), "--json").stdout) == whole
+
+
+def test_killed_campaign_resumes_to_figures_of_uninterrupted_one(
+    whole: list[object], tmp_path: Path
+) -> None:
+    folder, status, _ = part_of_campaign(tmp_path, signal.SIGKILL)
+    assert status == -signal.SIGKILL
     assert figures(invoke("campaign", str(folder), "--json").stdout) == whole
 
 
