@@ -20,7 +20,9 @@ from rise_di_controller.law import law as rise
 from rise_di_controller.law.control_law import ControlLaw
 from rise_di_controller.law.law import Sign
 
-Gains = dict[str, FloatArray]  # positive gains by name, (m, N), or (1, N) for all channels
+Gains = dict[str, FloatArray]
+"""Positive gains by name, for N sets of gains: (m, N), (G, N) for the axes of the wind, or (1, N)
+for all channels."""
 
 INITIAL_CROSSOVER_LAG_PRODUCT = 0.4
 """Bandwidth times the lag of the loop at the start of a search, rad. The lag then costs 23 degrees
@@ -51,7 +53,7 @@ INITIAL_COMMON_GAINS = {
 INITIAL_WIND_GAINS = {"gust": 0.5, "wind_time": 2.0}
 """Initial noise of the wind, m/s per root s, and its time constant, s, which are equal for every
 axis. Dryden's L / V0 at 100 m and 25 m/s is 4 s vertically and 10 s along the flight. A design gust
-of 15 m peaks after 0.6 s."""
+that takes 15 m to its peak takes 0.6 s."""
 
 
 # Models of a feedforward.

@@ -149,7 +149,10 @@ class ExcitationConfig(ControllerConfig):
         return frozenset()
 
     def check_law(self) -> None:
-        """Check that there is a value for each input, and that u stays inside its limits."""
+        """Check that each input has its values, and that u stays inside its limits.
+
+        The frequencies of a multisine must be in order, and below half the rate of the law.
+        """
         for key in ("amplitude", "width", "period", "lowest", "highest"):
             require_length(key, getattr(self, key), self.inputs)
         nyquist = self.rate / 2.0

@@ -41,10 +41,10 @@ def control_law(model: NominalModel) -> ControlLaw:
             a = 1 - exp(-bandwidth dt)
         u           = position_f + share Omega^-1 (y_m_dot - K e - y_dot_f)
 
-    The measured y_dot already contains the model error. The two filters are equal, so y_dot_f and
-    position_f belong to the same instant. The law has no integral, so it cannot wind up. Source: S.
-    Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6), 2010. E. J. J. Smeur, Q. P. Chu, G. C. H. E. de
-    Croon, JGCD 39(3), 2016, for the filters.
+    y_p is the y of the previous tick. The measured y_dot already contains the model error. The two
+    filters are equal, so y_dot_f and position_f belong to the same instant. The law has no
+    integral, so it cannot wind up. Source: S. Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6),
+    2010. E. J. J. Smeur, Q. P. Chu, G. C. H. E. de Croon, JGCD 39(3), 2016, for the filters.
     """
     inverse = model.inverse
 
@@ -70,7 +70,7 @@ def control_law(model: NominalModel) -> ControlLaw:
 
 
 def indi_params(gains: dict[str, FloatArray], _: NominalModel) -> IndiParams:
-    """Return the parameters for gains of the shapes (m, N)."""
+    """Return the parameters for N sets of gains, each of the shape (m, N)."""
     return IndiParams(**gains)
 
 

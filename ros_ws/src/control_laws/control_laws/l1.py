@@ -50,10 +50,10 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
     y_hat is a step of the predictor y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat. Within a
     tick, y_hat - y decays at the rate a, and sigma_hat cancels the rest of it. The reference input
     is u_r = u_trim + Omega^-1 y_m_dot. With `feedforward`, u_r = u_trim, which then contains the
-    feedforward. u_r cancels the part sigma_r of sigma. At engagement sigma_f = -K e and u = u_r
-    (bumpless transfer). If y_m_dot = 0, retuning also keeps u. As anti-windup, the predictor takes
-    u after saturation. Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010,
-    section 3.3.
+    feedforward. If sigma were sigma_r, u_r alone would give y_dot = y_m_dot, so only the rest of
+    sigma_hat is fed back. At engagement sigma_f = -K e and u = u_r (bumpless transfer). If
+    y_m_dot = 0, retuning also keeps u. As anti-windup, the predictor takes u after saturation.
+    Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
     """
 
     def engage(measurements: Measurements, params: L1Params) -> L1State:
@@ -112,7 +112,7 @@ CONTROL_LAWS = {feedforward: _control_law(feedforward=feedforward) for feedforwa
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> L1Params:
-    """Return the parameters for the gains K and bandwidth, each (m, N)."""
+    """Return the parameters for N sets of the gains K and bandwidth, each (m, N)."""
     return L1Params(gains["K"], gains["bandwidth"], model.Omega, model.inverse)
 
 

@@ -31,17 +31,17 @@ that the inputs do not control, or that the cost does not contain, must be stabl
 
 
 class LqiParams(NamedTuple):
-    """The gain of LQI on z = [x, y_m, y_m_dot, integral of e]."""
+    """The gain of LQI on z = [x, y_m, y_m_dot, integral of e], for N sets of weights."""
 
     gain: Array  # (m, n + 3 m, 1) or (m, n + 3 m, N)
 
 
 def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
-    """Return the law u = -gain [x, y_m, y_m_dot, integral of e].
+    """Return the law u = u_trim - gain [x, y_m, y_m_dot, integral of e].
 
-    With `vanes`, x is relative to the air. The integral uses the trapezoidal rule. As anti-windup
-    by conditional integration, channel i does not integrate while u_i is saturated and the
-    increment has the sign of the excess.
+    With `vanes`, x is relative to the air. The integral uses the trapezoidal rule. Anti-windup is
+    conditional integration: while u_i is saturated, the integral of channel i stays the same if its
+    increment would move u_i further beyond the limit.
     """
 
     def limited(
@@ -91,13 +91,13 @@ def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, Fl
     """Return the matrices F, G and E of the model z+ = F z + G u, z = [x, y_m, w, integral of e].
 
         x_dot   = (A + gravity) x + B u
-        y_m_dot = w - LEAK y_m,  w_dot = -fade w,  integral of e: C x - y_m
+        y_m_dot = w - LEAK y_m,  w_dot = -fade w,  e = C x - y_m
 
-    F is (n + 3 m, n + 3 m), G (n + 3 m, m) and E (2 m, n + 3 m). The model is sampled with u held
-    over a period, and the cost is on E z, which is e and the integral of e. In this model an
-    angle only decays, angle_dot = -LEAK angle, so that the design takes the angles as measured
-    disturbances. In reality an angle integrates the controlled rates, but a model with these
-    integrals could not control the integral of e.
+    The law has y_m_dot in the place of w. F is (n + 3 m, n + 3 m), G (n + 3 m, m) and E
+    (2 m, n + 3 m). The model is sampled with u held over a period, and the cost is on E z, which is
+    e and the integral of e. In this model an angle only decays, angle_dot = -LEAK angle, so that
+    the design takes the angles as measured disturbances. In reality an angle integrates the
+    controlled rates. A model with these integrals could not control the integral of e as well.
     """
     n, m = model.B.shape
     free = 1.0 - model.kinematic[:, None]

@@ -20,7 +20,7 @@ from rise_di_controller.law.saturation import Limits
 class NominalModel(NamedTuple):
     """The nominal aircraft, SI, and the loop around it.
 
-    The docstring of each law names the fields that it uses.
+    `model_data` in the catalogue says what each law knows of it.
     """
 
     A: FloatArray  # (n, n)

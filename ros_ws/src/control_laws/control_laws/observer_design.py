@@ -47,7 +47,8 @@ class Weights(NamedTuple):
     "sizes" below are the units of the states, `NominalModel.size`.
     """
 
-    effort: FloatArray  # error that costs as much as an input of unit response, (.., m), s
+    # an input that gives y the rate of change a costs as much as an error of effort a, (.., m), s
+    effort: FloatArray
     drift: FloatArray  # noise of the disturbances, (.., m), sizes/s per root s
     gust: FloatArray  # noise of the wind, (.., G), m/s per root s
     wind_time: FloatArray  # time constants of the wind, (.., G), s

@@ -27,7 +27,7 @@ class PiParams(NamedTuple):
 class PiState(NamedTuple):
     """State of PI control between two ticks, each field with the shape (m,)."""
 
-    e_0: Array  # e at engagement, which a retuning changes
+    e_0: Array  # e at engagement, until `_retune` chooses another value
     e: Array
     integral_e: Array
 
@@ -52,8 +52,7 @@ def _limited(
 ) -> tuple[PiState, Array, Array]:
     """Advance the law by a tick: u = u_trim - input_scale D K (e - e_0 + Lambda integral of e).
 
-    e_0 is the e at engagement. The integral uses the trapezoidal rule, with the anti-windup of
-    `limited_integral`.
+    The integral uses the trapezoidal rule, with the anti-windup of `limited_integral`.
     """
     e = measurements.y - measurements.y_m
     after = PiState(state.e_0, e, state.integral_e + dt * (e + state.e) / 2.0)
@@ -89,7 +88,7 @@ CONTROL_LAW = ControlLaw(
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> PiParams:
-    """Return the parameters for the gains K and Lambda, each (m, N)."""
+    """Return the parameters for N sets of the gains K and Lambda, each (m, N)."""
     return PiParams(gains["K"], gains["Lambda"], model.D[:, None], model.input_scale[:, None])
 
 

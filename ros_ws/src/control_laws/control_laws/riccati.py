@@ -17,9 +17,10 @@ MAX_DOUBLINGS = 40  # 2^40 steps are enough for a mode that decays within 1e9 st
 def riccati(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
     """Find the stabilising P = F'P F - F'P G (R + G'P G)^-1 G'P F + Q, shape (.., s, s).
 
-    Each iteration doubles the horizon. With W = I + G_k P_k,
+    Each iteration doubles the horizon. T is `transition`, S is `gramian`, and W = I + S P:
 
-        P+ = P + F'P W^-1 F,  G+ = G + F W^-1 G F',  F+ = F W^-1 F,  from G R^-1 G', Q and F
+        P+ = P + T'P W^-1 T,  S+ = S + T W^-1 S T',  T+ = T W^-1 T
+            beginning with P = Q,  S = G R^-1 G',  T = F
 
     scipy.linalg.solve_discrete_are solves a single equation at a time and is eight times slower.
     F and Q have the shape (.., s, s), G has (.., s, m), and R has (.., m, m). Source: E. K.-W. Chu,
