@@ -3,8 +3,8 @@
 """Compare the clocks of the nodes of an aircraft on several hosts: offset and delay.
 
 The delay is measured in both directions. Once a second, a node i publishes on `clocks` the least
-difference D_ij = (clock of i at the reception) - (clock of the sender) of the messages from a node
-j. With the delay d of a message, and theta_j = (clock of j) - (clock of i),
+difference D_ij = (clock of i at the reception) - (clock of j when it was sent) of the messages from
+a node j. With the delay d_ji of a message from j to i, and theta_j = (clock of j) - (clock of i),
 
     D_ij = d_ji - theta_j,   D_ji = d_ij + theta_j,   so theta_j = (D_ji - D_ij) / 2
         where d_ij = d_ji.
@@ -68,7 +68,7 @@ class ClockOfPeer(NamedTuple):
 class Peers:
     """The differences of clocks that a node measures, and those that its peers report.
 
-    Times are in s and ns.
+    Times whose names end in _ns are in ns, and all others in s.
     """
 
     def __init__(self, own_name: str, host: float = 0.0) -> None:
@@ -186,7 +186,10 @@ class PeerClocks:
         return report
 
     def news(self) -> list[str]:
-        """Write a sentence for every clock that begins to differ, or that agrees again."""
+        """Write a sentence for every clock whose offset has changed by more than DIFFERS.
+
+        A clock that differs by no more than DIFFERS counts as one that agrees, with an offset of 0.
+        """
         sentences = []
         for name, clock in self.clocks().items():
             offset = clock.offset if abs(clock.offset) > DIFFERS else 0.0

@@ -50,7 +50,7 @@ LATE_REQUEST_PAUSE = 10
 request took. The middleware blocks for 0.1 s before a reply whose reader does not match
 (rmw_fastrtps, `wait_for_subscription`). Without the pause, a client could take all of the time."""
 
-LONGEST_PAUSE_NS = NANOSECONDS
+LONGEST_PAUSE_NS = NANOSECONDS  # upper limit of that pause
 
 REPORT_TIME_NS = NANOSECONDS // 2  # the reports of each second are spread over this time
 

@@ -282,7 +282,7 @@ class FlightNode(Node, Generic[P]):
         self.set_parameters_atomically(changes)
 
     def clock_of(self, sender: str) -> str | None:
-        """Say how far a sender's clock differs, as `sentence_on` does, else return None."""
+        """Return what `PeerClocks.sentence_on` says; None if this node compares no clocks."""
         return None if self.clocks is None else self.clocks.sentence_on(sender)
 
     def warn_no_publisher(
@@ -291,8 +291,8 @@ class FlightNode(Node, Generic[P]):
         """Warn of a topic without samples; called at each tick without a sample.
 
         The warning is logged after 3 s, and then every 2 s. If the topic has no publisher, the
-        warning gives `lack` as the cause. A publisher that the user wrote may also be silent
-        because it waits for `start`, as nodes do in a flight by a launch file.
+        warning gives `lack` as the cause. If it has a publisher, this may be a node that waits for
+        `start`. So the warning also says if a node waits for `start` and nobody publishes it.
         """
         now_ns = time.monotonic_ns()
         last_ns, log_ns = self._waiting.get(subscription.name, (0, 0))

@@ -165,7 +165,8 @@ class Receiver(Generic[S]):
     instant. `lock` admits one publisher at a time; None admits all publishers. `max_age_ns` limits
     the age of a stamp and its lead over the clock. It is None if the sender does not have the clock
     of the flight. `max_size`, in bytes, is for a topic of reports, whose lengths differ by more
-    than GROWTH. It is None for a topic of samples. Refusals are raised as ChannelError.
+    than GROWTH. It is None for a topic of samples. `decode` and `take` refuse a message by a
+    ChannelError.
     """
 
     def __init__(
