@@ -104,9 +104,9 @@ class Bridge:
     def take_output(self, name: str, raw: float, stamp_ns: int, now_ns: int) -> None:
         """Take a value of a channel of y, of the pose or of a trim's source.
 
-        The channel becomes sign scale raw + offset. Raises ChannelError, reason "stamp", if the
-        stamp differs from the present by more than the age limit. The reason is "order" if the
-        stamp is not later than the previous one.
+        The channel becomes sign scale raw + offset, after the low-pass filter of its row if there
+        is one. Raises ChannelError, reason "stamp", if the stamp differs from the present by more
+        than the age limit. The reason is "order" if the stamp is not later than the previous one.
         """
         row = self._rows[name]
         if abs(now_ns - stamp_ns) > nanoseconds(row.max_age):
@@ -251,7 +251,11 @@ class Bridge:
         return self.conditions.is_active(name, now_ns, engaged=is_engaged)
 
     def _lack(self, now_ns: int) -> Refusal | None:
-        """Say which conditions for an engagement are missing."""
+        """Say of what an engaged bridge warns; None if it warns of nothing.
+
+        It warns of the end by `max_engaged`, of `problem`, of overrides without messages, and if it
+        does not notice the loss of the transmitter.
+        """
         warning = None
         if self._end_ns is not None and now_ns >= self._end_ns - END_WARNING_NS:
             warning = Refusal(
@@ -276,8 +280,8 @@ class Bridge:
     def reason_against_engagement(self, now_ns: int) -> Refusal | None:
         """Say why `engage` would be refused now.
 
-        Conditions for which an engagement waits do not count. A dry run states the same reason as
-        `dry_run: false` would.
+        Conditions for which an engagement waits do not count. A dry run says first that it sends
+        nothing, and then the reason that there would be with `dry_run: false`.
         """
         checks: tuple[Callable[[], Refusal | None], ...] = (
             lambda: self.conflict,
@@ -417,12 +421,13 @@ class Bridge:
             self._enter(Phase.RELEASE, now_ns)
 
     def step(self, now_ns: int) -> Phase:
-        """Return the phase at an instant.
+        """Advance the engagement to an instant, and return the phase.
 
-        An engagement ends if y or u is stale, if a value is outside the envelope, or if an input
-        stays at its limit. It also ends if a condition is lost, if a publisher conflicts, or if the
-        time `max_engaged` is over. The phases ENGAGING, NEUTRAL and RELEASE end after their times.
-        NEUTRAL also ends if a condition is lost or a publisher conflicts.
+        ENGAGED becomes NEUTRAL if u has timed out. It becomes RELEASE if y is stale, if a value is
+        outside the envelope, or if an input stays at its limit. It also becomes RELEASE if a
+        condition is lost, if a publisher conflicts, or if the time `max_engaged` is over. ENGAGING,
+        NEUTRAL and RELEASE end after their times. NEUTRAL also ends if a condition is lost or a
+        publisher conflicts.
         """
         if self.phase is Phase.ENGAGING:
             self._continue_engagement(now_ns)

@@ -81,8 +81,8 @@ class ChannelMap(Config):
     silence: SilenceConfig = Field(description="the failsafe if u times out")
     link_delay: NonNegative | None = Field(
         default=None,
-        description="delay that the link adds to that in a log of the board, s, both from y on the "
-        "board to u on the surface; gains that are identified from such a log allow for both",
+        description="delay that the link adds to the one in a log of the board, s; each is a delay "
+        "from y on the board to u on the surface, and gains from such a log allow for their sum",
     )
     outputs: Annotated[dict[Name, OutputRow], Field(min_length=1)] = Field(
         description="the channels of y"
