@@ -73,8 +73,8 @@ def descend(
     `lowest` and `highest`, (k, m), bound the exponents. Each move is multiplied by a whole number,
     the reach. As long as there is a shortage, the search takes the best move of all channels. If no
     move helps, it doubles the reach. If no move helps up to the reach REACH, the last trial still
-    has a shortage. Without a shortage, the channels move in turn. The reach stays at first, and is
-    halved whenever no channel finds a move that helps.
+    has a shortage. Without a shortage, the channels move in turn. The reach begins with its last
+    value, and is halved whenever no channel finds a move that helps.
     """
     best = start
     reach = moves.begin

@@ -136,7 +136,8 @@ def select_gains(
             (`observer_gains.read_gains`). With `accept` they are taken as they are. If None, the
             search begins at tuned gains of the scenario, or else at gains by a rule from the lags.
         phase_margin: Least phase margin of the nominal loop behind servos, deg; with the observer
-            35 suffice. Gain margin at least 6 dB, sensitivity at most 2, damping at least 0.4.
+            35 suffice. The loop must also have a gain margin of at least 6 dB, a sensitivity of at
+            most 2, and a damping of at least 0.4.
         accept: Whether a `phase_margin` below 40 deg is accepted.
         mixing: "diagonal" for one input per output, "full" for an allocation u = T v by the
             pseudo-inverse of C B. With more inputs than outputs there is always an allocation.

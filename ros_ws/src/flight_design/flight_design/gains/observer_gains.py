@@ -73,8 +73,8 @@ def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> O
 
 BESIDE_SKETCH = {"effort": (0.25, 4.0), "K": (16.0, 1.0)}
 """Factors on `gains_by_rule` beside a sketch, for a body rate and for V, found on the c172p and the
-737 of JSBSim. The law of the rates keeps two thirds of its bandwidth, because a sketch leaves out
-more than a model does."""
+737 of JSBSim. With them K is 0.42 / T for q and p, two thirds of what it is without an observer
+(CROSSOVER_LAG_PRODUCTS). The law keeps so much because a sketch leaves out more than a model."""
 
 
 def gains_beside_sketch(

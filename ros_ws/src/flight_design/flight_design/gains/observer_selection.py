@@ -293,7 +293,7 @@ class _AircraftDesigns(NamedTuple):
     ) -> Callable[[FloatArray], ObserverDesign]:
         """Return a function that designs the observer of a model for a relaxation, (m,).
 
-        The relaxation changes only the part u_o of the observer.
+        The relaxation changes only F, the gain from the estimates to u_o.
         """
         observer = aircraft_observer(model, self.names, gains.weights)
         model_by_tick = ObserverModel(observer.states, observer.Phi, observer.Gamma, observer.H)

@@ -43,7 +43,7 @@ AMPLITUDE = 0.2  # default amplitude, as a share of the smaller limit of an inpu
 
 
 class Excitation(NamedTuple):
-    """The excitation of an input by doublets and a frequency sweep."""
+    """The excitation of an input by doublets and a multisine, as in `ExcitationConfig`."""
 
     width: float = 0.25  # s
     period: float = 6.0  # s

@@ -450,8 +450,8 @@ def filter_bank(
         q_g = (w - l) / (V0 T),  l_dot = (w - l) / T
         alpha_dot -= shear_1 q_g,  q_dot -= shear_2 A[q, q] q_g
 
-    A frozen field of wind has the shear (0, -1). The specification gives q_g the opposite sign, and
-    in other models of the air the slope also moves alpha. The noises of the wind are the rows
+    A frozen field of wind has the shear (0, -1). MIL-F-8785C gives q_g the opposite sign, and in
+    other models of the air the slope also moves alpha. The noises of the wind are the rows
     `levels` of LEVELS, multiplied by `strength`, (N, G). `drift` is as in
     `observer_design.Weights`. If the models are `near` the first one, their gains are computed from
     its gains, exact to first order. With a `lag`, (N,), s, the outputs reach y through a filter,

@@ -87,7 +87,7 @@ APART = 5.0  # s, time from one gust to the next
 NOISE = {"q": 0.001, "V": 0.05, "p": 0.001, "r": 0.001}
 """Assumed noise of the sensors of an aircraft that learns, rms of a sample, rad/s and m/s.
 
-A first flight has the same.
+`first_flight` assumes the same noise.
 """
 
 

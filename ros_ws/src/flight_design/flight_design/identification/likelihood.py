@@ -199,7 +199,7 @@ class Likelihood:
         self.believe(np.repeat([unknown.error, unknown.effect], [count_A, count_B]))
 
     def believe(self, deviation: FloatArray, centre: FloatArray | None = None) -> None:
-        """Set the prior of the relative errors: standard deviation and mean, (p - G,) each.
+        """Set the prior of the relative errors: standard deviation and mean, (entries,) each.
 
         The mean is `centre`, by default 0. The standard deviations and the bounds of the search are
         relative to the values of the entries at the centre.
@@ -330,8 +330,8 @@ class Likelihood:
     def delays(self, fit: Fit) -> tuple[FloatArray, FloatArray]:
         """Return the delays of the inputs, s, and their standard deviations, (m,) each.
 
-        A delay includes the lag of y, and what the lag of the actuator exceeds the known one,
-        because a loop is late by all of them.
+        A delay includes the lag of y, and the time by which the lag of the actuator exceeds the
+        known lag, because a loop is late by all of them.
         """
         late = self._period * self._delay
         if self._delay_deviation:
@@ -427,9 +427,9 @@ class Likelihood:
 
             log p = -1/2 sum_i (e_i^2 / s_i + log s_i) - 1/2 log det S,   s_i = mean e_i^2
 
-        As in the cost, the means s_i are over the samples that fit the model. They take out the
-        scale of e, because the noise of the filter is a guess, and a model must not gain by a
-        better guess.
+        The means s_i are over the samples to which the model is fitted. They take out the scale of
+        e, as the means in the cost do: the noise of the filter is a guess, and a model must not
+        gain by a better guess.
         """
         (r,), (e,), (half_log_det,) = self.passed(theta, levels)
         scale = np.mean(e[self.fitted()] ** 2, axis=0)

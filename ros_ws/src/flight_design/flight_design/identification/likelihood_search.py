@@ -83,9 +83,10 @@ class Search(Likelihood):
     ) -> Fit:
         """Find the parameters theta of the least cost over the samples in the mask `used`, (T,).
 
-        The cost is N/2 sum_i log mean r_i^2 + sum log det S / 2 + |theta / prior|^2 / 2. Here r are
-        the normalised innovations, S is the covariance of the innovations, and N is the number of
-        samples. The cost has several minima, because a wrong wind can explain a wrong model.
+        The cost is N/2 sum_i log mean e_i^2 + sum log det S / 2 + |(theta - centre) / prior|^2 / 2.
+        Here e are the normalised innovations, S is the covariance of the innovations, and N is the
+        number of samples. The cost has several minima, because a wrong wind can explain a wrong
+        model.
 
         So the search has several starts. They average the flight over the shortest lag:
 
@@ -271,9 +272,9 @@ class Search(Likelihood):
         """Return theta after a damped step of Gauss-Newton, and the Hessian before the step.
 
         The third result is the decrease of the cost. The derivatives are finite differences, from
-        filters that run side by side. The Hessian is J'J + prior^-2, where J has the derivatives by
-        theta of the innovations divided by their rms. Source: L. Ljung, "System Identification",
-        7.4 and 10.2.
+        filters that run side by side. The Hessian is J J' + prior^-2, where J has a row for each
+        parameter: the derivatives of the innovations, divided by their rms. Source: L. Ljung,
+        "System Identification", 7.4 and 10.2.
         """
         slopes = self._slopes(theta, levels, used, free)
         hessian = slopes.J @ slopes.J.T + np.diag(self.prior**-2)
@@ -332,15 +333,17 @@ class Search(Likelihood):
         H is the Hessian. J has the derivatives by theta of the innovations e, divided by their rms.
         If the model were right, M would be J J'. Here M is the larger of two matrices. The first
         sums the outer products of J e over blocks of the log. With `leaves_out`, the J e of block k
-        is (I - J_k J_k' H^-1)^-1 J_k e_k: theta without this block is off by H^-1 times it. A few
-        gusts hold most of what a log shows, and the fit follows their own errors. The second is J
-        J' times the whiteness of each output, as in Birge's ratio. s is the change of theta with
-        the delay of u, and j is the derivative of e by this delay. Sources: H. White, Econometrica
-        50(1), 1982; J. G. MacKinnon, H. White, J. Econometrics 29(3), 1985, for a block left out;
-        R. T. Birge, Phys. Rev. 40(2), 1932; S. F. Schmidt, Advances in Control Systems 3, 1966, for
-        a delay that is not estimated.
+        is (I - J_k J_k' H^-1)^-1 J_k e_k. H^-1 times this is the change of theta if the block is
+        left out. It matters if a few blocks with gusts decide theta: the fit then follows the
+        errors in these blocks, and their e is too small to show them. The second is J J' times the
+        whiteness of each output, as in Birge's ratio. s is the change of theta with the delay of u,
+        and j is the derivative of e by this delay. Sources: H. White, Econometrica 50(1), 1982; J.
+        G. MacKinnon, H. White, J. Econometrics 29(3), 1985, for a block left out; R. T. Birge,
+        Phys. Rev. 40(2), 1932; S. F. Schmidt, Advances in Control Systems 3, 1966, for a delay that
+        is not estimated.
 
-        Returns the fit, and how much of each entry's standard deviation the delay causes, (p - G,).
+        Returns the fit, and the part of each entry's standard deviation that the delay causes,
+        (entries,).
         """
         theta, used = fit.theta, self.fitted()
         slopes = self._slopes(theta, fit.levels, used, np.ones(len(theta), dtype=bool))

@@ -176,8 +176,8 @@ class _Study(NamedTuple):
             doubted, _ = search.with_doubt(fit, Doubt(0.0, after.whiteness, leaves_out=True))
             widest = np.maximum(doubted.deviation, fit.deviation)
             stated = search.entries(fit._replace(deviation=widest))
-        # Behind a filter of y the loop is the same with a weaker effect and a shorter lag. So an
-        # effect counts as known if it would be known with the lag.
+        # Behind a filter of y, a weaker effect with a shorter lag gives the same loop. So an effect
+        # counts as known if it would be known once the lags were known.
         in_phase = np.hypot(by_timing, search.in_errors(fit, fit.by_lag)).tolist()
         identified = with_entries(self.airframe, entries)
         reasons = (
@@ -356,8 +356,8 @@ def identify_model(
         timing: Standard deviation of the delay in `actuation`, s. If it is given, even as 0, the
             standard deviations of the result also hold for a model that is not right
             (`Search.with_doubt`).
-        is_doubted: Whether the stated deviations also hold for a model that is not right. The
-            refusals still use the deviations that hold only for a right model.
+        is_doubted: Whether the stated deviations also hold for a model that is not right. Other
+            than with `timing`, the refusals still use the deviations of a right model.
 
     Raises:
         ParameterError: An output does not move.

@@ -19,7 +19,7 @@ MAX_DEVIATION = 0.1
 # Largest relative deviation of a best known effect that an uncertain delay of u may cause. For two
 # such deviations the guarantee must cover a loop gain that is 30 % off.
 MAX_BY_TIMING = 0.15
-# The search has the bound of a rough entry as a logarithm.
+# tolerance at a bound, because the search has the bound of a rough entry as a logarithm
 ROUNDING = 1e-9
 
 

@@ -28,8 +28,8 @@ def behind_servos(
 ) -> FloatArray:
     """Return the u for each of N models, (N, T, m), from the commanded u, (T, m).
 
-    Each input of a model is `late`, (N, m), in periods. `lag`, (m,), s, is that of the filters, and
-    `servo_lag` and `inertia`, (N, m), are those of `behind_servo`.
+    `late`, (N, m), are the delays of the inputs in periods. `lag`, (m,), s, is that of the filters,
+    and `servo_lag` and `inertia`, (N, m), are those of `behind_servo`.
     """
     acting = np.empty((len(late), *u.shape))
     for j, column in enumerate(u.T):

@@ -46,7 +46,7 @@ class ResponseColumn(NamedTuple):
     lag_deviation: float
     delay: float
     delay_deviation: float
-    sign_ratio: float
+    sign_ratio: float  # size of the driven output's response, in standard errors
 
 
 def no_column(m: int) -> ResponseColumn:
@@ -165,8 +165,8 @@ def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size:
 def _whitener(responses: FloatArray) -> FloatArray:
     """Return W, (N, N), with which the error W (s - true s) of a response s has covariance I.
 
-    The covariance follows from responses, (1 + DRAWS, N). W is exact to FLOOR of the largest value.
-    It is 0 for the responses of a constant output.
+    The covariance follows from responses, (1 + DRAWS, N). An error of FLOOR times the largest value
+    is added to it. W is 0 for the responses of a constant output.
     """
     values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(responses[1:].T)))
     floor = (FLOOR * np.max(np.abs(responses[0]))) ** 2 + RANK * values[-1]

@@ -126,8 +126,8 @@ class Learner:
         errors. This design flies from the start, and later in the parts without a learned model. If
         `design_of_rough` is None, these parts fly by the law of the start.
 
-        `rough` has the standard deviation of B in the rough model. It also has the noise of the
-        disturbances, which a test for a change uses too. With `quick`, an identification begins
+        `rough` has the standard deviations of A and B in the rough model. It also has the noise of
+        the disturbances, which a test for a change uses too. With `quick`, an identification begins
         with a single start (`identify_model`), and no guarantee is proved.
         """
         settings = controller.learn

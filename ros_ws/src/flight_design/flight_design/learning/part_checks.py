@@ -23,10 +23,11 @@ LIKELIER = 1.645
 DELAY_DEVIATION = 0.015
 # s, standard deviation of the lag of a filter in front of y, such as the low-pass of a gyro. If a
 # model has no lag, it takes a filter of 20 ms for a delay of u, and its effects of the inputs are
-# up to 8 standard deviations too weak. With 15 ms the deviations without a filter grow by more.
+# up to 8 standard deviations too weak. A larger value, 15 ms, would widen the stated deviations of
+# an aircraft without a filter more.
 LAG_DEVIATION = 0.01
-# standard deviation of the logarithm of an actuator's lag. With a lag of first order and 20 ms, the
-# effects of servos of second order at 40 rad/s were up to 10 stated deviations off.
+# standard deviation of the logarithm of an actuator's lag. With a fixed lag of 20 ms, of first
+# order, the effects of servos of second order at 40 rad/s were up to 10 stated deviations off.
 SERVO_DEVIATION = 0.3
 
 
