@@ -37,16 +37,15 @@ MEMORY = 10.0
 """Time over which the roll rate is compared with its command, s."""
 
 ASKED = 2.0
-"""Evidence a above which the test decides, divided by the square of the largest roll rate, s. A
-constant command of the largest roll rate gives this evidence in about this time. Without an aileron
-the osprey is by then 40 deg off its commanded bank. If it stays 7 deg off, the evidence comes after
-a time of MEMORY. A turn of the osprey onto a course gives less evidence."""
+"""Least `RollTest.asked` with which the test decides, divided by the square of the largest roll
+rate, s. A constant command of the largest roll rate reaches it in about this time. Without an
+aileron the osprey is by then 40 deg off its commanded bank. If it stays 7 deg off, `asked` reaches
+the limit after a time of MEMORY. A turn of the osprey onto a course does not reach it."""
 
 IGNORED = 0.3
-"""A command counts as ignored if p follows less than this fraction of it. The figures for the
-osprey, and for the c172p and the 737 of JSBSim, in strong turbulence: they follow at least 0.8 of a
-command. With 0.3 of the aileron's effect they follow at least 0.75, and without an aileron at most
-0.05."""
+"""A command counts as ignored if p follows less than this fraction of it. In strong turbulence the
+osprey, and the c172p and the 737 of JSBSim, follow at least 0.8 of a command. With 0.3 of the
+aileron's effect they follow at least 0.75, and without an aileron at most 0.05."""
 
 FOLLOWED = 0.7
 """Least fraction of a command that counts as followed again. `attitude.yaw_for_bank` alone

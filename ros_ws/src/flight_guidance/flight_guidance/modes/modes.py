@@ -122,8 +122,9 @@ def step(
 
     1. Euler's kinematics with p, q, r of y carry phi and theta of the pose forward over its age.
     psi follows by `heading_estimate`. While the pose is stale, only Euler's kinematics act
-    (`Mode.DEAD_RECKONING`). After `hold` the attitude is unknown (`Mode.POSE_LOST`) until the pose
-    returns. Then the wings are levelled at the present altitude.
+    (`GuidanceMode.DEAD_RECKONING`). If it stays stale for longer than `hold_ns`, the attitude is
+    unknown (`GuidanceMode.POSE_LOST`) until the pose returns. Then the wings are levelled at the
+    present altitude, or the aircraft flies home if `home.after_loss` is set.
     2. When a leg ends, the commands of the next leg apply, and then the given commands. The
     aircraft joins a leg by a circle that touches the leg at its start, unless it is near. If it
     passes the end of a leg far away, the leg counts as missed.
@@ -361,13 +362,14 @@ def _within_fence(
         predicted=float(found.predicted),
         course=float(found.course),
     )
-    bank = (
+    # A lateral command came after the turn began if home is not the target any more.
+    has_other_target = (
         state.lateral is not Lateral.ORBIT
         or (state.target.north, state.target.east) != params.home[:2]
     )
-    if bank and escape.action in {FenceAction.HOME, FenceAction.AROUND}:
+    if has_other_target and escape.action in {FenceAction.HOME, FenceAction.AROUND}:
         escape = escape._replace(action=FenceAction.NONE)
-    elif escape.begins or (bank and escape.action is FenceAction.BACK):
+    elif escape.begins or (has_other_target and escape.action is FenceAction.BACK):
         target = state.target._replace(**home(pose, params))
         state = state._replace(
             lateral=Lateral.ORBIT, vertical=Vertical.ALTITUDE, target=target, joining=Side.NONE

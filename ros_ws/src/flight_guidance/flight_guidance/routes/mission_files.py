@@ -147,12 +147,12 @@ TRANSECTS = ("survey", "CorridorScan")
 LANDINGS = ("fwLandingPattern", "vtolLandingPattern")  # they are not flown, like NAV_LAND
 
 
-def _plan_items(as_list: Sequence[Any], key: str) -> Iterator[tuple[int, Any]]:
+def _plan_items(rows: Sequence[Any], key: str) -> Iterator[tuple[int, Any]]:
     """Yield the items of a plan with their numbers from 1 on.
 
     Items inside a survey have the number of the survey.
     """
-    for number, entry in enumerate(as_list, start=1):
+    for number, entry in enumerate(rows, start=1):
         if member(entry, "complexItemType") in TRANSECTS:
             inside = entries(member(entry, "TransectStyleComplexItem"), "Items", key)
             require(

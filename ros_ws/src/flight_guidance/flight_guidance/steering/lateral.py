@@ -80,8 +80,8 @@ def path_acceleration(
 
         x       = min(abs(e) / (v_g P zeta), 1),  look-ahead angle l = pi/2 (1 - x)^2
         bearing = track - sign(e) min(pi/2 - l, max(capture, acos(1 / max(1 - kappa e, 1))))
-        a = (4 pi zeta / P) v_g turn_towards(bearing - course) + sin(l)^2 kappa / (1 - kappa e)
-        v_g^2 cos(course - track)
+        a       = (4 pi zeta / P) v_g turn_towards(bearing - course)
+                  + sin(l)^2 v_g^2 cos(course - track) kappa / (1 - kappa e)
 
     e, track and the curvature kappa are those of `error`, P, zeta and capture those of `params`.
     v_g is the speed over ground, m/s. Outside a circle of radius R, at the distance d from its
