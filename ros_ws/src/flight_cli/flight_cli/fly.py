@@ -339,8 +339,8 @@ def _as_host_allows(fleet: Fleet) -> Fleet:
     """
     scenarios = [member.scenario for member in fleet.members]
     lack = shortage(scenarios, cores_given, composed=fleet.composed)
-    has_common_time = any(member.delay > 0.0 for member in fleet.members)
-    if _falls_back(lack, can_step=not has_common_time):
+    has_delay = any(member.delay > 0.0 for member in fleet.members)
+    if _falls_back(lack, can_step=not has_delay):
         return replace(fleet, lockstep=True, composed=True)
     return fleet
 
