@@ -59,9 +59,8 @@ class NetworkClient(Client):
     def exchange(self, timeout: float) -> tuple[set[str], dict[str, ClockOfPeer]]:
         """Exchange clocks until this host has the clock of every other host.
 
-        This takes at most `timeout` s.
-        Returns the hosts whose messages arrive at this host. Returns also the clocks of those
-        hosts at which the messages of this host arrive in turn.
+        This takes at most `timeout` s. Returns the hosts whose messages arrive at this host, and
+        the clocks of those of them at which the messages of this host arrive, too.
         """
         heard_hosts: set[str] = set()
         clocks: dict[str, ClockOfPeer] = {}
