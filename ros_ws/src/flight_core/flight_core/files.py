@@ -52,9 +52,10 @@ INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)|0o[0-7]+|0x[0-9a-fA-F]+")
 FLOAT = re.compile(
     r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
 )
-"""Numbers of the core schema of YAML 1.2.2, section 10.3.2, except numbers with leading zeros,
-because YAML 1.1 reads 060 as 48, and YAML 1.2 as 60. The core schema lacks 1_000, and 1:00, which
-YAML 1.1 reads as 60. All of these are strings here, so that no number is guessed."""
+"""INTEGER and FLOAT match the numbers of the core schema of YAML 1.2.2, section 10.3.2, except
+those with a leading zero. YAML 1.1 reads 060 as 48, and YAML 1.2 as 60. YAML 1.1 also reads 1_000
+as 1000 and 1:00 as 60, and the core schema has neither. Here all of these are strings, so that no
+number is guessed."""
 
 
 LEADING_ZERO = re.compile(r"[-+]?0[0-9]+")

@@ -13,7 +13,8 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
 
 MAX_TILT = math.radians(80.0)
-"""Limit of phi in cos(phi) and of theta in tan(theta), which are singular at 90 deg."""
+"""Limit of an angle in a tangent, or in a cosine that is a divisor. At 90 deg both would be
+infinite."""
 
 
 def euler_rates(

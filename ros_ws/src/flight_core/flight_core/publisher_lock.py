@@ -11,8 +11,9 @@ from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError
 
 SHARED_NS = NANOSECONDS
-"""A name counts as shared for this time after the last evidence. The time exceeds the age limits of
-y and u, so that the failsafe begins."""
+"""If the numbers of a publisher go back, two publishers share its name, and no sample under this
+name is taken for this time. The time exceeds the age limits of y and u, so that the failsafe
+begins."""
 FOREVER_NS = 2**63  # longer than any flight
 SENDER = "sender"  # the reason of a ChannelError for a sample of a conflicting publisher
 
@@ -27,9 +28,9 @@ class PublisherLock:
     """Locks to the first publisher of a topic, until its samples time out.
 
     After the timeout, it locks to the next publisher. A restarted node, which has the same name,
-    can take over earlier than a different node. If the receiving node overruns, the time of the
-    overrun does not count as silence of the publisher, but the first sample after the overrun can
-    come from another publisher.
+    can take over earlier than a different node. The time in which the receiving node overruns does
+    not count as silence of the publisher. Otherwise another publisher could take over if the node
+    happens to take its sample first after the overrun.
 
     The middleware numbers the messages of a publisher. If the numbers go back, two publishers use
     the same name. In this case neither is admitted, because either can be forged.
@@ -136,7 +137,8 @@ class LockstepLock(PublisherLock):
         """Raise ChannelError, reason "sender", if the message's number is not the next one."""
         expected = self._sequence + 1
         if self.publisher is None:
-            self._sequence = 0  # forget the number of an earlier message, which may be refused
+            # If a message came before this one, it was refused, so its number does not count.
+            self._sequence = 0
         elif self._sequence and sequence not in {0, expected}:
             raise ChannelError(
                 SENDER,

@@ -162,7 +162,8 @@ class LostPart:
     """A span of a flight that its log lost: a file, the end of a file, or a leap of the clock."""
 
     sentence: str
-    # whether the end of a file is lost, which also shows after a planned end
+    # True if the end of a file is lost. If the flight has a planned end, this also shows by the
+    # samples that are missing before the planned end.
     is_end: bool = False
 
 
