@@ -153,7 +153,7 @@ class Shell(NamedTuple):
 
     place: str  # place of the code in the folder
     axes: str  # outputs that the controller can have
-    reason: str
+    reason: str  # why it can have no other outputs
     texts: Mapping[str, str]  # further files by name; `{channels}` and `{m}` are filled in
 
 

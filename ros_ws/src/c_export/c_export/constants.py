@@ -63,8 +63,9 @@ TABLE: Mapping[str, tuple[str, float, float]] = MappingProxyType(
         "effect": ("v/effector", LEAST, LARGEST),
     }
 )
-"""Unit and bounds of the reals. A matrix of the model has no row here, because it can have any
-finite values in SI."""
+"""Unit and bounds of the reals. In a unit, y, u and effector stand for the unit of the output,
+input or effector of each channel, and v stands for that of an input of the law. A matrix of the
+model has no row here, because it can have any finite values in SI."""
 
 REALS: Mapping[str, float] = MappingProxyType(
     {
@@ -137,8 +138,9 @@ IDLE_IN_C = frozenset(
 def exportable(controller: ControllerConfig) -> RiseDiConfig:
     """Return the controller if it can be exported.
 
-    Raises ParameterError if its law is not RISE-DI, or if it has a section that the C code lacks,
-    such as one for models that are learned or switched off.
+    Raises ParameterError if its law is not RISE-DI, if its model can be replaced in flight (the
+    section `learn`), if another key that the C code lacks is not at its default, or if its observer
+    is switched off by a `part` of 0.
     """
     require(
         isinstance(controller, RiseDiConfig),

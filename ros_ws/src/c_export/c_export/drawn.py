@@ -122,10 +122,10 @@ def _interval_ns(kind: float, size: float, period_ns: int) -> int:
 
 
 def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
-    """Yield the jumps that are added to samples of y, (m,).
+    """Yield the offset by which each sample of y has jumped, (m,).
 
-    A jump begins at one sample in 50 and lasts for some samples. It is up to 10^5 units large, so
-    that these samples are lost.
+    A jump begins at one sample in 50 and lasts for some samples. The offset is up to 10^5 times
+    `unit`, so the controller does not take the first samples of a large jump.
     """
     m = len(unit)
     offset = np.zeros_like(unit)
@@ -254,14 +254,20 @@ def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Re
 
 
 def _rows(values: Mapping[str, FloatArray], groups: Sequence[str]) -> FloatArray:
-    """Return the values of groups, (values, steps) each, side by side in a row for each step."""
+    """Return an array with a row for each step, in which the values of all groups are side by side.
+
+    `values` has an array of the shape (values, steps) for each group.
+    """
     return np.ascontiguousarray(np.vstack([values[name] for name in groups]).T)
 
 
 def _drawn_states(
     controller: RiseDiConfig, rng: np.random.Generator, dt_ns: NDArray[np.int64]
 ) -> tuple[dict[str, FloatArray], FloatArray, FloatArray]:
-    """Draw states by group, y and y_m, each with the shape (values, steps)."""
+    """Draw the states before the steps, by group, and the y and y_m that the steps take.
+
+    Each array has the shape (values, steps).
+    """
     m = len(controller.outputs)
     steps = len(dt_ns)
     eps = controller.law_params().eps[:, None]
@@ -365,7 +371,10 @@ def _feedforward_step(
     y_m: FloatArray,
     dt: FloatArray,
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return u_ff after a step of the feedforward, and its states by name, column by column."""
+    """Return u_ff after a step of the feedforward, and its states by name.
+
+    Each array has a column for each of the drawn steps.
+    """
     if nominal is None:
         return before["u_ff"], {}
     x, u, dt_before, ticks, u_0 = (

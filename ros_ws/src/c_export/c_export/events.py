@@ -36,7 +36,9 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 START, TAKE_Y, TAKE_Y_M, TICK, RETUNE, RESTART, GUARD_TICK, LOAD, TAKE_U_M, STEP_REFERENCE = range(
     10
 )
-REFUSALS = 1 << 20  # 20 bits, one for each sample since the last tick
+# The integer `refused` has a bit for each of the last 20 samples since the last tick, which is 1 if
+# the controller refused the sample.
+REFUSALS = 1 << 20
 INTEGERS = (
     "published",
     "refused",
@@ -411,8 +413,8 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
             stamp_ns = int(log.stamp_ns[k])
             sample = GuardSample(stamp_ns, groups["y"][k], groups["y_m"][k], offset_ns)
         elif log.stamp_ns[k] == recorder.state.stamp_ns:
-            # The controller stands by at the same stamp as before. So its last y was older than
-            # this stamp, and the law did not engage.
+            # In a failsafe, u keeps the stamp of the u before it only if the newest y is older than
+            # that u. The law does not engage with such a y, so each such y gives the same tick.
             stamp_ns = int(log.stamp_ns[k]) - 1
             sample = GuardSample(stamp_ns, groups["y"][k], groups["y_m"][k])
         recorder.guard_tick(int(now_ns[k]), sample, active=log["mode"][k] != Mode.INACTIVE)

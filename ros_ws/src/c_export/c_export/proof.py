@@ -40,8 +40,8 @@ COUNTING_FLAGS = ("-x", "c++", "-std=c++20", "-O2", "-include", "counting.h")
 LEAST_SAMPLES = 4  # least number of samples to keep, because the slope of y_m spans two periods
 
 FLOAT32_BOUND = 2.0**-10
-"""Largest difference of u in float32 along a flight, as a fraction of the range of u in the flight.
-"""
+"""Largest difference of u at which C in float32 still agrees with Python, as a fraction of the
+range of u in the flight."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,13 +63,13 @@ class Comparison(NamedTuple):
     differing: int  # number of values that differ
     first: Difference | None
     deviation: float  # largest difference of any u, as a fraction of its range
-    modes_equal: bool  # whether all modes and times are equal
+    modes_equal: bool  # whether all integers of the states, such as modes and times, are equal
 
     def holds(self, *, float32: bool) -> bool:
         """Return whether C agrees with Python.
 
-        In float64, every bit must be equal. In float32, every mode must be equal, and u must be
-        within FLOAT32_BOUND.
+        In float64, every bit must be equal. In float32, every integer, such as the mode, must be
+        equal, and u must be within FLOAT32_BOUND.
         """
         return (
             self.modes_equal and self.deviation <= FLOAT32_BOUND if float32 else self.differing == 0
@@ -202,10 +202,10 @@ class Program:
                 f"the exported code: {(process.stderr or 'the program failed').strip()[-2000:]}"
             )
         integers = recording.integers.shape[1]
-        words = np.fromfile(self._folder / "states", dtype=np.int64).reshape(
-            -1, len(recording.names)
-        )
-        return words[:, :integers], words[:, integers:].view(np.float64), json.loads(process.stdout)
+        states = np.fromfile(self._folder / "states", dtype=np.int64)
+        states = states.reshape(-1, len(recording.names))
+        reals = states[:, integers:].view(np.float64)
+        return states[:, :integers], reals, json.loads(process.stdout)
 
     def compare(self, recording: Recording) -> Comparison:
         """Compare the states of C with the states of Python."""
@@ -216,8 +216,9 @@ class Program:
                 f"the exported code: found {len(integers)} ticks of {recording.ticks}, expected "
                 "each"
             )
-        modes_differ = integers != recording.integers
-        differ = np.hstack([modes_differ, reals.view(np.int64) != recording.reals.view(np.int64)])
+        integers_differ = integers != recording.integers
+        reals_differ = reals.view(np.int64) != recording.reals.view(np.int64)
+        differ = np.hstack([integers_differ, reals_differ])
         first = None
         if differ.any():
             tick, column = np.argwhere(differ)[0].tolist()
@@ -241,7 +242,7 @@ class Program:
             differing=int(differ.sum()),
             first=first,
             deviation=float(parts.max()),
-            modes_equal=not modes_differ.any(),
+            modes_equal=not integers_differ.any(),
         )
 
 
@@ -271,8 +272,8 @@ def prove(
     """Compile the code in a folder with each compiler, and compare it with the recordings.
 
     Every state of the C code is compared with the recorded state of the Python code. `runner`, such
-    as qemu, starts the programs of a compiler for another machine. If g++ is installed, a further
-    program finds the largest number of operations on reals in one call.
+    as qemu, starts the programs of a compiler for another machine. If g++ is installed and the code
+    is in float64, a further program finds the largest number of operations on reals in one call.
     """
     comparisons: list[Comparison] = []
     with tempfile.TemporaryDirectory(prefix="rise_di_export_") as name:
@@ -361,10 +362,11 @@ def version(compiler: Sequence[str]) -> str:
 
 
 def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, int]:
-    """Return the numbers of bytes of machine code, of constants, and of the stack.
+    """Return the bytes of machine code with its constants, of global variables, and of the stack.
 
-    The stack is the sum of all frames. No function calls itself, so no chain of calls needs more
-    than this sum. An unknown number is left out.
+    FIGURES has their names. The bytes of the stack are the sum of the frames of all functions. No
+    function calls itself, so no chain of calls needs more than this sum. An unknown number is left
+    out.
     """
     for name in (*CODE, PARAMETERS):
         shutil.copyfile(code / name, folder / name)
