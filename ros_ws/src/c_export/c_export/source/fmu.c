@@ -33,7 +33,7 @@ typedef struct {
 
 typedef struct {
     rise_di_controller controller;
-    rise_di_parameters parameters[2]; /* in force: that of `flown`; and before */
+    rise_di_parameters parameters[2]; /* those in force, at the index `flown`, and those before */
     rise_di_parameters wanted;        /* with the values of the importer */
     int flown, edited;
     rise_di_real y[RISE_DI_M], y_m[RISE_DI_M];
@@ -70,7 +70,8 @@ EXPORTED int fmi2FreeFMUstate(unit *, unit **);
 EXPORTED int fmi2SerializedFMUstateSize(unit *, const unit *, size_t *);
 EXPORTED int fmi2SerializeFMUstate(unit *, const unit *, char *, size_t);
 EXPORTED int fmi2DeSerializeFMUstate(unit *, const char *, size_t, unit **);
-/* Not offered by the unit, as modelDescription.xml says by silence; every function of FMI 2.0 has to exist. */
+/* The unit does not offer these functions, so modelDescription.xml does not have their flags. But FMI 2.0 wants every function to
+ * exist. */
 EXPORTED int fmi2GetDirectionalDerivative(unit *, const unsigned *, size_t, const unsigned *, size_t, const double *, double *);
 EXPORTED int fmi2SetRealInputDerivatives(unit *, const unsigned *, size_t, const int *, const double *);
 EXPORTED int fmi2GetRealOutputDerivatives(unit *, const unsigned *, size_t, const int *, double *);
@@ -138,19 +139,19 @@ int fmi2Terminate(unit *u) { return (void)u, OK; }
 
 int fmi2CancelStep(unit *u) { return (void)u, ERROR; }
 
-/* The place of an input; NULL for an unknown reference. */
+/* The place of an input, or NULL if the reference is not known. */
 static rise_di_real *input_of(unit *u, unsigned reference) {
     rise_di_real *const groups[2] = {u->y, u->y_m};
     const unsigned group = reference / 100, i = reference % 100;
     return (group < 2 && i < RISE_DI_M) ? &groups[group][i] : NULL;
 }
 
-/* The place of a parameter among the values of the importer; NULL for an unknown reference. */
+/* The place of a parameter among the values of the importer, or NULL if the reference is not known. */
 static rise_di_real *parameter_of(unit *u, unsigned reference) {
     return (reference >= PARAMETER && reference - PARAMETER < REALS) ? &(&u->wanted.period)[reference - PARAMETER] : NULL;
 }
 
-/* The place of a real variable; NULL for an unknown reference. */
+/* The place of a real variable, or NULL if the reference is not known. */
 static const rise_di_real *real_of(unit *u, unsigned reference) {
     const rise_di_real *place = input_of(u, reference);
     if (reference >= PARAMETER) {
@@ -161,7 +162,8 @@ static const rise_di_real *real_of(unit *u, unsigned reference) {
     return place;
 }
 
-/* Take the parameters of the importer, in place of those two changes ago. False where one is out of its bounds. */
+/* Take the parameters of the importer, if it has changed any. They replace those that are no longer in force. Returns false if one
+ * of them is out of its bounds. */
 static bool are_taken(unit *u) {
     if (u->edited && rise_di_check(&u->wanted) == NULL) {
         u->wanted.digest = u->parameters[u->flown].digest + 1;

@@ -38,7 +38,7 @@ int64_t library_take(rise_di_controller *controller, int64_t is_y, int64_t stamp
                        : (int64_t)rise_di_take_y_m(controller, stamp_ns, now_ns, sample);
 }
 
-/* Returns the mode, or -1 where no u is to be sent. */
+/* Returns the mode, or -1 if u must not be sent. */
 int64_t library_tick(rise_di_controller *controller, int64_t now_ns, int64_t active, double *u) {
     rise_di_output output;
     const bool published = rise_di_tick(controller, now_ns, active != 0, &output);

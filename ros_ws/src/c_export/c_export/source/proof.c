@@ -1,9 +1,10 @@
 /* SPDX-FileCopyrightText: RISE-DI contributors
  * SPDX-License-Identifier: Apache-2.0
  *
- * The proof's program: reads events of controller and reference model, writes the state after each tick. Arguments: parameter sets, events, states to
- * load, states.
- * With counting.h in front, as C++, every value counts its operations; the largest count of a tick goes to standard output.
+ * The program of the proof. It reads events of a controller and a reference model, and writes the state after each tick. Its
+ * arguments are four files: parameter sets, events, states to load, and the states that it writes.
+ * If it is compiled as C++ with counting.h in front, every value counts its operations, and the largest counts of a call go to
+ * standard output.
  */
 #include <stdio.h>
 #include <stdlib.h>
@@ -14,7 +15,8 @@ enum { START = 0, TAKE_Y = 1, TAKE_Y_M = 2, TICK = 3, RETUNE = 4, RESTART = 5, G
        STEP_REFERENCE = 9 };
 
 typedef struct {
-    int64_t kind, now_ns, stamp_ns, flag, offset_ns; /* flag: index of a set, active, or 1 active + 2 with samples */
+    /* flag: the index of a set (START, RETUNE); 1 if the controller is active (TICK, GUARD_TICK), and 2 more with samples (GUARD_TICK) */
+    int64_t kind, now_ns, stamp_ns, flag, offset_ns;
     double y[RISE_DI_M], y_m[RISE_DI_M];
 } event;
 
@@ -87,7 +89,7 @@ static void read_reals(FILE *from, rise_di_real *values, int count) {
     }
 }
 
-/* The reals of write_state, into a controller that is engaged. */
+/* Read the reals that write_state writes into a controller, which is engaged afterwards. */
 static void load_state(rise_di_controller *c, FILE *from, int64_t stamp_ns) {
     rise_di_real unused[2 * RISE_DI_M + 2];
     c->mode = RISE_DI_ENGAGED;

@@ -12,7 +12,7 @@
 #if FLT_EVAL_METHOD != 0
 #error "float and double operations need their own precision: -msse2 -mfpmath=sse on 32-bit x86"
 #endif
-/* gcc names these flags; clang names few of them, so rise_di_start computes a test as well. */
+/* gcc defines a macro for each of these flags. clang defines few of them, so rise_di_start computes a test as well. */
 #if defined(__FAST_MATH__) || defined(__ASSOCIATIVE_MATH__)
 #error "-ffast-math, -funsafe-math-optimizations and -fassociative-math change the order of operations: -fno-fast-math"
 #endif
@@ -65,7 +65,7 @@ static rise_di_real magnitude(rise_di_real a) { return (a < ZERO) ? -a : a; }
 
 static rise_di_real seconds(uint64_t time_ns) { return (rise_di_real)time_ns / NANOSECONDS; }
 
-/* Time from a stamp to a later one, for all stamps; 0 for one that is not later. */
+/* The time from a stamp to a later one, without overflow for any two stamps. It is 0 if `later_ns` is not later. */
 static uint64_t elapsed_ns(int64_t later_ns, int64_t earlier_ns) {
     return (later_ns > earlier_ns) ? ((uint64_t)later_ns - (uint64_t)earlier_ns) : (uint64_t)0;
 }
@@ -109,7 +109,7 @@ static void product(const rise_di_real *matrix, int32_t rows, int32_t columns, c
 #endif
 
 #if (RISE_DI_N > 0) || (RISE_DI_S > 0)
-/* result = matrix' vector for a matrix of these rows and columns, in the same order. */
+/* result = matrix' vector for a matrix of these rows and columns, summed over the rows 0, 1, ... in this order. */
 static void product_transposed(const rise_di_real *matrix, int32_t rows, int32_t columns, const rise_di_real *vector,
                                rise_di_real *result) {
     for (int32_t i = 0; i < columns; i++) {
@@ -122,12 +122,13 @@ static void product_transposed(const rise_di_real *matrix, int32_t rows, int32_t
 }
 #endif
 
-/* The least value within the limits of magnitude, and of rate from `before` within `reach`. */
+/* The least value that is not below `lower` and at most `reach` away from `before`. If no value is both, the one nearest to `lower`
+ * that is within reach. */
 static rise_di_real least(rise_di_real lower, rise_di_real before, rise_di_real reach) {
     return greater(lesser(lower, before + reach), before - reach);
 }
 
-/* The largest such value. */
+/* The largest value that is not above `upper` and at most `reach` away from `before`, or the one nearest to `upper`. */
 static rise_di_real largest(rise_di_real upper, rise_di_real before, rise_di_real reach) {
     return lesser(greater(upper, before - reach), before + reach);
 }
@@ -140,7 +141,7 @@ static rise_di_real saturate(rise_di_real u, rise_di_real before, rise_di_real d
 
 /* ---- the law, equations (20) to (22) ---- */
 
-/* Equation (20): with the literal sign Pi is first used, then updated. */
+/* The input of equation (20), as a deviation from the trim. With the literal sign it uses the Pi from before the tick. */
 static rise_di_real control(const rise_di_parameters *p, const rise_di_real *scale, const rise_di_law *before,
                             const rise_di_law *after, int32_t i) {
     const rise_di_real Pi = (p->sign == (int64_t)RISE_DI_LITERAL) ? before->Pi[i] : after->Pi[i];
@@ -188,7 +189,8 @@ static void step_law(const rise_di_parameters *p, const rise_di_law *before, con
     }
 }
 
-/* Anti-windup of a tick: an outward increment of integral_e or Pi beyond a limit is reduced. Gives u before and after saturation. */
+/* Anti-windup of a tick. If u is beyond a limit, an increment of integral_e that moves it further out is removed, and such an
+ * increment of Pi is reduced. Gives u before and after saturation. */
 static void limit_law(const rise_di_parameters *p, const rise_di_real *scale, const rise_di_law *before, rise_di_real dt,
                       const rise_di_real *u_trim, const rise_di_real *u_before, const rise_di_limits *limits,
                       rise_di_law *after, rise_di_real *u_free, rise_di_real *u) {
@@ -215,7 +217,7 @@ static void limit_law(const rise_di_parameters *p, const rise_di_real *scale, co
     }
 }
 
-/* Pi of new parameters, without a jump of u. */
+/* Set Pi so that u does not jump when the parameters or the scale change. */
 static void retune_law(rise_di_law *law, const rise_di_parameters *old, const rise_di_real *old_scale,
                        const rise_di_parameters *next, const rise_di_real *next_scale) {
     for (int32_t i = 0; i < RISE_DI_M; i++) {
@@ -411,7 +413,7 @@ static void advance(const rise_di_parameters *p, const rise_di_real *forced, ris
     }
 }
 
-/* Runge-Kutta steps of the nominal model along y_m, and u_ff extrapolated to the instant of action. */
+/* Runge-Kutta steps of the nominal model along y_m, and u_ff extrapolated to the instant at which the input acts. */
 static void step_feedforward(const rise_di_parameters *p, rise_di_feedforward *state, const rise_di_real *y_m, rise_di_real dt,
                              uint64_t span_ns, rise_di_real *u_ff) {
     const uint64_t longest_ns = (uint64_t)RISE_DI_LONGEST_PART * (uint64_t)p->period_ns;
@@ -469,7 +471,7 @@ static void engage_all(const rise_di_parameters *p, rise_di_law *law, const rise
 #endif
 }
 
-/* A tick of the whole law from the state `before`: u_free, and u within limits; both are equal with a null pointer for these. */
+/* A tick of the whole law from the state `before`. Gives u_free, and u within `limits`. If `limits` is a null pointer, u is u_free. */
 static void tick_law(const rise_di_parameters *p, const rise_di_law *before, const rise_di_real *y, const rise_di_real *y_m,
                      rise_di_real dt, const rise_di_real *u_trim, const rise_di_real *u_before,
                      const rise_di_limits *limits, rise_di_law *after, rise_di_real *u_free, rise_di_real *u) {
@@ -513,7 +515,7 @@ static bool is_inside(const rise_di_real *u, const rise_di_real *low, const rise
     return inside;
 }
 
-/* u with the same effect, inside its limits where the sweeps find such a u. */
+/* Change u without a change of its effect, until it is inside its limits or the sweeps have ended. */
 static void pass_on(const rise_di_parameters *p, const rise_di_real *low, const rise_di_real *high, rise_di_real *u) {
     bool inside = false;
     for (int32_t sweep = 0; (sweep < RISE_DI_SWEEPS) && (!inside); sweep++) {
@@ -532,7 +534,7 @@ static void pass_on(const rise_di_parameters *p, const rise_di_real *low, const 
     }
 }
 
-/* target = the effectors after `begin + part move` and what they pass on. Returns whether these are inside. */
+/* target = begin + part move, after pass_on. Returns whether the target is inside the limits. */
 static bool moved(const rise_di_parameters *p, const rise_di_real *begin, rise_di_real part, const rise_di_real *move,
                   const rise_di_real *low, const rise_di_real *high, rise_di_real *target) {
     for (int32_t j = 0; j < RISE_DI_P; j++) {
@@ -542,7 +544,7 @@ static bool moved(const rise_di_parameters *p, const rise_di_real *begin, rise_d
     return is_inside(target, low, high);
 }
 
-/* u = values that are inside their limits. The limits stand here for the proof of the source, which cannot know it. */
+/* u = values, which are inside their limits. They are limited again because the proof of the source cannot know this. */
 static void take_inside(const rise_di_real *values, const rise_di_real *low, const rise_di_real *high, rise_di_real *u) {
     for (int32_t j = 0; j < RISE_DI_P; j++) {
         const rise_di_real raised = (values[j] < low[j]) ? low[j] : values[j];
@@ -553,7 +555,8 @@ static void take_inside(const rise_di_real *values, const rise_di_real *low, con
 /* The part of a step that has room, at most 1. */
 static rise_di_real part_of(rise_di_real room, rise_di_real step) { return (step > magnitude(room)) ? (room / step) : ONE; }
 
-/* u after a move as far as the limits let it, from a u inside; the halvings find the part of it, then the way is straight. */
+/* Move u, which is inside its limits, by as much of `move` as they allow. The halvings find the largest part of the move that has a
+ * target inside. From there u goes straight towards the first target that is outside, until it meets a limit. */
 static void towards(const rise_di_parameters *p, const rise_di_real *move, const rise_di_real *low, const rise_di_real *high,
                     rise_di_real *u) {
     rise_di_real begin[RISE_DI_P];
@@ -591,7 +594,7 @@ static void towards(const rise_di_parameters *p, const rise_di_real *move, const
     }
 }
 
-/* u after the effectors of each input of the law in the order of priority. */
+/* Move u by the effectors for each input of the law, one input after the other in the order of priority. */
 static void add_by_priority(const rise_di_parameters *p, const rise_di_real *v, const rise_di_real *low,
                             const rise_di_real *high, rise_di_real *u) {
     for (int32_t k = 0; k < RISE_DI_M; k++) {
@@ -604,7 +607,7 @@ static void add_by_priority(const rise_di_parameters *p, const rise_di_real *v, 
     }
 }
 
-/* The effectors inside their limits for v, and the v that they give. */
+/* Find effectors u for the demanded v inside their limits. Afterwards v is what these effectors give. */
 static void allocate(const rise_di_parameters *p, const rise_di_real *u_before, rise_di_real dt, rise_di_real *v,
                      rise_di_real *u) {
     const rise_di_stops *stops = &p->stops;
@@ -644,7 +647,7 @@ static void allocate(const rise_di_parameters *p, const rise_di_real *u_before, 
     }
 }
 
-/* The limits that take u_free to the u that the effectors give, for the anti-windup of the law. */
+/* The limits under which u_free becomes the u that the effectors give. The anti-windup of the law takes them. */
 static void reached(const rise_di_real *u_free, const rise_di_real *u, rise_di_limits *limits) {
     for (int32_t i = 0; i < RISE_DI_M; i++) {
         limits->lower[i] = (u_free[i] < u[i]) ? u[i] : -REAL_MAX;
@@ -671,7 +674,7 @@ void rise_di_append(rise_di_samples *samples, int64_t stamp_ns, const rise_di_re
     }
 }
 
-/* y_m at an instant: a sample, interpolated, or extrapolated by at most a period. False where neither is possible. */
+/* y_m at an instant: a sample, or interpolated, or extrapolated by at most a period. Returns false if none of these is possible. */
 static bool align(const rise_di_parameters *p, const rise_di_samples *samples, int64_t stamp_ns, rise_di_real *value) {
     const rise_di_sample *newer = (const rise_di_sample *)0;
     const rise_di_sample *older = (const rise_di_sample *)0;
@@ -712,7 +715,8 @@ static bool align(const rise_di_parameters *p, const rise_di_samples *samples, i
     } else if (possible) {
         const uint64_t span_ns = elapsed_ns(second->stamp_ns, first->stamp_ns);
         const uint64_t passed_ns = elapsed_ns(stamp_ns, first->stamp_ns);
-        const rise_di_real fraction = (rise_di_real)passed_ns / (rise_di_real)((span_ns > 0U) ? span_ns : 1U); /* it is: stamps increase */
+        /* The span is above 0, because stamps increase. */
+        const rise_di_real fraction = (rise_di_real)passed_ns / (rise_di_real)((span_ns > 0U) ? span_ns : 1U);
         for (int32_t i = 0; i < RISE_DI_M; i++) {
             value[i] = first->value[i] + (fraction * (second->value[i] - first->value[i]));
         }
@@ -744,7 +748,7 @@ static void log_inputs(rise_di_output *output, int64_t stamp_ns, const rise_di_r
     output->dt = dt;
 }
 
-/* A tick without fresh inputs, or of a deactivated controller, with the stamp of u. */
+/* A tick without fresh inputs, or of a deactivated controller. u gets the stamp `stamp_ns`. Returns whether there is a u to send. */
 static bool failsafe(rise_di_controller *c, int64_t stamp_ns, int64_t now_ns, bool active, rise_di_output *output) {
     const rise_di_parameters *p = c->parameters;
     const bool was_active = c->mode != RISE_DI_INACTIVE;
@@ -798,7 +802,7 @@ static void engage(rise_di_controller *c, const rise_di_sample *y, const rise_di
 #endif
 }
 
-/* A step of the law with a new y. Returns dt; 0 where u or a state would not be finite, and the law has to engage again. */
+/* A step of the law with a new y. Returns dt, or 0 if u or a state would not be finite. In that case the law must engage again. */
 static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const rise_di_real *y_m) {
     const rise_di_parameters *p = c->parameters;
     const uint64_t span_ns = elapsed_ns(y->stamp_ns, c->y_stamp_ns);
@@ -880,7 +884,7 @@ static bool is_fresh(int64_t now_ns, int64_t stamp_ns, int64_t max_age_ns) {
     return (elapsed_ns(now_ns, stamp_ns) <= (uint64_t)max_age_ns) && (elapsed_ns(stamp_ns, now_ns) <= (uint64_t)max_age_ns);
 }
 
-/* Whether y and y_m are finite: a sample with NaN or infinity is as none. */
+/* Whether y and y_m are finite. A sample with NaN or infinity counts as none. */
 static bool are_numbers(const rise_di_real *y, const rise_di_real *y_m) {
     rise_di_real sum[RISE_DI_M];
     for (int32_t i = 0; i < RISE_DI_M; i++) {
@@ -889,7 +893,8 @@ static bool are_numbers(const rise_di_real *y, const rise_di_real *y_m) {
     return is_finite(sum, RISE_DI_M);
 }
 
-/* Whether the last y of the law is longer ago than a step may take: the last tick with a fresh y, and a period. */
+/* Whether the last y of the law is longer ago than a step may take. This is the age limit and a period, because the last tick with a
+ * fresh y can be a period before the tick of the next y. */
 static bool has_gap(const rise_di_controller *c, int64_t stamp_ns) {
     const uint64_t longest_ns = (uint64_t)c->parameters->max_age_ns + (uint64_t)c->parameters->period_ns;
     return elapsed_ns(stamp_ns, c->y_stamp_ns) > longest_ns;
@@ -903,7 +908,7 @@ static bool any(const rise_di_real *values) {
     return result;
 }
 
-/* The stamp of a u without a y: that of the last u, and the time since then. */
+/* The stamp of a u without a y: the stamp of the last u plus the time since then. */
 static int64_t going_on(const rise_di_controller *c, int64_t now_ns) {
     return c->stamp_ns + (int64_t)elapsed_ns(now_ns, c->tick_ns);
 }
@@ -976,7 +981,7 @@ typedef uint64_t plain_bits;
 #endif
 
 #define MILLION ((rise_di_real)1000000)
-#define SINE_OF_PART ((rise_di_real)295520) /* sin(0.3) in millionths, below the part 0.2 */
+#define SINE_OF_PART ((rise_di_real)295520) /* sin(0.3), which is 295520.2 millionths */
 
 static rise_di_real from_bits(plain_bits bits) {
     volatile plain_bits stored = bits;
@@ -1046,7 +1051,7 @@ bool rise_di_start(rise_di_controller *controller, const rise_di_parameters *par
     return controller->parameters != (const rise_di_parameters *)0;
 }
 
-/* Whether a sample can be taken after those before, as far as one sample tells. */
+/* The status of a sample, without the tests that compare its values with those of earlier samples. */
 static rise_di_status checked(const rise_di_controller *c, const rise_di_samples *samples, int64_t stamp_ns, int64_t now_ns,
                               const rise_di_real *value) {
     rise_di_status status = RISE_DI_TAKEN;
@@ -1068,7 +1073,7 @@ static rise_di_status checked(const rise_di_controller *c, const rise_di_samples
     return status;
 }
 
-/* Whether a sample of y is near the one before, and its change in a period. */
+/* Whether a sample of y is near the sample `before`. Gives its change per period. */
 static bool is_near(const rise_di_controller *c, const rise_di_sample *before, int64_t stamp_ns, const rise_di_real *value,
                     rise_di_real *change) {
     const rise_di_parameters *p = c->parameters;
@@ -1109,8 +1114,8 @@ static bool stands_still(rise_di_controller *c, int64_t stamp_ns, const rise_di_
     return c->is_frozen;
 }
 
-/* Note the largest change of y, with that of a sample taken. In the first second no change that is far, and of the others at most
- * the reach: a gyro may start with garbage. */
+/* Update the largest change of y by a sample that is taken. In the first second a far change does not count, and a near one counts
+ * at most as y_reach, because a gyro may start with wrong values. */
 static void note_change(rise_di_controller *c, int64_t stamp_ns, const rise_di_real *value, const rise_di_real *change, bool near,
                         bool first) {
     const rise_di_sample *last = sample_at(&c->y_samples, 0);
@@ -1128,7 +1133,8 @@ static void note_change(rise_di_controller *c, int64_t stamp_ns, const rise_di_r
     }
 }
 
-/* Whether y has come here as an aircraft moves, or has jumped and stays: three far samples in a row agree. */
+/* The status of a y after the tests of how y changes. It is taken in the first second, if it is near the last y, and if it is the
+ * last of RISE_DI_AGREEING far samples in a row that agree. In the last case y has jumped, and the law engages again. */
 static rise_di_status compared(rise_di_controller *c, int64_t stamp_ns, const rise_di_real *value) {
     const bool first = elapsed_ns(stamp_ns, c->begin_ns) < (uint64_t)RISE_DI_FIRST_NS;
     rise_di_status status = RISE_DI_TAKEN;
@@ -1155,7 +1161,7 @@ static rise_di_status compared(rise_di_controller *c, int64_t stamp_ns, const ri
 rise_di_status rise_di_take_y(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]) {
     rise_di_status status = checked(controller, &controller->y_samples, stamp_ns, now_ns, value);
     if ((status == RISE_DI_TAKEN) && (controller->y_samples.count > 0)) {
-        controller->y_samples.seen_ns = stamp_ns; /* a lost sample does not come again */
+        controller->y_samples.seen_ns = stamp_ns; /* also of a lost sample, which is refused if it is sent again */
         if (stands_still(controller, stamp_ns, value)) {
             controller->agreeing = 0;
             status = RISE_DI_IMPLAUSIBLE;

@@ -11,7 +11,8 @@
  *   rise_di_tick      once a period; true: send rise_di_command(controller) with the stamp output.stamp_ns
  *
  * Vectors have RISE_DI_M values in the order of RISE_DI_OUTPUTS and RISE_DI_INPUTS (rise_di_parameters.h): SI and rad, deviations
- * from trim. Stamps are nanoseconds of the clock of the caller. An interrupt must not call two functions for one controller at once.
+ * from trim. Stamps are nanoseconds of the clock of the caller. Two functions must never run at once for the same controller, not
+ * even if one of them runs in an interrupt.
  *
  * Every operation is rounded once to rise_di_real. Compile with -ffp-contract=off: a fused multiply-add has a single rounding for
  * two operations and gives different last bits. Never compile with -ffast-math or a part of it: rise_di.c stops the compiler, or
@@ -85,11 +86,11 @@ typedef struct {
     int64_t deactivation_holds; /* 1: u is held when deactivated, 0: u ramps to trim */
     int64_t sign;             /* rise_di_sign */
 #if RISE_DI_P > 0
-    int64_t order[RISE_DI_M]; /* inputs of the law, the one that keeps its effect the longest first */
+    int64_t order[RISE_DI_M]; /* indices of the inputs of the law, beginning with the one that keeps its effect the longest */
 #endif
     rise_di_real period;      /* s */
     rise_di_real dt_least;    /* s, lower limit of dt */
-    rise_di_real dt_largest;  /* s, max_age_ns and period_ns: upper limit of dt */
+    rise_di_real dt_largest;  /* s, upper limit of dt: max_age_ns + period_ns */
     rise_di_real K[RISE_DI_M];           /* diagonal of K (22), 1/s */
     rise_di_real Lambda[RISE_DI_M];      /* diagonal of Lambda (4), 1/s */
     rise_di_real beta[RISE_DI_M];        /* diagonal of beta (21), units of y / s^2 */
@@ -172,10 +173,11 @@ typedef struct {
     rise_di_sample sample[RISE_DI_SAMPLES];
     int32_t newest;  /* index of the newest sample */
     int32_t count;   /* number of samples, at most RISE_DI_SAMPLES */
-    int64_t seen_ns; /* stamp of the newest sample, or of a later one that was lost for how y changes */
+    int64_t seen_ns; /* stamp of the newest sample, or of a later y that was lost because y jumped or stood still */
 } rise_di_samples;
 
-/* A controller. Read by the caller: mode, rise_di_command. u may be set by the caller before engagement: the law begins there. */
+/* A controller. The caller reads `mode`, and the command by rise_di_command. Before the law engages, the caller may set u, and the
+ * law then begins with this u. */
 typedef struct {
     const rise_di_parameters *parameters;
     rise_di_mode mode;
@@ -209,54 +211,58 @@ typedef struct {
     int32_t agreeing;               /* number of such y in a row that agree */
     int64_t since_ns;               /* stamp of the first y with the present values */
     int32_t changes;                /* number of y in a row with a change, at most RISE_DI_MOVING */
-    int32_t equal;                  /* number of y in a row since, as before in every value, at most RISE_DI_STILL */
+    int32_t equal;                  /* number of y in a row after that, each with the values before it, at most RISE_DI_STILL */
     bool is_frozen;                 /* whether y stands still */
 } rise_di_controller;
 
 /* Inputs of a tick, for a log, and the stamp of u. */
 typedef struct {
-    int64_t stamp_ns;            /* of u: that of its y; without one it goes on with the clock */
+    int64_t stamp_ns;            /* of u: the stamp of its y; without a y, that of the last u plus the time since then */
     rise_di_real y[RISE_DI_M];
     rise_di_real y_m[RISE_DI_M]; /* at the stamp of y */
     rise_di_real y_m_offset;     /* stamp of the newest y_m minus stamp of y, s */
     rise_di_real dt;             /* step of the law, s; 0 without a step */
 } rise_di_output;
 
-/* Set a controller to u = 0, waiting for the first samples. `parameters` has to outlive the controller. False where the compiler
- * does not compute what is written: docs/export.md has its flags. The controller then takes no sample and commands nothing, as
- * one in memory of zeros that was never started. */
+/* Set a controller to u = 0, so that it waits for the first samples. `parameters` must live as long as the controller. Returns
+ * false if the compiler does not compute what is written; docs/export.md has the flags that it needs. The controller then takes no
+ * sample and commands nothing. The same holds for a controller in memory of zeros that was never started. */
 bool rise_di_start(rise_di_controller *controller, const rise_di_parameters *parameters);
 
-/* Take a sample of y or of y_m. A refused sample changes nothing, but for the tests of how y changes. */
+/* Take a sample of y or of y_m. A sample that is not taken changes nothing, except that a y that jumps or stands still counts in
+ * the tests of the next y. */
 rise_di_status rise_di_take_y(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]);
 rise_di_status rise_di_take_y_m(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]);
 
-/* A tick at now_ns. Returns whether rise_di_command is to be sent, with the stamp output->stamp_ns. active false: deactivated. */
+/* Compute the tick at now_ns. If it returns true, send rise_di_command with the stamp output->stamp_ns. If `active` is false, the
+ * controller is deactivated. */
 bool rise_di_tick(rise_di_controller *controller, int64_t now_ns, bool active, rise_di_output *output);
 
-/* What is to be sent, RISE_DI_COMMANDS values from trim: u, or the effectors of an allocation. */
+/* The command, RISE_DI_COMMANDS values from trim. It is u, or with an allocation the values of the effectors. */
 const rise_di_real *rise_di_command(const rise_di_controller *controller);
 
-/* A tick with samples of the caller in place of those taken; y may be a null pointer. */
+/* Compute a tick with samples of the caller in place of those taken. Without a y, `y` is a null pointer. */
 bool rise_di_guard_tick(rise_di_controller *controller, int64_t now_ns, const rise_di_sample *y, const rise_di_samples *y_m,
                         bool active, rise_di_output *output);
 
 /* Replace the parameters between two ticks without a jump of u. Parameters of equal digest change nothing. */
 void rise_di_retune(rise_di_controller *controller, const rise_di_parameters *parameters);
 
-/* Engage again with the next fresh y and y_m, from the u of then; a failsafe goes on. */
+/* Let the law engage again with the next fresh y and y_m, from the u at that time. A failsafe goes on until then. */
 void rise_di_restart(rise_di_controller *controller);
 
 /* Append a sample to a ring. */
 void rise_di_append(rise_di_samples *samples, int64_t stamp_ns, const rise_di_real value[RISE_DI_M]);
 
-/* The first member of parameters that is out of its bounds, such as "K", after an edit; a null pointer where none is. An edit needs
- * another digest: rise_di_retune takes parameters of equal digest for the same. In rise_di_table.c. */
+/* Check parameters that you have edited. Returns the name of the first member that is out of its bounds, such as "K", or a null
+ * pointer if there is none. Give edited parameters another digest, because rise_di_retune takes parameters of equal digest for the
+ * same. In rise_di_table.c. */
 const char *rise_di_check(const rise_di_parameters *parameters);
 
 #define RISE_DI_TEXT 24 /* characters of a name and of a unit at most, with the 0 at the end */
 
-/* A row of the table of parameters: `count` reals of struct rise_di_parameters, the first at `place`, from `period` on. */
+/* A row of the table of parameters. It describes `count` reals of struct rise_di_parameters. The first of them comes `place` reals
+ * after `period`. */
 typedef struct {
     char name[RISE_DI_TEXT];
     char unit[RISE_DI_TEXT]; /* y, u: of the channel; v: of an input of the law */
@@ -266,7 +272,7 @@ typedef struct {
     rise_di_real largest;
 } rise_di_row;
 
-/* The row of an index from 0 on; a null pointer behind the last. In rise_di_table.c. */
+/* The row at an index, or a null pointer if the table has no such row. The first row has the index 0. In rise_di_table.c. */
 const rise_di_row *rise_di_row_at(int32_t index);
 
 #if RISE_DI_R > 0
@@ -281,24 +287,25 @@ typedef struct {
     rise_di_real reach[RISE_DI_M];                 /* largest change of u_m from step to step, units of y */
 } rise_di_reference_parameters;
 
-/* The reference model at number * period_ns since its start. Read by the caller: number. */
+/* The reference model at the time number * period_ns since its start. The caller reads `number`. */
 typedef struct {
     const rise_di_reference_parameters *parameters;
     int64_t number;                /* of the steps */
     int64_t stamp_ns;              /* of u_m */
     bool has_u_m;
     rise_di_real u_m[RISE_DI_M];     /* the last taken */
-    rise_di_real applied[RISE_DI_M]; /* within the limits of rate */
+    rise_di_real applied[RISE_DI_M]; /* u_m within `bounds` and `reach`, which the model follows */
     rise_di_real x_m[RISE_DI_R];
 } rise_di_reference;
 
 /* Set a reference model to x_m = 0. RISE_DI_REFERENCE initialises the parameters of the scenario. */
 void rise_di_reference_start(rise_di_reference *reference, const rise_di_reference_parameters *parameters);
 
-/* Take a live command, with its stamp since the start. Acts from the next step on; a refused u_m changes nothing. */
+/* Take a live command u_m, whose stamp counts from the start of the model. It acts from the next step on. A refused u_m changes
+ * nothing. */
 rise_di_status rise_di_take_u_m(rise_di_reference *reference, int64_t stamp_ns, const rise_di_real u_m[RISE_DI_M]);
 
-/* A step of a period. Gives y_m at its end, at number * period_ns since the start. */
+/* Step the model by a period, and give the y_m at the end of the step. */
 void rise_di_reference_step(rise_di_reference *reference, rise_di_real y_m[RISE_DI_M]);
 #endif
 

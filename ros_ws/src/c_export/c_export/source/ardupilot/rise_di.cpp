@@ -1,8 +1,9 @@
 // SPDX-FileCopyrightText: RISE-DI contributors
 // SPDX-License-Identifier: Apache-2.0
 //
-// A fast task of ArduPlane between stabilize and set_servos: rates and deflections to rise_di_rates.c and back. Its own rate
-// controllers run on as the spare. Deflections are hundredths of a degree, 4500 at the end stop.
+// A fast task of ArduPlane between stabilize and set_servos. It gives rates and deflections to rise_di_rates.c, and sets the
+// deflections that this returns. ArduPlane's own rate controllers run on as the spare. Deflections are hundredths of a degree, 4500
+// at the end stop.
 #include "Plane.h"
 #if CONFIG_HAL_BOARD == HAL_BOARD_SITL
 #include <fenv.h>
@@ -30,7 +31,7 @@ static_assert(RISE_DI_MAX_ERROR >= RISE_DI_MAX_ERROR_LEAST && RISE_DI_MAX_ERROR 
 static const float END = 4500.0f;
 static const SRV_Channel::Function surfaces[3] {SRV_Channel::k_aileron, SRV_Channel::k_elevator, SRV_Channel::k_rudder};
 
-// The equivalent airspeed, m/s: airspeed_estimate before ArduPlane 4.8.
+// The equivalent airspeed, m/s. Before ArduPlane 4.8 its function is named airspeed_estimate.
 template <class T> static auto take_airspeed(const T &ahrs, float &airspeed, int) -> decltype(ahrs.airspeed_EAS(airspeed))
 {
     return ahrs.airspeed_EAS(airspeed);
@@ -41,14 +42,15 @@ template <class T> static auto take_airspeed(const T &ahrs, float &airspeed, lon
     return ahrs.airspeed_estimate(airspeed);
 }
 
-// The switch of the transmitter: the channel whose RCx_OPTION is 300, "Scripting1", above 1800 us. Without one RISE-DI is off.
+// Whether the switch of the transmitter is on. It is the channel whose RCx_OPTION is 300, "Scripting1", and on above 1800 us. Without
+// such a channel RISE-DI is off.
 static bool is_enabled()
 {
     const RC_Channel *input = rc().find_channel_for_option(RC_Channel::AUX_FUNC::SCRIPTING_1);
     return input != nullptr && input->get_aux_switch_pos() == RC_Channel::AuxSwitchPos::HIGH;
 }
 
-// The self-test divides by 0 and compares NaN. SITL ends at both: its traps are held.
+// The self-test divides by 0 and compares NaN. Both would end SITL, so its traps are held meanwhile.
 static void start(rise_di_rates &rates)
 {
 #if CONFIG_HAL_BOARD == HAL_BOARD_SITL
@@ -66,7 +68,7 @@ static const char *text_of(bool flies, const rise_di_rates &rates)
     return flies ? "RISE-DI flies" : rise_di_refusal_text(rates.refusal);
 }
 
-// y is that of the law, or, while the spare flies, that of this loop: TimeUS is its instant.
+// Log y, y_m and u. While RISE-DI flies, y is that of the law, else it is that of this loop. TimeUS is the instant of y.
 static void write_log(const rise_di_rates &rates, const rise_di_cycle &cycle)
 {
 #if HAL_LOGGING_ENABLED
@@ -99,7 +101,7 @@ void Plane::rise_di()
 
     const Vector3f &gyro = ahrs.get_gyro();
     const bool manual = control_mode == &mode_manual || control_mode == &mode_training || control_mode == &mode_initializing;
-    const bool tunes = control_mode == &mode_autotune; // the spare, by its own response
+    const bool tunes = control_mode == &mode_autotune; // tunes the spare, which must fly meanwhile
     const float targets[3] {rollController.get_pid_info().target, pitchController.get_pid_info().target,
                             yawController.get_pid_info().target};
     rise_di_cycle cycle {};

@@ -1,7 +1,8 @@
 // SPDX-FileCopyrightText: RISE-DI contributors
 // SPDX-License-Identifier: Apache-2.0
 //
-// A module of PX4: topics to rise_di_rates.c and back. `fw_rate_control start vtol` runs on as the spare.
+// A module of PX4. It gives topics to rise_di_rates.c, and publishes the torque and the thrust that this returns.
+// `fw_rate_control start vtol` runs on as the spare.
 #include <mathlib/mathlib.h>
 #include <px4_platform_common/module.h>
 #include <px4_platform_common/module_params.h>
@@ -89,7 +90,7 @@ private:
 	)
 };
 
-// Of the second-order Butterworth filter at low frequencies, us: 1 / (sqrt(2) pi f).
+// The delay of the second-order Butterworth filter of the gyro at low frequencies, us: 1 / (sqrt(2) pi f).
 hrt_abstime RiseDiControl::filter_delay() const
 {
 	const float cutoff = _cutoff.get();
@@ -160,10 +161,10 @@ void RiseDiControl::Run()
 
 	if (flies ? fresh : (spare_fresh || flew || _rates.is_alone)) { publish(flies); }
 
-	ScheduleDelayed(20_ms); // where the rates stop
+	ScheduleDelayed(20_ms); // so that a cycle also runs if the rates stop
 }
 
-// Each change of what flies, and what speaks against RISE-DI where it is wanted.
+// Report each change between RISE-DI and the spare. While RISE-DI is enabled but does not fly, report why.
 void RiseDiControl::report(bool flew, bool was_alone, const rise_di_cycle &cycle)
 {
 	const rise_di_refusal refusal = _rates.refusal;

@@ -3,12 +3,12 @@
  */
 #include "rise_di_rates.h"
 
-#define FADE 0.3f         /* s, of the difference after the spare has taken over */
+#define FADE 0.3f         /* s, time constant with which the handover fades after the spare has taken over */
 #define MEAN 0.1f         /* s, time constant of the mean torque of the spare */
-#define LONGEST 0.04f     /* s, of a step of these two */
-#define PAUSE_PERIODS 50U /* without a sample: the reference model starts again */
+#define LONGEST 0.04f     /* s, longest step of the fade and of the mean */
+#define PAUSE_PERIODS 50U /* after more periods than these without a sample, the reference model starts again */
 #define BIGGEST 1e30f     /* a larger number counts as infinite */
-#define DWELL_US 1000000U  /* without a fault before RISE-DI flies again */
+#define DWELL_US 1000000U  /* time without a fault, after which RISE-DI flies again */
 #define WINDOW_US 1000000U /* in which the rate of the samples is measured: a lost one is 1 % of 100 Hz */
 #define SLOWEST_PART 0.98f /* of the rate of the law: slower samples are refused */
 #define LIKE_PART 1.05f    /* of the rate of the law: up to it each sample is a tick */
@@ -26,23 +26,24 @@ static float least_of(float a, float b) { return (a < b) ? a : b; }
 
 static int64_t in_ns(uint64_t time_us) { return (int64_t)time_us * 1000; }
 
-/* NaN is not. */
+/* Whether a value is within two bounds. NaN is not. */
 static bool is_within(float value, float low, float high) { return (value >= low) && (value <= high); }
 
 static float rate_of_law(void) { return 1e9f / (float)exported.period_ns; }
 
-/* With an age that is NaN, too. */
+/* Whether a stamp is older than max_age. If max_age is NaN, every stamp is. */
 static bool is_stale(const rise_di_cycle *cycle, uint64_t stamp_us, float max_age) {
     const uint64_t age_us = (cycle->now_us > stamp_us) ? (cycle->now_us - stamp_us) : 0U;
     return !((float)age_us <= (max_age * 1e6f));
 }
 
-/* The maximum age; out of its bounds the largest, for a RISE-DI that has nothing to fall back to. */
+/* The maximum age. If the setting is out of its bounds, it is the largest bound. Only a RISE-DI with nothing to fall back to flies
+ * with such a setting. */
 static float age_of(const rise_di_cycle *cycle) {
     return is_within(cycle->max_age, RISE_DI_MAX_AGE_LEAST, RISE_DI_MAX_AGE_LARGEST) ? cycle->max_age : RISE_DI_MAX_AGE_LARGEST;
 }
 
-/* An autopilot holds the last setpoint: one that comes slowly is not stale. */
+/* Whether the setpoint is stale. An autopilot holds the last setpoint for `hold`, so setpoints may come slowly. */
 static bool is_setpoint_stale(const rise_di_cycle *cycle) {
     const float age = age_of(cycle);
     const bool is_longer = is_within(cycle->hold, age, RISE_DI_HOLD_LARGEST);
@@ -57,7 +58,7 @@ static bool are_numbers(const rise_di_cycle *cycle) {
     return numbers;
 }
 
-/* What an engineer has to change first. */
+/* The first setting that an engineer has to change before RISE-DI can fly. */
 static rise_di_refusal wrong_setting(const rise_di_rates *rates, const rise_di_cycle *cycle) {
     rise_di_refusal refusal = RISE_DI_FLIES;
     if (!rates->started) {
@@ -78,7 +79,7 @@ static rise_di_refusal wrong_setting(const rise_di_rates *rates, const rise_di_c
     return refusal;
 }
 
-/* What the pilot and the autopilot want. A spare that fell silent cannot be switched to. */
+/* The first reason why the pilot or the autopilot does not want RISE-DI to fly. A pilot cannot switch to a spare that fell silent. */
 static rise_di_refusal not_wanted(const rise_di_rates *rates, const rise_di_cycle *cycle) {
     rise_di_refusal refusal = RISE_DI_FLIES;
     if ((!cycle->enabled) && (!rates->is_alone)) {
@@ -95,7 +96,7 @@ static rise_di_refusal not_wanted(const rise_di_rates *rates, const rise_di_cycl
     return refusal;
 }
 
-/* What passes by itself. */
+/* The first fault that passes by itself. */
 static rise_di_refusal fault_of(const rise_di_rates *rates, const rise_di_cycle *cycle) {
     rise_di_refusal refusal = RISE_DI_FLIES;
     if (is_stale(cycle, cycle->rates_us, age_of(cycle))) {
@@ -112,7 +113,8 @@ static rise_di_refusal fault_of(const rise_di_rates *rates, const rise_di_cycle 
     return refusal;
 }
 
-/* Settings, switches, faults, a fault of the law, then the time that a take-over waits: no return within a second of a fault. */
+/* The first reason against RISE-DI: a setting, a wish of the pilot or the autopilot, a fault that passes, or a fault of the law that
+ * holds. A take-over also waits until the rate of the samples is measured, and for a second after a fault that passes. */
 static rise_di_refusal refusal_before(rise_di_rates *rates, const rise_di_cycle *cycle, bool flew) {
     const rise_di_refusal setting = wrong_setting(rates, cycle);
     const rise_di_refusal wish = not_wanted(rates, cycle);
@@ -147,7 +149,8 @@ static void measure_rate(rise_di_rates *rates, uint64_t stamp_us) {
     }
 }
 
-/* Torque and thrust of the spare, the last that are numbers; without any for max_age it is silent, and RISE-DI alone if it flies. */
+/* Keep the last torque and thrust of the spare that are numbers. If there were none for max_age, the spare is silent. If RISE-DI flies
+ * then, it is alone. */
 static void take_spare(rise_di_rates *rates, const rise_di_cycle *cycle) {
     bool numbers = true;
     for (int32_t k = 0; k < 3; k++) {
@@ -164,7 +167,8 @@ static void take_spare(rise_di_rates *rates, const rise_di_cycle *cycle) {
     rates->is_alone = rates->is_silent && cycle->armed && (rates->is_alone || (rates->refusal == RISE_DI_FLIES));
 }
 
-/* Torque of u = 1 at this airspeed over that at the speed of the scenario: less where the surfaces have more effect. */
+/* The torque for a u at this airspeed, divided by the torque for this u at the speed of the scenario. It falls with the airspeed,
+ * because the surfaces then have more effect. */
 static rise_di_real effect_scale(const rise_di_cycle *cycle) {
     rise_di_real scale = (rise_di_real)1;
 #if RISE_DI_SCALED
@@ -178,8 +182,9 @@ static rise_di_real effect_scale(const rise_di_cycle *cycle) {
     return scale;
 }
 
-/* Whether a y of the law falls due by this sample of the rates: its instant and its values. Samples at the rate of the law are
- * taken as they come. Of faster ones y is interpolated at the periods of the law, as late as the next sample. */
+/* Return whether this sample of the rates gives a y of the law, and set the values and the instant of this y. If the samples come at
+ * the rate of the law, each of them is a y. If they come faster, y is interpolated at the periods of the law, when the first sample
+ * after its instant has come. */
 static bool resample(rise_di_rates *rates, const rise_di_cycle *cycle, uint64_t *instant_us) {
     const uint64_t period_us = ((uint64_t)exported.period_ns + 500U) / 1000U;
     const uint64_t stamp_us = (cycle->rates_us > cycle->filter_us) ? (cycle->rates_us - cycle->filter_us) : 0U;
@@ -199,7 +204,7 @@ static bool resample(rise_di_rates *rates, const rise_di_cycle *cycle, uint64_t 
     return is_due;
 }
 
-/* A y, and the y_m past its instant, for the controller. */
+/* Give the controller a y, and every y_m up to the first that is not before this y. */
 static void take_samples(rise_di_rates *rates, const rise_di_cycle *cycle, uint64_t stamp_us) {
     const int64_t stamp_ns = in_ns(stamp_us);
     const int64_t now_ns = in_ns(cycle->now_us);
@@ -222,7 +227,7 @@ static void take_samples(rise_di_rates *rates, const rise_di_cycle *cycle, uint6
     (void)rise_di_take_y(&rates->controller, stamp_ns, now_ns, rates->y);
 }
 
-/* The law begins with the u of the torque that flies. */
+/* Let the law engage again, from the u that gives the mean torque of the spare. */
 static void engage(rise_di_rates *rates, rise_di_real scale) {
     rise_di_restart(&rates->controller);
     rates->number = 0;
@@ -231,7 +236,8 @@ static void engage(rise_di_rates *rates, rise_di_real scale) {
     }
 }
 
-/* No u beyond the torque of 1 at this airspeed: other limits, of the observer too, are other parameters. */
+/* Limit u to the torques from -1 to 1 at this airspeed. If this changes the limits of u, and with them those of the observer, the
+ * controller takes other parameters. */
 static void limit(rise_di_rates *rates, rise_di_real scale) {
     const rise_di_parameters *now = rates->controller.parameters;
     rise_di_parameters *next = &rates->parameters[(now == &rates->parameters[0]) ? 1 : 0];
@@ -254,7 +260,7 @@ static void limit(rise_di_rates *rates, rise_di_real scale) {
     }
 }
 
-/* A tick of the law, and the torque of u; what speaks against it. */
+/* Compute a tick of the law if there is a y, and give the torque of u. Returns the fault of the law, or RISE_DI_FLIES. */
 static rise_di_refusal tick(rise_di_rates *rates, const rise_di_cycle *cycle, bool has_y, rise_di_real scale, float *torque) {
     rise_di_refusal refusal = RISE_DI_FLIES;
     rise_di_output output;
@@ -320,7 +326,7 @@ void rise_di_rates_start(rise_di_rates *rates) {
     }
 }
 
-/* The spare's torque, and the difference to what flew before, which fades. */
+/* Set the torque to that of the spare plus the handover. The handover is the difference to the torque that flew before, and fades. */
 static void fall_back(rise_di_rates *rates, bool changed, bool flew, float step) {
     for (int32_t k = 0; k < 3; k++) {
         const float spare = rates->is_silent ? 0.0f : rates->spare[k];
@@ -330,7 +336,8 @@ static void fall_back(rise_di_rates *rates, bool changed, bool flew, float step)
     }
 }
 
-/* The thrust of the spare; of a silent one that of the setpoint, which it would hand on, and 0 where that is old. */
+/* Set the thrust to that of the spare. If the spare is silent, it is the thrust of the setpoint, which the spare would hand on, or 0
+ * if the setpoint is stale. */
 static void choose_thrust(rise_di_rates *rates, const rise_di_cycle *cycle) {
     const bool is_old = is_setpoint_stale(cycle);
     for (int32_t k = 0; k < 3; k++) {

@@ -1,8 +1,9 @@
 /* SPDX-FileCopyrightText: RISE-DI contributors
  * SPDX-License-Identifier: Apache-2.0
  *
- * Which rate controller flies: RISE-DI or the spare, the autopilot's own. No header of an autopilot: times in us of its clock,
- * roll, pitch, yaw in rad/s, torque and thrust setpoints from -1 to 1. rise_di_axes.h maps these to the channels of the scenario.
+ * Decides which rate controller flies: RISE-DI, or the spare, which is the autopilot's own. This code needs no header of an
+ * autopilot. Times are in us of the autopilot's clock, the rates of roll, pitch and yaw in rad/s, and torques and thrusts from -1
+ * to 1. rise_di_axes.h maps the axes to the channels of the scenario.
  */
 #ifndef RISE_DI_RATES_H
 #define RISE_DI_RATES_H
@@ -12,7 +13,7 @@
 
 /* Why the spare flies. */
 typedef enum {
-    RISE_DI_FLIES = 0,          /* it does not */
+    RISE_DI_FLIES = 0,          /* the spare does not fly */
     RISE_DI_OFF = 1,            /* not enabled */
     RISE_DI_NOT_ARMED = 2,
     RISE_DI_NO_RATES = 3,       /* no rate control in this mode */
@@ -21,7 +22,7 @@ typedef enum {
     RISE_DI_STALE_SETPOINT = 6,
     RISE_DI_NO_NUMBER = 7,      /* a rate or a setpoint is not finite */
     RISE_DI_REFUSED = 8,        /* wrong compiler flags */
-    RISE_DI_FAILSAFE = 9,       /* of the law; this and the next two until not enabled */
+    RISE_DI_FAILSAFE = 9,       /* of the law; this and the next two hold until RISE-DI is no longer enabled */
     RISE_DI_DIVERGED = 10,      /* a rate is too far from its reference */
     RISE_DI_WRONG_TORQUE = 11,  /* not finite */
     RISE_DI_SLOW = 12,          /* the measured rate of the samples is below the controller's */
@@ -49,7 +50,7 @@ typedef struct {
     bool enabled, armed, has_rates, landed;
     float rates[3];
     float setpoint[3];
-    float setpoint_thrust[3]; /* that the spare hands on */
+    float setpoint_thrust[3]; /* thrust of the setpoint, which the spare hands on */
     float spare[3];       /* torque of the spare */
     float spare_thrust[3];
     float airspeed;       /* m/s; not finite or 0: unknown, the torque is not scaled */
@@ -63,14 +64,14 @@ typedef struct {
     rise_di_controller controller;
     rise_di_reference reference;
     bool started;
-    bool is_silent; /* the spare: no torque, or none with all numbers, for max_age */
-    bool is_alone;  /* RISE-DI since the spare fell silent while it flew: nothing to fall back to */
+    bool is_silent; /* the spare has given no torque and thrust that are numbers for max_age */
+    bool is_alone;  /* the spare fell silent while RISE-DI flew, which has nothing to fall back to */
     rise_di_refusal refusal;
-    rise_di_refusal latched; /* a fault until not enabled, or RISE_DI_FLIES */
-    uint64_t fault_us;       /* of the last cycle with a fault that passes */
-    uint64_t last_us;        /* sample of the rates of the last cycle */
-    float last[3];           /* and the rates */
-    uint64_t due_us;         /* of the next y of the law */
+    rise_di_refusal latched; /* a fault that holds until RISE-DI is no longer enabled, or RISE_DI_FLIES */
+    uint64_t fault_us;       /* instant of the last cycle with a wrong setting or a fault that passes by itself */
+    uint64_t last_us;        /* stamp of the last sample of the rates */
+    float last[3];           /* the last rates that are numbers */
+    uint64_t due_us;         /* instant of the next y of the law */
     uint64_t window_us;      /* begin of the window in which the rate is measured */
     uint32_t window_samples;
     float rate;              /* Hz, measured, of the samples of the rates; 0: not yet */
@@ -86,21 +87,25 @@ typedef struct {
     uint64_t spare_us;       /* of the last torque and thrust of the spare with all numbers */
     float spare[3];
     float spare_thrust[3];
-    float mean[3];           /* torque of the spare, low-passed while it flies */
+    float mean[3];           /* torque, low-passed while the spare flies */
     float handover[3];       /* the last torque less that of the spare when it took over; fades */
 } rise_di_rates;
 
 /* Begin with the spare. */
 void rise_di_rates_start(rise_di_rates *rates);
 
-/* A cycle, at each sample of the rates and when these stop. Returns whether RISE-DI flies; rates->torque and rates->thrust are to
- * be sent. The law steps at its own period: rates up to 5 % faster are a tick each, those of faster rates are interpolated.
- * Where the spare is silent RISE-DI does not take over. One that falls silent while RISE-DI flies cannot be fallen back to:
- * RISE-DI flies on, not enabled too, with the thrust of the setpoint. Where the law cannot, the torque fades to 0, and RISE-DI
- * returns at once. */
+/* Run a cycle. Call this for each sample of the rates, and also if these stop. Then send rates->torque and rates->thrust. Returns
+ * whether RISE-DI flies.
+ *
+ * The law steps at its own period. If the samples come at most 5 % faster than the law steps, each is a tick. If they come faster, y
+ * is interpolated at the periods of the law.
+ *
+ * RISE-DI does not take over from a silent spare. If the spare falls silent while RISE-DI flies, there is nothing to fall back to.
+ * RISE-DI then flies on with the thrust of the setpoint, even if it is no longer enabled. If the law cannot fly, the torque fades to
+ * 0, and RISE-DI returns without the wait of a second. */
 bool rise_di_rates_run(rise_di_rates *rates, const rise_di_cycle *cycle);
 
-/* The words for a refusal. */
+/* The text of a refusal, for the user. */
 const char *rise_di_refusal_text(rise_di_refusal refusal);
 
 #endif
