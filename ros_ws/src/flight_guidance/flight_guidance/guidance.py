@@ -205,7 +205,7 @@ class Guidance:
         self.take_target({"leg": 0.0})
 
     def keep_link(self) -> None:
-        """Note a message of the operator; from the next step on, the link's age counts from now."""
+        """Note a message of the operator. The age of the link then counts from the next step."""
         self._operated_ns = None
         self._link_lost = False
 
@@ -279,10 +279,10 @@ class Guidance:
         self._is_engaged = engaged
 
     def pause(self, *, paused: bool, forget: bool) -> None:
-        """Command nothing while the controller does not fly.
+        """Stop commanding if `paused`, because the controller does not fly, or else fly again.
 
-        With `forget`, guidance holds the measured heading, altitude and airspeed when it flies
-        again. Otherwise it then continues with its last commands.
+        If `forget` was set since guidance last flew, it then holds the measured heading, altitude
+        and airspeed. Otherwise it continues with its last commands.
         """
         if forget:
             self._begin = Begin.HOLD

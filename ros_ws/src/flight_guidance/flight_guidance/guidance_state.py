@@ -257,7 +257,7 @@ def bits(names: Collection[str]) -> int:
 
 CARRIED = ("mode", "lateral", "vertical", "target", "leg", "joining", "fence", "loitered")
 """Fields of the state that stay if the filters start again. The mode is one of them, because the
-wings are levelled after a lost pose."""
+step must still see that the pose was lost, so that it levels the wings."""
 
 
 def begun_again(
@@ -270,9 +270,9 @@ def begun_again(
     """Return the state `holding`, with the fields CARRIED and `further` taken from `state`.
 
     `holding` is a state that holds the measured values, and `state` is the last state, if any. If
-    `inputs.begin` is HOLD, or if there is no last state, the result is `holding` itself. The result
-    also has u_m of the last state, unless this is older than the age limit of u_m. Until then the
-    reference model flies this u_m.
+    `inputs.begin` is HOLD, or if there is no last state, the result is `holding` itself. If the
+    last state is within the age limit of u_m, the result also has its u_m, because the reference
+    model still flies this u_m.
     """
     if state is None or inputs.begin is Begin.HOLD:
         return holding

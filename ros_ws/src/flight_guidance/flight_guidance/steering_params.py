@@ -52,12 +52,13 @@ is for the lag of the model at a damping of 0.9, the rest for the lag that the s
 the osprey rolls."""
 
 MODEL_LAG = 2.0
-"""The lag of a turn behind the bank without a lead, multiplied by the natural frequency of r in the
-reference model, or of p without a rudder: that of the model at a damping of 1."""
+"""If r does not lead the bank, a turn lags the bank by this number divided by the natural frequency
+of r in the reference model, or of p without a rudder. This is the lag of the reference model at a
+damping of 1."""
 
 SPEED_STEP = 1.0
-"""Change of the speed command, m/s, whose slew is SPEED_STEP / BANDWIDTH_RATIO times the natural
-frequency of V in the reference model."""
+"""The command of the airspeed changes by this much, m/s, in no less than BANDWIDTH_RATIO / w, where
+w is the natural frequency of V in the reference model."""
 
 RUDDERLESS = 1.5
 """Factor on the period of path following without a rudder, because then no lead compensates the lag

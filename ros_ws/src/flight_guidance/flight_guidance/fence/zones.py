@@ -30,7 +30,7 @@ class Zone(NamedTuple):
     east: tuple[float, ...]  # m
     radius: float = 0.0  # m, 0 for a polygon
     exclude: bool = False  # whether the aircraft must keep out of the zone
-    # number of its group for a zone to stay in; None for a group of its own
+    # number of the zone's group, if the aircraft must stay in the zone; None for a group of its own
     group: int | None = None
 
 

@@ -114,8 +114,8 @@ def step(
     """Take a step: attitude, commands, u_m.
 
         v_c = towards the place or the path, within V
-        a_c = a_ff + k_v (v_c - v) + d (v_ff - W),  within g tan(bank)
-        [p, q] = k_tilt (angle from the thrust to [a_c, g]),  r = k_psi (heading - psi)
+        a_c = a_ff + k_v (v_c - v) + d (v_ff - W),  within l tan(bank),  l = g + d climb
+        [p, q] = k_tilt (angle from the thrust to [a_c, l]),  r = k_psi (heading - psi)
 
     The attitude is that of the pose; p, q, r of y carry it forward to the present. While the pose
     is stale, the thrust is vertical. After `hold` the rates are 0 until the pose returns. When a

@@ -121,11 +121,11 @@ def slip_estimate(
         slip+ = slip + (1 - exp(-dt/T)) max(1 - rolling / 0.2, 0) (turn - acceleration - slip),
         within +-LARGEST_SLIP abs(turn)
 
-    `rolling` is abs(p) / p_max. Because the turn lags the bank by the reference model of r, a roll
-    looks like a sideslip, so the estimate rests while the aircraft rolls. A bias of the gyro of r
-    looks like a sideslip, too. In straight flight the bound is 0, so the bias has no effect. Path
-    following adds the estimate to its acceleration, so that an aircraft stays on an arc in a turn
-    that is not coordinated.
+    T is `time`, s, and `rolling` is abs(p) / p_max. Because the turn lags the bank by the reference
+    model of r, a roll looks like a sideslip, so the estimate rests while the aircraft rolls. A bias
+    of the gyro of r looks like a sideslip, too. In straight flight the bound is 0, so the bias has
+    no effect. Path following adds the estimate to its acceleration, so that an aircraft stays on an
+    arc in a turn that is not coordinated.
     """
     steady = array_namespace(slip).maximum(1.0 - rolling / 0.2, 0.0)
     return clip(
