@@ -183,8 +183,8 @@ def _repeat_interrupt(ignored: "sys.UnraisableHookArgs") -> None:
 def _looks_on(words: Sequence[str]) -> bool:
     """Return whether a command only shows a flight. Such a command yields its CPU time.
 
-    A page with buttons that deactivate the law or hold does not yield, because it has to answer
-    when the host is busy.
+    A page with buttons that deactivate the law, or that command a hold, does not yield, because it
+    has to answer when the host is busy.
     """
     return words[:1] == ["watch"] and CONTROLS.isdisjoint(words)
 

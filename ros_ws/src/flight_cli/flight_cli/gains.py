@@ -80,7 +80,7 @@ SELECTION = (
     "accept",
     "mixing",
 )
-"""Options of a study, and further options of a selection."""
+"""STUDY has the options of a study, and SELECTION the further options of a selection."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ def milliseconds(margin: float) -> str:
 
 
 class Verdict(NamedTuple):
-    """The verdict on a part of the conditions. Its sentence is empty if there are none."""
+    """The verdict on a part of the conditions. The sentence is empty if the part has none."""
 
     holds: bool
     sentence: str
@@ -91,7 +91,8 @@ HEADINGS = {
     "theorem": "Theorem 1: sufficient conditions on a loop without servos in continuous time",
 }
 VERDICTS = {"loop": loop_verdict, "rules": rules_verdict, "theorem": theorem_verdict}
-"""The parts of the conditions on a gain set, in the order in which they are shown."""
+"""HEADINGS and VERDICTS have the heading of each part of the conditions on a gain set, and the
+function that judges this part, in the order in which the parts are shown."""
 
 
 def condition_name(row: tuple[GainCondition, ...], outputs: tuple[str, ...]) -> str:

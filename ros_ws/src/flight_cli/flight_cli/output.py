@@ -186,8 +186,8 @@ NAME_COLUMN = TextColumn("{task.description}")
 COUNT_COLUMNS = (NAME_COLUMN, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
 SHOWN_COLUMN = TextColumn("{task.fields[shown]}")
 CLOCK_COLUMNS = (TextColumn("{task.fields[clock]}"), BarColumn(), SHOWN_COLUMN)
-"""Columns of progress bars, with a count and the remaining time, with a text, or with a clock and a
-text."""
+"""Columns of progress bars. NAME_COLUMN has a name, COUNT_COLUMNS have a count and the remaining
+time, SHOWN_COLUMN has a text, and CLOCK_COLUMNS have a clock and a text."""
 
 
 def progress_bar(*columns: ProgressColumn, quiet: bool = False) -> Progress:

@@ -109,7 +109,11 @@ def as_function(command: Callable[..., Executable]) -> Callable[..., None]:
 
 
 def _parameter(declared: Field[Any], hint: Any) -> Parameter:
-    """Turn a field into a parameter of the function. A field without help has Typer's default."""
+    """Turn a field into a parameter of the function.
+
+    A field that is declared neither as an option nor as an argument, such as `context`, only has
+    its type.
+    """
     default = Parameter.empty if declared.default is MISSING else declared.default
     if declared.metadata:
         hint = Annotated[hint, declared.metadata[DECLARE](declared.name)]
