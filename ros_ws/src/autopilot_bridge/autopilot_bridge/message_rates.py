@@ -62,8 +62,8 @@ class MessageRates:
     def slow(self, now: float) -> dict[str, Refusal]:
         """Return the faults of slow messages, by name.
 
-        A message counts as slow if its rate is slow now. It also counts as slow if its rate was
-        slow less than REMEMBERED ago, after it had been reached once.
+        A message counts as slow if its rate is slow now. A message that came at the requested rate
+        before also counts as slow if its rate was slow less than REMEMBERED ago.
         """
         reasons = {name: rate.slowness(name, now) for name, rate in self._rates.items()}
         return {name: reason for name, reason in reasons.items() if reason is not None}

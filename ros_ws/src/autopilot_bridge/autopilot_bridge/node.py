@@ -399,7 +399,11 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._bridge.disengage(ACTIVATION_TIMED_OUT, now_ns)
 
     def _report(self, now_ns: int) -> None:
-        """Publish the phase and its reason, and each second the reason against an engagement."""
+        """Publish, once a second, the phase, its reason, and the reason against an engagement.
+
+        Also has a controller deactivated that has just appeared, and activates the controller for
+        which an engaged bridge waits.
+        """
         bridge = self._bridge
         self._report_ns = now_ns
         refusal = None
@@ -426,7 +430,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._activate(active=True)
 
     def _deactivate_unengaged(self, state: Future) -> None:
-        """Deactivate a controller that was active before an engagement, as with `ros2 run`."""
+        """Deactivate a controller that is active without an engagement.
+
+        Such a controller was started by `ros2 run`, for example.
+        """
         if (
             state.result().current_state.id == State.PRIMARY_STATE_ACTIVE
             and self._bridge.phase is not Phase.ENGAGED
