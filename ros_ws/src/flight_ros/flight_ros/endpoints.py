@@ -106,8 +106,8 @@ class EndpointMonitor:
     def check_subscribers(self, publisher: Publisher) -> None:
         """Log an error for each subscriber that does not match a publisher of the node."""
         topic = publisher.topic_name
-        # The graph reports the QoS of both sides in the same terms. A new publisher is not in the
-        # graph yet.
+        # The QoS of the publisher is taken from the graph, which reports it in the same terms as
+        # that of the subscribers. A new publisher is not in the graph yet, so it is checked later.
         for endpoint in self._node.get_publishers_info_by_topic(topic):
             if endpoint.node_name == self._node.get_name():
                 peers = self._node.get_subscriptions_info_by_topic(topic)

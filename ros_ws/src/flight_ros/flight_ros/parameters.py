@@ -23,7 +23,8 @@ from flight_core.text import bounded
 
 P = TypeVar("P", bound=NodeConfig)
 AT_RESTART = "a change at a restart only"
-"""What is expected of a change by an operator to a parameter of `changed_by_node`."""
+"""What an error says is expected, if an operator changes in flight a parameter that only the node
+itself may change (`changed_by_node`)."""
 
 
 def read_parameters(node: Node, schema: type[P]) -> P:
