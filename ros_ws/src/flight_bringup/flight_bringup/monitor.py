@@ -44,9 +44,9 @@ MODES = {float(mode): mode.name for mode in Mode}
 
 
 class FlightMonitor(Client):
-    """Follows a flight by the states of its nodes and the internals of its controller.
+    """Follows a flight by the states of its nodes and the progress of its log.
 
-    In lockstep it also follows the progress of the log.
+    In real time it also follows the internals of the controller and the engagement of a bridge.
     """
 
     def __init__(
@@ -159,9 +159,10 @@ class FlightMonitor(Client):
         ]
 
     def recorded(self) -> float | None:
-        """Return the flight time up to which the log of a lockstep flight is complete, s.
+        """Return the instant up to which the log is complete, s.
 
-        Returns None if nothing has changed since the last call.
+        It is a flight time in lockstep, and a time by the clock of the stamps in real time. Returns
+        None if nothing has changed since the last call.
         """
         stamps = self._decoded(self._recorded, stamp_of)
         return seconds(stamps[-1]) if stamps else None
