@@ -47,8 +47,8 @@ class ZeroDynamics(StrEnum):
     """Location of the invariant zeros, which decides whether Assumption 3 holds."""
 
     STABLE = "stable"  # all in the open left half plane
-    # some on the imaginary axis. This is outside the theorem too, because an outer loop must
-    # control the angles to which these zeros belong.
+    # some on the imaginary axis. Assumption 3 does not cover them, so an outer loop must control
+    # the angles to which these zeros belong.
     MARGINAL = "marginal"
     UNSTABLE = "unstable"  # some in the right half plane: outside the theorem
 
@@ -81,7 +81,8 @@ class AirframeFacts(NamedTuple):
         """Whether the theorem applies to the airframe.
 
         It does if Assumption 1 holds, if D of (10)-(11) exists, and if no zero lies in the right
-        half plane.
+        half plane. Zeros on the imaginary axis are allowed here, because an outer loop can control
+        the angles to which they belong.
         """
         return (
             self.controllable

@@ -91,7 +91,7 @@ class Channel(NamedTuple):
 
         A critically damped filter of second order answers a step of height A with a rate of at most
         A frequency / e, at the time 1 / frequency. To hold A at the end, the input must cause a
-        y_dot of A damping. The size of a pitch rate is at most 1 g / V0.
+        y_dot of A damping. The size of a pitch rate is at most g / V0.
         """
         reach = OF_AUTHORITY * self.authority / (self.frequency / math.e + self.damping)
         return max(min(_largest(self.motion, speed), reach), SEEN * self.noise)

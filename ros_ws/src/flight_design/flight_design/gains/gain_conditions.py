@@ -173,8 +173,10 @@ def rho(Omega: FloatArray, CAC: FloatArray, Lambda: FloatArray) -> float:
 def least_beta(Lambda: FloatArray, bounds: Bounds) -> FloatArray:
     """Compute the smallest beta of step 1 of Theorem 1, shape (m,), from the last channel up.
 
-    beta_i = (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i), i = m .. 1 Source:
-    (29), (30), with the bound zeta_U,ij of two indices that Lemma 2 requires (docs/theory.md).
+        beta_i = (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i)
+
+    Source: (29), (30), with the bound zeta_U,ij of two indices that Lemma 2 requires
+    (docs/theory.md).
     """
     beta = np.zeros(len(Lambda))
     for i in reversed(range(len(Lambda))):

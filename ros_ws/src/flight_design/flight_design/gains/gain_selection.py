@@ -459,9 +459,10 @@ def assess_gains(
 def _rise_di_conditions(
     study: Study, controller: RiseDiConfig, setting: LoopSetting, D: FloatArray
 ) -> tuple[tuple[GainCondition, ...], tuple[GainCondition, ...], tuple[GainCondition, ...], Bounds]:
-    """Evaluate the conditions of Theorem 1, `check_rules`, `check_loop`, and the theorem's bounds.
+    """Evaluate the conditions of Theorem 1, `check_rules` and `check_loop`, in this order.
 
-    `check_rules` and `check_loop` apply only without an observer.
+    The last entry has the bounds of the theorem. `check_rules` and `check_loop` apply only without
+    an observer.
 
     The value of the condition "D" is the fraction of the samples whose Omega has the signs D. That
     of "zero dynamics" is the fraction whose zeros are stable. The bounds of (29), (30), steps 2 and

@@ -209,9 +209,8 @@ class ObserverSearch(NamedTuple):
         """Evaluate the trial at a place.
 
         `least` is the least cost so far of a trial that meets the margins, infinite if there is
-        none. If `least` is finite, the margins of some trials need not be computed. A trial is
-        rejected if it costs no less, or if a loop is unstable when each input is late by the delay
-        margin that it needs.
+        none. If `least` is finite, a trial is rejected before its margins are computed if it costs
+        no less, or if a loop is unstable when each input is late by the delay margin that it needs.
         """
         loops = self._loops(place)
         if least < math.inf:

@@ -4,13 +4,14 @@
 
 The results are Omega, lags and delays with standard errors.
 
-A predictor gives every sample of y from earlier samples of y and from u. Least squares fit it. The
-predictor is long enough to include the disturbances. Its step response is the step response of the
-aircraft. A second-order response with a delay and a lag is fitted to the beginning of this step
-response, and yields Omega, the lag and the delay. Sources: L. Ljung, "System Identification", 1999,
-7.3 and 13.4 (direct identification in closed loop); U. Forssell, L. Ljung, Automatica 35, 1999; Y.
-Zhu, "Multivariable System Identification for Process Control", 2001, 6 (a high-order ARX model,
-then a reduced one).
+A predictor gives every sample of y from earlier samples of y and from u. It is fitted by least
+squares, and it goes back far enough to predict the effect of earlier disturbances too. Its step
+response is the step response of the aircraft. A second-order response with a delay and a lag is
+fitted to the beginning of this step response, and yields Omega, the lag and the delay.
+
+Sources: L. Ljung, "System Identification", 1999, 7.3 and 13.4 (direct identification in closed
+loop); U. Forssell, L. Ljung, Automatica 35, 1999; Y. Zhu, "Multivariable System Identification for
+Process Control", 2001, 6 (a high-order ARX model, then a reduced one).
 """
 
 import math
@@ -49,8 +50,8 @@ HORIZON = 0.8  # s, length of the step response
 # number of random draws of the predictor's coefficients, from which the covariance of the step
 # response follows
 DRAWS = 200
-# Prior standard deviation of a coefficient. Such a coefficient turns a typical y or u into this
-# many typical changes of y within a window.
+# Prior standard deviation of a coefficient. A coefficient of 1 turns the typical change of an
+# output within a window, or the standard deviation of an input, into the typical change of y.
 PRIOR = 10.0
 MEMORY = 0.2  # s, decay of the prior standard deviations of the predictor's coefficients
 MIN_ROWS_PER_COEFFICIENT = 5.0
@@ -101,7 +102,8 @@ class Response(NamedTuple):
     seconds: float  # how many seconds of the log were used
     share: FloatArray  # (m,) share of the motion that the excitation explains; 1 in open loop
     # (m,) response of output i to input i, in standard errors; the sign of Omega_ii is certain from
-    # MIN_RATIO on
+    # MIN_RATIO on. It is 0 if `share` is below MIN_SHARE, or if the delay is below LEAST_DELAY in a
+    # closed loop.
     sign_ratio: FloatArray
 
     def reason_against_sign(self, i: int) -> Refusal | None:

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Let actuators whose model has a lag of first order move as late servos of the second order do.
 
-An actuator has no noise, so its position follows from u alone. So the filters keep the model of
-first order, and get the u with which this model has the position of the servo at each tick.
+An actuator has no noise, so its position follows from u alone. The filters can therefore keep the
+model of first order. They get the u with which this model has the position of the servo at each
+tick.
 """
 
 import numpy as np
@@ -26,7 +27,7 @@ def behind_servos(
     servo_lag: FloatArray,
     inertia: FloatArray,
 ) -> FloatArray:
-    """Return the u for each of N models, (N, T, m), from the commanded u, (T, m).
+    """Delay the commanded u, (T, m), and apply `behind_servo`, for each of N models, (N, T, m).
 
     `late`, (N, m), are the delays of the inputs in periods. `lag`, (m,), s, is that of the filters,
     and `servo_lag` and `inertia`, (N, m), are those of `behind_servo`.

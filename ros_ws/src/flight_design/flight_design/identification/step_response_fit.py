@@ -24,7 +24,7 @@ STARTS_LAG = (0.03, 0.2)  # s; the search starts from each pair
 # part are relative to the largest value of the step response.
 LOWER = np.array([0.0, 0.003, -np.inf, -2.0, -20.0, -np.inf])
 UPPER = np.array([MAX_DELAY, MAX_LAG, np.inf, 300.0, 5000.0, np.inf])
-SCALE = np.array([0.05, 0.05, 5.0, 5.0, 50.0, 50.0])
+SCALE = np.array([0.05, 0.05, 5.0, 5.0, 50.0, 50.0])  # typical sizes, which scale the search
 SPREAD = np.array([1.0, 0.2, 1e3, 50.0, 2500.0, 5000.0])  # prior standard deviations
 # Which of these parameters are free in an integrator, in a model of first order, and in one of
 # second order.
@@ -33,8 +33,9 @@ MIN_GAIN = 6.0  # decrease of chi squared per additional parameter that a higher
 # Relative change of chi squared at which a search ends. It has no effect on MIN_GAIN or on a
 # standard error.
 TOLERANCE = 1e-6
-EARLY = 0.3  # s after delay and lag; until then the sign of a response shows
-COUPLING_SPAN = 0.25  # s after delay and lag; until then Omega shows in the other outputs
+EARLY = 0.3  # s after delay and lag; the response until then decides on the sign of Omega_jj
+# s after delay and lag; the responses of the other outputs until then give the rest of Omega
+COUPLING_SPAN = 0.25
 
 
 class ResponseColumn(NamedTuple):
@@ -65,10 +66,10 @@ def no_column(m: int) -> ResponseColumn:
 def second_order_response(
     t: FloatArray, delay: float, lag: float, damping: float, stiffness: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return two step responses of a second order behind a lag and a delay, from rest, (N,) each.
+    """Return the step responses of two second-order systems behind a lag and a delay, (N,) each.
 
     The first is that of y'' + damping y' + stiffness y = v', and the second has v in place of v'.
-    In both, lag v' = u(t - delay) - v.
+    In both, lag v' = u(t - delay) - v, and the system is at rest before the step.
     """
     begin = np.maximum(t - delay, 0.0)
     # the state z, z', v; the output is z' for the first response, z for the second
@@ -149,7 +150,8 @@ def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 -
 def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size: float) -> float:
     """Return how much a fitted response lowers chi squared, minus its number of parameters.
 
-    Only the time up to EARLY after delay and lag counts.
+    Only the time up to EARLY after delay and lag counts. The result is 0 if this is negative, or if
+    the response does not begin with the sign of Omega.
     """
     early = t <= theta[0] + theta[1] + EARLY
     first, second = second_order_response(t[early], *theta[[0, 1, 3, 4]])

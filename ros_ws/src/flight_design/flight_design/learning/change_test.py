@@ -33,8 +33,8 @@ from flight_design.identification.model_refusals import MAX_DEVIATION
 # s, length of the record that is tested. With 10 s, losses were found up to 4 s later, and halved
 # effects were not found at all.
 RECORD = 4.0
-# Share of an input's effect. A loss of at most this share counts as no change: it is two deviations
-# of an accepted model.
+# Share of an input's effect. A loss of at most this share counts as no change, since an accepted
+# model may be wrong by this much: it is twice the largest standard deviation of its effects.
 LOSS = 2.0 * MAX_DEVIATION
 # Gain of log-likelihood above which a change is found. It stands for 4.9 standard deviations, see
 # `change_test`. Healthy surfaces with a gust every 3 s had gains up to 10.3, and once 17.4, because
@@ -51,7 +51,9 @@ FACTOR = 1.0
 REVERSED = -2.0  # least relative change of an effect: the input acts the other way
 DEAD = -1.0  # relative change of an effect that is lost
 MOST = 2.0  # largest relative change of an effect
-NONE = MAX_DEVIATION  # share of an effect that counts as none: it is known no better than that
+# Largest share of an effect that counts as none. An accepted model may have a standard deviation
+# as large as this.
+NONE = MAX_DEVIATION
 # A reversed effect of at most this share counts as none. No surface reverses in flight, but a
 # surface that is jammed off centre pushes steadily against the u that is to balance it. If it is
 # jammed at 5 deg while u is at its stop of 30 deg, it looks like an effect of -17 %. This effect
@@ -91,9 +93,10 @@ def change_test(
         G = min J(kappa_j >= -LOSS) - min J(kappa_j >= -2)
 
     with the normalised innovations e and their covariance S, as in `Search.fit`. A fault of an
-    effector multiplies its column of B by a factor, so a part has as many unknowns as inputs. A is
-    known. The winds and the angles at the beginning are free too, but the two minima have the same
-    winds.
+    effector multiplies its column of B by a factor, so a part has as many unknown factors as
+    inputs. A is known. The winds and the angles at the beginning are free too. Each minimum is also
+    sought with the levels of the wind of the other one, so that no difference in the wind passes
+    for a loss.
 
     G is 0 while the losses are within LOSS. If a loss is z standard deviations larger than LOSS, 2
     G = z^2, by S. S. Wilks (Ann. Math. Statist. 9(1), 1938). In one test a single input with a loss

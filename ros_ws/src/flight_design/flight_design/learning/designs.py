@@ -31,9 +31,9 @@ DELAY_LEFT = 0.01
 # loop of the file, and 2 % more error. A weight of 0 was no better than 0.5.
 ACTIVITY = 0.5
 SPEED = "V"  # the output whose observer needs the observers of the other outputs
-# Number of stated deviations of each entry that the box of a learned model has, and the largest
-# number up to which a guarantee is sought.
+# How far the box of a learned model reaches in each entry, in stated standard deviations.
 DEVIATIONS = 2.0
+# How far a guarantee is sought, in the same unit.
 MOST_DEVIATIONS = 4.0
 ROUNDED = 1.001  # factor on the required margins of a loop, so that it has them despite rounding
 

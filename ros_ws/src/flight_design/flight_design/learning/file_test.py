@@ -70,11 +70,14 @@ def is_contradicted(found: Identification, believed: Unknown) -> bool:
 
         sum (theta_i / s_i)^2,   its mean nu = sum (1 - d_i^2 / s_i^2)
 
-    theta_i are the errors that were found, d_i their deviations, and s_i those of the file. If s_i
-    are right, the sum is at most as wide as chi-square of nu degrees. Entries at the bounds of the
-    search contradict the file too. Only parts whose model explains the record count. A model whose
-    innovations are not white, or whose best known effect on an output is at its bound, is wrong for
-    another reason, such as parts that couple.
+    theta_i are the errors that were found, d_i their deviations, and s_i those of the file. If the
+    s_i are right, the variance of the sum is at most that of a chi-squared distribution with nu
+    degrees of freedom. The file is contradicted if this distribution exceeds the sum with a
+    probability below CONTRADICTED. Entries at the bounds of the search contradict the file too.
+
+    Only parts whose model explains the record count. A model whose innovations are not white, or
+    whose best known effect on an output is at its bound, is wrong for another reason, such as parts
+    that couple.
     """
     parts = [part for part in found.parts if _counts(part, believed.factor)]
     name = found.airframe.name

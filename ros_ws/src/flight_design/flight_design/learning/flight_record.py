@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Keep the record of a learner: y, u and the flown parameters of the last seconds' ticks."""
+"""Keep the record of a learner: y, u and the flown parameters in the ticks of the last seconds."""
 
 from collections import deque
 from collections.abc import Collection

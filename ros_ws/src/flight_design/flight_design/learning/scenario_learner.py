@@ -42,8 +42,9 @@ from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiCo
 def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False) -> Learn | None:
     """Return the function that `simulate` and `fly_and_report` take as `learn`, or None.
 
-    The rough model is the published airframe, not the aircraft in flight. For an aircraft of JSBSim
-    it is the feedforward of the controller. In real time the loop has the delay of the section
+    The rough model is the published airframe, not the aircraft in flight. For an aircraft of
+    JSBSim, and with `learn.prior.sketch`, it is the feedforward of the controller instead. A file
+    in `learn.prior.file` replaces either. In real time the loop has the delay of the section
     controller. In one process and in lockstep u acts at once.
 
     Args:
