@@ -64,8 +64,8 @@ PAUSE = 1.5  # s, pause between the excitations of two inputs
 # Ratio of the controller's age limit to the largest age limit of the bridge. It is above 1, so that
 # the failsafe of the bridge acts first.
 AGE = 1.5
-HOLD = 0.5  # s
-RAMP = 2.0  # s
+HOLD = 0.5  # s, `hold` of the controller
+RAMP = 2.0  # s, `ramp` of the controller
 WAIT = 30.0  # s before the first command of the flight; in this time the user engages
 
 
@@ -73,8 +73,8 @@ def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
     """Pair each output with the input that drives it, and return the signs of the effects, (m,).
 
     An output and an input belong together if the map gives them the same motion. Raises
-    ParameterError if two inputs drive the same output, if an output has no input, or if the map
-    gives an output the opposite sign of the axes forward, right, down.
+    ParameterError if two inputs drive the same output, if an output has no input, or if an output
+    of the map has not the sign of the stack, as in `output_signs`.
     """
     drivers: dict[str, tuple[str, int]] = {}
     for name, row in channel_map.inputs.items():

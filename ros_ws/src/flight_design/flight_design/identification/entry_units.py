@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Give the errors of A and B their units, and with them choose the entries that are identified."""
+"""Choose the units in which errors of A and B are counted; an entry with the unit 0 is known."""
 
 import numpy as np
 

@@ -39,7 +39,7 @@ FEWEST = 3  # least number of doublets on an axis
 LENGTH = 0.5  # s, length of half a doublet, if the scenario has no pulses
 SIZE = 0.3  # rad/s, size of a doublet, if the scenario has no pulses
 APART = 2.0  # s, time between doublets
-YAW_RATES = "FW_ACRO_YAW_EN"
+YAW_RATES = "FW_ACRO_YAW_EN"  # parameter of PX4, see `to_set`
 
 
 class OwnShare(NamedTuple):

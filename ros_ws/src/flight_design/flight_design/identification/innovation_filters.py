@@ -46,7 +46,7 @@ LOOSE = 1.5e-4
 MIN_NOISE = 1e-2
 LEAK = 1e-3  # factor on observer_design.LEAK, because the filter must keep its angles for minutes
 HOLD = 5  # periods of a block, over which sin(x) - x is held, because it changes slowly
-# s, time constants with which the rate of a gust decays, and the change of this rate
+# s, time constants with which the rate of a gust and the change of this rate decay
 GUST_TIME = 0.5
 RATE_TIME = 0.2
 # m/s^3 per root s, negligible noise of the change of the rate, for a level without gusts
@@ -60,8 +60,8 @@ LEVELS = np.array(
 
 The columns are the noise of the wind relative to moderate turbulence, the noise of the change of
 its rate, m/s^3 per root s, and the noise of the rotary gust relative to moderate turbulence. A gust
-is smooth. If the wind or its rate had the noise, the model would have gusts as fast as the inputs,
-and the effects of the inputs would come out too weak.
+is smooth, so its noise acts on the change of the rate. If it acted on the wind or on the rate, the
+model would have gusts as fast as the inputs, and the effects of the inputs would come out too weak.
 """
 
 
@@ -443,9 +443,9 @@ def filter_bank(
         w_dot = v - w / wind_time + noise,  v_dot = a - v / GUST_TIME,
             a_dot = -a / RATE_TIME + noise
 
-    A rotary gust has neither v nor a. With a `shear`, (N, 2), the slope of the vertical wind w
-    along the path acts on the aircraft as a pitch rate q_g of the air. It acts behind the lag T =
-    4b / (pi V0), where b is the span.
+    `wind_time` is the time constant of `wind_model`. A rotary gust has neither v nor a. With a
+    `shear`, (N, 2), the slope of the vertical wind w along the path acts on the aircraft as a pitch
+    rate q_g of the air. It acts behind the lag T = 4b / (pi V0), where b is the span.
 
         q_g = (w - l) / (V0 T),  l_dot = (w - l) / T
         alpha_dot -= shear_1 q_g,  q_dot -= shear_2 A[q, q] q_g

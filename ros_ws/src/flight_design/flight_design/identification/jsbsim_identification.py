@@ -185,9 +185,11 @@ def identify_jsbsim(
     The stall speed of guidance is that of `slowest_trim`. Its sideslip feedback can also fly an
     aircraft whose `sideslip_zero` is positive.
 
-    If `learns`, the flight learns in moderate turbulence. The flight begins with the gains alone.
-    The designs of the learner have the `observer_margin`, and its rough model is the `sketch` of
-    Omega and speed. `named` has properties that the user names for an input, in place of JSBSim's.
+    If `learns`, which needs an `observer_margin`, the controller of step 3 gets no observer. The
+    scenario in the result then learns in moderate turbulence, and begins with the gains alone. The
+    designs of the learner have the `observer_margin`, and its rough model is the `sketch` of Omega
+    and speed. The flights of step 4 are without learning. `named` has properties that the user
+    names for an input, in place of JSBSim's.
 
     Raises FlightEnded if the aircraft does not trim or does not respond, and ParameterError if its
     outputs and inputs cannot be paired, or if the speed is below guidance's speed floor.

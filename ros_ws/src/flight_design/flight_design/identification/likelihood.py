@@ -53,7 +53,9 @@ CHANGE = 3.0
 # A span whose innovations have a mean square above this multiple of the median is explained by no
 # level of the wind.
 UNEXPLAINED = 5.0
-FEW = 0.25  # gusts in a smaller share of the spans do not count, because gusts are no white noise
+# If fewer than this share of the spans have gusts, these spans do not count in the fit, because
+# gusts are no white noise.
+FEW = 0.25
 # number of spans that are left out after a span that was left out, while the estimates recover
 RECOVERY = 2
 
@@ -261,7 +263,8 @@ class Likelihood:
         """Return the models for N thetas, (N, p): A (N, n, n), B (N, n, m), wind (N, n, G).
 
         The wind acts on each model through the A of this model, because an aircraft is moved by its
-        motion relative to the air. So an entry that is 0 only in the nominal airframe counts too.
+        motion relative to the air. So an identified entry also changes the effect of the wind, even
+        if it is 0 in the nominal airframe.
         """
         matrices = []
         errors = self.relative_errors(thetas[:, : self.count])

@@ -204,7 +204,7 @@ class Search(Likelihood):
         """Return theta, (p,), clipped to the bounds, with a lag of y and inertias of the actuators.
 
         Each of them is one standard deviation. From 0 the search would explain a filter of y or a
-        slow servo by a delay of u, and end there. But they predict better.
+        slow servo by a delay of u, and end there, although a lag or an inertia predicts better.
         """
         begin = self._within(theta)
         begin[self._lag] = begin[self._inertia] = 1.0
@@ -331,16 +331,18 @@ class Search(Likelihood):
             covariance = H^-1 (M + prior^-2) H^-1 + s s' timing^2,  s = -H^-1 J j
 
         H is the Hessian. J has the derivatives by theta of the innovations e, divided by their rms.
-        If the model were right, M would be J J'. Here M is the larger of two matrices. The first
-        sums the outer products of J e over blocks of the log. With `leaves_out`, the J e of block k
-        is (I - J_k J_k' H^-1)^-1 J_k e_k. H^-1 times this is the change of theta if the block is
-        left out. It matters if a few blocks with gusts decide theta: the fit then follows the
-        errors in these blocks, and their e is too small to show them. The second is J J' times the
-        whiteness of each output, as in Birge's ratio. s is the change of theta with the delay of u,
-        and j is the derivative of e by this delay. Sources: H. White, Econometrica 50(1), 1982; J.
-        G. MacKinnon, H. White, J. Econometrics 29(3), 1985, for a block left out; R. T. Birge,
-        Phys. Rev. 40(2), 1932; S. F. Schmidt, Advances in Control Systems 3, 1966, for a delay that
-        is not estimated.
+        If the model were right, M would be J J'. Here two matrices take its place, and each
+        parameter gets the larger of its two standard deviations. The first matrix sums the outer
+        products of J e over blocks of the log. With `leaves_out`, the J e of block k is
+        (I - J_k J_k' H^-1)^-1 J_k e_k. H^-1 times this is the change of theta if the block is left
+        out. This matters if a few blocks with gusts decide theta: the fit then follows the errors
+        in these blocks, and their e is too small to show them. The second matrix is J J' times the
+        whiteness of each output, as in Birge's ratio.
+
+        s is the change of theta with the delay of u, and j is the derivative of e by this delay.
+        Sources: H. White, Econometrica 50(1), 1982; J. G. MacKinnon, H. White, J. Econometrics
+        29(3), 1985, for a block left out; R. T. Birge, Phys. Rev. 40(2), 1932; S. F. Schmidt,
+        Advances in Control Systems 3, 1966, for a delay that is not estimated.
 
         Returns the fit, and the part of each entry's standard deviation that the delay causes,
         (entries,).

@@ -16,8 +16,9 @@ from flight_core.tape import Tape
 
 RATE = 200.0  # Hz, of y and y_m
 HEIGHTS = {"q": 0.05, "V": 2.0, "p": 0.15, "r": 0.05}
-"""Heights of the pulses of the outputs, SI. In these units the outputs are paired with the
-inputs. An aircraft flies if its errors in calm air are below them."""
+"""Heights of the pulses of the outputs, SI. `IdentifiedAircraft.coupling` is measured in these
+units. For an output without a pulse, the largest rms error in calm air of an aircraft that flies is
+its height."""
 GUST_SPEED = 5.0  # m/s, downwards
 GUST_LENGTH = 30.48  # m, 100 ft to the peak; FAR/CS 25.341 has 30 to 350 ft
 TURN = math.pi / 2.0  # rad

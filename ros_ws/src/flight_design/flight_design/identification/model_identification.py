@@ -356,8 +356,8 @@ def identify_model(
         timing: Standard deviation of the delay in `actuation`, s. If it is given, even as 0, the
             standard deviations of the result also hold for a model that is not right
             (`Search.with_doubt`).
-        is_doubted: Whether the stated deviations also hold for a model that is not right. Other
-            than with `timing`, the refusals still use the deviations of a right model.
+        is_doubted: Whether the stated deviations also hold for a model that is not right. The
+            refusals do not use these deviations, while they do use those of `timing`.
 
     Raises:
         ParameterError: An output does not move.

@@ -35,7 +35,8 @@ STEP = 0.004  # s, step of the simulation
 BEFORE = 0.3
 AFTER = 0.5
 MIN_CERTAINTY = 5.0  # an estimate is certain if it is at least this many standard errors
-# times 1 / (delay + lag), about the crossover frequency of the loops of `rise-di gains`
+# Frequency at which gain and phase have to be certain, as a multiple of 1 / (delay + lag). It is
+# about the crossover frequency of the loops of `rise-di gains`.
 LOOP_FREQUENCY = 0.5
 MAX_ZERO_LAG = 0.5  # largest product of zero and lag; at 1 zero and lag would cancel
 # 1/s, fastest zero that a feedforward of 100 Hz follows (rise_di_controller.params, _check_nominal)
@@ -157,7 +158,7 @@ def fit_channel(
         gained = np.concatenate([[0.0], np.cumsum(gravity.values[:-1, 0] * np.diff(t_g))])
 
     def response(theta: FloatArray) -> FloatArray:
-        """Return the response of the model to u, minus the response to gravity."""
+        """Return the response of the model to u, plus the response to gravity."""
         to_u = _simulated(t, t_u, impulse, np.concatenate([theta, np.zeros(6 - len(theta))]))
         if gravity is None:
             return to_u
