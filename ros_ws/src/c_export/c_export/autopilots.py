@@ -35,21 +35,21 @@ ArduPlane/Plane.cpp, in scheduler_tasks, behind FAST_TASK(stabilize),
 """
 """The two lines that must be added to files of ArduPlane."""
 
-MESSAGE = """# Rate controller of RISE-DI: a cycle, in the order {channels}
+MESSAGE = """# A cycle of the rate controller of RISE-DI. The arrays have the channels {channels}.
 uint8 ORB_QUEUE_LENGTH = 16  # the logger misses no tick
 uint64 timestamp         # [us]
-uint64 timestamp_sample  # [us] of y
-uint64 parameters        # digest of the scenario's
-uint32 number            # of the ticks since the law engaged
+uint64 timestamp_sample  # [us] instant of y
+uint64 parameters        # digest of the controller's parameters in the scenario
+uint32 number            # number of the tick since the law engaged
 uint8 mode               # rise_di_mode
-uint8 refusal            # rise_di_refusal; 0: RISE-DI flies
-float64[{m}] y           # [rad/s] that the law took; else the rates
-float64[{m}] y_m         # [rad/s] at the instant of y
+uint8 refusal            # rise_di_refusal; 0 if RISE-DI flies
+float64[{m}] y           # [rad/s] y that the law took; the rates if RISE-DI does not fly
+float64[{m}] y_m         # [rad/s] y_m at the instant of y
 float64[{m}] e           # [rad/s] y - y_m
-float64[{m}] u           # units of the input
-float64[{m}] u_end       # abs(u) of the torque of 1 at this airspeed
-float64 y_m_offset       # [s] of the newest y_m after y
-float32 rate             # [Hz] of the samples of the rates, measured; 0: not yet
+float64[{m}] u           # u in the units of the input
+float64[{m}] u_end       # abs(u) at which the torque is 1 at this airspeed
+float64 y_m_offset       # [s] instant of the newest y_m minus that of y
+float32 rate             # [Hz] measured rate of the samples; 0 if it is not measured yet
 """
 
 TOPICS = """rise_di_status
@@ -142,8 +142,8 @@ HEADER = """/* Axes, signs and sizes of the autopilot for the channels of the sc
 #define RISE_DI_SPEED ((rise_di_real){speed!r}) /* m/s */
 #define RISE_DI_SLOWEST {slowest!r}F
 #define RISE_DI_FASTEST {fastest!r}F
-#define RISE_DI_OBSERVER_PART {part} /* limits of u_o over those of u */
-#define RISE_DI_OBSERVER_SLEW {slew} /* 1/s, change of u_o in a second over the limits of u */
+#define RISE_DI_OBSERVER_PART {part} /* limits of u_o as a fraction of those of u */
+#define RISE_DI_OBSERVER_SLEW {slew} /* 1/s, largest rate of u_o as a fraction of the limits of u */
 #endif
 """  # noqa: E501 - a text as it is written
 

@@ -304,10 +304,10 @@ FIGURES = {
     "parameters_bytes": "struct rise_di_parameters, bytes",
     "controller_bytes": "struct rise_di_controller, bytes, with the samples kept",
     "stack_bytes": "stack at most, bytes (sum of the frames of all functions)",
-    "add": "additions and subtractions, most of a call in the proof",
-    "multiply": "multiplications, most of a call in the proof",
-    "divide": "divisions, most of a call in the proof",
-    "compare": "comparisons, most of a call in the proof",
+    "add": "largest number of additions and subtractions in one call of the proof",
+    "multiply": "largest number of multiplications in one call of the proof",
+    "divide": "largest number of divisions in one call of the proof",
+    "compare": "largest number of comparisons in one call of the proof",
 }
 
 

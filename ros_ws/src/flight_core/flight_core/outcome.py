@@ -49,9 +49,10 @@ class End(StrEnum):
 
 
 class Aim(StrEnum):
-    """What a flight must achieve, in the order of gravity.
+    """What a flight must achieve.
 
-    The gravest aim comes first, because a shortfall of it explains shortfalls of the later ones.
+    The aims whose shortfalls are the most serious come first, because a shortfall of an aim can
+    explain shortfalls of the later aims.
     """
 
     ENGAGEMENT = "engagement"  # the law flies while it should
