@@ -44,12 +44,13 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
     """Return the law, which has e_dot in the sign term.
 
         r          = e_dot + Lambda e
-        Pi        += dt beta clip(r / eps, -1, 1)  the sign, softened: measured r is noisy
+        Pi        += dt beta clip(r / eps, -1, 1)
         integral_e += dt (e + e_p) / 2
         u          = u_trim - Omega^-1 (K (e - e_0 + Lambda integral_e) + Pi)
 
-    e_0 is the e at engagement, and the index p marks the previous tick. If u_trim is constant, then
-    u_dot = -Omega^-1 (K r + beta sgn(r)). With `ideal`, e_dot = y_dot - y_m_dot with the perfect
+    The clip stands for sgn(r), because a measured r is noisy. e_0 is the e at engagement, and e_p
+    is the e of the previous tick. If u_trim is constant and abs(r) > eps, then u_dot = -Omega^-1
+    (K r + beta sgn(r)). With `ideal`, e_dot = y_dot - y_m_dot with the perfect
     derivative of C x. Otherwise it is a filtered difference, e_dot += (1 - exp(-bandwidth dt))
     ((e - e_p) / dt - e_dot). Source: W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST
     18(6), 2010. Here the law inverts the nominal Omega.
