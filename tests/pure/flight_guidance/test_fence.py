@@ -197,6 +197,30 @@ def test_turn_begins_at_last_moment() -> None:
     assert right > left
 
 
+@pytest.mark.parametrize(
+    "heading, wind, action",
+    [
+        # Home is south. The wind turns the course from -160 to -170 degrees, or from -175 to -154.
+        (-160.0, (0.0, 4.41), HOME),
+        (-175.0, (0.0, -10.0), LEFT),
+    ],
+)
+def test_turn_in_wind_ends_by_the_course_over_the_ground(
+    heading: float, wind: tuple[float, float], action: FenceAction
+) -> None:
+    fence = Fence((FIELD,), (200.0, 0.0))
+    moving = motion(1150.0, 0.0, math.radians(heading))._replace(wind=wind)
+    assert float(last_safe_turn(fence, LEFT, moving).action) == action
+
+
+def test_turn_in_a_head_wind_ends_by_the_course_over_the_ground() -> None:
+    """Home is west. The wind from the north turns the course from -70 to -80 degrees."""
+    fence = Fence((FIELD,), (0.0, -400.0))
+    moving = motion(0.0, 350.0, math.radians(-70.0))
+    assert float(last_safe_turn(fence, LEFT, moving).action) == LEFT
+    assert float(last_safe_turn(fence, LEFT, moving._replace(wind=(-4.41, 0.0))).action) == HOME
+
+
 def test_turn_is_predicted_from_the_end_of_a_roll() -> None:
     """A roll of the reference model, second order, gains p 2 zeta / w once p = 0 is commanded."""
     scenario = find_scenario("osprey_route")
