@@ -18,11 +18,11 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import best_error
 from flight_analysis.report.account import Account
-from flight_analysis.report.linear_flight import error_pair
+from flight_analysis.report.linear_flight import _reach, error_pair
 from flight_analysis.report.shortfalls import judge
 from flight_analysis.report.tracking import saturation_notes
 from flight_core.modes import Mode
-from flight_core.outcome import COMPLETED, Aim, End, Outcome, Refusal
+from flight_core.outcome import COMPLETED, Aim, End, Outcome, Refusal, Shortfall
 from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
@@ -371,16 +371,88 @@ def test_landing_does_not_swallow_what_else_was_short() -> None:
     )
 
 
+def shortfall_on_leg(
+    aim: Aim, topic: str, name: str, value: float | FloatArray, **guidance: object
+) -> Shortfall:
+    """The shortfall of one kind if `name` has other values for two seconds of the first leg."""
+    tape, scenario = on_first_leg()
+    signal = tape[topic]
+    values = signal.values.copy()
+    t = tape.time(topic)
+    values[(t >= 1.0) & (t < 3.0 - 1e-6), signal.names.index(name)] = value
+    signals = dict(tape.signals) | {topic: Signal(signal.stamp_ns, signal.names, values)}
+    scenario = scenario.vary(guidance=guidance)
+    outcome = judge(COMPLETED, replace(tape, signals=signals), scenario, WHOLE)
+    (shortfall,) = [each for each in outcome.shortfalls if each.aim is aim]
+    return shortfall
+
+
 def test_flight_below_its_ground_is_told() -> None:
     """Two seconds at up to 70 m, 10 m below the touch-down of its landing."""
-    tape, scenario = on_first_leg()
-    truth = tape["truth"]
-    values = truth.values.copy()
-    values[100:300, truth.names.index("pose.altitude")] = np.linspace(-61.0, -70.0, 200)
-    signals = dict(tape.signals) | {"truth": Signal(truth.stamp_ns, truth.names, values)}
-    outcome = judge(COMPLETED, replace(tape, signals=signals), scenario, WHOLE)
-    (below,) = [each for each in outcome.shortfalls if each.aim is Aim.GROUND]
+    heights = np.linspace(-61.0, -70.0, 200)
+    below = shortfall_on_leg(Aim.GROUND, "truth", "pose.altitude", heights)
     assert below.figures == pytest.approx({"below_s": 2.0, "deepest_m": 10.0})
+
+
+def test_flight_below_its_stall_speed_is_told() -> None:
+    """Two seconds 13 m/s below the trim speed of 25 m/s."""
+    slow = shortfall_on_leg(Aim.STALL, "truth", "x.V", -13.0, stall_speed=15.0, landing=None)
+    assert slow.figures == pytest.approx(
+        {"least": 12.0, "stall_speed": 15.0, "below_s": 2.0}, abs=0.05
+    )
+    assert slow.sentence == "V down to 12.0 m/s, below the stall speed of 15 m/s for 2.0 s"
+
+
+def test_flight_outside_of_its_fence_is_told() -> None:
+    """Two seconds 30 m east of a field that ends at 700 m."""
+    field = {"north": [-900.0, 900.0, 900.0, -900.0], "east": [-700.0, -700.0, 700.0, 700.0]}
+    route = {"north": [0.0, 300.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
+    outside = shortfall_on_leg(
+        Aim.FENCE,
+        "truth",
+        "pose.east",
+        730.0,
+        fence={"field": field},
+        route=route,
+        landing=None,
+        touchdown=None,
+    )
+    assert outside.figures == pytest.approx({"outside_s": 2.0, "farthest_m": 30.0})
+    assert outside.sentence == "outside of the fence for 2.0 s, 30 m at most"
+
+
+def test_guidance_that_the_log_lacks_is_left_to_the_account() -> None:
+    """The account says which topics a log lacks; the rest of the flight is judged."""
+    tape, scenario = on_first_leg()
+    signals = {name: signal for name, signal in tape.signals.items() if name != "guidance"}
+    assert judge(COMPLETED, replace(tape, signals=signals), scenario, WHOLE) == COMPLETED
+
+
+def test_leg_that_ends_before_the_aircraft_was_on_it_is_told() -> None:
+    tape, scenario = on_first_leg()
+    log = tape["guidance"]
+    values = log.values.copy()
+    half = len(values) // 2
+    values[half:, log.names.index("leg")] = 1.0
+    values[half, log.names.index("missed")] = 321.0
+    signals = dict(tape.signals) | {"guidance": Signal(log.stamp_ns, log.names, values)}
+    outcome = judge(COMPLETED, replace(tape, signals=signals), scenario, WHOLE)
+    missed = next(each for each in outcome.shortfalls if each.aim is Aim.ROUTE)
+    assert missed.sentence == "missed leg 0 by 321 m"
+    assert missed.figures == {"leg": 0, "missed_m": 321.0}
+
+
+def test_input_behind_an_allocation_reaches_as_far_as_its_first_effector() -> None:
+    twin = find_scenario("osprey_twin")
+    allocation = twin.controller.allocation
+    assert allocation is not None
+    T = np.reshape(allocation.T, (len(allocation.effectors), -1))
+    actuators = twin.aircraft.actuators
+    reach = _reach(twin.controller, twin.aircraft)
+    for i, column in enumerate(T.T):
+        for limits, whole in ((actuators.upper, reach.travel), (actuators.rate, reach.rate)):
+            parts = np.abs(column * whole[i]) / np.array(limits)
+            assert parts.max() == pytest.approx(1.0)
 
 
 def test_error_before_a_late_engagement_hides_nothing() -> None:
