@@ -523,10 +523,10 @@ def test_processes_of_a_lockstep_flight_have_their_samples_and_no_time_of_day(
     flight = read_flight(whole)
     tape = replace(flight.tape, processes=processes)
     found = account(tape, find_scenario("osprey_gust")).processes
-    assert {name: (each.ready, each.samples) for name, each in found.items()} == {
-        "/controller": (None, 402),
-        "/aircraft": (None, 1001),
-        "/stray": (None, 3),
+    assert {name: tuple(each) for name, each in found.items()} == {
+        "/controller": (None, 0.0, 2.0, 402),
+        "/aircraft": (None, 0.0, 2.0, 1001),
+        "/stray": (None, 0.0, 1e-9, 3),
     }
     content = {name: each._asdict() for name, each in found.items()}
     summary = figures | {"account": figures["account"] | {"processes": content}}

@@ -114,6 +114,18 @@ def test_fault_of_the_reference_model_is_told_where_guidance_commands(
     assert Aim.REFERENCE in {shortfall.aim for shortfall in outcome.shortfalls}
 
 
+def test_fault_is_told_from_its_first_sample_to_its_last() -> None:
+    """Three seconds of p are reversed, while its pulse is on."""
+    tape = flown("servo")
+    values = tape["y_m"].values.copy()
+    values[1250:1550, 2] *= -1.0
+    y_m = replace(tape["y_m"], values=values)
+    (told,) = reference_shortfalls(with_y_m(tape, y_m), servo())
+    assert (told.figures["start"], told.figures["stop"]) == pytest.approx((12.5, 15.49), abs=0.02)
+    assert told.figures["largest"] == pytest.approx(2.0 * np.abs(values[1250:1550, 2]).max())
+    assert told.sentence.endswith(" at most, from t = 12.5 to 15.5 s")
+
+
 def test_flight_of_other_commands_is_told() -> None:
     """The file that judges has another pulse than the file that flew."""
     pulses = {name: each.model_dump() for name, each in servo().reference_model.pulses.items()}

@@ -18,7 +18,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import best_error
 from flight_analysis.report.account import Account
-from flight_analysis.report.linear_flight import _reach, error_pair
+from flight_analysis.report.linear_flight import Reach, _reach, _share_within, error_pair
 from flight_analysis.report.shortfalls import judge
 from flight_analysis.report.tracking import saturation_notes
 from flight_core.modes import Mode
@@ -440,6 +440,15 @@ def test_leg_that_ends_before_the_aircraft_was_on_it_is_told() -> None:
     missed = next(each for each in outcome.shortfalls if each.aim is Aim.ROUTE)
     assert missed.sentence == "missed leg 0 by 321 m"
     assert missed.figures == {"leg": 0, "missed_m": 321.0}
+
+
+def test_part_of_u_that_the_actuators_can_follow() -> None:
+    """Sines of 1 Hz, with an rms of 0.5, 0.5 and 1: three of them are 1.5, 1.5 and 3."""
+    t = np.arange(0.0, 10.0, 0.01)
+    u = np.sin(2.0 * np.pi * t)[:, None] * np.sqrt(2.0) * [0.5, 0.5, 1.0]
+    slow = 3.0 * 2.0 * np.pi * 0.5
+    reach = Reach(np.array([2.0, 2.0, 2.0]), np.array([np.inf, slow / 4.0, np.inf]))
+    assert _share_within(reach, u, 0.01) == pytest.approx([1.0, 0.25, 2.0 / 3.0], rel=1e-3)
 
 
 def test_input_behind_an_allocation_reaches_as_far_as_its_first_effector() -> None:
