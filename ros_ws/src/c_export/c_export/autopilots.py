@@ -126,7 +126,7 @@ PX4 = {
     "msg/RiseDiStatus.msg": MESSAGE,
 }
 
-MULTICOPTER: Mapping[str, str] = MappingProxyType(
+PX4_MULTICOPTER: Mapping[str, str] = MappingProxyType(
     {"fw_rate_control": "mc_rate_control", "virtual_fw": "virtual_mc"}
 )
 """Module and topics of PX4 for a multicopter, which replace those for a fixed wing."""
@@ -155,10 +155,14 @@ class Shell(NamedTuple):
     axes: str  # outputs that the controller can have
     reason: str  # why it can have no other outputs
     texts: Mapping[str, str]  # further files by name; `{channels}` and `{m}` are filled in
+    # words of the shell and their replacements for a multicopter; {} if it flies none
+    multicopter: Mapping[str, str] = MappingProxyType({})
 
 
 SHELLS = {
-    "px4": Shell("src/modules/rise_di_control", "pqr", "PX4 controls the speed", PX4),
+    "px4": Shell(
+        "src/modules/rise_di_control", "pqr", "PX4 controls the speed", PX4, PX4_MULTICOPTER
+    ),
     "ardupilot": Shell(
         "ArduPlane",
         "pq",
@@ -189,7 +193,7 @@ def write_module(
     shell = SHELLS[autopilot]
     controller = exportable(scenario.controller)
     outputs = controller.outputs
-    words = _words_of_vehicle(autopilot, scenario)
+    words = _words_of_vehicle(shell, scenario)
     expected = f"some of {', '.join(shell.axes)}: {shell.reason}"
     require(set(outputs) <= set(shell.axes), "controller.outputs", ", ".join(outputs), expected)
     require(
@@ -214,7 +218,7 @@ def write_module(
     return [*files, *(folder / name for name in texts)]
 
 
-def _words_of_vehicle(autopilot: str, scenario: Scenario) -> Mapping[str, str]:
+def _words_of_vehicle(shell: Shell, scenario: Scenario) -> Mapping[str, str]:
     """Return the replacements of words in the shell for a multicopter; {} for a fixed wing.
 
     A fixed wing has a trim speed. A multicopter has none, and its inputs are torques about the
@@ -228,14 +232,14 @@ def _words_of_vehicle(autopilot: str, scenario: Scenario) -> Mapping[str, str]:
     fixed_wing = "a trim speed with surfaces as inputs (fixed wing)"
     is_multicopter = channels.speed == 0.0 and has_torques
     require(
-        is_multicopter and autopilot == "px4",
+        is_multicopter and bool(shell.multicopter),
         "aircraft.airframe",
         found,
         f"{fixed_wing} or none with some of roll, pitch, yaw (multicopter)"
-        if autopilot == "px4"
+        if shell.multicopter
         else fixed_wing,
     )
-    return MULTICOPTER
+    return shell.multicopter
 
 
 def _with_words(text: str, words: Mapping[str, str]) -> str:
