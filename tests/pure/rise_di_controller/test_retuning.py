@@ -13,7 +13,9 @@ import pytest
 from pytest import approx
 from tests.closed_loop import law_params
 
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.modes import Mode
+from flight_core.parameters import flatten
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller.extensions.feedforward import FeedforwardState, Nominal, nominal_model
 from rise_di_controller.extensions.observer import (
@@ -22,11 +24,13 @@ from rise_di_controller.extensions.observer import (
     PastTick,
     with_observer,
 )
-from rise_di_controller.guard.guard import ControllerState, GuardParams, initial_state
+from rise_di_controller.guard.guard import ControllerState, GuardParams, initial_state, tick
 from rise_di_controller.guard.retuning import retune_state
 from rise_di_controller.law.control_law import TunedLaw
 from rise_di_controller.law.law import CONTROL_LAWS, LawState, Sign, control
 from rise_di_controller.law.saturation import Limits
+from rise_di_controller.learning.proposals import DESIGNED
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 DT = np.float64(0.1)
 TRIM = 10.0
@@ -181,3 +185,42 @@ def test_observer_takes_over_from_a_feedforward_that_ends() -> None:
 def test_equal_feedforward_is_left_alone() -> None:
     before = engaged()
     assert retuned(before, params(), params(), (model(-1.0, 4.0), model(-1.0, 4.0))) == before
+
+
+def test_without_a_record_the_trim_takes_over_the_feedforward() -> None:
+    """One tick tells no slope of y_m, so the new feedforward begins again at y_m."""
+    before = engaged()._replace(history=(TICK,))
+    after = retuned(before, params(), params(), (model(-1.0, 4.0), model(-2.0, 4.0)))
+    assert contributions(after) == approx((OF_LAW, OF_OBSERVER, 0.0))
+    assert after.u_trim.item() == approx(TRIM + OF_FEEDFORWARD)
+    assert after.feedforward is not None
+    assert after.feedforward.x.tolist() == [7.0]
+    assert after.feedforward.ticks.item() == 0.0
+    assert retuned(before, params(), params(), (model(-1.0, 4.0), None)).feedforward is None
+
+
+def test_record_holds_what_each_tick_had() -> None:
+    """Seven ticks of 10 ms with one that had no y, in a record of four."""
+    flown = find_scenario("osprey_learn").rise_di()
+    observed = dict(flatten(find_scenario("osprey_observer").rise_di().model_dump()))
+    change = {name: value for name, value in observed.items() if name.split(".")[0] in DESIGNED}
+    config = RiseDiConfig.validate_mapping(flown.changed(change), "learned")
+    short = config.guard()._replace(history=4)
+    state = initial_state(4)
+    u = []
+    for k in (0, 1, 2, 3, 5, 6):
+        y_m = 0.01 * np.sin(k + np.arange(4.0))
+        now = StampedVector(10_000_000 * k, y_m + 1e-3 * k)
+        state, _ = tick(
+            state, now.stamp_ns, now, [now._replace(value=y_m)], short, config.tuned_law()
+        )
+        u.append(state.u - state.u_trim - state.u_ff)
+    assert state.u_ff.any()
+    assert [None if past.e is None else past.e[0] for past in state.history] == approx(
+        [3e-3, None, 5e-3, 6e-3]
+    )
+    assert [float(past.dt) for past in state.history] == approx([0.01, 0.01, 0.02, 0.01])
+    # The tick without a y had the u and the y_m of the tick before it.
+    for past, flown_u, k in zip(state.history, [u[3], u[3], u[4], u[5]], (3, 3, 5, 6), strict=True):
+        assert past.u == approx(flown_u, abs=1e-15)
+        assert past.y_m == approx(0.01 * np.sin(k + np.arange(4.0)))
