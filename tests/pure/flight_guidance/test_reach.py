@@ -180,9 +180,9 @@ def rolled(share: float, test: RollTest) -> RollTest:
 
 
 def test_roll_rate_that_ignores_its_command_is_found_without_a_model() -> None:
-    assert not rolled(0.7, RollTest()).ignored
+    assert not rolled(0.7, RollTest()).is_ignored
     lost = rolled(0.0, RollTest())
-    assert lost.ignored
+    assert lost.is_ignored
     # The yaw alone rolls with up to half of the command: the aileron is not back.
-    assert rolled(0.5, lost).ignored
-    assert not rolled(1.0, lost).ignored
+    assert rolled(0.5, lost).is_ignored
+    assert not rolled(1.0, lost).is_ignored

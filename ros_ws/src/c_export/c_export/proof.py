@@ -63,7 +63,7 @@ class Comparison(NamedTuple):
     differing: int  # number of values that differ
     first: Difference | None
     deviation: float  # largest difference of any u, as a fraction of its range
-    modes_equal: bool  # whether all integers of the states, such as modes and times, are equal
+    has_equal_integers: bool  # integers of the states are modes and times
 
     def holds(self, *, float32: bool) -> bool:
         """Return whether C agrees with Python.
@@ -72,7 +72,9 @@ class Comparison(NamedTuple):
         equal, and u must be within FLOAT32_BOUND.
         """
         return (
-            self.modes_equal and self.deviation <= FLOAT32_BOUND if float32 else self.differing == 0
+            self.has_equal_integers and self.deviation <= FLOAT32_BOUND
+            if float32
+            else self.differing == 0
         )
 
 
@@ -242,7 +244,7 @@ class Program:
             differing=int(differ.sum()),
             first=first,
             deviation=float(parts.max()),
-            modes_equal=not integers_differ.any(),
+            has_equal_integers=not integers_differ.any(),
         )
 
 

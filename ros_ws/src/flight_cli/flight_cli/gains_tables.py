@@ -153,15 +153,15 @@ def _show_margins(console: Console, study: Study, answers: dict[str, Assessment]
     say(console, legend(MARGIN_WORDS), style="dim")
 
 
-def _show_verdicts(console: Console, result: GainSets) -> None:
+def _show_verdicts(console: Console, sets: GainSets) -> None:
     """Print the conditions in parts, each with a verdict. The verdict on the loop decides."""
-    answers = result.titles
-    first = result.first
+    answers = sets.titles
+    first = sets.first
     for part, heading in HEADINGS.items():
         if getattr(first, part):
             print_table(console, _condition_table(answers, part, heading))
         for name, answer in answers.items():
-            verdict = VERDICTS[part](answer, result.guarantee)
+            verdict = VERDICTS[part](answer, sets.guarantee)
             if verdict.sentence:
                 say(console, f"{name}: {verdict.sentence}", "bold" if part == "loop" else "")
     if first.theorem and (marginal := marginal_sentence([airframe_facts(first.study.airframe)])):
@@ -266,10 +266,10 @@ def _stable_speed_ratio(study: Study, answer: Assessment) -> float | None:
     return ratio if math.isfinite(ratio) else None
 
 
-def gains_as_json(result: GainSets, seed: int) -> dict[str, Any]:
+def gains_as_json(sets: GainSets, seed: int) -> dict[str, Any]:
     """Return the study, gain sets with conditions, and the guarantee, if any, for JSON."""
-    study = result.study
-    guarantee = result.guarantee
+    study = sets.study
+    guarantee = sets.guarantee
     inputs = list(study.airframe.inputs)
     return {
         "airframe": study.airframe.name,
@@ -279,13 +279,13 @@ def gains_as_json(result: GainSets, seed: int) -> dict[str, Any]:
         "seed": seed,
         "slew": dict(zip(inputs, study.slew.tolist(), strict=True)),
         "slew_calm": dict(zip(inputs, study.slew_undisturbed.tolist(), strict=True)),
-        "checked": result.checked or None,
+        "checked": sets.checked or None,
         **{
             name: _assessment_as_json(study, answer, guarantee)
-            for name, answer in result.answers.items()
+            for name, answer in sets.answers.items()
         },
         **({} if guarantee is None else {"guarantee": guarantee.as_json()}),
-        **({} if result.limited is None else {"saturation": result.limited.as_json()}),
+        **({} if sets.limited is None else {"saturation": sets.limited.as_json()}),
     }
 
 

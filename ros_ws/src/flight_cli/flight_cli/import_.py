@@ -128,7 +128,7 @@ def _show_agreement(console: Console, rows: list[Agreement]) -> None:
     headings = ("", "what the log says", "what the map says")
     table = new_table("", headings, headings, headings)
     for row in rows:
-        style = "bold red" if row.differs else None
+        style = "bold red" if row.is_different else None
         table.add_row(row.what, row.logged or "not recorded", row.mapped, style=style)
     print_table(console, table)
 

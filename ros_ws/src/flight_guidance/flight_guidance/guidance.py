@@ -360,7 +360,7 @@ class Guidance:
         at_p = params.outputs.index("p")
         dt = seconds(params.period_ns)
         self._roll = self._roll.after(dt, state.u_m[at_p], y[at_p], params.attitude.roll_rate)
-        self._authority = self._authority._replace(roll=0.0 if self._roll.ignored else UNKNOWN)
+        self._authority = self._authority._replace(roll=0.0 if self._roll.is_ignored else UNKNOWN)
 
     def _land(self) -> None:
         """Add the commands of the landing, unless the operator or the program gives others."""

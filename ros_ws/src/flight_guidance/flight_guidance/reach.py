@@ -76,21 +76,21 @@ class RollTest(NamedTuple):
 
     asked: float = 0.0  # a, rad^2/s
     flown: float = 0.0  # f, rad^2/s
-    ignored: bool = False
+    is_ignored: bool = False
 
     def after(self, dt: float, command: float, p: float, largest: float) -> "RollTest":
         """Return the test after a further step of dt, s, with a command and a measured p, rad/s.
 
-        `largest` is the largest command, rad/s. The verdict `ignored` can only change while `asked`
-        is above ASKED largest^2.
+        `largest` is the largest command, rad/s. The verdict `is_ignored` can only change while
+        `asked` is above ASKED largest^2.
         """
         memory = math.exp(-dt / MEMORY)
         asked = memory * self.asked + dt * command**2
         flown = memory * self.flown + dt * command * p
-        ignored = self.ignored
+        is_ignored = self.is_ignored
         if asked > ASKED * largest**2:
-            ignored = flown < (FOLLOWED if ignored else IGNORED) * asked
-        return RollTest(asked, flown, ignored)
+            is_ignored = flown < (FOLLOWED if is_ignored else IGNORED) * asked
+        return RollTest(asked, flown, is_ignored)
 
 
 AUTHORITY = tuple(f"{side}.{name}" for side, name in product(SIDES, ("q", "p", "V")))

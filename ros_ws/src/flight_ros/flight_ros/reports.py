@@ -29,7 +29,7 @@ class Report(NamedTuple):
     sender: str  # name of the publisher
     sentence: str
     values: Mapping[str, Any] = {}
-    warns: bool = False  # whether the level is WARN instead of OK
+    is_warning: bool = False  # whether the level is WARN instead of OK
 
 
 def encode(report: Report, name: str) -> bytes:
@@ -39,7 +39,7 @@ def encode(report: Report, name: str) -> bytes:
         sec=report.stamp_ns // NANOSECONDS, nanosec=report.stamp_ns % NANOSECONDS
     )
     message.header.frame_id = report.sender
-    level = DiagnosticStatus.WARN if report.warns else DiagnosticStatus.OK
+    level = DiagnosticStatus.WARN if report.is_warning else DiagnosticStatus.OK
     values = [KeyValue(key=key, value=json.dumps(value)) for key, value in report.values.items()]
     message.status = [
         DiagnosticStatus(level=level, name=name, message=report.sentence, values=values)
@@ -62,5 +62,7 @@ def decode(raw: bytes) -> Report:
         raise ChannelError("malformed", " ".join(str(error).split())) from None
     stamp = message.header.stamp
     sender = message.header.frame_id
-    warns = status.level != DiagnosticStatus.OK
-    return Report(stamp.sec * NANOSECONDS + stamp.nanosec, sender, status.message, values, warns)
+    is_warning = status.level != DiagnosticStatus.OK
+    return Report(
+        stamp.sec * NANOSECONDS + stamp.nanosec, sender, status.message, values, is_warning
+    )

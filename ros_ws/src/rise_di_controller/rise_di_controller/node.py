@@ -384,7 +384,11 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         else:
             self.get_logger().info(sentence)
         report = Report(
-            event.stamp_ns, self.instance, sentence, {"event": event.kind}, warns=not event.change
+            event.stamp_ns,
+            self.instance,
+            sentence,
+            {"event": event.kind},
+            is_warning=not event.change,
         )
         self._publish_learning(reports.encode(report, "learning"))
 

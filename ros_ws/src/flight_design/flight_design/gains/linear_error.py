@@ -27,7 +27,7 @@ MEAN = math.sqrt(2.0 / math.pi)  # mean magnitude of a normal value, in standard
 
 GUST_TIME = 0.6  # s, time from the entry of a gust to its peak
 GUST_LENGTHS = (9.1, 106.7)  # m, from the entry to the peak, CS 25.341 (a)(3): 30 to 350 ft
-GUST_SPEED = 17.07  # m/s, at 106.7 m and sea level, CS 25.341 (a)(5): 56 ft/s
+REFERENCE_GUST = 17.07  # m/s, at 106.7 m and sea level, CS 25.341 (a)(5): 56 ft/s
 
 
 class Air(NamedTuple):
@@ -51,13 +51,13 @@ class Air(NamedTuple):
 def discrete_gust(speed: float) -> tuple[float, float]:
     """Return the peak, m/s, and the duration, s, of a 1-cosine gust at a speed, m/s.
 
-        U = GUST_SPEED (H / 106.7 m)^(1/6),  H = GUST_TIME speed within GUST_LENGTHS
+        U = REFERENCE_GUST (H / 106.7 m)^(1/6),  H = GUST_TIME speed within GUST_LENGTHS
 
     H is the distance from the entry to the peak. Source: CS 25.341 (a), without the alleviation
     factor.
     """
     length = min(max(GUST_TIME * speed, GUST_LENGTHS[0]), GUST_LENGTHS[1])
-    peak = GUST_SPEED * (length / GUST_LENGTHS[1]) ** (1.0 / 6.0)
+    peak = REFERENCE_GUST * (length / GUST_LENGTHS[1]) ** (1.0 / 6.0)
     return peak, 2.0 * length / speed
 
 

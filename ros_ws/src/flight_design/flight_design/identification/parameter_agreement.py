@@ -194,7 +194,7 @@ class Agreement(NamedTuple):
     what: str  # the parameter, or the quantity that is taken from the log
     logged: str  # the value in the log; "" if the log has no record
     mapped: str  # the value in the map; "" if the map has none
-    differs: bool = False
+    is_different: bool = False
     is_known: bool = True  # whether a record before the samples gives the value
 
 
@@ -210,14 +210,14 @@ def compared(
     rows = []
     for stick in sticks:
         for name, (value, tolerance) in stick.parameters().items():
-            differs = name in parameters and not abs(parameters[name] - value) <= tolerance
+            is_different = name in parameters and not abs(parameters[name] - value) <= tolerance
             logged = f"{parameters[name]:g}" if name in parameters else ""
             rows.append(
                 Agreement(
                     what=name,
                     logged=logged,
                     mapped=f"{value:g}",
-                    differs=differs,
+                    is_different=is_different,
                     is_known=name in values,
                 )
             )
@@ -226,7 +226,7 @@ def compared(
 
 def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> None:
     """Raise ParameterError if a parameter in the log differs from that of the map."""
-    differing = [row for row in rows if row.differs]
+    differing = [row for row in rows if row.is_different]
     if differing:
         logged = ", ".join(f"{row.what} {row.logged}" for row in differing)
         expected = ", ".join(f"{row.what} {row.mapped}" for row in differing)

@@ -139,7 +139,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
             self.instance,
             proposal.sentence or "",
             values,
-            warns=not proposal.change,
+            is_warning=not proposal.change,
         )
         self._publish(reports.encode(report, "proposal"))
         if proposal.sentence is not None:
