@@ -47,7 +47,8 @@ class ControlOutput(NamedTuple):
 class Prepared(NamedTuple):
     """What a controller computes from new parameters before they take effect.
 
-    Computing it takes a third of the time of a change in flight.
+    It can be computed before the tick at which the parameters change, and is a third of the work
+    of a change in flight. `Controller.retune` does the rest.
     """
 
     parameters: ControllerConfig

@@ -279,8 +279,9 @@ class ControllerSection(NodeConfig):
     def probe_gain(self) -> FloatArray:
         """Compute abs(y_i / u_i) at the frequency of each sine of the probe, shape (m,).
 
-        It is 0 for an input without a sine. The model is C (j omega - A)^-1 B if there is a nominal
-        model, and 1 / (input_scale omega) otherwise. The lag of the actuator is included.
+        It is 0 for an input without a sine. The response is that of C (j omega I - A - gravity)^-1
+        B if there is a nominal model, and 1 / (input_scale omega) otherwise. The lag of the
+        actuator is included.
         """
         gain = np.zeros(len(self.outputs))
         if self.probe is None:

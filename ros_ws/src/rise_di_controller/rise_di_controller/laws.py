@@ -95,7 +95,10 @@ class AnyLaw(ControllerConfig):
 
     @classmethod
     def keys_beside(cls, values: Mapping[str, Any]) -> Set[str]:
-        """Return the keys of the law that `values` name, or of all laws if it is unknown."""
+        """Return the keys of the law that `values` name.
+
+        If there is no such law, the keys are those that every law has.
+        """
         with suppress(ParameterError):
             return schema(values.get("law", DEFAULT)).model_fields.keys()
         return ControllerConfig.model_fields.keys()

@@ -55,8 +55,9 @@ MAX_DELAY_PERIODS = 100
 channels, 100 periods take 3 s of processor time, and 1000 periods half a minute."""
 
 MAX_STABLE_STEP = 2.5
-"""Largest product of dt and the fastest zero. A Runge-Kutta step is stable up to 2.78. dt is the
-longest step that the law takes."""
+"""Largest product of dt and abs(zero), for the fastest zero of the nominal model. dt is the longest
+Runge-Kutta step of the feedforward, LONGEST_PART periods. A step is stable up to a product of
+2.78."""
 
 
 class ControllerConfig(ControllerSection):

@@ -45,7 +45,7 @@ HISTORY = 5.0
 class SpeedConfig(Config):
     """The models of feedforward and observer at another airspeed.
 
-    Values are in SI units, matrices row by row as in those sections.
+    Values are in SI units. Matrices are row by row, as in the sections feedforward and observer.
     """
 
     ratio: Positive = Field(description="this airspeed divided by the trim speed")

@@ -94,9 +94,9 @@ def with_new_model(
 ) -> FeedforwardState:
     """Return the state with which the feedforward continues its motion by a new model.
 
-    If the old state has as many states, x and u_0 stay. Otherwise they begin anew, with the outputs
-    at y_m. u is computed with the new model, so that the feedforward goes on with u - u_0. y_m_dot
-    and dt belong to the last tick.
+    If x has the same length in both models, x and u_0 stay. Otherwise they begin anew, with the
+    outputs at y_m and u_0 = 0. u is computed with the new model, and u - u_0 is then the
+    feedforward until the next tick. y_m_dot and dt belong to the last tick.
     """
     start = initial_state(y_m, nominal)
     if state is not None and state.x.shape == start.x.shape:

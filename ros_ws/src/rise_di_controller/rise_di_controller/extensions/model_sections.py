@@ -28,7 +28,8 @@ from rise_di_controller.extensions.observer import VaneParams
 from rise_di_controller.law.decomposition import DecompositionError, signs
 from rise_di_controller.law.saturation import Limits
 
-# largest error of an entry of effect T against I, which is about 1e-9 if the file has ten digits
+# Largest amount by which an entry of the product of `effect` and T may differ from that of I. If
+# the file has ten digits, the difference is about 1e-9.
 MAX_INVERSE_ERROR = 1e-6
 
 
@@ -199,9 +200,10 @@ class ObserverConfig(Config):
     def at_rate(self, rate: float, nominal: Nominal) -> "ObserverConfig":
         """Convert the observer to another rate.
 
-        With the ratio a = self.rate / rate of the new period to the old one,
+        Let a = self.rate / rate be the ratio of the new period to the old one. The matrices with
+        the index a hold at the new rate:
 
-        [Phi, Gamma; 0, I]' = [Phi, Gamma; 0, I]^a,  I - L' H = (I - L H)^a,  F' = F
+            [Phi_a, Gamma_a; 0, I] = [Phi, Gamma; 0, I]^a,  I - L_a H = (I - L H)^a,  F_a = F
         """
         from scipy.linalg import fractional_matrix_power  # noqa: PLC0415 - few flights need it
 

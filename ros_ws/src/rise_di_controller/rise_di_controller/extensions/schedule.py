@@ -91,7 +91,7 @@ class ScheduleParams(NamedTuple):
     speed: Array  # trim speed V0, m/s, ()
     airspeed: Array  # 1 for the output V, else 0, (m,)
     time: Array  # time constant with which the factor follows the airspeed, s, ()
-    # the law's parameters as a function of the airspeed; None without an observer
+    # ObserverParams as a function of the airspeed; None without an observer
     observer: OverSpeed | None = None
 
 
@@ -204,7 +204,7 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
     """Extend a control law by scheduling its input_scale over the dynamic pressure.
 
         scale += min(dt / time, 1) (target_scale(y) - scale)
-        the law is retuned to input_scale scale (bumpless transfer), then takes the step
+        the law is retuned to `scale` times input_scale (bumpless transfer), then takes the step
 
     The retuning keeps u, so the schedule acts only on u_dot. At engagement scale = target_scale(y).
     An observer keeps its estimates, which have the same meaning at every speed, and u_o moves to

@@ -166,8 +166,8 @@ def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> Flo
 
     If a sample has exactly this stamp, its value is returned unchanged. Between two samples the
     signal is linear. Beyond the newest sample it is extrapolated by at most `reach_ns`, with the
-    slope between the newest sample and one that is at least MIN_SLOPE_SPAN `reach_ns` older. If
-    there is no such older sample, the newest value is held.
+    slope between the newest sample and one that is older by at least MIN_SLOPE_SPAN times
+    `reach_ns`. If there is no such older sample, the newest value is held.
 
     The samples must have increasing stamps.
     """

@@ -131,7 +131,10 @@ def _with_nominal(
 
 
 def _is_replaced(old: ObserverParams, new: ObserverParams) -> bool:
-    """Return whether the model of the observer changes, or the observer is added or removed."""
+    """Return whether the model of the observer changes, or the observer begins or ceases to act.
+
+    An observer does not act if the limits of its u_o are 0.
+    """
     return not _same_model(old, new) or bool(np.any(old.limits.upper) != np.any(new.limits.upper))
 
 

@@ -166,10 +166,11 @@ def step(
         NEAR if change <= max(TIMES largest, reach) in all outputs, and then largest = max(change,
         faded largest)
 
-    The possible change grows with the time since the last sample that was taken, so no sensor is
-    locked out for ever. After lost samples, `largest` takes the whole change instead of the change
-    per period. The reason is that these samples may have been lost because y is noisy, and the
-    changes of noise do not grow with time.
+    `largest` is `state.change`, and `reach` and the period come from `limits`. The possible change
+    grows with the time since the last sample that was taken, so no sensor is locked out for ever.
+    After lost samples, `largest` takes the whole change instead of the change per period. The
+    reason is that these samples may have been lost because y is noisy, and the changes of noise do
+    not grow with time.
 
     The samples within the first FIRST_NS are always NEAR. A gyro may start with wrong values.
     During this time `largest` therefore takes at most `reach` of a near change, and nothing of a

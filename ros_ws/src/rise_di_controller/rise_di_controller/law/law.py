@@ -221,7 +221,7 @@ def step_with_anti_windup(
         beyond = abs(u_trim + u - saturated)
         excess = max(beyond - abs(change of u by the increment of integral_e), 0)
         change = abs(change of u by the increment of Pi)
-        Pi+    = Pi + max(change - excess, 0) / change (increment of Pi)
+        Pi+    = Pi + (max(change - excess, 0) / change) * increment of Pi
 
     Without saturation every bit equals that of the law alone. Theorem 1 does not cover saturation.
     """

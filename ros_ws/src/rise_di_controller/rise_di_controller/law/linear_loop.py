@@ -24,8 +24,8 @@ ROOT = np.sqrt(3.0)  # factor of the normalised second Legendre polynomial, ROOT
 
 SMALL = (
     2.0**-40
-    # Size of the steps from 0. It is below every limit and every width of a soft sign. As a power
-    # of two it loses no digit.
+    # Step with which `linear_law` differentiates. It is below every limit and every width of a soft
+    # sign. A division by it loses no digit, because it is a power of two.
 )
 
 
@@ -137,7 +137,7 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
 def _takes_columns(params: Any) -> bool:
     """Return whether the law is known to step many states at once, one in each column.
 
-    RISE-DI does, also with an observer.
+    RISE-DI does, alone or with an observer without vanes.
     """
     if isinstance(params, ObserverParams) and params.vanes is None:
         params = params.law
@@ -170,9 +170,10 @@ def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatA
 
 @lru_cache(maxsize=64)
 def _exponential(matrices: bytes, shape: tuple[int, ...]) -> FloatArray:
-    """Compute exp of matrices, given as bytes with their shape; cached.
+    """Compute exp of matrices, which are given as bytes with their shape.
 
-    If gains change in flight, the matrices of the plant stay the same.
+    The results are cached, because the matrices of the plant stay the same if gains change in
+    flight.
     """
     from scipy.linalg import expm  # noqa: PLC0415 - a controller without an observer starts without it
 
@@ -197,8 +198,8 @@ def sampled_plant(
 ) -> SampledPlant:
     """Compute the exact motion of aircraft, actuators and delay over a period.
 
-    The n + m + kept m states are x, then the actuators, then u of the `kept` earlier ticks that
-    still act.
+    The states are x, (n,), then the positions of the m actuators, and then u, (m,), of each earlier
+    tick that still acts, the latest first.
 
     u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,).
     If `rising`, u of a tick is not constant but multiplies the second Legendre polynomial ROOT (2 s

@@ -70,7 +70,9 @@ def limited_integral(before: Array, after: Array, change: Array, beyond: Array) 
     If the increment pushes u further beyond a limit, it is reduced:
 
         before + max(1 - beyond / change, 0) (after - before)
-            if change beyond > 0, otherwise `after`, to the last bit
+
+    This holds if `change` and `beyond` have the same sign. Otherwise the result is `after`, to the
+    last bit.
 
     u then ends at the limit, or moves at the rate if a rate limit acts.
     Source: conditional integration, K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5. The

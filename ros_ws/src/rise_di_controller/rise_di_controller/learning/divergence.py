@@ -25,9 +25,9 @@ LEAST = {"V": 1.0}  # rms error of V that does not yet count as a divergence, m/
 # moderate turbulence.
 LEAST_RATE = 0.1
 
-# Length of the record of e, and the time over which each of its values is averaged, s. No loop with
-# servos oscillates so fast.
-WINDOW = 10.0
+WINDOW = 10.0  # length of the record of e, s
+# Time over which each value of the record is averaged, s. A loop with servos oscillates more
+# slowly.
 STEP = 0.02
 TEST = 50  # number of averaged values between two tests for an oscillation, 1 s
 # Correlation of e with e a period later. It is 0.9 in a limit cycle, and at most 0.5 in turbulence
@@ -139,8 +139,8 @@ class Oscillations:
 def oscillating(y: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
     """Return which outputs, (m,), oscillate over a record y, (N, m).
 
-    They must move by more than the fraction HARMLESS of `least`. Repeated commands count as an
-    oscillation, too.
+    An output counts only if its variance over the record is above HARMLESS^2 `least`. Repeated
+    commands count as an oscillation, too.
     """
     is_moving = np.var(y, axis=0) > HARMLESS**2 * least
     return np.array(
