@@ -47,9 +47,10 @@ TRUE_ERROR = "true error"
 MEASURED_ERROR = "measured error"
 
 TURN_BANK = math.radians(5.0)  # guidance turns if it commands more bank than this, rad
-# Guidance captures if it commands a flight path that is steeper than this, rad, ...
+# Guidance captures if it commands a flight path that is steeper than CAPTURE_ANGLE, rad. It also
+# captures if the path is farther away than the aircraft flies in CAPTURE_TIME, s.
 CAPTURE_ANGLE = math.radians(1.0)
-CAPTURE_TIME = 0.5  # ... or if the path is farther away than the aircraft flies in this time, s
+CAPTURE_TIME = 0.5
 
 CALM = "calm"
 UNKNOWN_AIR = "other"

@@ -66,7 +66,7 @@ class LinearLoop(NamedTuple):
     """
 
     model: str  # a few words on what the plant models
-    states: tuple[str, ...]  # states of the aircraft, then the actuators whose lag deviates
+    states: tuple[str, ...]  # states of the aircraft; `plant_states` has all states of `plant`
     outputs: tuple[str, ...]  # outputs that the law reads, with the vanes last
     inputs: tuple[str, ...]
     plant: LinearPlant  # N aircraft, with the nominal one first: A (N, n, n), B (N, n, m)

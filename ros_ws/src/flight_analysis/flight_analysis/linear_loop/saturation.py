@@ -6,7 +6,7 @@ The aircraft gets a = phi(u) instead of u, so that w = u - a is cut off. phi can
 slope lies between 0 and 1. Take any taps h_j >= 0 at earlier and later ticks j, whose sum is at
 most 1. Then
 
-    sum over ticks of w_k (a_k - sum_j h_j a_k-j) >= 0
+    sum over ticks k of w_k (a_k - sum_j h_j a_(k-j)) >= 0
 
 (Zames-Falb). The loop has the sensitivity S at this input, and m = 1 - sum_j h_j z^-j. If Re(m S) >
 0 at each frequency, every aircraft settles. If this holds only above a lowest frequency, no
@@ -257,9 +257,9 @@ def _worst_corners(
 ) -> FloatArray:
     """Search for the corners of a box with the least `_rooms`, starting from N corners, (N, k).
 
-    Only the CLIMBERS starts with the least room are used. Each step of a search flips between -1
-    and 1 the deviation whose flip gives the least room. The search ends when the room no longer
-    shrinks.
+    Only the CLIMBERS starts with the least room are used. Each step of a search changes the sign of
+    the one deviation with whose other sign the room is least. The search ends when the room no
+    longer shrinks, or after LONGEST_CLIMB steps.
     """
     flips = 1.0 - 2.0 * np.eye(len(part.entries))
     found = []

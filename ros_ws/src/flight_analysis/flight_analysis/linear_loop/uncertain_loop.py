@@ -14,12 +14,12 @@ u can be late by an unknown time from 0 to `late`, s, which differs from tick to
 to input. At each instant the newest u that has arrived acts. Where the period of a u begins at
 s = 0, the input then changes by
 
-    -sum_j (1 + e_j(s)) / 2 v_j,  v_j = u_k-j - u_k-j-1
+    -sum_j (1 + e_j(s)) / 2 v_j,  v_j = u_(k-j) - u_(k-j-1)
 
-over the first p_j of the period, p_j = min(late / T - j, 1). e_j is 1 until u_k-j arrives, and -1
-from then on. The middle, e_j = 0, belongs to the loop. e_j v_j is a function over p_j whose root
-mean square is abs(v_j), whatever e_j is: all its Legendre coefficients together are one channel
-that reads v_j, a full block of size 1. It can change from tick to tick, so it has one X for all
+over the first p_j of the period, p_j = min(late / T - j, 1). e_j is 1 until u_(k-j) arrives, and -1
+from then on. The middle, e_j = 0, belongs to the loop. e_j v_j is a function over p_j. Its root
+mean square is abs(v_j) whatever e_j is, so all its Legendre coefficients together form a full block
+of size 1 that reads v_j. The block can change from tick to tick, so it has one X for all
 frequencies, and G = 0.
 """
 

@@ -221,8 +221,8 @@ def _near(z: NDArray[Any], frequency: float, period: float) -> FloatArray:
 def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float) -> float:
     """Find the size s at which a mode near a frequency, rad/s, becomes unstable.
 
-    The deviations are s times `corner`.
-    The result is infinite if no mode near the frequency becomes unstable up to the size `largest`.
+    The deviations are s times `corner`. The result is infinite if no mode near the frequency
+    becomes unstable up to the size `largest`.
     """
 
     def unstable(size: FloatArray) -> NDArray[np.bool_]:
@@ -242,7 +242,7 @@ def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float)
 
 
 def _growth(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
-    """Compute the slopes d abs(z) / d d_i of the largest mode near a frequency, (N, k).
+    """Compute the slopes d log abs(z) / d d_i of the largest mode near a frequency, (N, k).
 
     They are evaluated at the deviations d, (N, k).
     """

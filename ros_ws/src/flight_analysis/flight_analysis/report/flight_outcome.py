@@ -48,8 +48,9 @@ def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcom
 def until_last_tick(tape: Tape) -> Tape:
     """Cut the tape after the controller's last tick.
 
-    Later samples belong to the shutdown of the processes. If u ends much earlier than planned, and
-    y and y_m go on, the log has a gap. In this case the tape is cut only at the planned end.
+    Later samples belong to the shutdown of the processes. If u ends more than LATE_TICK_NS earlier
+    than planned, and y or y_m goes on, the log has a gap. In this case the tape is cut only at the
+    planned end. In any other case in which both go on for more than SILENCE, nothing is cut.
     """
     ticks = [
         int(tape[name].stamp_ns[-1]) for name in TICKS if name in tape and len(tape[name].stamp_ns)

@@ -11,8 +11,8 @@ first u_m of the log it takes the commands of the scenario, and from then on the
 Every bit must be equal, except for ROUNDING. In real time the log does not show before which step a
 u_m arrived. The computation finds the step, within the age limit of u_m, from which on y_m has the
 right bits. If several steps give the right bits, it follows all of them until they differ from the
-log. If the log lost a y_m or a u_m, the check only finds an error above the fraction HARMLESS of
-the least errors of a divergence.
+log. If the log lost a y_m or a u_m, the check only finds an error above HARMLESS times the least
+rms error that counts as a divergence (LEAST, LEAST_RATE).
 """
 
 import copy

@@ -85,7 +85,10 @@ def starved_intervals(flight: RecordedFlight) -> list[Interval]:
 
 
 def gap_intervals(tape: Tape) -> list[Interval]:
-    """Return the intervals of at least SHOWN_GAP without a sample of y."""
+    """Return the intervals without a sample of y.
+
+    They are longer than SHOWN_GAP, and than MIN_GAP_PERIODS times the median period of y.
+    """
     if "y" not in tape or len(tape["y"].stamp_ns) < 2:
         return []
     t = tape.time("y")

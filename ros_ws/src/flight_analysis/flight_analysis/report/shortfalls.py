@@ -164,7 +164,11 @@ def _engagement(tape: Tape, *, may_pause: bool, starved: Starvation = FED) -> li
 def _height(
     tape: Tape, aircraft: AircraftConfig | None, section: GuidanceConfig | None
 ) -> list[Shortfall]:
-    """Return a shortfall if the aircraft was below the ground of the scenario."""
+    """Return a shortfall if the aircraft was below the ground.
+
+    The ground is that of the scenario, or else that of the landing. It is unknown for an aircraft
+    of JSBSim.
+    """
     ground = None if aircraft is None or aircraft.is_jsbsim else aircraft.ground()
     if ground is None and section is not None and not (aircraft and aircraft.is_jsbsim):
         landing = section.landing_on(section.plan(section.waypoints())) if section.landing else None

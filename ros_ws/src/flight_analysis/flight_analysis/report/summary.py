@@ -323,11 +323,11 @@ def summarise_own(tape: Tape, law: str, log: str, outcome: Outcome) -> dict[str,
 
 
 def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
-    """Return a sentence if u is older at the aircraft than planned.
+    """Return a sentence if u at the aircraft is older than `controller.delay` by a period or more.
 
     The linear loop is computed with the delay that the controller was told. Any further delay uses
-    up its delay margin. If u is more than a period older than planned, the sentence also states
-    this margin.
+    up the delay margin of this loop, which the sentence states. If there is no linear model, there
+    is no sentence.
     """
     controller = scenario.controller
     if age is None or age.mean - controller.delay < 1.0 / controller.rate:
@@ -400,8 +400,9 @@ def _with_late_ticks(
 ) -> Account:
     """Return the account, which says that the host is too busy if too many ticks had no new y.
 
-    These ticks are the host's fault only if the log has every y, and if y has the rate of the
-    scenario. In any other case, such as a y from outside of the stack, the account stays.
+    These ticks are the host's fault only if the log has every y, and if y comes at least about as
+    often as the controller ticks. In any other case, such as a y from outside of the stack, the
+    account stays.
     """
     log_complete = (
         not (flight_account.over("y", "internals") and not flight_account.busy)
@@ -441,8 +442,8 @@ FIGURES = {
     "latency": ("y", "u"),
     "age_of_u": ("u",),
 }
-"""Topics that each table needs in addition to the error. Some have the values of the table, and the
-others show the parts of the flight."""
+"""Topics that each table needs, besides `truth` for a true error. Some have the values of the
+table, and the others show the parts of the flight."""
 
 
 def taken_over(summary: Mapping[str, Any], table: str) -> str:

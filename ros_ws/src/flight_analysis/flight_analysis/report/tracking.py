@@ -57,10 +57,10 @@ FACTOR = 2.0
 healthy flights have at most 1.3 times the error."""
 
 COMMAND_PART = 0.5
-"""Fraction of a command. Largest part of the allowed error that a command causes, as a fraction of
-the command. A law is no success if it is so weak that even its linear loop does not follow the
-command. An output counts as commanded, unless the command of another output of its kind is more
-than twice as large."""
+"""Upper limit of the part of the allowed error that commands cause, as a fraction of rms(y_m). A
+law is no success if it is so weak that even its linear loop does not follow the command. An output
+counts as commanded if its rms(y_m) is more than twice the floor, and if no other output of its kind
+has an rms(y_m) of more than twice this size."""
 
 END = 1.0
 """Length of the end of a flight, s. An error that grows is larger there than over WINDOW."""
