@@ -9,17 +9,15 @@ from flight_log.bag import BagChannel
 
 @dataclass(kw_only=True)
 class RecordedTopic:
-    """A topic and its channel in the bag.
-
-    Only the messages of the stack contain the name of their publisher.
-    """
+    """A topic and its channel in the bag."""
 
     name: str  # full name
+    # whether nodes outside of the stack publish the topic; their messages do not name the publisher
     is_foreign: bool
     channel: BagChannel
     publishers: int = 0  # number of publishers at the last check
-    first_ns: int = 0  # monotonic time of the first and the last message
-    heard_ns: int = 0
+    first_ns: int = 0  # monotonic time at which the first message was received
+    heard_ns: int = 0  # monotonic time at which the last message was received
     stamp_ns: int = -1  # stamp of the last message
     sent_ns: int = 0  # time of sending of the last message
     silent_ns: int = 0  # when a silence began; 0 without a silence
@@ -36,7 +34,10 @@ class RecordedTopic:
         self.sent_ns = sent_ns
 
     def continues(self, sequence: int) -> bool:
-        """Return whether a message follows the last one, as far as its sequence number shows."""
+        """Return whether a message follows the last one, as far as its sequence number shows.
+
+        The number shows nothing if the topic is foreign, or if two publishers have the same name.
+        """
         if not self.is_foreign and not self._is_shared and sequence != self._next_sequence:
             return False
         self._next_sequence = sequence + 1
