@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read files of recorded commands, which are CSV with the columns time, in s, and value.
 
-time,value
-0.00,0.0
-0.02,0.013
+    time,value
+    0.00,0.0
+    0.02,0.013
+
+`params.Recorded` checks that the times rise from 0.
 """
 
 import csv
