@@ -396,9 +396,9 @@ class Airframe(Config):
         return self.validate_mapping(self.model_dump() | values, f"airframe {self.name}")
 
     def with_rotary_gusts(self, axes: Sequence[str] = ROTARY) -> Self:
-        """Copy the airframe and add the axes of rotary gusts, at which the air turns, rad/s.
+        """Copy the airframe, and add the axes of rotary gusts, in which the air itself turns.
 
-            x_dot_i -= A_ij w_j,  i and j in p, q, r,  w = (p_g, q_g, r_g)
+            x_dot_i -= A_ij w_j,  i and j in p, q, r,  w = (p_g, q_g, r_g), rad/s
 
         Forces caused by these rates are left out, because A[alpha, q] and A[beta, r] also contain
         kinematics. Effects of rotary gusts that the file already states stay as they are.

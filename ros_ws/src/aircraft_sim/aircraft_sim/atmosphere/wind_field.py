@@ -20,9 +20,9 @@ PEAK_HEIGHT = math.log(LAYER) / (LAYER - 1.0)
 height of the largest outflow to z*."""
 
 PEAK = 0.319086343 * (math.exp(-PEAK_HEIGHT) - math.exp(-LAYER * PEAK_HEIGHT))
-"""Largest outflow u of a microburst, divided by l R. It is the largest value of (1 - exp(-s^2)) / 2
-s, at s = r / R = 1.1209, times exp(-z / z*) - exp(-z / e) at the height z of the largest outflow.
-"""
+"""Largest outflow u of a microburst, divided by l R. It is the product of two factors. The first is
+the largest value of (1 - exp(-s^2)) / (2 s), at s = r / R = 1.1209. The second is exp(-z / z*) -
+exp(-z / e) at the height z of the largest outflow."""
 
 
 class Log(NamedTuple):
@@ -63,12 +63,13 @@ class Table(NamedTuple):
 class Microburst(NamedTuple):
     """A downdraft that spreads over the ground.
 
-        u = l R^2 / 2 r (1 - exp(-r^2 / R^2)) (exp(-z / z*) - exp(-z / e))     outward
+        u = l R^2 / (2 r) (1 - exp(-r^2 / R^2)) (exp(-z / z*) - exp(-z / e))   outward
         w = -l exp(-r^2 / R^2) (e (exp(-z / e) - 1) - z* (exp(-z / z*) - 1))   up
 
-    with l = speed / PEAK R, z* = height / PEAK_HEIGHT and e = z* / LAYER. The flow is
-    incompressible. Source: R. M. Oseguera, R. L. Bowles, A Simple, Analytic 3-Dimensional Downburst
-    Model Based on Boundary Layer Stagnation Flow, NASA TM-100632 (1988).
+    Here l = speed / (PEAK R), z* = height / PEAK_HEIGHT and e = z* / LAYER. In `wind`, l is
+    `scale`, z* is `far` and e is `near`. The flow is incompressible. Source: R. M. Oseguera, R. L.
+    Bowles, A Simple, Analytic 3-Dimensional Downburst Model Based on Boundary Layer Stagnation
+    Flow, NASA TM-100632 (1988).
     """
 
     north: float  # m, north of the centre

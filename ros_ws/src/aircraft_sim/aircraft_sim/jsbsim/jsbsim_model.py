@@ -54,8 +54,10 @@ class JsbsimModel:
     is
 
         position+ = actuators.apply_faults(t_k, position, actuators.step(position, u, dt))
-        wind+     = gusts(t_k + dt) + turbulence.wind(z+), along the heading, to the right and down
+        wind+     = gusts(t_k + dt) + turbulence.wind(z+) + wind of the place
         commands  = trim + actuators.effect(t_k, position+), then JSBSim runs
+
+    The components of the wind are along the heading, to the right and down.
 
     If the throttle of an engine is lost, the throttle is 0, and the engine has no fuel or no
     ignition.

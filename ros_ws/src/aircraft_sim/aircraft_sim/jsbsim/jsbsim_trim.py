@@ -76,7 +76,7 @@ NEAR = 100.0
 FAR = 1e6  # multiple of TOLERANCE that replaces accelerations that are not finite
 IDLE = 0.01  # throttle below which a running engine may give no thrust
 
-# alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad).
+# First guess of the unknowns: alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad).
 START = np.array([0.05, 0.7, 0.0, 0.0, 0.0, 0.0])
 SCALE = np.array([0.1, 0.5, 0.5, 0.5, 0.5, 0.1])  # scales of these unknowns for the solver
 # Bounds of these unknowns.

@@ -83,8 +83,8 @@ def aircraft_at(t_ns: int, plant: PlantParams, x: Array | None = None) -> Aircra
     """Return the aircraft at t in the state x, (n,), or in trim if x is None.
 
     The drift multiplies A, B and the effect of wind by 1 + share (factor - 1). If the plant follows
-    the airspeed, their entries are also multiplied by powers of r = 1 + V / V0. Deviations are then
-    taken from the trim at r, (x_r, u_r):
+    the airspeed, which it cannot do beside a drift, the entries are instead multiplied by powers of
+    r = 1 + V / V0. Deviations are then taken from the trim at r, (x_r, u_r):
 
         x_dot = A x + gravity sin(x) + B u + trim,  trim = -(A x_r + gravity sin(x_r) + B u_r)
     """
