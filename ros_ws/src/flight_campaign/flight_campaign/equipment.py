@@ -60,8 +60,8 @@ def published(scenario: Scenario) -> dict[str, float]:
 def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, float]:
     """Replace the entries lag and noise by an entry for each channel.
 
-    An entry for a single channel takes precedence. The delay is rounded to whole periods. Raises
-    ParameterError if an entry is unknown.
+    An entry for a single channel takes precedence. The delay is rounded down to whole
+    periods. Raises ParameterError if an entry is unknown or the delay is below a period.
     """
     entries_of_scenario = published(scenario)
     every = dict[str, float]()

@@ -134,8 +134,8 @@ def mission_figures(tape: Tape, guidance: GuidanceConfig) -> dict[str, float]:
     and the missed legs. With a fence there are also the distance flown outside of it and the
     distance from home at the end. The score is the largest cross-track error divided by the
     distance that the aircraft flies in half a second at V0. Errors on the orbit round the last
-    waypoint and on the way onto a leg do not count. If no leg was flown, the score and these errors
-    are NaN.
+    waypoint, on the way onto a leg and while the fence acts do not count. If no leg was flown, the
+    score and these errors are NaN.
     """
     log = tape["guidance"]
     last_leg = len(guidance.plan(guidance.waypoints()).legs) - 1

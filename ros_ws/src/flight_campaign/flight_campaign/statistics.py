@@ -93,7 +93,7 @@ class FigureStatistics(Config):
         return math.sqrt(self.squares / (self.count - 1)) if self.count > 1 else 0.0
 
     def quantile(self, share: float) -> float:
-        """Return a quantile of the flights, rounded up to the edge of a bin (2.3 % wide)."""
+        """Return a quantile of the flights, interpolated within its bin, which is 2.3 % wide."""
         rank = share * self.count
         below = 0
         for place, number in self.bins.items():

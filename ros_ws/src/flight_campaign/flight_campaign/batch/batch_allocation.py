@@ -67,7 +67,8 @@ def _where_not(final: Array, value: Array, otherwise: Callable[[], Array]) -> Ar
 def _by_priority(start: Array, v: Array, limits: _Range, params: Allocation) -> Array:
     """Add the inputs v of the law to u one by one, in order of priority.
 
-    Returns u. For each input, u moves from `start` as far as the limits allow.
+    Returns u, which begins at `start`. Each input moves it as far as the limits allow, from where
+    the input before left it.
     """
     order = jnp.array(params.order)
     moves = params.T.T[order][:, :, None] * v[order][:, None]

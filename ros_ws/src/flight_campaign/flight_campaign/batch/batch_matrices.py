@@ -223,7 +223,7 @@ def at(t: Array, fleet: FleetMatrices) -> FleetMatrices:
     keys = ("tick", "forced", "rate", "forced_rate")
     now = {
         key: jax.tree.map(
-            lambda begin, end: begin + part * end, getattr(fleet, key), getattr(change, key)
+            lambda begin, full: begin + part * full, getattr(fleet, key), getattr(change, key)
         )
         for key in keys
     }

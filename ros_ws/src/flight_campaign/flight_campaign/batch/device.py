@@ -60,9 +60,10 @@ def thread_count() -> int:
 
 
 def turn() -> AbstractContextManager[object]:
-    """Return a context that only one thread enters at a time, to fly a chunk.
+    """Return the context in which a thread flies a chunk.
 
-    Meanwhile other threads draw or write their chunks.
+    On a GPU only one thread enters it at a time, and meanwhile other threads draw or write their
+    chunks. On a CPU every thread may enter it.
     """
     return nullcontext() if is_cpu() else _TURN
 
