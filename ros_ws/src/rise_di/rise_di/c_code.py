@@ -95,11 +95,12 @@ def export(
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
         folder: Folder for the code and the report of the proof.
         run: A recorded flight, whose ticks replace the flights and random inputs of the proof. If
-            the scenario learns, the last model of this flight is exported.
+            the scenario learns, the last model of this flight is exported instead, and the proof
+            has its own flights and random inputs.
         float32: Whether to compute in single precision. The proof then bounds the difference of u.
         duration: Duration of each flight of the proof, s. If None, it is that of the scenario, at
             most 20 s.
-        drawn: Number of random steps in the proof.
+        drawn: Number of random steps in the proof. In single precision there are none.
         seed: Seed of the random inputs.
         compiler: Commands of C compilers. If empty, they are gcc and clang.
         runner: Command that starts a program of the compiler, such as qemu-aarch64 for a cross
@@ -226,7 +227,7 @@ def _certified(scenario: Scenario, constants: Path) -> tuple[str, str] | None:
 
     The guarantee is the one that `rise-di gains guarantee` has stored for the loop of the scenario.
     `constants` is the file of the C constants, whose text goes into the certificate. Returns None
-    if no guarantee is stored.
+    if no guarantee of a stable loop is stored.
     """
     if scenario.aircraft.is_jsbsim or is_literal(scenario.controller):
         return None

@@ -382,7 +382,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
             The observations, shape (N, 2 m), SI, and an empty mapping.
 
         Raises:
-            ParameterError: `seed` is a list.
+            ParameterError: `seed` is a list or negative.
         """
         seed = None if seed is None else as_count(seed, "seed", 0)
         super().reset(seed=seed, options=options)
@@ -401,7 +401,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
             truncated (N,), and `info`.
 
         Raises:
-            ParameterError: The shape is wrong, or a value is not finite.
+            ParameterError: No episode has begun, the shape is wrong, or a value is not finite.
         """
         u = _actions(actions, (self.num_envs, len(self._vehicle.inputs)))
         require(self._last > 0, "step", "a step before an episode", "reset() first")

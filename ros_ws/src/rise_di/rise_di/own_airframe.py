@@ -197,9 +197,8 @@ def _flying(
 
     Its gains are selected for these commands. The flight must stay clear of the end stops. If there
     is no such flight, the scenario has the smallest commands, and the second result says what is
-    wrong with its flight. `trial` is the file
-    of the airframe for the trial flights. `files` are the paths of airframe and scenario that the
-    text names.
+    wrong with its flight. `trial` is the file of the airframe for the trial flights. `files` are
+    the paths of airframe and scenario that the text names.
     """
     shortfall = None
     scenario = ""
@@ -237,10 +236,11 @@ def _stop_shares(flight: Scenario, tape: Tape) -> dict[str, float]:
 def _shortfall(flight: Scenario, tape: Tape, hardest: str) -> Refusal:
     """Return what is wrong with the flight of a scenario, as a sentence.
 
-    The sentence names the input `hardest`, which is at its stop, and says whether the commands or
-    the gusts drive it there. It also names the state or gust that requires the most of this input,
-    and says how large it gets. The input that keeps y constant is u = -Omega^+ C (A x + f), where f
-    includes the gusts. It has a term for each state and gust, and the largest term counts.
+    The sentence names the input `hardest`, which comes closest to its end stop, and says whether
+    the commands or the gusts drive it there. It also names the state or gust that requires the most
+    of this input, and says how large it gets. The input that keeps y constant is
+    u = -Omega^+ C (A x + f), where f includes the gusts. It has a term for each state and gust, and
+    the largest term counts.
     """
     airframe = flight.aircraft.load()[0]
     calm = simulate(flight.vary(aircraft={"gusts": {}}))

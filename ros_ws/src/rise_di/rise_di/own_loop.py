@@ -71,7 +71,7 @@ class Loop:
         self._now_ns = -1  # instant of the last tick
         # Output of the last tick, or None if no u is to be sent.
         self.output: ControlOutput | None = None
-        self.lost: Refusal | None = None  # why a sample of the last tick is lost, if any is
+        self.lost: Refusal | None = None  # why a sample of the last tick was not accepted
 
     @property
     def mode(self) -> Mode:
@@ -90,10 +90,11 @@ class Loop:
     def step(self, t: float, y: ArrayLike | None, y_m: ArrayLike | None) -> FloatArray:
         """Compute u of a tick at t.
 
-        A sample counts as lost if it is None, or if no aircraft can give its values. `lost` then
-        has the reason, and the first of several lost samples in a row also gives a RuntimeWarning.
-        y and y_m belong to t, which may jitter but must not go back. The failsafe of the guard
-        starts if samples are older than `max_age`.
+        A sample that is None is lost. A sample whose values no aircraft can give counts as lost,
+        too. `lost` then has the reason, and the first of several such ticks in a row gives a
+        RuntimeWarning. Another RuntimeWarning says why the law engages again after a jump or a gap
+        of the samples. y and y_m belong to t, which may jitter but must grow from tick to tick. The
+        failsafe of the guard starts if samples are older than `max_age`.
 
         Args:
             t: Instant of the tick, s.
@@ -106,7 +107,7 @@ class Loop:
             order of the inputs, or of the effectors, and 0 before the engagement.
 
         Raises:
-            ParameterError: t goes back, a length is wrong, or a value is not finite.
+            ParameterError: t does not grow, a length is wrong, or a value is not finite.
         """
         now_ns = nanoseconds(as_number(t, "t", 0.0, unit="s"))
         last_ns = self._now_ns
