@@ -66,7 +66,8 @@ Assess = Callable[[Scenario, ControllerConfig], dict[str, Any]]
 class FlightLink(Protocol):
     """A link to the nodes of a flight.
 
-    Its methods return why something is refused, and may raise ParameterError.
+    A method that commands something returns why it is refused, or None. All methods may raise
+    ParameterError.
     """
 
     def nodes(self) -> list[str]:
@@ -154,7 +155,7 @@ class Control:
         self._undo: list[dict[str, Any]] = []  # earlier values, the most recent last
         self._digest = 0  # digest of the controller's parameters, 0 until it is known
         self._values: dict[str, Any] = {}  # values of the controller's tunable parameters
-        self._faults: dict[str, Any] = {}  # values of the aircraft's parameters, without gusts
+        self._faults: dict[str, Any] = {}  # values of the aircraft's parameters in `_faults_of`
         self._actions: Mapping[str, Callable[[Mapping[str, Any]], Refusal | None]] = {
             "state": self._refresh,
             "gains": self._set_gains,
@@ -394,8 +395,9 @@ class Control:
     ) -> Refusal | None:
         """Set new values of the controller's parameters. Returns why the node refuses them.
 
-        Raises RefusedError if the parameters are no longer those that the page shows. If `undo` is
-        True, the earlier values are kept, so that this change can be undone.
+        Raises RefusedError if the parameters are no longer those that the page shows, or if the
+        bridge sends to an autopilot and `--real` is missing. If `undo` is True, the earlier values
+        are kept, so that this change can be undone.
         """
         self._require_simulated()
         self._read()

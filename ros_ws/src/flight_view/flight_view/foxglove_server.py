@@ -83,7 +83,7 @@ def _channel(
 ) -> foxglove.Channel | None:
     """Return the channel of a record's topic, and advertise it with the first messages.
 
-    Returns None if the record has no messages.
+    Returns None if the record is of another kind than `Messages`.
     """
     if not isinstance(record, Messages):
         return None

@@ -57,7 +57,7 @@ def require_range(name: str, value: Any, base: Any) -> None:
 
 
 def like_parameter(name: str, base: Any, value: Any) -> Any:
-    """Convert a value to a float or a list, like the parameter's present value `base`."""
+    """Convert a value to a float or a list, as the parameter's value `base` in the scenario is."""
     values = as_list(finite_numbers(name, value))
     expected = len(as_list(base))
     require_form(

@@ -301,8 +301,8 @@ def answer(
 class _LimitedServer(HTTPServer):
     """A server with at most MAX_CONNECTIONS connections with the token, and RESERVED others.
 
-    WebSockets count as connections. A new connection replaces the oldest connection that has not
-    shown the token.
+    WebSockets count as connections. If there are as many as this, a new connection replaces the
+    oldest one that has not shown the token.
     """
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
