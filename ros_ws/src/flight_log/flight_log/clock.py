@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import LostPart, Recording, Signal
 
-STEP_NS = NANOSECONDS // 10  # ns, least backward step of a clock; no sample is late by this much
+STEP_NS = NANOSECONDS // 10  # ns, least backward step of a clock
 # ns, least forward step of a clock, relative to the time of the recording
 LEAP_NS = NANOSECONDS // 4
 # ns. If the stamps go back by more than this for fewer than CONFIRMED messages, these stamps are
@@ -143,8 +143,9 @@ class StampClock:
     def _jump_to(self, stamp_ns: int, offset_ns: int, *, has_time: bool) -> tuple[int, bool]:
         """Return the time from the last usable stamp to a stamp, ns, and whether the stamp leads.
 
-        A stamp leads if it is too far ahead of the time of the recording. The returned time is 0 if
-        there is no usable stamp yet.
+        A stamp leads if it is too far ahead of the time of the recording, and if the last samples
+        are no history that was recorded in a burst. The returned time is 0 if there is no usable
+        stamp yet.
         """
         # There is no usable stamp yet, or only a stamp that was not set.
         if not self._last_ns:
@@ -244,7 +245,9 @@ LOOP = ("y", "y_m", "u", "internals", "truth")  # topics that must all show a le
 def without_leaps(
     signals: Mapping[str, Signal], recording: Mapping[str, Recording]
 ) -> tuple[dict[str, Signal], dict[str, Recording], list[Leap]]:
-    """Take the leaps of the clock out of the stamps, and return the signals and the leaps.
+    """Take the leaps of the clock out of the stamps.
+
+    Returns the signals, the findings in the recording, and the leaps.
 
     A leap is a forward step that the clock of all topics makes. After a forward step of a single
     topic, the samples of this topic are left out.

@@ -153,9 +153,9 @@ def kind_of_head(head: bytes) -> FileKind:
 
 
 def tlog_start(head: bytes) -> int | None:
-    """Return the place of the first packet that has a time before it; None without a packet.
+    """Return the place of the time before the first packet; None without a packet.
 
-    A text that a radio sends at its start may come before this packet. In this case a second packet
+    A text that a radio sends at its start may come before this time. In this case a second packet
     must follow.
     """
     for start in range(len(head) - TLOG_TIME.size):

@@ -38,7 +38,8 @@ def instances_of_flight(
     """Return a table for each message, and each choice among several instances with its reason.
 
     `fields` has the fields that are read, by message. For a message that is not in `fields`, the
-    first instance is taken. Raises ParameterError if two different instances remain.
+    first instance is taken. Raises ParameterError if two different instances remain, if `choice`
+    names an instance that the log lacks, or if no airspeed sensor or IMU was in use.
     """
     for name in choice.instances:
         require(

@@ -146,9 +146,10 @@ class _Publisher:
 class TopicSamples:
     """The samples of a topic, decoded in batches.
 
-    The samples that have the same channel names form the signal. Steps of the clock, lost numbers
-    and damage are counted for each publisher, so that the faults of a foreign publisher are not
-    attributed to another one.
+    The signal has the samples with the channels of the publisher that has the most samples (see
+    `_names`), and the other samples are refused. Steps of the clock, lost numbers and damage are
+    counted for each publisher, so that the faults of a foreign publisher are not attributed to
+    another one.
     """
 
     def __init__(self, decode: Decoder, expected: int) -> None:

@@ -21,7 +21,8 @@ CONTROL = "control"  # name of the node that carries out the requests of a page
 PARAMETER = "parameter"
 MAX_TEXT = 400  # largest number of characters of a text from the log
 CUT = " ..."  # mark at the end of a longer text
-# length of the end of a log in which the last messages count; a node that waits says so every 2 s
+# The last words are those up to this time before the very last one. A node that waits says so
+# every 2 s.
 LAST_NS = 3 * NANOSECONDS
 # largest number of values of a parameter that are shown: enough for one per channel, but not for a
 # matrix
@@ -120,7 +121,10 @@ def log_messages(texts: Iterable[StoredText], namespace: str, first_ns: int) -> 
 
 
 def last_words(messages: Iterable[LogMessage]) -> list[str]:
-    """Return the warnings and errors at the end of a log in their order, without repetitions."""
+    """Return the last warning or error and those up to LAST_NS before it, without repetitions.
+
+    They are in the order of `messages`.
+    """
     said = [each for each in messages if each.kind in {"warning", "error"}]
     end_ns = max((each.stamp_ns for each in said), default=0) - LAST_NS
     return list(dict.fromkeys(each.text for each in said if each.stamp_ns > end_ns))

@@ -150,7 +150,8 @@ def open_scan(file: Path) -> Iterator[Scan]:
 def _unpack(file: Path, plain: Path, kind: FileKind) -> None:
     """Unpack the content of a packed file into the file `plain`.
 
-    If the file is truncated, only the beginning is written. Raises ParameterError.
+    If the file is truncated, only the beginning is written. Raises ParameterError if the file
+    cannot be read, or if its content is larger than half of the free space.
     """
     limit = shutil.disk_usage(plain.parent).free // 2
     open_packed: Any = lz4.frame.open if kind is FileKind.LZ4 else zstandard.open
@@ -241,7 +242,10 @@ def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
 
 
 def require_mcap(file: Path) -> None:
-    """Refuse a file that is no MCAP file, and name its kind. An empty file passes."""
+    """Raise ParameterError for a file that is no MCAP file, and name its kind.
+
+    An empty file passes, and so does a file with only the first bytes of an MCAP file.
+    """
     kind = file_kind(file)
     found = kind.value
     if kind in PACKED and file.name.endswith(PACKED_SUFFIXES):

@@ -108,7 +108,10 @@ def read_playback(
 
 
 def _within(messages: Sequence[StoredMessage], namespace: str, where: str) -> list[StoredMessage]:
-    """Return the messages of an aircraft, and of SHARED topics. Raises ParameterError."""
+    """Return the messages of an aircraft, and of SHARED topics.
+
+    Raises ParameterError if no aircraft has the namespace.
+    """
     topics = {message.topic for message in messages}
     names = names_within(chosen_namespace(topics, namespace, where), topics)
     inside = {*names, *SHARED}

@@ -91,7 +91,7 @@ AHEAD = 2  # number of groups of chunks that are decoded ahead
 MAX_CHUNK_BYTES = 64 << 20
 """Largest size of the records in a compressed chunk, bytes.
 
-Without a limit, a damaged chunk of 1 kB could claim any size, or decompress to 20 MB.
+Without a limit, a damaged chunk of 1 kB could claim any size.
 
 Recorders close a chunk at about 1 MB, or after the message that exceeds it.
 """

@@ -106,7 +106,9 @@ def parameter_changes(
 
 
 def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> bytes:
-    """Return a message of PARAMETER_EVENTS with changes by dotted name; None deletes one.
+    """Return a message of PARAMETER_EVENTS with changes by dotted name.
+
+    A value of None means that the parameter was deleted.
 
     This is the inverse of `parameter_changes`.
     """
@@ -115,12 +117,14 @@ def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> byt
         name: store.types[f"rcl_interfaces/msg/{name}"]
         for name in ("ParameterEvent", "Parameter", "ParameterValue")
     }
-    texts = (bool, int, float, str)
+    scalars = (bool, int, float, str)
 
     def parameter(name: str, value: Any) -> Any:
         array = isinstance(value, (list, tuple))
         kind = (
-            0 if value is None else 1 + texts.index(type(value[0] if array else value)) + 5 * array
+            0
+            if value is None
+            else 1 + scalars.index(type(value[0] if array else value)) + 5 * array
         )
         empty = [np.zeros(0, dtype=dtype) for dtype in (np.uint8, bool, np.int64, float)]
         fields: list[Any] = [False, 0, 0.0, "", *empty, []]  # fields of the types from 1 on

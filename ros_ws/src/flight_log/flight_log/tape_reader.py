@@ -260,7 +260,7 @@ def _tape(
         recording=recording,
         processes={printable(name): process for name, process in processes.items()},
         refused=refusals,
-        is_by_clock=SIMULATED_TIME in log.metadata or _is_before_epoch(start_ns, spans),
+        is_by_clock=SIMULATED_TIME in log.metadata or _stamped_by_clock(start_ns, spans),
         lost_parts=tuple(replace(lost, sentence=printable(lost.sentence)) for lost in lost_parts),
     )
 
@@ -302,7 +302,7 @@ def _publishers(senders: Sequence[str]) -> str:
     return ", ".join(bounded(sender) or UNNAMED for sender in senders[:NAMED]) + more
 
 
-def _is_before_epoch(start_ns: int, spans: Mapping[str, SampleSpan]) -> bool:
+def _stamped_by_clock(start_ns: int, spans: Mapping[str, SampleSpan]) -> bool:
     """Return whether the processes took their stamps from /clock.
 
     The stamps then lie long before the present, and the names of the publishers have a process id.
@@ -365,7 +365,8 @@ def aircraft_namespaces(topics: Collection[str]) -> list[str]:
 def chosen_namespace(topics: Collection[str], namespace: str | None, where: str) -> str:
     """Return the namespace of an aircraft; "" for the root and if there is no aircraft.
 
-    `namespace` is the choice of the caller.
+    `namespace` is the choice of the caller. Raises ParameterError if no aircraft is in it, or if it
+    is None and there are several aircraft.
     """
     aircraft = aircraft_namespaces(topics)
     aircraft_names = ", ".join(name or "/" for name in aircraft) or "none"

@@ -74,7 +74,7 @@ class _Log:
 
     def __init__(self, content: bytes) -> None:
         self._content = content
-        self._sizes: dict[int, int] = {}  # size of the data by number; 0 before the first data
+        self._sizes: dict[int, int] = {}  # size of the data by subscription; 0 before the first
         self.stamp_us = 0  # stamp of the newest data, us
 
     def end_of(self, here: int) -> int:

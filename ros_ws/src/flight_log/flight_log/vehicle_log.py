@@ -87,7 +87,8 @@ byte of the log. pymavlink takes some 35."""
 def read_foreign_log(path: Path, choice: Choice = ANY) -> VehicleLog:
     """Read a log by `read_vehicle_log` in an isolated process, as a guard against hostile logs.
 
-    A log of a few bytes may claim billions of values. Raises ParameterError.
+    A log of a few bytes may claim billions of values. Raises ParameterError as `read_vehicle_log`
+    does, and if the decoding exceeds LIMITS or MEMORY.
     """
     require(path.is_file(), str(path), "no such file", EXPECTED)
     size = path.stat().st_size

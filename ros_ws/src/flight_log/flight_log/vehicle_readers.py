@@ -213,8 +213,9 @@ def _flown_system(
 ) -> tuple[int, tuple[tuple[str, str], ...]]:
     """Choose the system of a tlog that flew, and return its number.
 
-    `choice` is the user's. Also returns the choice with its reason, if there were several systems.
-    Raises ParameterError if two systems moved, or if the log lacks the user's choice.
+    `choice` is the user's. The number is 0 if no autopilot sent a heartbeat. Also returns the
+    choice with its reason, if it is the user's or if there were several systems. Raises
+    ParameterError if two systems moved, or if the log lacks the user's choice.
     """
     numbers = " and ".join(map(str, messages_of)) or "none with a heartbeat"
     if choice is not None:
@@ -245,6 +246,7 @@ def _flown_system(
 LEAST_TIMES = 0.1
 # number of recent messages with a time, from which a message without a time gets its time
 RECENT = 16
+# ns; a message that arrives again within this time, with the same name and time, is a repetition
 AGAIN_NS = 30 * NANOSECONDS
 
 
@@ -253,8 +255,8 @@ def _dated(messages: list[Received]) -> Iterator[Sample]:
 
     The times of arrival cannot serve: a radio may bunch messages, and a second link repeats
     messages later. A message without a time gets that of the preceding message on the same link,
-    which is found by the sequence numbers. Stamps count from the first arrival. If the messages
-    have no clock, the arrival is the time.
+    which is found by the sequence numbers. The stamp of the first message with a time is its
+    arrival. If no message has a time, or if the clock stands still, each stamp is an arrival.
     """
     with_time = [message for message in messages if hasattr(message.content, "time_boot_ms")]
     times = {message.content.time_boot_ms for message in with_time}
@@ -266,7 +268,7 @@ def _dated(messages: list[Received]) -> Iterator[Sample]:
     newest_ns = with_time[0].arrival_ns if with_time else 0
     # Sequences and stamps; the stamp is None for a message that has come before.
     recent = deque[tuple[int, int | None]](maxlen=RECENT)
-    arrivals: dict[tuple[str, int], int] = {}  # number of arrivals by name and time
+    arrivals: dict[tuple[str, int], int] = {}  # ns, by name and time, without repetitions
     for message in messages:
         name, content, arrival_ns = message.name, message.content, message.arrival_ns
         stamp_ns: int | None
@@ -275,7 +277,6 @@ def _dated(messages: list[Received]) -> Iterator[Sample]:
         elif (boot_ms := getattr(content, "time_boot_ms", None)) is not None:
             before_ns = arrivals.get((name, boot_ms))
             repeated = before_ns is not None and arrival_ns - before_ns <= AGAIN_NS
-            arrivals.setdefault((name, boot_ms), arrival_ns)
             if not repeated:
                 arrivals[name, boot_ms] = arrival_ns
             stamp_ns = None if repeated else offset_ns + 1_000_000 * boot_ms
@@ -398,7 +399,10 @@ def _angles(attitude: MessageTable) -> dict[str, FloatArray]:
 
 
 def _vehicle(instances: Instances) -> tuple[str, bool]:
-    """Return the kind of vehicle in `vehicle_status`, "" if unknown, and whether it is a VTOL."""
+    """Return the kind of vehicle in `vehicle_status`, "" if unknown, and whether it is a VTOL.
+
+    In a log before PX4 1.10, this adds the field `vehicle_type` to the table.
+    """
     table = instances.get("vehicle_status", {}).get(0)
     if table is None:
         return "", False
@@ -437,7 +441,7 @@ ULOG_VALUES = 65535
 
 
 def _require_short(formats: Mapping[str, Any]) -> None:
-    """Refuse a format with more values than a message can hold, by ValueError.
+    """Raise ValueError for a format with more values than a message can hold.
 
     pyulog would make a field for each value.
     """
