@@ -20,6 +20,7 @@ import time
 import tracemalloc
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from tornado.httpclient import AsyncHTTPClient, HTTPRequest, HTTPResponse
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.metrics import settling_bands
 from flight_core.tape import Tape
 from flight_guidance.routes.route_file import Origin, Waypoint
 from flight_guidance.steering.path import route_outline
@@ -222,6 +224,30 @@ def test_long_flight_becomes_coarser_in_place() -> None:
     assert (samples.values[: rows // 2 : 2] == groups.min(axis=1)).all()
     assert (samples.values[1 : rows // 2 : 2] == groups.max(axis=1)).all()
     assert (samples.stamp_ns[: rows // 2] == np.arange(0, rows, 2)).all()
+
+
+def test_settling_bands_grow_with_a_flight_that_became_coarser(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rows are halved near their limit, so their number does not tell how long it flies."""
+    ends = []
+
+    def bands(tape: Tape) -> dict[str, float]:
+        ends.append(int(tape["y"].stamp_ns[-1]))
+        return settling_bands(tape)
+
+    monkeypatch.setattr(followed_flight, "settling_bands", bands)
+    monkeypatch.setattr(followed_flight, "Series", partial(Series, max_rows=72))
+    content = (recorded / "run_0.mcap").read_bytes()
+    live = Flight(tmp_path)
+    for start in range(0, len(content), 1009):
+        with (tmp_path / "run_0.mcap").open("ab") as stream:
+            stream.write(content[start : start + 1009])
+        live.update()
+    samples = live.samples["internals"]
+    first, last = samples.stamp_ns[[0, -1]].tolist()
+    assert samples.thinned > 1
+    assert ends[-1] - first > (last - first) / 1.2
 
 
 def test_browser_gets_thinned_samples_again_from_start(recorded: Path) -> None:

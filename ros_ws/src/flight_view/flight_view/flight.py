@@ -128,7 +128,7 @@ class Flight:
         self._reference_ns: int | None = None  # stamp of the first y_m
         self._first_ns: int | None = None
         self._mode = -1
-        self._banded = 0  # number of rows of internals from which the bands were computed
+        self._banded_ns = 0  # length of the record of ticks from which the bands were computed
         self._flown: list[ParameterTicks] = []
         self._now = now
         self._changed = now()
@@ -509,14 +509,17 @@ class Flight:
             self._note(f"events after the first {MAX_EVENTS} are left out")
 
     def _update_bands(self) -> None:
-        """Update the settling bands whenever the number of ticks has grown by a tenth."""
+        """Update the settling bands whenever the record of ticks has become a tenth longer."""
         samples = self.samples.get("internals")
-        if samples is None or samples.count < 1.1 * self._banded + 2:
+        if samples is None or samples.count < 2:
+            return
+        recorded_ns = int(samples.stamp_ns[-1] - samples.stamp_ns[0])
+        if recorded_ns <= 1.1 * self._banded_ns:
             return
         y, y_m = (self._ticks(group) for group in ("y", "y_m"))
         if y.names and y.names == y_m.names:
             self.bands = settling_bands(Tape({"y": y, "y_m": y_m}))
-        self._banded = samples.count
+        self._banded_ns = recorded_ns
 
     def _ticks(self, group: str) -> Signal:
         """Return a group of channels from the samples of the ticks."""
