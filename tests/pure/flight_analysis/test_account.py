@@ -48,7 +48,7 @@ from flight_cli.output import show_flight
 from flight_cli.replay import Replay
 from flight_cli.report import Report
 from flight_core.modes import Mode
-from flight_core.outcome import COMPLETED, STATUS_SHORTFALL
+from flight_core.outcome import COMPLETED, STATUS_SHORTFALL, End
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.tape import Process, Recording, Signal, Tape
 from flight_log.clock import StampClock
@@ -198,6 +198,21 @@ def test_flight_counts_from_its_first_u(
     flight = Tape(late, duration=2.0)
     flight_account = account(flight, osprey_gust)
     assert str(judge(COMPLETED, flight, osprey_gust, flight_account)).startswith(outcome)
+
+
+def test_number_of_the_first_tick_tells_that_u_came_before_the_log(
+    tape: Tape, osprey_gust: Scenario
+) -> None:
+    """The log lacks u and `internals` until 1.9 s. Tick 191 is its first one: the law has flown."""
+    late = {name: tape[name].where(tape.time(name) >= 1.9) for name in ("u", "internals")}
+    signals = {name: tape[name] for name in ("y", "y_m", "truth")} | late
+    flight = Tape(signals, duration=2.0)
+    outcome = judge(COMPLETED, flight, osprey_gust, account(flight, osprey_gust))
+    assert outcome.end is End.COMPLETED
+    assert [shortfall.sentence for shortfall in outcome.shortfalls] == [
+        f"log incomplete: {name} 11 of 201 samples, begins at t = 1.900 of 2.000 s"
+        for name in ("u", "internals")
+    ]
 
 
 @pytest.mark.parametrize("share, named", [(0.005, False), (0.02, True), (0.1, True), (0.5, True)])
