@@ -180,10 +180,11 @@ class Control:
         self._require_key(key, lease)
         if action not in AT_ONCE:
             self._require_rate()
-        if not isinstance(action, str) or action not in {*self._actions, "check"}:
+        known = (*self._actions, "check")
+        if not isinstance(action, str) or action not in known:
             raise RefusedError(
                 HTTPStatus.BAD_REQUEST,
-                f"do: found {short_repr(action)}, expected one of {', '.join(self._actions)}",
+                f"do: found {short_repr(action)}, expected one of {', '.join(known)}",
             )
         # A later flight in this domain is a new flight, which has another page.
         if action not in {"state", "check", *AT_ONCE} and self._flight.state() in OVER:

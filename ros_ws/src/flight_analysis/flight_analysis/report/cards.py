@@ -66,7 +66,7 @@ def _margin_card(margins: LoopMargins, command: str) -> Card:
         sentences=[
             (
                 f"The linear loop is stable. At its worst input, {margins.inputs[worst]}, it "
-                f"stands {phase:.0f} deg more phase lag; at any input {gain_text}."
+                f"withstands {phase:.0f} deg more phase lag; at any input {gain_text}."
             ),
             (
                 f"If u came {1e3 * margins.delay:.0f} ms later in all inputs, it would be unstable."

@@ -80,12 +80,12 @@ GLOSSARY = MappingProxyType(
         "age of y": "how old the newest y is when the controller uses it",
         "age of u": "how old a u is when the actuators get it",
         # Margins
-        "phase": "how much more phase lag at one input the loop stands, and the frequency at "
+        "phase": "how much more phase lag at one input the loop withstands, and the frequency at "
         "which it would then oscillate; the other inputs closed",
         "gain": "the factor by which the effect of one input may change, the other inputs closed",
         "largest S": "the largest factor by which the loop amplifies a disturbance at this "
         "input; it is 1 without a loop, and 2 at the circle of the Nyquist plot",
-        "disk": "the size of the disk of gains and phases around 1 that the loop stands at "
+        "disk": "the size of the disk of gains and phases around 1 that the loop withstands at "
         "this input; from 0, none, to 2",
         "delay": "how much later u may come before the loop is unstable",
         "all inputs": "a disk of its own in each input at the same time; phase and gain are those "
