@@ -132,3 +132,35 @@ def test_actuator_without_a_lag_passes_u_on() -> None:
     u = np.array([0.0, 1.0, -1.0])
     assert_array_equal(behind_servo(u, 0.01, 0.0, 0.0, 1.0), u)
     assert np.isfinite(behind_servo(u, 0.01, 1e-4, 1e-4, 1.0)).all()
+
+
+@pytest.mark.parametrize(("frequency", "damping"), [(40.0, 0.6), (25.0, 0.5)])
+def test_first_order_actuator_moves_as_a_servo_at_its_rate_limit(
+    frequency: float, damping: float
+) -> None:
+    """The reference is the servo in steps of 0.1 ms, at most at its rate."""
+    lag, period, limit = 0.02, 0.01, 2.0
+    u = np.repeat([0.0, 0.3, -0.3, 0.02], 20)
+    expected = [0.0]
+    rate = 0.0
+    for commanded in u:
+        position = expected[-1]
+        for _ in range(100):
+            pull = frequency**2 * (commanded - position) - 2.0 * damping * frequency * rate
+            rate = min(max(rate + 1e-4 * pull, -limit), limit)
+            position += 1e-4 * rate
+        expected.append(position)
+    servo = 2.0 * damping / frequency, 1.0 / (frequency * lag) ** 2
+    moved = first_order(behind_servo(u, period, lag, *servo, limit), lag, period)
+    # where the servo reaches or leaves its limit within a tick, it is off by a part of its motion
+    # of 0.02 in a tick
+    assert_allclose(moved, expected, atol=0.01)
+    free = first_order(behind_servo(u, period, lag, *servo), lag, period)
+    assert np.abs(free - expected).max() > 0.1
+
+
+def test_servo_of_the_known_lag_gets_u_as_it_is_unless_it_reaches_its_limit() -> None:
+    u = np.repeat([0.0, 0.1, 0.0], 20)
+    assert_array_equal(behind_servo(u, 0.01, 0.02, 0.02, 0.0, 5.1), u)
+    moved = first_order(behind_servo(u, 0.01, 0.02, 0.02, 0.0, 1.0), 0.02, 0.01)
+    assert np.abs(np.diff(moved)).max() == pytest.approx(0.01)

@@ -28,6 +28,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.vectors import StampedVector
 from flight_design.gains.gain_design import selected_observer
 from flight_design.gains.observer_search import SelectedObserver
+from flight_design.identification.innovation_filters import Actuation
 from flight_design.identification.model_refusals import best_known
 from flight_design.learning.designs import Goal
 from flight_design.learning.learner import Learner
@@ -343,7 +344,8 @@ def test_effects_at_another_speed_are_reduced_to_the_trim_speed() -> None:
         },
     )
     ticks = simulate(scenario.vary(controller={"learn": None}))["internals"]
-    learner = Learner(scenario.rise_di(), OSPREY, no_design)
+    actuation = Actuation(np.array([0.02, 0.1, 0.02, 0.02]), 0.0)
+    learner = Learner(scenario.rise_di(), OSPREY, no_design, actuation)
     for stamp_ns, y, u in zip(
         ticks.stamp_ns.tolist(), ticks.group("y").values, ticks.group("u").values, strict=True
     ):

@@ -97,10 +97,11 @@ def coarser(recorded: FlightData, factor: int) -> FlightData:
 
 
 class Actuation(NamedTuple):
-    """The lags and the delay between u and the aircraft."""
+    """The lags, the delay and the rate limits between u and the aircraft."""
 
     lag: FloatArray  # (m,) time constants of the actuators in the airframe's order, s
     delay: float  # s
+    rate_limit: FloatArray | None = None  # (m,) units of u / s; None if no actuator has a limit
 
 
 def recording(tape: Tape, airframe: Airframe) -> FlightData:

@@ -150,12 +150,14 @@ class Likelihood:
         factor: int | None = None,
         *,
         coupled: bool = False,
+        rates: FloatArray | None = None,
     ) -> None:
         """Set up the likelihood, with the priors of the errors of A and B in `unknown`.
 
         `believe` may replace the priors later. `delay` is the delay of u, s. The search starts with
         means over `factor` periods, by default over the shortest lag. If `coupled`, the entries
-        that are 0 are identified, too.
+        that are 0 are identified, too. `rates` has the limits of the aircraft's actuators, in units
+        of u / s. They count only if the delay is identified.
         """
         if factor is None:
             factor = max(int(float(np.min(model.lag)) / recorded.period + 1e-9), 1)
@@ -165,13 +167,14 @@ class Likelihood:
             slow = model._replace(noise=model.noise / np.sqrt(factor), period=period)
             means = coarser(recorded, factor)
             self.coarse = type(self)(
-                means, slow, block, airframe, delay, unknown, factor=1, coupled=coupled
+                means, slow, block, airframe, delay, unknown, 1, coupled=coupled, rates=rates
             )
         self._period = recorded.period
         self._delay = np.broadcast_to(delay, len(block.inputs)) / recorded.period
         self._delay_deviation = unknown.delay / recorded.period
         self._lag_deviation = unknown.lag
         self._servo_deviation = unknown.servo
+        self._rates = None if rates is None else rates[block.inputs]
         self._drift = unknown.drift
         angles = np.flatnonzero(block.restricted(model).gravity.any(axis=0))
         self._angles = angles if unknown.angle else angles[:0]
@@ -290,16 +293,14 @@ class Likelihood:
         order.
         """
         levels = np.unique(levels)
-        strength = np.exp(thetas[:, self._winds])
         airframe = self._airframe
-        drift = self._drift
         bank = filter_bank(
             self.with_errors(thetas),
             self.names,
             airframe.speed,
-            strength,
+            np.exp(thetas[:, self._winds]),
             levels,
-            drift,
+            self._drift,
             near=near,
             span=airframe.span,
             shear=thetas[:, self._shear] if self._is_sheared else None,
@@ -314,7 +315,7 @@ class Likelihood:
             return Models(bank, levels, begin, self._delayed(self._delay))
         periods = self._delay + self._delay_deviation * thetas[:, self._late]
         inertia = thetas[:, self._inertia] if self._servo_deviation else np.zeros(periods.shape)
-        servo = self._servo_lag(thetas), inertia
+        servo = self._servo_lag(thetas), inertia, self._rates
         u = behind_servos(self._u, periods, self._period, self._model.lag, *servo)
         return Models(bank, levels, begin, u)
 

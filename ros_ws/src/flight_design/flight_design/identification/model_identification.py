@@ -136,7 +136,7 @@ class _Study(NamedTuple):
 
     recorded: FlightData
     airframe: Airframe
-    delay: float  # s, delay of u
+    actuation: Actuation
     unknown: Unknown
     validating: NDArray[np.bool_]  # (T,)
     # (T,) samples on which the model in flight is compared with the nominal model
@@ -155,9 +155,10 @@ class _Study(NamedTuple):
             model=model,
             block=block,
             airframe=self.airframe,
-            delay=self.delay,
+            delay=self.actuation.delay,
             unknown=self.unknown,
             coupled=coupled,
+            rates=self.actuation.rate_limit,
         )
         search.progress = self.step
         return search
@@ -340,7 +341,7 @@ def identify_model(
     Args:
         recorded: The flight.
         airframe: The nominal airframe.
-        actuation: Lags and delay between u and the aircraft.
+        actuation: Lags, delay and rate limits between u and the aircraft.
         channels: Channels in the law's order, whose D the model must keep; by default they are in
             the airframe's order.
         progress: Takes the steps `completed` and their largest number `total`.
@@ -372,7 +373,7 @@ def identify_model(
     study = _Study(
         recorded=recorded,
         airframe=blown,
-        delay=actuation.delay,
+        actuation=actuation,
         unknown=unknown,
         validating=validating,
         later=is_known & (recorded.t > after),

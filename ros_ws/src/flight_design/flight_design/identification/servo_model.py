@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Let actuators whose model has a lag of first order move as late servos of the second order do.
 
-An actuator has no noise, so its position follows from u alone. The filters can therefore keep the
-model of first order. They get the u with which this model has the position of the servo at each
-tick.
+The servos may have rate limits. An actuator has no noise, so its position follows from u alone. The
+filters can therefore keep the model of first order. They get the u with which this model has the
+position of the servo at each tick.
 """
 
 import numpy as np
@@ -26,42 +26,79 @@ def behind_servos(
     lag: FloatArray,
     servo_lag: FloatArray,
     inertia: FloatArray,
+    rate_limit: FloatArray | None = None,
 ) -> FloatArray:
     """Delay the commanded u, (T, m), and apply `behind_servo`, for each of N models, (N, T, m).
 
-    `late`, (N, m), are the delays of the inputs in periods. `lag`, (m,), s, is that of the filters,
-    and `servo_lag` and `inertia`, (N, m), are those of `behind_servo`.
+    `late`, (N, m), are the delays of the inputs in periods. `lag`, (m,), s, is that of the filters.
+    `servo_lag` and `inertia`, (N, m), and `rate_limit`, (m,), are those of `behind_servo`.
     """
     acting = np.empty((len(late), *u.shape))
+    limits = np.full(u.shape[1], np.inf) if rate_limit is None else rate_limit
     for j, column in enumerate(u.T):
         found: dict[tuple[float, ...], FloatArray] = {}
         of_models = np.stack([late[:, j], servo_lag[:, j], inertia[:, j]], axis=1)
         for n, servo in enumerate(map(tuple, of_models.tolist())):
             if servo not in found:
-                later = delayed(column[:, None], max(servo[0], 0.0))[:, 0]
-                found[servo] = behind_servo(later, period, float(lag[j]), *servo[1:])
+                periods, its_lag, its_inertia = servo
+                later = delayed(column[:, None], max(periods, 0.0))[:, 0]
+                found[servo] = behind_servo(
+                    later, period, float(lag[j]), its_lag, its_inertia, float(limits[j])
+                )
             acting[n, :, j] = found[servo]
     return acting
 
 
 def behind_servo(
-    u: FloatArray, period: float, lag: float, servo_lag: float, inertia: float
+    u: FloatArray,
+    period: float,
+    lag: float,
+    servo_lag: float,
+    inertia: float,
+    rate_limit: float = np.inf,
 ) -> FloatArray:
     """Return the u, (T,), with which a first-order actuator moves as a servo does at each tick.
 
-        inertia lag^2 p_ddot + servo_lag p_dot + p = u
+        inertia lag^2 p_ddot + servo_lag p_dot + p = u,   abs(p_dot) <= rate_limit
 
     `lag` is that of the first-order actuator, s. The servo is at rest at the first u. Without an
-    inertia it is of first order. An actuator without a lag has no inertia either.
+    inertia it is of first order. An actuator without a lag has no inertia either, and no limit.
     """
-    if lag == 0.0 or (inertia == 0.0 and servo_lag == lag):
+    if lag == 0.0:
         return u
     square = max(inertia, LEAST_INERTIA) * lag**2
     motion = np.array([[0.0, 1.0], [-1.0 / square, -servo_lag / square]])
     Phi, Gamma = zero_order_hold(motion, np.array([[0.0], [1.0 / square]]), period)
-    # position at the next tick over u: of second order, and then the inverse of the first order
-    position = [Gamma[0, 0], Phi[0, 1] * Gamma[1, 0] - Phi[1, 1] * Gamma[0, 0]]
-    keep = np.exp(-period / lag)
-    numerator = np.convolve(position, [1.0, -keep]) / (1.0 - keep)
+    # position at the next tick over u
+    numerator = [Gamma[0, 0], Phi[0, 1] * Gamma[1, 0] - Phi[1, 1] * Gamma[0, 0]]
     denominator = [1.0, -np.trace(Phi), np.linalg.det(Phi)]
-    return np.asarray(u[0] + signal.lfilter(numerator, denominator, u - u[0]))
+    position = np.asarray(signal.lfilter(numerator, denominator, u - u[0]))
+    if np.abs(np.diff(position, prepend=0.0)).max() > rate_limit * period:
+        position = _within_rate(u - u[0], Phi, Gamma[:, 0], rate_limit, period)
+    elif inertia == 0.0 and servo_lag == lag:
+        return u
+    keep = np.exp(-period / lag)
+    before = np.concatenate([[0.0], position[:-1]])
+    return np.asarray(u[0] + (position - keep * before) / (1.0 - keep))
+
+
+def _within_rate(
+    u: FloatArray, Phi: FloatArray, Gamma: FloatArray, rate_limit: float, period: float
+) -> FloatArray:
+    """Return the positions of a servo after each tick, (T,), whose rate is limited.
+
+    The servo is at rest at 0. Without the limit its position and rate would be Phi times those
+    before, plus Gamma u.
+    """
+    (by_position, by_rate), (rate_by_position, rate_by_rate) = Phi.tolist()
+    by_u, rate_by_u = Gamma.tolist()
+    farthest = rate_limit * period
+    positions = []
+    position = rate = 0.0
+    for commanded in u.tolist():
+        step = (by_position - 1.0) * position + by_rate * rate + by_u * commanded
+        turned = rate_by_position * position + rate_by_rate * rate + rate_by_u * commanded
+        position += min(max(step, -farthest), farthest)
+        rate = min(max(turned, -rate_limit), rate_limit)
+        positions.append(position)
+    return np.array(positions)

@@ -113,7 +113,7 @@ class Learner:
         controller: RiseDiConfig,
         airframe: Airframe,
         design: Design,
-        delay: float = 0.0,
+        actuation: Actuation,
         rough: Unknown = KNOWN,
         design_of_rough: DesignOfFile | None = None,
         *,
@@ -121,10 +121,10 @@ class Learner:
     ) -> None:
         """Make a learner with an empty record.
 
-        `airframe` is the rough model, the prior. `delay` is the delay of the loop, s, beyond
-        sampling and lags. `design_of_rough` makes a design for the rough model that allows for its
-        errors. This design flies from the start, and later in the parts without a learned model. If
-        `design_of_rough` is None, these parts fly by the law of the start.
+        `airframe` is the rough model, the prior. The delay in `actuation` is that of the loop
+        beyond sampling and lags. `design_of_rough` makes a design for the rough model that allows
+        for its errors. This design flies from the start, and later in the parts without a learned
+        model. If `design_of_rough` is None, these parts fly by the law of the start.
 
         `rough` has the standard deviations of A and B in the rough model. It also has the noise of
         the disturbances, which a test for a change uses too. With `quick`, an identification begins
@@ -143,8 +143,7 @@ class Learner:
         self._quick = quick
         self._has_speeds = controller.schedule is not None and bool(controller.schedule.models)
         self._thrust = controller.inputs[controller.outputs.index("V")] if self._has_speeds else ""
-        lag = dict(zip(controller.inputs, controller.lag, strict=True))
-        self._actuation = Actuation(np.array([lag[name] for name in airframe.inputs]), delay)
+        self._actuation = actuation
         self._record = FlightRecord(controller, airframe, settings.window)
         self._window_ns = nanoseconds(settings.window)
         self._latency_ns = nanoseconds(settings.latency)

@@ -27,7 +27,9 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_design.gains.gain_design import selected_observer
+from flight_design.gains.gain_selection import loop_setting
 from flight_design.gains.observer_search import SelectedObserver
+from flight_design.identification.innovation_filters import Actuation
 from flight_design.identification.jsbsim_identification import NOISE, STEP_MARGIN
 from flight_design.identification.likelihood import KNOWN
 from flight_design.identification.sketch import ROUGH, sketched, with_sketch
@@ -115,7 +117,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
         parameters,
         airframe,
         design,
-        parameters.delay if real_time else 0.0,
+        _actuation(scenario, airframe, parameters.delay if real_time else 0.0),
         rough,
         None if sketch else design_of_rough,
         quick=quick,
@@ -159,6 +161,13 @@ def with_law_inputs(airframe: Airframe, controller: RiseDiConfig) -> Airframe:
     order = [controller.outputs.index(name) for name in airframe.outputs]
     T = distribution(airframe, controller)[:, order]
     return airframe.through(T, [controller.inputs[k] for k in order])
+
+
+def _actuation(scenario: Scenario, airframe: Airframe, delay: float) -> Actuation:
+    """Return the actuators of a scenario, in the airframe's order, with a delay of u, s."""
+    loop = loop_setting(scenario)
+    lag = np.array([loop.lag[name] for name in airframe.inputs])
+    return Actuation(lag, delay, np.array([loop.rate_limit[name] for name in airframe.inputs]))
 
 
 def _speeds(controller: RiseDiConfig, airframe: Airframe) -> tuple[float, float] | None:
