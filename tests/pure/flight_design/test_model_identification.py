@@ -321,6 +321,18 @@ def test_flight_without_noise_that_is_mostly_at_rest_has_deviations() -> None:
     assert all(0.0 < entry.deviation < 0.3 for entry in model.entries)
 
 
+def test_noise_of_a_rounded_y_is_at_least_the_error_of_rounding() -> None:
+    """A slow y mostly stays at a step, which its third differences take for no noise."""
+    slow = np.sin(np.linspace(0.0, 6.0, 2000))
+    noise = 0.02 * np.random.default_rng(5).standard_normal(2000)
+    still = np.zeros(2000)
+    y = np.stack([0.1 * np.round(slow / 0.1), slow + noise, still], axis=1)
+    y[7] = np.nan
+    least = innovation_filters.MIN_NOISE
+    found = innovation_filters.measured_noise(y, np.ones(3))
+    assert_allclose(found, [0.1 / np.sqrt(12.0), 0.02, least], rtol=0.1)
+
+
 @pytest.fixture(scope="module")
 def coupled_flight(
     tmp_path_factory: pytest.TempPathFactory,

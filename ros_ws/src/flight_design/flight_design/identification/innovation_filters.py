@@ -178,13 +178,18 @@ def delayed(u: FloatArray, periods: float) -> FloatArray:
 def measured_noise(y: FloatArray, size: FloatArray) -> FloatArray:
     """Estimate the noise of each channel from the third differences of y, (T, m), rms per sample.
 
-    The variance of these differences is 20 times that of the noise. The result is at least
-    MIN_NOISE times `size`, the unit of the channel.
+    The variance of these differences is 20 times that of the noise. They do not show the noise of a
+    y that is rounded to larger steps, because it often stays the same. So the result is at least
+    the rms error of rounding, step / sqrt(12), where the step is the least change of y. It is also
+    at least MIN_NOISE times `size`, the unit of the channel.
     """
     third = np.diff(y, n=3, axis=0)
     # 0.6745 sigma is the median magnitude of a normal value
     spread = np.nanmedian(np.abs(third), axis=0) / 0.6745
-    return np.asarray(np.maximum(spread / np.sqrt(20.0), MIN_NOISE * size))
+    change = np.abs(np.diff(y, axis=0))
+    step = np.min(change, axis=0, where=change > 0.0, initial=np.inf)
+    rounding = np.where(np.isfinite(step), step, 0.0) / np.sqrt(12.0)
+    return np.asarray(np.maximum.reduce([spread / np.sqrt(20.0), rounding, MIN_NOISE * size]))
 
 
 class FilterBank(NamedTuple):
