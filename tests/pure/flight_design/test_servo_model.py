@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification of aircraft whose servos are of second order, where the file has a lag."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,15 @@ from tests.pure.flight_design.test_model_identification import (
 )
 
 from aircraft_sim.plant import actuators
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.vectors import FloatArray
 from flight_design.identification import innovation_filters
 from flight_design.identification.likelihood import Unknown
+from flight_design.identification.likelihood_search import Search
 from flight_design.identification.model_identification import identify_model
 from flight_design.identification.servo_model import behind_servo, behind_servos
+from flight_design.learning import scenario_learner
 from flight_design.learning.change_test import ANGLE
 from flight_design.learning.part_checks import (
     DELAY_DEVIATION,
@@ -164,3 +168,37 @@ def test_servo_of_the_known_lag_gets_u_as_it_is_unless_it_reaches_its_limit() ->
     assert_array_equal(behind_servo(u, 0.01, 0.02, 0.02, 0.0, 5.1), u)
     moved = first_order(behind_servo(u, 0.01, 0.02, 0.02, 0.0, 1.0), 0.02, 0.01)
     assert np.abs(np.diff(moved)).max() == pytest.approx(0.01)
+
+
+def test_learner_knows_the_actuators_of_its_scenario(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scenario_learner, "Learner", lambda *given, **_: given)
+    scenario = find_scenario("osprey_learn")
+    make = scenario_learner.learner(scenario)
+    assert make is not None
+    given: Any = make(scenario.rise_di())
+    actuation = next(each for each in given if isinstance(each, innovation_filters.Actuation))
+    assert list(OSPREY.inputs) == ["elevator", "thrust", "aileron", "rudder"]
+    assert_array_equal(actuation.lag, [0.02, 0.1, 0.02, 0.02])
+    assert_array_equal(actuation.rate_limit, [5.23599, 2.0, 5.23599, 5.23599])
+    assert actuation.delay == 0.0
+
+
+def test_search_of_the_whole_aircraft_begins_with_the_file_and_the_delays_of_the_parts() -> None:
+    """Behind the wrong model of a part that couples, a servo is wrong as well."""
+    count = 1000
+    y, u = np.random.default_rng(6).standard_normal((2, count, 4))
+    recorded = innovation_filters.FlightData(0.01, np.linspace(0.0, 9.99, count), y, u)
+    model = innovation_filters.filter_model(OSPREY, ACTUATORS, recorded)
+    unknown = Unknown(delay=DELAY_DEVIATION, lag=LAG_DEVIATION, servo=SERVO_DEVIATION)
+
+    def search(block: innovation_filters.Block) -> Search:
+        return Search(recorded, model, block, OSPREY, 0.0, unknown)
+
+    parts = [search(block) for block in innovation_filters.blocks(model)]
+    fits: list[Any] = [SimpleNamespace(theta=np.full(len(part.prior), 0.5)) for part in parts]
+    whole = search(innovation_filters.whole_aircraft(model))
+    begin = whole.joined(zip(parts, fits, strict=True))
+    found = {name for name, value in zip(whole.named(), begin.tolist(), strict=True) if value}
+    delays = {f"delay of {name}" for name in OSPREY.inputs}
+    assert found == {*OSPREY.gusts, *delays, "lag of y", "shear of alpha", "shear of q"}
+    assert set(begin[begin != 0.0]) == {0.5}

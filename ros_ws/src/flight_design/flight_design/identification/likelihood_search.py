@@ -394,8 +394,8 @@ class Search(Likelihood):
     def joined(self, parts: Iterable[tuple[Likelihood, Fit]]) -> FloatArray:
         """Return theta, (p,), with the mean winds, angles and delays of the parts.
 
-        The errors of A and B in it are 0, because the errors that were found for a part are wrong
-        if the part couples with another one.
+        The errors of A and B in it are 0, and so are the lags and inertias of the actuators. Those
+        that were found for a part are wrong if the part couples with another one.
         """
         values: dict[str, list[float]] = {}
         for part, fit in parts:
@@ -403,7 +403,9 @@ class Search(Likelihood):
                 part.count :
             ]:
                 values.setdefault(name, []).append(value)
-        return np.array([np.mean(values.get(name, [0.0])) for name in self.named()])
+        theta = np.array([np.mean(values.get(name, [0.0])) for name in self.named()])
+        theta[self._servo] = theta[self._inertia] = 0.0
+        return theta
 
 
 def damped_steps(
