@@ -354,7 +354,10 @@ class Search(Likelihood):
         by_output = slopes.J.reshape(len(theta), *slopes.e.shape)
         coloured = (by_output * np.sqrt(np.maximum(doubt.whiteness, 1.0))).reshape(slopes.J.shape)
         places = np.flatnonzero(used) // round(BLOCK / self._period)
-        sums = self._block_scores(by_output, slopes.e, places, inverse * doubt.leaves_out)
+        of_blocks = self._block_scores(by_output, slopes.e, places)
+        if doubt.leaves_out:
+            of_blocks = self._scores_left_out(by_output, of_blocks, places, inverse)
+        sums = of_blocks - of_blocks.mean(axis=0)
         middles = (coloured @ coloured.T, sums.T @ sums * len(sums) / max(len(sums) - 1, 1))
         spread = [np.diag(inverse @ (middle + before) @ inverse) for middle in middles]
         models = self.models(theta[None], fit.levels)
@@ -369,19 +372,29 @@ class Search(Likelihood):
 
     @staticmethod
     def _block_scores(
-        by_output: FloatArray, e: FloatArray, places: NDArray[np.int64], inverse: FloatArray
+        by_output: FloatArray, e: FloatArray, places: NDArray[np.int64]
     ) -> FloatArray:
-        """Return (I - J_k J_k' H^-1)^-1 J_k e_k of each block k less their mean, (blocks, p).
+        """Return J_k e_k of each block k, (blocks, p). `places` has the block of each sample."""
+        return np.array(
+            [
+                by_output[:, places == k].reshape(len(by_output), -1) @ e[places == k].ravel()
+                for k in np.unique(places)
+            ]
+        )
 
-        `places` has the block of each sample, and `inverse` is H^-1, or 0 for J_k e_k itself.
+    @staticmethod
+    def _scores_left_out(
+        by_output: FloatArray, scores: FloatArray, places: NDArray[np.int64], inverse: FloatArray
+    ) -> FloatArray:
+        """Return (I - J_k J_k' H^-1)^-1 J_k e_k of each block k, (blocks, p).
+
+        `scores` has J_k e_k, and `inverse` is H^-1.
         """
-        scores = []
-        for k in np.unique(places):
+        left_out = np.empty_like(scores)
+        for row, k in enumerate(np.unique(places)):
             J = by_output[:, places == k].reshape(len(inverse), -1)
-            without = np.eye(len(inverse)) - J @ J.T @ inverse
-            scores.append(np.linalg.solve(without, J @ e[places == k].ravel()))
-        sums = np.asarray(scores, float)
-        return np.asarray(sums - sums.mean(axis=0))
+            left_out[row] = np.linalg.solve(np.eye(len(inverse)) - J @ J.T @ inverse, scores[row])
+        return left_out
 
     def flying(self, flown: FloatArray, parts: Iterable[tuple[Likelihood, Fit]]) -> Innovations:
         """Return the innovations of the model that flies, whose theta is `flown`, (p,).
