@@ -493,25 +493,16 @@ class BridgeNode(FlightNode[BridgeConfig]):
 
     def _cause(self, subscription: PolledSubscription | MavlinkReader) -> str:
         """Return a sentence on why no sample of a topic was accepted."""
+        name = subscription.topic.name
+        refusals = [what for what in self.refusals.counts if what.startswith(f"{name}: ")]
         if isinstance(subscription, MavlinkReader):
-            if problem := subscription.link.problem(subscription.message_name):
-                return str(problem)
-            refusal = (
-                what
-                for what in self.refusals.counts
-                if what.startswith(f"{subscription.topic.name}: ")
-            )
-            return next(refusal, "no such message comes")
-        publishers = self.get_publishers_info_by_topic(subscription.name)
-        if not publishers and (fault := version_fault(subscription.name, subscription.topic.type)):
-            return f"no publisher. {fault}"
-        if not publishers:
-            return no_publisher(os.environ)
+            problem = subscription.link.problem(subscription.message_name)
+            return str(problem or (*refusals, "no such message comes")[0])
+        if not self.get_publishers_info_by_topic(subscription.name):
+            fault = version_fault(subscription.name, subscription.topic.type)
+            return f"no publisher. {fault}" if fault else no_publisher(os.environ)
         faults = self.endpoints.mismatches(subscription)
-        refusal = (
-            what for what in self.refusals.counts if what.startswith(f"{subscription.topic.name}: ")
-        )
-        return str(next(iter((*faults, *refusal)), "no sample of its publisher arrives"))
+        return str((*faults, *refusals, "no sample of its publisher arrives")[0])
 
     def graph_checks(self) -> list[Callable[[], None]]:
         """Return the checks of the graph, also of the topics that the autopilot must receive.

@@ -205,18 +205,15 @@ def _two_speeds(speeds: ArrayLike, *, observer: bool) -> tuple[float, float] | N
 
     Raises ParameterError if they are not on both sides of 1, or given without an observer.
     """
-    ratios = as_numbers(
-        speeds,
-        "speeds",
-        expected := "two parts of the trim speed, one below 1 and one above: 0.7,1.4",
-    )
+    expected = "two parts of the trim speed, one below 1 and one above: 0.7,1.4"
+    ratios = as_numbers(speeds, "speeds", expected)
     require(
         observer or not ratios,
         "speeds",
         speeds,
         "an observer too: the law alone follows the airspeed by a schedule",
     )
-    pair = (ratios[0], ratios[1]) if len(ratios) == len(("slow", "fast")) else None
+    pair = (ratios[0], ratios[1]) if len(ratios) == 2 else None
     fits = not ratios or (pair is not None and LEAST_SPEED <= pair[0] < 1.0 < pair[1] <= MOST_SPEED)
     require(fits, "speeds", speeds, f"{expected}, from {LEAST_SPEED:g} to {MOST_SPEED:g}")
     return pair

@@ -1,15 +1,21 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Choose the units in which errors of A and B are counted; an entry with the unit 0 is known."""
+"""Choose units and bounds of the relative errors of A and B; an entry with the unit 0 is known."""
 
 import numpy as np
 
 from control_laws.nominal_model import NominalModel
+from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.vectors import FloatArray
 
 # Unit of an entry that is 0, relative to the largest effect on its row. With it, the prior
 # deviation is 10 % of this effect.
 COUPLING = 0.34
+# two prior standard deviations; its negative is the lower bound of a relative error
+MAX_ERROR = 0.6
+# Largest ratio of an entry to its nominal value, 1 / (1 - MAX_ERROR): a rough model errs by a
+# factor, up or down.
+MAX_FACTOR = 2.5
 
 
 def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:
@@ -34,3 +40,8 @@ def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, Fl
             for part, largest in ((units_A, largest_A), (units_B, largest_B))
         )
     return units_A, units_B
+
+
+def largest_error(entry: Entry) -> float:
+    """Return the upper bound of the relative error of an entry."""
+    return MAX_FACTOR - 1.0 if entry.nominal else MAX_ERROR

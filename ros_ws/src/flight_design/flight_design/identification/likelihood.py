@@ -19,7 +19,7 @@ from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.outcome import Refusal
 from flight_core.vectors import FloatArray
-from flight_design.identification.entry_units import units
+from flight_design.identification.entry_units import MAX_ERROR, MAX_FACTOR, largest_error, units
 from flight_design.identification.innovation_filters import (
     DRIFT,
     HOLD,
@@ -41,13 +41,8 @@ from flight_design.identification.spans import held_out, span_length
 PRIOR = 0.29  # standard deviation of a relative error before the flight: uniform within +-50 %
 SHEAR_PRIOR = 1.0  # prior standard deviation of the effect of the vertical wind's slope on a state
 WIND_PRIOR = 1.0  # prior standard deviation of the logarithm of the wind's strength along an axis
-# two prior standard deviations; its negative is the lower bound of a relative error
-MAX_ERROR = 0.6
 # largest error of the delay in standard deviations: 60 ms for a deviation of 15 ms
 MAX_DELAY_ERROR = 4.0
-# Largest ratio of an entry to its nominal value, 1 / (1 - MAX_ERROR): a rough model errs by a
-# factor, up or down.
-MAX_FACTOR = 2.5
 # least gain of log-likelihood in a span for which a stronger wind is taken: odds of 20 to 1
 CHANGE = 3.0
 # A span whose innovations have a mean square above this multiple of the median is explained by no
@@ -127,11 +122,6 @@ class Fit(NamedTuple):
     by_lag: FloatArray  # (p,) part of each deviation that comes from the lags, see `by_lag`
     # innovations of the model in flight, in the winds that fit it best
     flown: Innovations | None = None
-
-
-def largest_error(entry: Entry) -> float:
-    """Return the upper bound of the relative error of an entry."""
-    return MAX_FACTOR - 1.0 if entry.nominal else MAX_ERROR
 
 
 class Likelihood:

@@ -11,7 +11,8 @@ from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.outcome import Refusal
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
-from flight_design.identification.likelihood import MAX_ERROR, MAX_FACTOR, PRIOR, largest_error
+from flight_design.identification.entry_units import MAX_ERROR, MAX_FACTOR, largest_error
+from flight_design.identification.likelihood import PRIOR
 
 # Largest relative standard deviation of the best known effect on each output. Two such deviations
 # change the loop gain by a fifth.
