@@ -89,7 +89,8 @@ def export(
 ) -> Exported:
     """Write the controller of a scenario as C99, compile the code and prove it.
 
-    The proof shows that C and Python give the same bits.
+    In double precision the proof shows that C and Python give the same bits. If a guarantee is
+    stored for the loop, its certificate is written, too.
 
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
@@ -100,7 +101,8 @@ def export(
         float32: Whether to compute in single precision. The proof then bounds the difference of u.
         duration: Duration of each flight of the proof, s. If None, it is that of the scenario, at
             most 20 s.
-        drawn: Number of random steps in the proof. In single precision there are none.
+        drawn: Number of random steps in the proof. There are none in single precision, or if the
+            ticks of `run` are used.
         seed: Seed of the random inputs.
         compiler: Commands of C compilers. If empty, they are gcc and clang.
         runner: Command that starts a program of the compiler, such as qemu-aarch64 for a cross
@@ -167,7 +169,9 @@ def export(
 def at_rate(scenario: Scenario, rate: float) -> Scenario:
     """Return a scenario with the law, the reference model and y at another rate, Hz.
 
-    Raises ParameterError if the observer has less than the required delay margin at this rate.
+    The step of the simulation becomes the longest that divides the new period in whole ns and is
+    not longer than before. Raises ParameterError if the rate is not within RATES, if the controller
+    has no C code, or if the observer has less than the required delay margin at this rate.
     """
     rate = as_number(rate, "rate", *RATES, "Hz")
     controller = exportable(scenario.controller)
@@ -187,9 +191,9 @@ def at_rate(scenario: Scenario, rate: float) -> Scenario:
 
 
 class CertificateSources(NamedTuple):
-    """The files from which the loop of a certificate was built."""
+    """The files from which the loop of a certificate was built, as the certificate names them."""
 
-    texts: dict[str, str]  # SHA-256 of "airframe" and "scenario", and text of "constants"
+    texts: dict[str, str]  # "airframe" and "scenario" as SHA-256, "constants" as the text itself
     without: str = ""  # a sentence on why there are no constants
 
 
@@ -197,7 +201,8 @@ def certificate_sources(airframe: Airframe, scenario: FilePath | Scenario) -> Ce
     """Return the sources from which the loop of a certificate was built.
 
     The constants are the text of rise_di_parameters.h as `export` writes it by default. They are
-    missing for a law that C cannot express, and for a section `controller` without a scenario.
+    missing for a law that C cannot express. A section `controller` without a scenario has neither
+    constants nor a scenario.
     """
     texts = {"airframe": _sha256(as_yaml(airframe))}
     if controller_alone(scenario) is not None:
@@ -227,7 +232,8 @@ def _certified(scenario: Scenario, constants: Path) -> tuple[str, str] | None:
 
     The guarantee is the one that `rise-di gains guarantee` has stored for the loop of the scenario.
     `constants` is the file of the C constants, whose text goes into the certificate. Returns None
-    if no guarantee of a stable loop is stored.
+    if no guarantee of a stable loop is stored, for an aircraft of JSBSim, and for a controller that
+    samples the literal sign, which has no linear loop.
     """
     if scenario.aircraft.is_jsbsim or is_literal(scenario.controller):
         return None
