@@ -321,9 +321,9 @@ def part_masks(
     """Return masks of the instants t, (N,), by part of the flight.
 
     The parts are "whole", `air`, "command" and "gust". In a guided flight, "capture" and "turn"
-    replace "command". Every instant is in "whole" and in one more part. During a transient this is
-    the part of the transient, or the last one in the order above if transients overlap. Otherwise
-    it is `air`.
+    replace "command". Every instant is in "whole", and in at most one more part. During a transient
+    this is the part of the transient, or the last one in the order above if transients overlap.
+    During an engagement alone there is none. Otherwise it is `air`.
     """
     kinds = {transient.kind for transient in transients}
     commands = ["capture", "turn"] if kinds & {"capture", "turn"} else ["command"]

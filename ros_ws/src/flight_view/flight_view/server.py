@@ -251,8 +251,8 @@ def answer(
 ) -> bytes:
     """Encode the data that a browser lacks, as a head and the columns of each topic in the head.
 
-    `fleet` is the number that stands for the places of all aircraft, or 0 without a fleet. `ghost`
-    says whether there is a second flight for comparison, and `control` whether the page has
+    `fleet` is the number of the data set with the positions of all aircraft, or 0 without a fleet.
+    `ghost` says whether there is a second flight for comparison, and `control` whether the page has
     control.
 
     The head has the length of its JSON as uint32, and then the JSON. It is little endian, and ends

@@ -150,7 +150,7 @@ class Airframe(Config):
             require(
                 shape == [columns] * n, key, f"rows of {shape} values", f"{n} rows of {columns}"
             )
-        # There must be as many outputs as inputs, and their units must be known.
+        # There must be an output, at most as many as inputs, and all units must be known.
         fewer = f"{m} or fewer, as many as inputs or fewer"
         require(0 < len(self.outputs) <= m, "outputs", f"{len(self.outputs)} of them", fewer)
         for key, unit in (

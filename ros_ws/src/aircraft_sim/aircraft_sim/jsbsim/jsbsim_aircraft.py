@@ -50,7 +50,9 @@ class Command(NamedTuple):
 
 
 NamedProperties = tuple[tuple[str, float], ...]
-"""Properties of a model, and the value of each at the command 1; empty if there is no rudder."""
+"""Properties of a model for an input, with the value of each at the command 1.
+
+For the rudder of a `FlightCondition`, () means that the model has no rudder."""
 
 NONE = "none"  # in place of the rudder's properties: the model has no rudder
 

@@ -63,9 +63,9 @@ class JsbsimModel:
     ignition.
 
     JSBSim integrates the forces of the previous step, and then computes the forces for the new
-    commands and the new wind. So commands and wind act one step later. Because the forces are those
-    at the instant t_k + dt, JSBSim gets the actuator positions at this instant. The mean positions
-    over the step would be half a step older.
+    commands and the new wind. So commands and wind act one step later. JSBSim gets the actuator
+    positions at the instant t_k + dt, because it computes the forces at this instant. The mean
+    positions over the step would be half a step too old.
 
     An isolated process tries the aircraft first. Raises FlightEnded if the aircraft has no trim, or
     if it crashes or hangs the process.

@@ -112,7 +112,10 @@ class Margins(NamedTuple):
 
 
 def disk_gain(disk: FloatArray) -> FloatArray:
-    """Convert a balanced disk margin to a gain margin, up and down: (2 + disk) / (2 - disk)."""
+    """Convert a balanced disk margin to the gain margin (2 + disk) / (2 - disk).
+
+    The gain may be multiplied or divided by this factor.
+    """
     with np.errstate(divide="ignore"):
         return np.asarray((2.0 + disk) / np.maximum(2.0 - disk, 0.0))
 

@@ -163,7 +163,7 @@ class Channels(NamedTuple):
 def uncertain_loop(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box, late: float = 0.0
 ) -> Channels:
-    """Build the loop of a plant with the entries of the box and disks in all inputs pulled out.
+    """Build the loop of a plant, and pull out the entries of the box and a disk in each input.
 
     The plant has A (n, n). u is late by an unknown time from 0 to `late`, s.
     """

@@ -254,7 +254,7 @@ class Figure:
     def add(self, trace: dict[str, Any], index: int = 0, values: FloatArray | None = None) -> None:
         """Add a trace to a subplot.
 
-        `values` are the samples of the trace if it has none itself, because the page holds them.
+        If the page holds the samples of the trace, `values` gives them, and the trace has none.
         """
         self.data.append(trace | {"xaxis": axis("x", index), "yaxis": axis("y", index)})
         shown = trace.get("y") if values is None else values

@@ -305,9 +305,10 @@ def _allowance(excess: Excess, unit: DisplayUnit) -> Allowance:
 def saturation_notes(tape: Tape) -> list[str]:
     """Return sentences on inputs that go from limit to limit in most ticks of a WINDOW.
 
-    An input is at a limit in at least the share SATURATED of the ticks, and in at least SIDE at
-    each of its limits. In a climb at full throttle it stays at one limit. A limit of the rate does
-    not count, because noise drives a slow engine to both of its rate limits.
+    Such an input is at a limit in at least the share SATURATED of the ticks, and at each of its two
+    limits in at least the share SIDE. A throttle that is full in a climb is at one limit only, so
+    it has no sentence. A limit of the rate does not count, because noise drives a slow engine to
+    both of its rate limits.
     """
     if "internals" not in tape:
         return []

@@ -372,7 +372,7 @@ def _pairing(
 ) -> tuple[str, ...]:
     """Return the input of each output: from `inputs`, or if that is empty, from the controller.
 
-    Returns () if the controller has an allocation, or other inputs than the airframe.
+    The controller gives (), if it has an allocation, or other inputs than the airframe.
     """
     names = as_names(inputs, "inputs", f"the inputs {', '.join(airframe.inputs)} in any order")
     if names:

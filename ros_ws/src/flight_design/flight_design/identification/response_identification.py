@@ -296,7 +296,7 @@ def _rows(
 
 
 class _Predictor(NamedTuple):
-    """The predictor y(k) = coefficients' regressors + e, with its uncertainty."""
+    """The predictor y(k) = coefficients^T regressors + e, with its uncertainty."""
 
     layout: Layout
     coefficients: FloatArray  # (m lags, m), rows in the order of the regressors

@@ -201,10 +201,10 @@ def command(
     dt: float,
     params: GuidanceParams,
 ) -> tuple[GuidanceState, StepCommands]:
-    """Apply protection and compute u_m of `step`, from the bank of the lateral mode, rad.
+    """Apply protection, and compute u_m of `step`.
 
-    `t_ns` of the state stays as it is. The values may be arrays with an element for each aircraft
-    of a fleet; then all aircraft have the same modes.
+    `phi` is the bank of the lateral mode, rad. `t_ns` of the state stays as it is. The values may
+    be arrays with an element for each aircraft of a fleet; then all aircraft have the same modes.
     """
     speed = true_airspeed(y["V"], params)
     limits = params.limits

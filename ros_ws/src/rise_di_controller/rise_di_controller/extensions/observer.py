@@ -184,7 +184,7 @@ def without_frozen(params: ObserverParams, frozen: Sequence[bool]) -> ObserverPa
 def filter_matrix(params: ObserverParams) -> FloatArray:
     """Compute the matrix that advances z by a tick, (s, s).
 
-    It is Phi (I - L H - sum of L_v [H, H_v]). Only vanes with a finite `least` count.
+    It is Phi (I - L H - sum of L_v [H, H_v]). Vanes without a finite `least` are left out.
     """
     corrected = params.L @ params.H
     if params.vanes is not None:

@@ -89,8 +89,8 @@ UNVERIFIED = "until a model is learned"
 """End of the sentence of a proposal that flies the rough model before there is any record."""
 
 FALLBACKS = 2
-"""Number of fallbacks in an engagement after which a part of the model gets no further models. Its
-second model was then certified as well and still diverged. A part consists of the outputs that the
+"""Number of fallbacks in an engagement after which a part of the model gets no further models. By
+then a second model has diverged although it was certified. A part consists of the outputs that the
 model couples with each other (`coupled`)."""
 
 AUTHORITY_TICKS = 10
