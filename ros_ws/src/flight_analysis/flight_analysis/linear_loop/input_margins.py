@@ -70,15 +70,13 @@ class Margins(NamedTuple):
     stable: NDArray[np.bool_]  # whether no eigenvalue lies outside the unit circle, (...)
     phase: FloatArray  # phase margin, rad, (..., m), infinite if abs(L_i) is never 1
     crossover: FloatArray  # frequency of the phase margin, rad/s, (..., m), 0 without one
-    gain_decrease: (
-        FloatArray  # factor below 1 at which the loop becomes unstable, (..., m), 0 without a limit
-    )
+    # factor below 1 at which the loop becomes unstable, (..., m), 0 without a limit
+    gain_decrease: FloatArray
     gain_increase: FloatArray  # the same factor above 1, (..., m), infinite without one
     sensitivity: FloatArray  # largest abs(S_ii), (..., m)
     disk: FloatArray  # balanced disk margin of an input, 0 to 2, (..., m)
-    sensitivity_all: (
-        FloatArray  # largest singular value of the diagonally scaled S for all inputs, (...)
-    )
+    # largest singular value of the diagonally scaled S for all inputs, (...)
+    sensitivity_all: FloatArray
     disk_all: FloatArray  # balanced disk margin for independent disks in all inputs, (...)
     damping: FloatArray  # least damping ratio of a slow mode, 1 without one, (...)
 
