@@ -3,6 +3,7 @@
 """A flight over topics in real time: its log, and its accuracy beside a flight in one process."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -62,12 +63,15 @@ def test_flight_over_topics_recorded_and_as_accurate_as_in_one_process(
     # Host delays count that made the controller late by more than a quarter of its period, or the
     # aircraft or the reference model by more than a sample. Those of u on its way to the aircraft
     # are in no topic, so that one flight beyond the bounds proves nothing. A flight that ends
-    # with the status of a busy host is not judged at all.
+    # with the status of a busy host is not judged at all, nor one in which the aircraft had not the
+    # time to send each sample while more than twice as many threads ran as the host has cores.
     delays = []
     is_judged = False
     for _ in range(4):
         flight = start("flight_cli.cli", "fly", str(short_scenario), "--real-time")
-        if flight.end() == STATUS_HOST:
+        status = flight.end()
+        is_crowded = os.getloadavg()[0] > 2.0 * (os.cpu_count() or 1)
+        if status == STATUS_HOST or (is_crowded and "were never sent" in flight.output):
             delays.append(True)
             continue
         flight.succeed()
