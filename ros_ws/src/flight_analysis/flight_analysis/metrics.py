@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compute metrics of a flight, each as a pure function of the tape of the flight.
+"""Compute metrics of a flight, each as a pure function of the tape (the signals) of the flight.
 
 They are the error, the noise floor, the ultimate bound, settling, control effort, saturation and
 how often the sign term switches.
@@ -92,7 +92,7 @@ class ErrorMetrics:
 class InputMetrics(ErrorMetrics):
     """Deviation of an input from trim over some samples, in the unit of the input.
 
-    `rate` is the mean rate in this unit per s.
+    `rate` is the mean of abs(u_dot), in this unit per s.
     """
 
     rate: float
@@ -117,7 +117,7 @@ def tracking_error(tape: Tape) -> Signal:
     """Return the measured error e = y - y_m, (N, m).
 
     It has a row for each sample of y within the time of y_m. Channels that y_m lacks are left out.
-    y_m is interpolated linearly. This is the error that the law sees, with the noise of the
+    y_m is interpolated linearly. The law controls this error, which contains the noise of the
     sensors.
     """
     names = _controlled(tape)
@@ -127,10 +127,7 @@ def tracking_error(tape: Tape) -> Signal:
 
 
 def _controlled(tape: Tape) -> tuple[str, ...]:
-    """Return the channels that y and y_m share. Each of them can have more.
-
-    Raises ParameterError if they share none.
-    """
+    """Return the channels that y and y_m share. Raises ParameterError if there are none."""
     names = tuple(name for name in tape["y"].names if name in tape["y_m"].names)
     require(
         bool(names),
@@ -142,12 +139,12 @@ def _controlled(tape: Tape) -> tuple[str, ...]:
 
 
 def true_error(tape: Tape) -> Signal | None:
-    """Return the true error C x - y_m, (N, m).
+    """Return the true error C x - y_m, (N, m), which only a simulation logs.
 
-    It has a row for each sample of `truth` within the time of y_m. The channels are those of
-    `tracking_error`. The noise and bias of the sensors do not enter this error, except through
-    their effect on the flight. Returns None if `truth` lacks "x.output" for a channel. Only a
-    simulation logs this.
+    It has a row for each sample of the topic `truth` within the time of y_m. The channels are those
+    of `tracking_error`. The noise and bias of the sensors do not enter this error, except through
+    their effect on the flight. Returns None if `truth` lacks the state x.CHANNEL of one of the
+    channels.
     """
     if "truth" not in tape:
         return None
@@ -160,11 +157,11 @@ def true_error(tape: Tape) -> Signal | None:
 
 
 def best_error(tape: Tape) -> tuple[str, Signal]:
-    """Return the name and the signal of the best error on a tape.
+    """Return the name and the signal of the most accurate error e = y - y_m on a tape.
 
-    It is the true error if the tape has it, else the measured one. The name is "true error" or
-    "measured error", and e = y - y_m, (N, m), is in SI. Raises ParameterError if the tape has no y
-    and y_m.
+    This is the true error if the tape has it, else the measured one. The name is "true error" or
+    "measured error". The signal has the shape (N, m) and is in SI. Raises ParameterError if the
+    tape has no y and y_m.
     """
     error = true_error(as_tape(tape))
     return (MEASURED_ERROR, tracking_error(tape)) if error is None else (TRUE_ERROR, error)
@@ -192,13 +189,13 @@ def _columns(signal: Signal, names: Sequence[str]) -> FloatArray:
 
 
 def noise_floor(tape: Tape) -> dict[str, float]:
-    """Return the noise floor of y by channel, SI.
+    """Return the noise floor of y by channel, SI: the error below which the sensors tell nothing.
 
-    A measured error below the floor cannot be told from noise, while a true error can be smaller.
-    The floor is the rms of "noise.channel" of `truth` if the tape has it. Otherwise it is estimated
-    for white noise from the second differences d_k = y_(k+1) - 2 y_k + y_(k-1), as rms =
-    median(abs(d)) / (0.6745 sqrt(6)). d has 6 times the variance of the noise, and half of a normal
-    distribution lies within 0.6745 rms. The floor is at least the rounding of the largest y.
+    A true error can be smaller than the floor. The floor is the rms of "noise.CHANNEL" of the topic
+    `truth` if the tape has it. Otherwise it is estimated for white noise from the second
+    differences d_k = y_(k+1) - 2 y_k + y_(k-1), as rms = median(abs(d)) / (0.6745 sqrt(6)). d has 6
+    times the variance of the noise, and half of a normal distribution lies within 0.6745 rms. The
+    floor is at least the rounding of the largest y.
     """
     noise = tape["truth"].group("noise") if "truth" in tape else None
     floor = {}
@@ -216,7 +213,7 @@ def noise_floor(tape: Tape) -> dict[str, float]:
 
 
 def engagements(tape: Tape) -> list[Transient]:
-    """Return the instants at which the controller engaged, from the modes in `internals`."""
+    """Return the instants of engagement as transients, from the modes in `internals`."""
     if "internals" not in tape:
         return []
     is_engaged = tape["internals"]["mode"] == Mode.ENGAGED
@@ -228,7 +225,7 @@ def engagements(tape: Tape) -> list[Transient]:
 
 
 def live_commands(tape: Tape) -> list[Transient]:
-    """Return the changes of a live command, from `u_m`, as transients.
+    """Return the changes of the commands in the topic `u_m`, as transients.
 
     If two changes of a channel are at most SETTLING_DWELL apart, they belong to one transient.
     """
@@ -252,12 +249,11 @@ def live_commands(tape: Tape) -> list[Transient]:
 
 
 def guided_transients(tape: Tape) -> list[Transient]:
-    """Return the turns and captures of a guided flight, as the glossary defines them.
+    """Return the turns and captures of a guided flight, from the commands in the topic `guidance`.
 
-    They are found in the topic `guidance`.
-
-    In a guided flight `u_m` changes all the time, so that it shows no transients. Transients of the
-    same kind that are less than SETTLING_DWELL apart count as one.
+    In a turn, guidance commands more bank than TURN_BANK. In a capture, it climbs, descends,
+    returns to its path or changes speed. `u_m` changes all the time in a guided flight, so it shows
+    no transients. Transients of the same kind that are less than SETTLING_DWELL apart count as one.
     """
     if "guidance" not in tape:
         return []
@@ -318,12 +314,12 @@ def part_masks(
     settle: float = SETTLING_DWELL,
     air: str = CALM,
 ) -> dict[str, NDArray[np.bool_]]:
-    """Return masks of the instants t, (N,), by part of the flight.
+    """Return a mask of the instants t, (N,), for each part of the flight.
 
     The parts are "whole", `air`, "command" and "gust". In a guided flight, "capture" and "turn"
     replace "command". Every instant is in "whole", and in at most one more part. During a transient
-    this is the part of the transient, or the last one in the order above if transients overlap.
-    During an engagement alone there is none. Otherwise it is `air`.
+    this is the part of the transient, or the last one in the order above if transients overlap. An
+    instant with only an engagement is in no other part, and one without any transient is in `air`.
     """
     kinds = {transient.kind for transient in transients}
     commands = ["capture", "turn"] if kinds & {"capture", "turn"} else ["command"]
@@ -388,10 +384,10 @@ def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMe
 
 
 def known_entries(learned: Signal) -> list[str]:
-    """Return the names of the entries of A and B that the flight shows, from samples of `learned`.
+    """Return the names of the entries of A and B that the flight has identified.
 
-    The flight shows an entry if, in a sample, the deviation of the entry is below MAX_DEVIATION
-    times the value of the entry.
+    `learned` has the samples of the topic `learned`. An entry counts as identified if, in a sample,
+    its standard deviation is below MAX_DEVIATION times its value.
     """
     values = learned.group("value")
     deviations = learned.group("deviation")
@@ -408,10 +404,10 @@ def errors_by_part(
     settle: float = SETTLING_DWELL,
     air: str = CALM,
 ) -> dict[str, dict[str, ErrorMetrics]]:
-    """Return the metrics of `best_error` by channel and part of the flight.
+    """Return rms and maximum of `best_error` by channel and part of the flight.
 
-    The maximum of "calm" is the ultimate bound, which is the largest abs(e) in calm air later than
-    `settle` s after the end of every transient.
+    The maximum of the part "calm" is the ultimate bound. This is the largest abs(e) in calm air,
+    later than `settle` s after the end of every transient.
     """
     _, error = best_error(tape)
     masks = part_masks((error.stamp_ns - tape.start_ns) / 1e9, transients, settle, air)
@@ -468,7 +464,7 @@ def settling_time(
 
 
 class Settling(NamedTuple):
-    """How the channels that a transient excites settle after it."""
+    """How long each channel that a transient excites takes to settle."""
 
     transient: Transient
     until: dict[str, float]  # start of the next transient of the channel, or end of the flight, s
@@ -479,8 +475,8 @@ def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling
     """Return, for each transient, how long `best_error` takes to settle in the `settling_bands`.
 
     The time counts from the start of the transient. Only samples before the next transient that
-    excites the channel count. Transients after the end of the flight are left out. So are turns and
-    captures, because their commands change until they end.
+    excites the channel count. Transients after the end of the flight are left out. Turns and
+    captures are also left out, because their commands change until they end.
     """
     _, error = best_error(tape)
     t = (error.stamp_ns - tape.start_ns) / 1e9
@@ -517,9 +513,9 @@ def inputs_by_part(
 ) -> dict[str, dict[str, InputMetrics]]:
     """Return the control effort by input and part of the flight.
 
-    The metrics are rms and max abs(u) about trim, and mean abs(u_dot). If `topic` is "y", y takes
-    the place of u. mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1)) over the steps
-    that end in the part. This mean is NaN if there is no such step.
+    The metrics are rms and max abs(u) about trim, and mean abs(u_dot), which is sum abs(u_k -
+    u_(k-1)) / sum (t_k - t_(k-1)) over the steps that end in the part. This mean is NaN if there is
+    no such step. If `topic` is "y", the metrics are those of y.
     """
     if topic not in tape:
         return {}
@@ -541,7 +537,7 @@ def inputs_by_part(
 
 
 def saturation_shares(tape: Tape) -> dict[str, dict[str, float]]:
-    """Return the share of the ticks with a saturated input, by input and kind of saturation.
+    """Return the share of ticks with a saturated input, by input and kind of saturation.
 
     The kinds are "magnitude" and "rate".
     """
@@ -556,11 +552,11 @@ def saturation_shares(tape: Tape) -> dict[str, dict[str, float]]:
 
 
 def sign_switches(tape: Tape) -> dict[str, float]:
-    """Return the rate at which the sign term switches, by output, 1/s.
+    """Return how often the sign term beta Sgn(e) switches, by output, 1/s.
 
-    The rate is the number of changes of sign between successive nonzero increments of Pi, divided
-    by the time of the ticks. If the tape has no `internals`, the changes of sign of the measured
-    error are counted instead.
+    This is the number of changes of sign between successive nonzero increments of Pi, divided by
+    the time of the ticks. If the tape has no topic `internals`, the changes of sign of the measured
+    error are counted in their place.
     """
     if "internals" in tape:
         signal = tape["internals"].group("Pi")

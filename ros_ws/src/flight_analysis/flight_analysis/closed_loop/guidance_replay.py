@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recompute every step of guidance that a log contains, to check that the log is complete.
 
-The inputs of a step come from its own sample in the log, and its initial state from the sample
-before.
+The inputs of a step come from its own sample in the log, and its initial state comes from the
+sample before it.
 """
 
 from collections.abc import Iterator, Mapping
@@ -26,7 +26,7 @@ from flight_guidance.steering.path import Route
 
 
 class GuidanceReplay(NamedTuple):
-    """The result of comparing the recorded steps of guidance and their u_m with computed ones."""
+    """The result of a replay of guidance: how many recorded steps the computation repeats."""
 
     steps: int
     checked: int
@@ -35,20 +35,20 @@ class GuidanceReplay(NamedTuple):
     notes: tuple[str, ...]
 
     def equal(self) -> bool:
-        """Return whether no checked step differs from the log in a bit."""
+        """Return whether all checked steps are equal to the log in every bit."""
         return self.differing == 0
 
 
 def _waypoints(rows: FloatArray) -> list[Waypoint]:
-    """Return the waypoints of a route, given its messages as rows of (number, *waypoint)."""
+    """Return the waypoints of a route from samples of the topic `route`, (number, *waypoint)."""
     return [Waypoint(*row[1:]) for row in rows.tolist()]
 
 
 def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
-    """Return the routes that guidance could fly in this flight, by the digest of the route.
+    """Return the routes that guidance could fly in this flight, by their digests.
 
-    They come from the section `guidance` of the scenario and from the topic `route`. The log of
-    guidance names a route by the same digest.
+    One route can be in the section `guidance` of the scenario, and further ones on the topic
+    `route`. The log of guidance names the route of each step by its digest.
     """
     lists = [list(parameters.waypoints())]
     if "route" in tape:
@@ -65,10 +65,10 @@ def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
 def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceReplay:
     """Recompute every step of the topic `guidance`, and its u_m, and compare both with the log.
 
-    If a step failed in flight, the replay checks that the state stayed as it was and that the last
-    u_m was published again. A step is not checked if the log lacks its route or the state before
-    it. If the log has other channels than this version records, no step is checked. Raises
-    ParameterError if the log lacks the scenario's section of guidance.
+    If a step failed in flight, the replay checks that the state of guidance did not change and that
+    the last u_m was published again. A step is not checked if the log lacks its route or the state
+    before it. No step is checked if the channels of the topic are other than those of this version.
+    Raises ParameterError if the log lacks the scenario's section of guidance.
     """
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")
@@ -100,7 +100,7 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
 
 
 class _Comparison:
-    """The steps of guidance in a log, and the u_m that was published at their instants."""
+    """Compares the recorded steps of guidance, and their u_m, with computed ones."""
 
     def __init__(self, tape: Tape, parameters: GuidanceConfig) -> None:
         self.checked = 0
@@ -150,7 +150,8 @@ class _Comparison:
     ) -> FloatArray:
         """Compute the step that follows the state `previous`, and return its channels and u_m.
 
-        If `goes_on` is True, the step failed in flight, and guidance went on with the last u_m.
+        If `goes_on` is True, the step failed in flight, so guidance kept its state and the last
+        u_m.
         """
         route = int(channels["route"])
         if goes_on and previous is not None:

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The interface of a learner, and the stations that run it in a flight in one process."""
+"""Define the interface of a learner, and the stations that run it in a flight in one process.
+
+A learner identifies A and B in flight and proposes new parameters of the control law.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
@@ -22,7 +25,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 
 class ModelGuarantee(NamedTuple):
-    """What is proved of the loop of the law with proposed parameters and the learned model."""
+    """The guarantee for a proposal: the deviations from its model with proved stability."""
 
     # Every aircraft is stable if each of its entries differs from the model by at most so many
     # times the stated deviation of this entry. 0 if nothing is proved.
@@ -44,7 +47,7 @@ class LearnerResult(NamedTuple):
 
 
 class Learner(Protocol):
-    """A learner, which identifies the model of the control law during a flight.
+    """Interface of a learner, which identifies A and B during a flight and proposes parameters.
 
     Its channels are in the order of the control law.
     """
@@ -57,10 +60,11 @@ class Learner(Protocol):
         """
 
     def propose(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
-        """Propose parameters from the record so far.
+        """Propose parameters from the ticks that were recorded so far.
 
-        `flown` is the digest of the parameters at the end of the record. `given_up` has the outputs
-        that the law controls without a model until the engagement ends.
+        `flown` is the digest of the parameters in force at the last of these ticks. `given_up` has
+        the outputs whose model failed, so that the law controls them without a model until it
+        disengages.
         """
 
 
@@ -70,9 +74,9 @@ Learn = Callable[[RiseDiConfig], Learner]
 class Entry(NamedTuple):
     """An entry of A or B with its nominal value, and the error of this value as found in flight.
 
-    The nominal value is in SI. `deviation` is the standard deviation of the error after the flight.
-    `error` and `deviation` are fractions of `unit`, which is the nominal value, or another value if
-    the nominal value is 0.
+    The nominal value is in SI. `error` is a fraction of `unit`, which is the nominal value, or
+    another value if the nominal value is 0. `deviation` is the standard deviation that the error
+    still has after the flight, also as a fraction of `unit`.
     """
 
     matrix: str
@@ -95,11 +99,11 @@ class Entry(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """The channels of the topic `learned`.
+    """A sample of the topic `learned`, with the names of its channels.
 
     The first channel, `proposed`, is 1 if parameters were proposed, else 0. Then follow the values
-    of the entries of A and B in the rows of the outputs, and after them their standard deviations.
-    The last three channels are those of GUARANTEE.
+    of the entries of A and B that act on the outputs, and after them the standard deviations of
+    these values. The last three channels are those of GUARANTEE.
     """
 
     names: tuple[str, ...]
@@ -118,10 +122,10 @@ bits, which a channel holds exactly."""
 def learned_sample(
     entries: Iterable[Entry], outputs: tuple[str, ...], proposal: LearnerResult
 ) -> Learned:
-    """Return the sample of the topic `learned` for the `entries` of an identification.
+    """Return the sample of the topic `learned` for an identification and its proposal.
 
-    The sample also has the proposal that followed, and this function computes the guarantee of the
-    proposal. The last three channels are 0 if nothing was proposed.
+    `entries` are those of the identification. The function computes the guarantee of the proposal.
+    If nothing was proposed, the channels of GUARANTEE are 0.
     """
     output_entries = [entry for entry in entries if entry.row in outputs]
     channels = {"proposed": float(proposal.controller is not None)}
@@ -137,7 +141,10 @@ def learned_sample(
 
 
 class Identifications:
-    """Hands out each identification of a learner once. Some learners make no identification."""
+    """Returns each new identification of a learner once, as a sample of the topic `learned`.
+
+    Some learners make no identification.
+    """
 
     def __init__(self, learner: Learner, outputs: tuple[str, ...]) -> None:
         self._learner = learner
@@ -146,7 +153,7 @@ class Identifications:
         self._names: tuple[str, ...] = ()
 
     def next(self, proposal: LearnerResult) -> Learned | None:
-        """Return the sample of `learned` for the newest identification, and for its proposal.
+        """Return the sample of the topic `learned` for the newest identification and its proposal.
 
         Returns None if there was no identification since the last call. Call this after the
         proposal has been sent, because it computes the guarantee, which takes long.
@@ -162,10 +169,11 @@ class Identifications:
 
 
 def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown: int) -> Proposal:
-    """Return a proposal as the controller receives it.
+    """Return a proposal in the form in which the controller receives it.
 
-    It is stamped with `end_ns`, the end of the window of data. `flown` is the digest of the
-    parameters that were in force at that instant.
+    `start` are the parameters with which the flight started. `end_ns` is the stamp of the proposal:
+    the end of the data that the learner used. `flown` is the digest of the parameters in force at
+    this time.
     """
     change = {} if proposal.controller is None else design_changes(start, proposal.controller)
     return Proposal(
@@ -188,9 +196,9 @@ def proposed(
 
 
 class ProposalStation:
-    """Puts proposals in force when they are due, and publishes `authority`.
+    """Lets a learner's proposals take effect when they are due, and publishes `authority`.
 
-    If the law diverges, the station falls back to the law with which the flight started.
+    If the law diverges, the station returns to the parameters with which the flight started.
     """
 
     def __init__(self, controller: Controller, learning: Learning, topics: Topics) -> None:
@@ -201,7 +209,7 @@ class ProposalStation:
         topics.advertise("authority", authority_names(controller.parameters.outputs))
 
     def step(self, t_ns: int) -> None:
-        """Put a proposal in force if it is due, and publish `authority` if this is due."""
+        """Let a proposal take effect if it is due. Publish `authority` if this is due."""
         self._learning.step(self._controller, t_ns)
         if t_ns % (AUTHORITY_TICKS * self.period_ns) == 0:
             self._topics.publish(
@@ -210,7 +218,7 @@ class ProposalStation:
 
 
 class LearnerStation:
-    """Records the ticks of the controller for a learner.
+    """Passes the ticks of the controller to a learner.
 
     When an identification is due, the station asks the learner for a proposal.
     """
@@ -226,7 +234,7 @@ class LearnerStation:
         self._identifications = Identifications(learner, learning.start.outputs)
 
     def step(self, t_ns: int) -> None:
-        """Record the tick for the learner, and ask for a proposal if an identification is due."""
+        """Pass the tick to the learner, and ask for a proposal if an identification is due."""
         controller = self._station.controller
         output = self._station.output
         if output is None or not controller.has_internals:

@@ -42,7 +42,7 @@ OPEN_LOOP = "open loop: the recorded aircraft did not fly this u"
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayDifference:
-    """A channel of a tick whose recorded and computed values differ."""
+    """A channel of a tick whose computed value differs from the recorded one."""
 
     number: int  # number of the tick's sample in `internals`
     t: float  # flight time at the stamp of the tick, s
@@ -59,9 +59,9 @@ class ReplayDifference:
 
 
 class ReplayResult(NamedTuple):
-    """The k channels of the N ticks of a log, as recorded and as computed.
+    """The result of a replay: k channels of the N ticks of a log, as recorded and as computed.
 
-    The channels of `internals` come first, followed by the channels of u.
+    The channels of the topic `internals` come first, and the published u follows.
     """
 
     names: tuple[str, ...]
@@ -70,19 +70,19 @@ class ReplayResult(NamedTuple):
     recorded: FloatArray  # (N, k)
     computed: FloatArray  # (N, k), NaN if nothing was computed
     checked: NDArray[np.bool_]  # whether the state before the tick is known, (N,)
-    # # whether the recorded controller had other parameters, (N,)
+    # whether the recorded controller had other parameters, (N,)
     other_parameters: NDArray[np.bool_]
     notes: tuple[str, ...]
-    # # whether y and u of the tick are on their topics, (N,)
+    # whether y and u of the tick are on their topics, (N,)
     published: NDArray[np.bool_] | None = None
 
     @property
     def compared(self) -> NDArray[np.bool_]:
-        """Mask of the ticks whose y, state and u are compared, shape (N,)."""
+        """Mask of the ticks that are compared with y, state and published u, shape (N,)."""
         return self.checked if self.published is None else self.checked & self.published
 
     def different(self) -> NDArray[np.bool_]:
-        """Return the mask of the values that differ in a bit from the log, shape (N, k)."""
+        """Return a mask of the computed values that differ from the log in a bit, shape (N, k)."""
         different: NDArray[np.bool_] = self.checked[:, None] & (
             _bits(self.recorded) != _bits(self.computed)
         )
@@ -98,7 +98,7 @@ class ReplayResult(NamedTuple):
     def first(self) -> ReplayDifference | None:
         """Return the first difference in the first tick that differs, or None without a difference.
 
-        If several channels of this tick differ, a channel of u comes before all others.
+        If several channels of this tick differ, a channel of u is preferred to the others.
         """
         different = self.different()
         rows = np.flatnonzero(different.any(axis=1))
@@ -123,7 +123,7 @@ class ReplayResult(NamedTuple):
         """Return the channels "prefix.name" of `recorded` or `computed`, stamped with flight time.
 
         Args:
-            values: `recorded` or `computed`, shape (N, k).
+            values: The array `recorded` or the array `computed`, shape (N, k).
             prefix: Group of channels, such as "u".
 
         Returns:
@@ -137,8 +137,9 @@ class ReplayResult(NamedTuple):
 def recorded_parameters(scenario: StoredFile, namespace: str | None = None) -> ControllerConfig:
     """Read the controller's parameters from the scenario of a log, or from a parameter file.
 
-    No other section is read, so the file needs only the section of the controller in this
-    namespace. Raises ParameterError.
+    No other section is read, so a file with only the section `controller` is enough. If the file
+    has no such section for `namespace`, the section of another namespace is read. Raises
+    ParameterError.
     """
     path = Path(scenario.name)
     needed = {"controller": AnyLaw}
@@ -309,7 +310,7 @@ class _Steps:
         self.other_parameters = self.checked.copy()
 
     def compute(self) -> None:
-        """Compute every tick whose previous state is known."""
+        """Compute every tick if the state of the controller before it is known."""
         ticks = self._ticks
         in_force = self._in_force
         state: ControllerState | None = None
@@ -331,10 +332,11 @@ class _Steps:
                 state = ticks.state(k, in_force.limits, in_force.law, state)
 
     def _state_after_gap(self, k: int) -> ControllerState | None:
-        """Return the state with which the computation goes on from tick k, after a gap in the log.
+        """Return the state with which the computation goes on at tick k, after a gap in the log.
 
-        This is the recorded state after tick k. In an open loop, it is the state of a law that
-        engages at tick k. Returns None if the recorded controller is not engaged at this tick.
+        The log has the state after tick k but not the one before it, so the result is the recorded
+        state after tick k. In an open loop, it is the state of a law that engages at tick k.
+        Returns None if the recorded controller is not engaged at this tick.
         """
         if not self._ticks.flies[k]:
             return None
@@ -345,9 +347,9 @@ class _Steps:
 def _recorded(
     run: Tape | RecordedRun, parameters: ControllerConfig | None, changes: Sequence[Change] | None
 ) -> tuple[Tape, ControllerConfig, Sequence[Change]]:
-    """Return the tape of a run, the parameters, and their changes in flight.
+    """Return the tape of a run, the controller's parameters, and their changes in flight.
 
-    If `parameters` or `changes` are None, they are those of the run. Raises ParameterError.
+    If `parameters` or `changes` are None, they are read from the run. Raises ParameterError.
     """
     if isinstance(run, Tape):
         if parameters is None and isinstance(run.scenario, Scenario):
@@ -365,7 +367,7 @@ def _recorded(
 
 
 def recorded_changes(run: RecordedRun, parameters: ControllerConfig) -> Sequence[Change]:
-    """Return the changes in flight of the recorded controller's parameters, in order.
+    """Return how the parameters of the recorded controller changed in flight, in order.
 
     If the run has no log file, the changes come from its tape.
     """
@@ -399,7 +401,7 @@ def later_aircraft(run: RecordedRun, scenario: Scenario) -> tuple[AircraftConfig
 
 
 def _coverage_notes(ticks: Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
-    """Yield a note on each thing that the log lacks and that was therefore not checked."""
+    """Yield a note on each gap of the log, and on what could therefore not be checked."""
     if len(ticks.number) and not ticks.begins[0]:
         yield f"the log begins with sample {ticks.number[0]} of internals: earlier ones are missing"
     for start in ticks.starts:
@@ -425,7 +427,7 @@ def _coverage_notes(ticks: Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
 def _controller_at(processes: Mapping[str, Process], stamp_ns: int) -> str:
     """Return the name of the controller that runs at an instant, as ", NAME," to insert in a note.
 
-    This is the last controller that began before the instant. Returns "" if the log has no name.
+    This is the controller that began last before the instant. Returns "" if the log has no name.
     """
     begins = [
         (process.first_ns, name)
@@ -440,6 +442,9 @@ def _bits(values: FloatArray) -> NDArray[np.int64]:
 
 
 def _ordinal(value: float) -> int:
-    """Return the index of a float64 among all float64 numbers in order, where 0 has index 0."""
+    """Return the place of a float64 among all float64 numbers in order, with 0 at place 0.
+
+    So the difference of two places is their distance in units in the last place.
+    """
     bits = int(np.float64(value).view(np.int64))
     return bits if bits >= 0 else -(bits & 0x7FFF_FFFF_FFFF_FFFF)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The ticks of a recorded controller with their inputs, and the parameters in force at each."""
+"""Read a recorded controller's ticks, their inputs, and the parameters in force at each."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -33,14 +33,14 @@ Change = Mapping[str, Any]
 def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> ControllerConfig:
     """Return the parameters with some values changed, validated.
 
-    `changes` has the new values by dotted name. The value None removes a parameter. Raises
-    ParameterError if a changed value is invalid.
+    `changes` has the new values by dotted name, such as observer.L. The value None removes a
+    parameter. Raises ParameterError if a changed value is invalid.
     """
     return AnyLaw.validate_mapping(parameters.changed(changes), "controller")
 
 
 class ParametersInForce:
-    """The parameters in force at a tick, and the changes that are still to come."""
+    """The parameters of a recorded controller at a tick, and the changes that are still to come."""
 
     def __init__(self, parameters: ControllerConfig, changes: Sequence[Change]) -> None:
         self._changed: dict[
@@ -51,7 +51,7 @@ class ParametersInForce:
         self.begin()
 
     def begin(self) -> None:
-        """Restore the parameters that a controller starts with."""
+        """Restore the parameters with which each controller starts."""
         self._unmatched: set[int] = set()
         self._apply(self._first)
 
@@ -73,10 +73,11 @@ class ParametersInForce:
     def change(
         self, digest: int, number: int, state: ControllerState | None
     ) -> ControllerState | None:
-        """Apply the next changes until the parameters have the digest `digest`.
+        """Apply the next changes until the parameters have the digest that the log has for a tick.
 
-        Returns the state, adapted to the new parameters. If no number of changes leads to this
-        digest, none is applied, and the state is returned as it is. `number` is that of the tick.
+        `digest` is this digest, and `number` is the number of the tick. Returns the state, adapted
+        to the new parameters. If the parameters reach this digest after none of the changes, no
+        change is applied, and the state is returned as it is.
         """
         if digest == self.digest or digest in self._unmatched:
             return state
@@ -107,7 +108,7 @@ class ParametersInForce:
 
 
 class Ticks:
-    """The samples of `internals` in the order of the controller's ticks, and their inputs."""
+    """The samples of the topic `internals` in the order of the ticks, with their inputs."""
 
     def __init__(self, tape: Tape, parameters: ControllerConfig) -> None:
         groups = parameters.logged_groups()
@@ -247,9 +248,9 @@ class Ticks:
 
 
 def _checked_internals(tape: Tape, names: Sequence[str]) -> Signal:
-    """Return the channels `names` of `internals`, in this order.
+    """Return the topic `internals` with the channels `names`, in this order.
 
-    Raises ParameterError if `internals` has other channels, or values that no controller publishes.
+    Raises ParameterError if the topic has other channels, or values that no controller publishes.
     """
     require(
         "internals" in tape,
@@ -280,10 +281,10 @@ def _checked_internals(tape: Tape, names: Sequence[str]) -> Signal:
 def _tick_order(
     now_ns: NDArray[np.int64], number: FloatArray
 ) -> tuple[NDArray[np.int64], list[int]]:
-    """Order the ticks by their instants, and return the order and where each controller starts.
+    """Order the ticks by their instants, and find where each controller starts.
 
-    The starts are indices into this order. The ticks of one controller are in the order of their
-    numbers, even if they were stored in another order.
+    Returns the order, and the starts as indices into this order. The ticks of one controller are in
+    the order of their numbers, even if they were stored in another order.
     """
     order = np.argsort(now_ns, kind="stable")
     starts = controller_starts(number[order])
@@ -297,7 +298,7 @@ def _as_published(
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return the samples of a topic at N stamps, (N, m), and a mask of the stamps with a sample.
 
-    A stamp without a sample has the values of `otherwise`.
+    A stamp without a sample gets the values of `otherwise` at this stamp.
     """
     matched = np.zeros(len(stamp_ns), dtype=bool)
     if topic not in tape or not set(names) <= set(tape[topic].names):

@@ -36,7 +36,7 @@ ParameterOverrides = dict[str, str | float | bool | list[str] | list[float]]
 
 
 class FlightConfig(Config):
-    """How to run the scenario."""
+    """The section `flight` of a scenario: how to run the flight."""
 
     duration: Annotated[float, Field(gt=0, le=1e6)] = Field(description="how long to fly, s")
     lockstep: bool = Field(
@@ -125,7 +125,7 @@ class Scenario:
         return varied
 
     def _varied(self, name: str, changes: Mapping[str, Any] | Config) -> Any:
-        """Return a section with changes, validated."""
+        """Return a section of the scenario with changes, validated."""
         schema = SCHEMAS.get(name)
         if schema is None:
             if owners := self.sections_with(name):
@@ -153,10 +153,10 @@ class Scenario:
         return [key for key in SCHEMAS if name in getattr(getattr(self, key), "model_fields", ())]
 
     def _values(self, name: str, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the parameters of a section to which `changes` will be added.
+        """Return the parameters of a section, to which the caller then adds `changes`.
 
-        If the law will change, the gains of the present law are left out. If there is no section of
-        guidance, its parameters are those of `guidance_by_rule`.
+        If `changes` has another law, the gains of the present law are left out. If there is no
+        section of guidance, its parameters are those of `guidance_by_rule`.
         """
         section: Config | None = getattr(self, name)
         if section is None:
@@ -179,11 +179,11 @@ class Scenario:
         return self.controller
 
     def learns(self) -> bool:
-        """Return whether the models of the controller are learned in flight."""
+        """Return whether the controller learns its models, A and B, in flight."""
         return isinstance(self.controller, RiseDiConfig) and self.controller.learn is not None
 
     def air(self) -> str:
-        """Return the most violent disturbance of the air, apart from gusts, as a name from AIRS."""
+        """Return the most violent disturbance of the air, except gusts, as a name in AIRS."""
         aircraft = self.aircraft
         if aircraft.microburst is not None:
             return "microburst"
@@ -194,10 +194,10 @@ class Scenario:
         return "wind" if any(aircraft.wind) else "calm"
 
     def gust_windows(self) -> dict[str, tuple[float, float]]:
-        """Return the start and the stop of each gust, s.
+        """Return the times at which each gust starts and ends, s, by the name of the gust.
 
-        A gust of length H starts when the aircraft enters it, and stops 2 H / V0 later. If a gust
-        is repeated, its name has a number from the second time on.
+        A gust of length H starts when the aircraft enters it, and ends 2 H / V0 later. If a gust is
+        repeated, its name has a number from the second time on.
         """
         speed = self.aircraft.channels().speed
         windows = {}
@@ -212,7 +212,7 @@ class Scenario:
 
 
 def as_scenario(value: object) -> Scenario:
-    """Return the value if it is a Scenario. Raises ParameterError otherwise."""
+    """Return the value if it is a Scenario, or raise ParameterError if it is not."""
     return as_instance(
         value, Scenario, "scenario", "a Scenario, as find_scenario and recorded_scenario return one"
     )
@@ -237,8 +237,8 @@ guidance.
 def load_scenario(path: FilePath, *, with_route: bool = True) -> Scenario:
     """Read and validate a scenario file. Raises ParameterError if it is invalid.
 
-    If `with_route` is False, the route and the program of guidance are left out before the check,
-    because the flight will take another route.
+    If `with_route` is False, guidance's route and its program of targets are left out before the
+    validation, because the flight will take another route.
     """
     path = as_path(path, "scenario", A_SCENARIO)
     content = read_file(path, str(path), A_SCENARIO)
@@ -256,12 +256,12 @@ def load_scenario(path: FilePath, *, with_route: bool = True) -> Scenario:
 
 
 def parse_scenario(content: bytes, path: Path) -> Scenario:
-    """Parse and validate the scenario in the content of a file or log. Raises ParameterError."""
+    """Parse and validate a scenario, given the content of its file. Raises ParameterError."""
     return scenario_of(path.stem, path, parse_scenario_sections(content, path))
 
 
 def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]) -> Scenario:
-    """Build the scenario from these sections and validate it. Raises ParameterError."""
+    """Build and validate a scenario from the values of its sections. Raises ParameterError."""
     parameters: dict[str, Any] = {
         key: schema.validate_mapping(sections.get(key, {}), key)
         for key, schema in SCHEMAS.items()
@@ -287,9 +287,10 @@ def parse_scenario_sections(content: bytes, path: Path, namespace: str | None = 
 def find_files(sections: Sections, path: Path) -> None:
     """Replace the paths in the sections of a parameter file by paths at which the files exist.
 
-    A section can name an airframe file and recorded commands. If such a path leads to no file from
-    the working folder, it is tried relative to the folder of the parameter file. Then its bare file
-    name is tried in that folder. A path stays as it is if no file is found.
+    A section can name an airframe file and recorded commands. If such a path, relative to the
+    working folder, leads to no file, it is tried relative to the folder of the parameter file. If
+    that fails, its bare file name is tried in the folder of the parameter file. A path stays as it
+    is if no file is found.
     """
     recorded = sections.get("reference_model", {}).get("recorded")
     signals = recorded.values() if isinstance(recorded, Mapping) else ()
@@ -307,10 +308,10 @@ def guidance_by_rule(
 ) -> dict[str, Any]:
     """Compute the parameters of guidance that follow from the other sections.
 
-    For RISE-DI, the authority of throttle and of aileron is abs(Omega_ii) u. Here Omega_ii = omega
-    / input_scale, and u is the limit of this input as a deviation from trim. For a controller
-    without these numbers, the result has no authorities. Raises ParameterError if the model or the
-    aircraft does not suit guidance.
+    For RISE-DI, they include the authority of throttle and of aileron: the largest effect of the
+    input, abs(Omega_ii) u. Here Omega_ii = omega / input_scale, and u is the limit of this input as
+    a deviation from trim. For a controller without these numbers, the result has no authorities.
+    Raises ParameterError if the reference model or the aircraft does not suit guidance.
     """
     key = "reference_model.second_order"
     channels = aircraft.channels()
@@ -447,7 +448,8 @@ def check_together(scenario: Scenario) -> None:
 def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
     """Return a warning for each limit of the controller that is beyond the actuator's end stop.
 
-    With such a limit, the anti-windup starts too late.
+    With such a limit, the anti-windup starts too late, because the actuator saturates before u
+    does.
     """
     controller = scenario.controller
     actuators = scenario.aircraft.actuators
@@ -479,11 +481,11 @@ def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
 
 
 def require_guidable(scenario: Scenario) -> None:
-    """Raise ParameterError if guidance cannot fly a scenario.
+    """Check that guidance can fly a scenario. Raises ParameterError if it cannot.
 
     Guidance cannot fly if a bank does not turn the simulated airframe, or if the flight begins
-    outside a fence. Do not call this for a flight behind a bridge, where an airframe flies that is
-    not in the scenario.
+    outside a fence. Do not call this for a flight with a real autopilot behind the bridge, because
+    the airframe that flies there is not in the scenario.
     """
     aircraft = scenario.aircraft
     guidance = scenario.guidance

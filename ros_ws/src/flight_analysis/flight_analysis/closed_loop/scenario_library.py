@@ -53,7 +53,7 @@ def find_scenario(
     Args:
         name: Name in the library, path of a scenario file (.yaml), or a Scenario.
         duration: Duration of the flight, s. If None, the duration in the file stays.
-        with_route: Whether guidance keeps the route and the program of the file.
+        with_route: Whether guidance keeps the route and the program of targets of the file.
 
     Returns:
         The scenario, read and validated. If `name` is a Scenario, only its duration can change.
@@ -80,9 +80,9 @@ def with_route(
 ) -> Scenario:
     """Return the scenario with a route that guidance flies from the start.
 
-    The route replaces the scenario's route and program of targets. `fence` has further sections of
-    guidance, such as the result of `read_fence_file`. Raises ParameterError if the route cannot be
-    flown.
+    The new route replaces the scenario's own route and program of targets. `fence` has further
+    parameters of guidance, such as the result of `read_fence_file`. Raises ParameterError if the
+    route cannot be flown.
     """
     leg_speeds = speeds(waypoints, scenario.aircraft.channels().speed)
     route: dict[str, list[Any]] = {
@@ -103,7 +103,7 @@ def with_route(
 
 
 def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
-    """Return the scenario with a file that the nodes in a namespace can read.
+    """Return the scenario with a parameter file that the nodes in a namespace can read.
 
     The scenario keeps its own file if the nodes read the same values from it. If this file names
     recorded commands, or has sections for another namespace, such as /uav7/controller, a new file
@@ -117,10 +117,10 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
 
 
 def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
-    """Return the scenario with values replaced by those of a parameter file.
+    """Return the scenario with values replaced by those of a ROS parameter file.
 
-    Only the sections of the file for the nodes in `namespace` count. Raises ParameterError, which
-    names the parameter file, because the scenario was valid before.
+    Only the sections of the file for the nodes in `namespace` count. Raises ParameterError if a
+    value is invalid. The message names the parameter file, because the scenario was valid before.
     """
     content = read_file(path, str(path), "a ROS parameter file")
     further = parse_sections(content, path, SCHEMAS, tuple(SCHEMAS), namespace, with_general=True)
@@ -147,11 +147,11 @@ def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
 
 
 def _reaches_nodes(path: Path, namespace: str) -> bool:
-    """Return whether every section of a scenario file is for one of the nodes in a namespace.
+    """Return whether the nodes in a namespace read all values of a scenario file.
 
-    If the file has a section for all nodes, the result is False. With such a file, rcl would put
-    the overrides of a node into the section for all nodes. The node's own section would then
-    replace the overrides.
+    Each section of the file must be for one of these nodes. If the file has a section for all
+    nodes, the result is False. With such a file, rcl would put the overrides of a node into the
+    section for all nodes, and the node's own section would then replace the overrides.
     """
     content = read_file(path, str(path), A_SCENARIO)
     if has_general(content, path):

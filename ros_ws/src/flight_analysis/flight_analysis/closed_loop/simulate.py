@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop in one process, without ROS.
+"""Simulate the closed loop in one process, without ROS.
 
 The code of the nodes is called in the order of the data flow.
 """
@@ -37,7 +37,7 @@ Record = Callable[[Mapping[str, Signal]], None]
 
 
 class _Recorder:
-    """Hands the samples to `record` once per simulated second, then the time to `progress`."""
+    """Calls `record` with the new samples every simulated second, then `progress`."""
 
     period_ns = NANOSECONDS
 
@@ -49,7 +49,7 @@ class _Recorder:
         self._progress = progress
 
     def step(self, t_ns: int) -> None:
-        """Hand the samples since the last call to `record`, then the flight time to `progress`."""
+        """Call `record` with the new samples, then `progress` with the flight time, s."""
         self._record(self._topics.pop_signals())
         if self._progress is not None:
             self._progress(seconds(t_ns))
@@ -65,10 +65,10 @@ def simulate(
 ) -> Tape:
     """Simulate a flight in memory and return its tape, which also says how the flight ended.
 
-    The tape is in SI and radians. `progress` is called with the flight time, s, once per simulated
-    second. `guide`, `control` and `learn` make guidance, controller and learner. `announce` takes
-    the events of the learning. Raises ParameterError if `scenario` is no Scenario, or if it learns
-    and `learn` is None.
+    The tape has a signal for each topic, in SI and radians. `progress` is called with the flight
+    time, s, once per simulated second. `guide`, `control` and `learn` make guidance, controller and
+    learner. `announce` is called with each event of the learning. Raises ParameterError if
+    `scenario` is no Scenario, or if its controller learns in flight and `learn` is None.
     """
     as_scenario(scenario)
     change = (
@@ -106,11 +106,11 @@ def fly(
 ) -> Outcome:
     """Fly a scenario and return the outcome.
 
-    `record` takes the samples once per simulated second and at the end. After each of these calls
-    `progress` is called with the flight time. `guide` makes the guidance if the scenario has any.
-    `control` makes the controller. `learn` makes the learner of a scenario that learns, and
-    `announce` takes the events of the learning. Raises ParameterError if the scenario learns and
-    `learn` is None.
+    `record` is called with the new samples, by topic, once per simulated second and at the end.
+    After each of these calls `progress` is called with the flight time, s. `guide` makes the
+    guidance if the scenario has any. `control` makes the controller. `learn` makes the learner of a
+    controller that learns in flight, and `announce` is called with each event of the learning.
+    Raises ParameterError if the controller learns and `learn` is None.
 
     The order at an instant is: y of the aircraft, y_m of the reference model, u_m of guidance,
     proposals of the learner, u of the controller. A flight ends early if it diverges or is

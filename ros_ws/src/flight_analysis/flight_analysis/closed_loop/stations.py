@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The loop of a flight in one process.
+"""The loop of a flight in one process: stations that act in the order of the data flow.
 
-Stations, which have the code of the nodes, step in the order of the data flow.
+Each station has the code of a node, without ROS.
 """
 
 import math
@@ -32,18 +32,18 @@ Take = Callable[[StampedVector, int], object]
 
 
 class Station(Protocol):
-    """A part of the closed loop, such as the controller, that acts once in each of its periods."""
+    """Interface of a part of the loop, such as the controller, that acts once a period."""
 
     @property
     def period_ns(self) -> int:
         """The period of the steps, ns."""
 
     def step(self, t_ns: int) -> None:
-        """Act at flight time t. Raises FlightEnded or ChannelError if the flight ends."""
+        """Act at flight time t, ns. Raises FlightEnded or ChannelError if the flight ends."""
 
 
 class FlightLoop:
-    """Steps the stations that are due at each instant, in the order of the list."""
+    """Steps, at each instant, the stations that are due, in the order of their list."""
 
     def __init__(self, stations: Sequence[Station]) -> None:
         self._stations = stations
@@ -53,7 +53,8 @@ class FlightLoop:
     def run(self, end_ns: int) -> None:
         """Step all stations from the present instant on, up to and including `end_ns`.
 
-        The attribute `t_ns` is the present instant. It is also correct after an error.
+        The attribute `t_ns` is the present instant, ns. After an error it is the instant of the
+        error.
         """
         for t_ns in range(self.t_ns + self._base_ns, end_ns + 1, self._base_ns):
             self.t_ns = t_ns
@@ -63,7 +64,7 @@ class FlightLoop:
 
 
 class Topics:
-    """Hands the samples of each topic to its subscribers, and keeps them if `recorded`."""
+    """Passes samples to the subscribers of their topic, and keeps them if `recorded`."""
 
     def __init__(self, *, recorded: bool = True) -> None:
         self._recorded = recorded
@@ -73,28 +74,29 @@ class Topics:
         self._subscriptions: dict[str, list[tuple[Sequence[str] | None, Take]]] = defaultdict(list)
 
     def advertise(self, topic: str, names: Sequence[str]) -> None:
-        """Name the channels of a topic."""
+        """Announce a topic with the names of its channels."""
         self._names[topic] = tuple(names)
 
     def names(self, topic: str) -> tuple[str, ...]:
-        """Return the channels of a topic. Raises KeyError before it is advertised."""
+        """Return the channels of a topic. Raises KeyError if it is not advertised yet."""
         return self._names[topic]
 
     def subscribe(self, topic: str, take: Take, channels: Sequence[str] | None = None) -> None:
-        """Hand each sample of a topic to `take`.
+        """Call `take` with each sample of a topic.
 
-        `take` gets the values of `channels`, in this order, or of all channels if this is None.
+        `take` gets the values of `channels`, in this order, or of all channels if `channels` is
+        None.
         """
         self._subscriptions[topic].append((channels, take))
 
     def is_taken(self, topic: str) -> bool:
-        """Return whether a topic is recorded, or a station takes it."""
+        """Return whether a topic is recorded or has a subscriber."""
         return self._recorded or topic in self._subscriptions
 
     def publish(self, topic: str, sample: StampedVector, t_ns: int) -> None:
         """Record a sample, then call the subscribers.
 
-        Raises ChannelError if a channel is missing.
+        Raises ChannelError if the topic lacks a channel to which a station subscribes.
         """
         if self._recorded:
             # The stamp comes first: an interrupt before the next line leaves a stamp without a row.
@@ -119,7 +121,7 @@ class Topics:
 
 
 def _or_refuse(take: Take) -> Take:
-    """Wrap `take` so that it ignores a sample that raises ChannelError, as a node does."""
+    """Wrap a subscriber so that it ignores a sample that raises ChannelError, as a node does."""
 
     def take_or_refuse(sample: StampedVector, t_ns: int) -> None:
         with suppress(ChannelError):
@@ -131,8 +133,8 @@ def _or_refuse(take: Take) -> Take:
 class AircraftStation:
     """The simulated aircraft, which publishes y, pose and truth, and holds the last u.
 
-    A lost sample of y is not published, and a delayed sample keeps its stamp. `every_ns` replaces
-    the period of the sensors by a longer one.
+    A lost sample of y is not published. A delayed sample keeps the stamp of its measurement.
+    `every_ns` replaces the period of the station by a longer one.
     """
 
     def __init__(
@@ -158,7 +160,10 @@ class AircraftStation:
         return simulator
 
     def step(self, t_ns: int) -> None:
-        """Simulate up to flight time t, and publish y, and pose and truth if they are taken."""
+        """Simulate up to flight time t, and publish y.
+
+        The topics `pose` and `truth` are only published if they are recorded or have a subscriber.
+        """
         simulator = self._simulator
         for sample in simulator.sample(t_ns // simulator.period_ns, self._u):
             self._topics.publish("y", sample, t_ns)
@@ -192,7 +197,7 @@ class ReferenceStation:
 
 
 class GuidanceStation:
-    """Guidance, which publishes u_m and the log of its steps."""
+    """Guidance, which publishes u_m and the topic `guidance`, the log of its steps."""
 
     def __init__(self, guidance: Guidance, parameters: GuidanceConfig, topics: Topics) -> None:
         self._guidance = guidance
@@ -209,7 +214,11 @@ class GuidanceStation:
         self._guidance.take_authority(dict(zip(names, sample.value.tolist(), strict=True)))
 
     def step(self, t_ns: int) -> None:
-        """Take a step of guidance, and publish u_m. Raises FlightEnded if guidance must wait."""
+        """Take a step of guidance, and publish u_m.
+
+        Raises FlightEnded if guidance has published no u_m for too long, for example if the pose is
+        too old.
+        """
         if reason := self._guidance.reason_to_wait(t_ns):
             raise FlightEnded(f"ended at t = {seconds(t_ns):.2f} s: {reason}")
         if (guided := self._guidance.step(t_ns, t_ns)) is not None:
@@ -218,9 +227,9 @@ class GuidanceStation:
 
 
 class ControllerStation:
-    """The controller, which publishes u and the log of its ticks.
+    """The controller, which publishes u and the topic `internals`, the log of its ticks.
 
-    `output` is the output of the last tick, or None if that tick had none.
+    The attribute `output` is the output of the last tick, or None if that tick had none.
     """
 
     def __init__(self, controller: Controller, topics: Topics) -> None:

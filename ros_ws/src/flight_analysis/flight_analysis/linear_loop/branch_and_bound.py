@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prove stability for every aircraft of a box, if one bound for the whole box is too large.
 
-The box is halved along one parameter, and a half that is not proved is halved again. A half is only
-examined at the frequencies at which nothing is proved yet. Source: M. P. Newlin, P. M. Young,
-International Journal of Robust and Nonlinear Control 7, 1997.
+A box has an interval for each uncertain entry of A and B. It is halved along one of these entries,
+and a half that is not proved is halved again. A half is only examined at the frequencies at which
+nothing is proved yet. Source: M. P. Newlin, P. M. Young, International Journal of Robust and
+Nonlinear Control 7, 1997.
 """
 
 from typing import Any, NamedTuple
@@ -30,10 +31,11 @@ DIGITS = 5  # significant digits of X and G in a step of a proof
 
 
 class Region(NamedTuple):
-    """A part of a box, with a range of frequencies, that one step of a proof covers.
+    """A smaller box within a box, with a range of frequencies: one step of a proof covers it.
 
-    It has the aircraft with abs(d - centre) <= half, where d holds the r deviations. The range is
-    from `low` to `high`. d, `centre` and `half` have the shape (r,).
+    It contains the aircraft with abs(d - centre) <= half, where d holds the r deviations of the
+    entries. The range of frequencies is from `low` to `high`. d, `centre` and `half` have the shape
+    (r,).
     """
 
     centre: FloatArray
@@ -44,7 +46,7 @@ class Region(NamedTuple):
     scaling: Scaling | None = None
 
     def halves(self, i: int) -> list["Region"]:
-        """Return the two halves of the region along parameter i."""
+        """Return the two halves of the region, cut in the middle of the range of entry i."""
         half = self.half.copy()
         half[i] /= 2.0
         step = np.zeros(len(half))
@@ -53,9 +55,9 @@ class Region(NamedTuple):
         return [narrowed._replace(centre=self.centre + side * step) for side in (-1.0, 1.0)]
 
     def outside(self, begin: float, end: float) -> list["Region"]:
-        """Return what remains of the region without the interval from `begin` to `end`, rad/s.
+        """Return the region at the frequencies outside the interval from `begin` to `end`, rad/s.
 
-        These are a region below the interval and a region above it, unless they are empty.
+        The result has a region below the interval and a region above it. An empty one is left out.
         """
         below = self._replace(high=begin)
         above = self._replace(low=end)
@@ -69,10 +71,10 @@ def proof_of(
 
     The proof holds for all abs(d_i) <= size, for delays that change from tick to tick within their
     range if `levelled` has scaled their channels, and for complex disks of size `disk` in the
-    channels `part.disks`. It starts from d = 0,
-    where the loop is stable, and shows that no aircraft of the box has a mode on abs(z) = RADIUS.
-    The eigenvalues move continuously over the box, so none of them can leave the circle. Each
-    region is proved for half widths that are larger by the fraction `reserve`.
+    channels `part.disks`. The loop is known to be stable at d = 0. The proof shows that no aircraft
+    of the box has a mode on abs(z) = RADIUS. The eigenvalues move continuously over the box, so
+    none of them can leave this circle. Each region is proved for half widths that are larger by the
+    fraction `reserve`.
 
     Each step takes the last region of a list, which at first holds the whole box from 0 to pi / T.
     A step {"halve": i} halves this region along entry i and appends both halves to the list. Every
@@ -114,11 +116,12 @@ def proof_of(
 
 
 def _as_step(scaling: Scaling, part: Channels) -> dict[str, list[float]]:
-    """Round the scalings X and G, and return those of the entries as `t` and `g` of a step.
+    """Round the scalings X and G, and return them as the lists `t` and `g` of a step.
 
-    Rounding is safe, because any X and G prove a bound. If the X and G of the second Legendre
-    coefficients follow from those of the means over a period, as in `least_bound_at`, the step has
-    only the X and G of the means. A factor of all X proves the same: that of a delay becomes 1.
+    The lists have only the scalings of the uncertain entries. Rounding is safe, because any X and G
+    prove a bound. If the X and G of the second Legendre coefficients follow from those of the means
+    over a period, as in `least_bound_at`, the lists have only the X and G of the means. A common
+    factor of all X changes no bound, so X is divided by its value at the channels of a delay.
     """
     k = len(part.entries)
     count = part.uncertain if scaling.g[k:].any() else k
@@ -140,16 +143,20 @@ def frequency_in(region: Region, highest: float) -> float:
 
 
 def _sizes(part: Channels, size: float, disk: float) -> FloatArray:
-    """Return the largest deviation of each channel."""
+    """Return the size to which the deviation in each channel is proved.
+
+    The channels are those of the entries, of a late u and of the disks, in this order.
+    """
     late, disks = len(part.late), len(part.D) - part.disks.start
     return np.repeat([size, LATE, disk], [part.uncertain, late, disks])
 
 
 def levels_of(part: Channels, size: float, disk: float) -> FloatArray:
-    """Return t = log(X) / 2 of the channels of a late u at the worst frequency, rounded.
+    """Return t = log(X) / 2 of the channels of a late u, rounded, with the mean 0.
 
-    The mean is 0. A delay can change from tick to tick, so its channels must have the same X at all
-    frequencies, up to a common factor. The coefficients of a block share theirs.
+    A delay can change from tick to tick, so the ratios of X between its channels must be the same
+    at all frequencies. They are taken from the frequency at which the bound is largest. The
+    Legendre coefficients of one block of the delay have the same X.
     """
     k, late = len(part.entries), len(part.late)
     scale = _sizes(part, size, disk)
@@ -167,7 +174,10 @@ def levels_of(part: Channels, size: float, disk: float) -> FloatArray:
 
 
 def levelled(part: Channels, levels: FloatArray) -> Channels:
-    """Scale the channels of a late u by `levels_of`, so that X is equal in all of them."""
+    """Scale the channels of a late u by exp(levels), so that the same X fits all of them.
+
+    `levels` is the result of `levels_of`.
+    """
     size = np.ones(len(part.D))
     size[part.uncertain : part.disks.start] = np.exp(levels)
     rows = size[:, None]
@@ -177,7 +187,8 @@ def levelled(part: Channels, levels: FloatArray) -> Channels:
 def effects_of(part: Channels, M: ComplexArray, scaling: Scaling) -> FloatArray:
     """Estimate how much the bound of M falls if the half width of an entry becomes smaller.
 
-    There is a value for each entry of the part. All values have the same unknown factor.
+    The result has a value for each entry of the part. Only the ratios of these values count,
+    because all have the same unknown factor.
     """
     scale = np.exp(scaling.t)
     N = scale[:, None] * M / scale

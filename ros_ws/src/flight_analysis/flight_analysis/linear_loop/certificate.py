@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write a guarantee to a file that can be checked without this stack, and keep guarantees.
 
-examples/check_certificate.py reads a certificate, which contains the sampled loop in numbers, the
-box of its entries, and the steps of the proof. The checker computes the motion over a period again,
-and bounds the error of the Legendre coefficients that are left out.
+A certificate contains the sampled loop in numbers, the box of its uncertain entries, and the steps
+of the proof. The script examples/check_certificate.py checks it. The script computes the motion
+over a period again, and bounds the error of the Legendre coefficients that are left out.
 
-The report of a flight shows the guarantee that was kept for its loop, but computes none itself.
-Guarantees are kept in the folder rise-di/guarantees in $XDG_CACHE_HOME, or in ~/.cache, by the
-digest of the loop.
+Guarantees are also kept in the folder rise-di/guarantees in $XDG_CACHE_HOME, or in ~/.cache, under
+the digest of their loop. The report of a flight computes no guarantee. It shows the one that was
+kept for its loop.
 """
 
 import hashlib
@@ -69,7 +69,7 @@ def limit_certificate(
 
 
 def _text(linear: LinearLoop, deviation: float, proof: Mapping[str, Any]) -> str:
-    """Return a loop, its box, the proved relative deviation `deviation`, and the proof, as JSON."""
+    """Return a loop with its box and a proof as JSON. `deviation` is the proved relative one."""
     box = linear.box
     assert box is not None  # noqa: S101 - a guarantee has a box
     content = {
@@ -117,14 +117,18 @@ def unstated(linear: LinearLoop, guarantee: Guarantee) -> tuple[str, ...]:
     """Return the reasons why a guarantee cannot be stated for the aircraft that flies.
 
     The result is empty if the guarantee can be stated. A guarantee holds for a linear loop and for
-    the aircraft within its box, so it says nothing about what the loop leaves out.
+    the aircraft within its box. So a reason is an effect that the linear loop does not contain, or
+    an aircraft outside of the box.
     """
     reasons = [each.sentence for each in linear.differences if each.standing is not Standing.TAKEN]
     return (*reasons, *_beyond_box(linear, guarantee))
 
 
 def beyond_kept(linear: LinearLoop) -> tuple[str, ...]:
-    """Return a sentence if the aircraft lies beyond the guarantee kept for its loop, else ()."""
+    """Return a sentence if the aircraft lies beyond the guarantee kept for its loop.
+
+    The result is empty if the aircraft lies within this guarantee, or if no guarantee is kept.
+    """
     guarantee = _kept(linear)
     return () if guarantee is None else _beyond_box(linear, guarantee)
 
@@ -157,6 +161,6 @@ def _unstable(content: dict[str, Any] | None) -> Unstable | None:
 
 
 def _path(loop: str) -> Path:
-    """Return the path of the kept guarantee of a loop, given the digest of the loop."""
+    """Return the file in which a guarantee is kept, given the digest of its loop."""
     caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(caches) / "rise-di" / "guarantees" / f"{loop}.{BOUND}.json"

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The delay of u at the limit of stability of a linear loop."""
+"""Find the longest delay of u at which a linear loop is still stable."""
 
 import math
 
@@ -27,11 +27,11 @@ def delay_margin(
 ) -> float:
     """Find the delay margin: the delay beyond loop.delay, s, at the limit of stability.
 
-    Input i is delayed by `share`_i times the delay, so you can delay all inputs alike or only some
+    Input i is delayed by share_i times this delay, so you can delay all inputs alike or only some
     of them. `share` has the shape (m,). The margin is 0 if the loop is unstable without extra
-    delay, and infinite if the loop tolerates `longest`, s. The search takes steps of half a period,
-    then bisects down to 0.1 ms. If you give the margin of a similar loop as `near`, s, the search
-    begins at this margin and takes a third of the time.
+    delay, and infinite if the loop tolerates a delay of `longest`, s. The search takes steps of
+    half a period, then bisects down to 0.1 ms. If you give the margin of a similar loop as `near`,
+    s, the search begins at this margin and takes a third of the time.
     """
     delayed = np.broadcast_to(share, loop.lag.shape)
     stride = 1  # in multiples of the resolution, which is 0.1 ms or less

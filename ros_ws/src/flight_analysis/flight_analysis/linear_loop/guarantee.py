@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guarantees that hold for every aircraft of a box.
+"""Prove guarantees that hold for every aircraft of a box.
 
-A guarantee states the deviation up to which the loop is stable, and the disk margins that remain.
-It assumes that the deviations are constant in time, and that the loop is linear, without saturation
-or rate limits.
+A box is the set of all aircraft whose entries of A and B, and lags of actuators, lie within given
+intervals. A guarantee states the deviation up to which the loop is stable, and the disk margins
+that remain. It assumes that the deviations are constant in time, and that the loop is linear,
+without saturation or rate limits.
 """
 
 from collections.abc import Callable, Sequence
@@ -66,7 +67,7 @@ class Unstable(NamedTuple):
 
 
 class Zeros(NamedTuple):
-    """How far entries that are 0 in the airframe file may deviate, if all others are exact."""
+    """How far entries that are 0 in the airframe file may deviate while all others are exact."""
 
     # fraction of its row up to which each of these entries may deviate in a stable aircraft
     stable: float
@@ -104,11 +105,11 @@ class Guarantee(NamedTuple):
 
     @property
     def certificate(self) -> str:
-        """Name of the certificate, or "" if nothing is proved."""
+        """Name of the certificate of this guarantee, or "" if nothing is proved."""
         return self.loop[:NAMED] if self.stable else ""
 
     def as_json(self) -> dict[str, Any]:
-        """Return everything except the proof."""
+        """Return the guarantee as a mapping for JSON, without the proof."""
         content = self._asdict() | {"holds": self.holds}
         del content["proof"]
         if self.unstable is not None:
@@ -127,9 +128,9 @@ def loop_guarantee(
 ) -> Guarantee:
     """Compute the guarantee for the box of a loop.
 
-    The guarantee holds although each input is late by an unknown time from 0 to `late`, s, which
-    changes from tick to tick. The work can take minutes, and `report` is told each of its steps.
-    Raises ParameterError if the loop has no box.
+    The guarantee includes inputs that are late. Each input is late by an unknown time from 0 to
+    `late`, s, which can change from tick to tick. The work can take minutes, and `report` is called
+    with a sentence at the start of each step. Raises ParameterError if the loop has no box.
     """
     none = _none(linear, late)
     box = linear.box
@@ -169,9 +170,9 @@ def loop_guarantee(
 
 
 def _none(linear: LinearLoop, late: float) -> Guarantee:
-    """Return the guarantee of a loop before anything is proved.
+    """Return a guarantee for the box of a loop in which nothing is proved yet.
 
-    Raises ParameterError if the loop has no box.
+    The stable deviation and the disk margins are 0. Raises ParameterError if the loop has no box.
     """
     box = linear.box
     require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
@@ -190,16 +191,15 @@ def _none(linear: LinearLoop, late: float) -> Guarantee:
 
 
 def _is_lag(box: Box) -> NDArray[np.bool_]:
-    """Return which entries of a box are lags of actuators."""
+    """Return a mask of the entries of a box that are lags of actuators."""
     return np.array([name.startswith(LAG_ENTRY) for name in box.names], dtype=bool)
 
 
 def zeros_alone(linear: LinearLoop, late: float = 0.0) -> Zeros | None:
-    """Compute how far entries that are 0 in the airframe file may deviate.
+    """Compute how far entries that are 0 in the airframe file may deviate if all others are exact.
 
-    All other entries are exact.
-    The box of `linear` must have only these entries. They can be very many, so search and proof
-    stop early, as in `quick_guarantee`. Returns None if there is no box, or if the nominal loop is
+    The box of `linear` must have only such entries. They can be very many, so search and proof stop
+    early, as in `quick_guarantee`. Returns None if there is no box, or if the nominal loop is
     unstable.
     """
     box = linear.box
@@ -210,12 +210,12 @@ def zeros_alone(linear: LinearLoop, late: float = 0.0) -> Zeros | None:
 
 
 def quick_guarantee(linear: LinearLoop, most: float) -> Guarantee:
-    """Compute the guarantee for the box of a loop, up to `most` times its deviations.
+    """Compute the guarantee for the box of a loop, enlarged by up to the factor `most`.
 
-    A box of the size s has s times the deviations of the loop's box. Search and proof stop early,
-    at a gap of GAPS[0], and there are no disk margins. This takes less than a tenth of the time of
-    `guarantee`. Nothing is proved if the nominal loop is unstable. Raises ParameterError if the
-    loop has no box.
+    Search and proof stop early, when the proved size is within GAPS[0] of the size that was found
+    unstable, and no disk margins are computed. So this takes less than a tenth of the time of
+    `loop_guarantee`. Nothing is proved if the nominal loop is unstable. Raises ParameterError if
+    the loop has no box.
     """
     none = _none(linear, 0.0)
     if not _is_nominal_stable(linear):
@@ -227,7 +227,11 @@ def quick_guarantee(linear: LinearLoop, most: float) -> Guarantee:
 def _quick(
     linear: LinearLoop, most: float, late: float
 ) -> tuple[float, Unstable | None, list[dict[str, Any]]]:
-    """Return the size that is proved, the unstable aircraft that deviates least, and the proof."""
+    """Search and prove as `quick_guarantee` does.
+
+    Returns the proved size of the box, as a factor on its deviations, the unstable aircraft that
+    deviates least, or None if none was found, and the steps of the proof.
+    """
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
     first = _nearest(_unstable(linear, late, LARGEST * most, quick=True))
@@ -256,20 +260,24 @@ def _exact_entries(linear: LinearLoop, box: Box) -> tuple[str, ...]:
 
 
 def _loops(linear: LinearLoop, late: float) -> list[LoopTiming]:
-    """Return the timing of the loop with u in time, and with u late by the whole of `late`, s."""
+    """Return the timing of the loop with u in time, and with every u late by `late`, s."""
     loop = linear.loop
     return [loop._replace(delay=loop.delay + extra) for extra in sorted({0.0, late})]
 
 
 def _nearest(found: Sequence[Unstable]) -> Unstable | None:
-    """Return the aircraft that deviates least, or None if there is none."""
+    """Return the unstable aircraft that deviates least, or None if there is none."""
     return min(found, key=lambda unstable: unstable.deviation, default=None)
 
 
 def _unstable(
     linear: LinearLoop, late: float, largest: float, *, quick: bool = False
 ) -> list[Unstable]:
-    """Search for unstable aircraft up to a size of the box. Those that deviate least come first."""
+    """Search for unstable aircraft up to a size of the box, and sort them by their deviation.
+
+    `largest` is this size, as a factor on the deviations of the box. The search takes constant
+    delays, of 0 and of `late`, s.
+    """
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
     found = []
@@ -284,9 +292,10 @@ def _unstable(
 def _leaving(
     linear: LinearLoop, late: float, known: Unstable, nearest: Unstable | None
 ) -> Unstable:
-    """Return an aircraft that a sequence of delays makes unstable, or the known one.
+    """Search for an aircraft that a sequence of delays makes unstable, and that deviates less.
 
-    It lies in the direction of the known one and is nearer than `nearest`.
+    The search begins at the size of `nearest`, in the direction of the deviations of the unstable
+    aircraft `known`. Returns `known` if nothing is found.
     """
     assert nearest is not None  # noqa: S101 - the known one is found
     box = linear.box
@@ -304,7 +313,11 @@ def _leaving(
 def _disks(
     linear: LinearLoop, uncertain: Channels, late: float, report: Callable[[str], None]
 ) -> tuple[dict[str, float], float]:
-    """Return the proved disk margins of each input alone, by name, and of all inputs at once."""
+    """Return the disk margins that are proved for every aircraft of the box.
+
+    The first result has the margin of each input alone, by the name of the input. The second one is
+    the margin for independent disks in all inputs at once.
+    """
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
     report("searching for the aircraft with the least margins")
@@ -323,9 +336,9 @@ def _disks(
 
 
 def _disk(loop: Channels, inputs: tuple[int, ...], least: float) -> float:
-    """Return the disk margin that is proved for every aircraft of the box.
+    """Return the disk margin in `inputs` that is proved for every aircraft of the box.
 
-    `least` is the least disk margin that a search has found.
+    `least` is the least disk margin that a search over the box has found.
     """
     return _proved(parts_of(loop, inputs), min(least, WIDEST_DISK), disks=True)[0]
 
@@ -342,11 +355,11 @@ def _proved(
 ) -> tuple[float, list[dict[str, Any]]]:
     """Find the largest size below `least` that can be proved, and return it with its proof.
 
-    The size is a factor on the deviations of the box. If `disks` is True, it is the size of the
-    disks instead, and the deviations cover the whole box. The result is 0 if no size is proved.
-    `least` is a size that a search has found too large. If `exact` is True, `least` itself may be
-    provable, and is tried first. Without `finer_gaps` the first proof is the last one. `show` gets
-    each size before its proof is tried.
+    The size is a factor on the deviations of the box. If `disks` is True, the size is that of the
+    disks, and the deviations cover the whole box. The result is 0 if no size is proved. `least` is
+    a size that a search has found too large. If `exact` is True, the search has found no such size,
+    so `least` itself may be provable and is tried first. Without `finer_gaps` the first size that
+    is proved is the result. `show` gets each size before its proof is tried.
     """
 
     def proof_at(gap: float, most: int) -> list[dict[str, Any]] | None:
@@ -382,10 +395,10 @@ def _proved(
 def _proof(
     parts: list[Channels], size: float, most: int, *, disks: bool, reserve: float
 ) -> list[dict[str, Any]] | None:
-    """Prove each part for a size, or return None if `most` steps are not enough.
+    """Prove each part of the loop for a size, or return None if `most` steps are not enough.
 
     The proof covers deviations that are larger than the size by the fraction SLACK. If `reserve` is
-    not 0, the half widths of each region are larger by the fraction `reserve` instead.
+    not 0, the half widths of each region are larger by the fraction `reserve` instead of this.
     """
     proof = []
     whole = size if reserve else (1.0 + SLACK) * size
@@ -405,9 +418,10 @@ def _proof(
 
 
 def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:
-    """Return the aircraft with deviations d if the exact loop confirms that it is unstable.
+    """Confirm that the aircraft with deviations d is unstable, or return None.
 
-    If necessary, d grows a little until the exact loop confirms it.
+    The search that found it has left out small terms. So if the exact loop is stable at d, d grows
+    a little, up to CONFIRMED times.
     """
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
@@ -424,7 +438,7 @@ def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:
 
 
 def _as_unstable(box: Box, d: FloatArray, frequency: float) -> Unstable:
-    """Return the unstable aircraft with deviations d."""
+    """Describe the aircraft with deviations d, whose unstable mode has this frequency, rad/s."""
     entries = {
         name: float(part) for name, part in zip(box.names, d * box.part, strict=True) if part
     }

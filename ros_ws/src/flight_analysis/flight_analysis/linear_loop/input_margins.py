@@ -87,7 +87,7 @@ class Margins(NamedTuple):
             return np.minimum(self.gain_increase, 1.0 / self.gain_decrease)
 
     def at(self, place: int | slice) -> "Margins":
-        """Return the margins of one of N aircraft, or of some of them."""
+        """Return the margins of one or some of N aircraft. `place` is their index or slice."""
         return Margins(**{name: value[place] for name, value in self._asdict().items()})
 
     def worst(self) -> "Margins":
@@ -124,7 +124,7 @@ def disk_phase(disk: FloatArray) -> FloatArray:
 
 
 class SlowModes(NamedTuple):
-    """Oscillating modes of a closed loop that take at least four ticks a cycle, slowest first."""
+    """Oscillating modes of a closed loop whose cycle takes at least four ticks, slowest first."""
 
     frequency: FloatArray  # natural frequency, rad/s, (k,)
     damping: FloatArray  # damping ratio, (k,)
@@ -322,7 +322,7 @@ def _sensitivity(form: SchurForm, z: ComplexArray) -> ComplexArray:
 
 
 def _margins(form: SchurForm, period: float, *, together: bool) -> Margins:
-    """Compute the margins of the aircraft of a batch."""
+    """Compute the margins of the aircraft of a batch, from their closed loops in Schur form."""
     stable = _stable(form)
     m = form.R.shape[-1]
     w, S = on_grid(form, period)
@@ -361,7 +361,7 @@ def _stable(form: SchurForm) -> NDArray[np.bool_]:
 
 
 def on_grid(form: SchurForm, period: float) -> tuple[FloatArray, ComplexArray]:
-    """Return the frequencies of each aircraft, (N, F), rad/s, and the balanced S, (N, F, m, m)."""
+    """Choose frequencies for each aircraft, (N, F), rad/s, and return S there, balanced."""
     w = _frequencies(form.eigenvalues, period)
     return w, _balanced(_sensitivity(form, np.exp(1j * w * period)))
 

@@ -4,12 +4,14 @@
 
 u of each tick and input is either in time or late by `late`, which is at most a period. At each
 instant the newest u that has arrived acts. A tick begins when a u in time would arrive. Over a tick
-the motion is exactly one of 2^m matrices, for m inputs. A sequence of them leaves if a mode of
-their product grows, that is, lies outside the unit circle.
+the motion is exactly one of 2^m matrices, for m inputs: one for each choice of the inputs that are
+late. A sequence of these choices makes the loop unstable if a mode of the product of its matrices
+lies outside the unit circle.
 
-With x_k and p_k, the right and left eigenvectors of the product carried to tick k, another matrix M
-in this tick changes the mode to p_k+1 M x_k / (p_k+1 x_k+1), to first order. So the best choice of
-each tick is known at once, and the ascent takes as many of these choices as help together.
+The search changes the choices of a sequence. x_k and p_k are the right and left eigenvectors of the
+product, carried to tick k. If tick k gets another matrix M, the mode changes to p_k+1 M x_k /
+(p_k+1 x_k+1), to first order. So the best choice of each tick is known at once, and the ascent
+takes as many of these choices as help together.
 """
 
 from itertools import pairwise
@@ -41,7 +43,7 @@ COUPLED = 1e-12  # smallest entry of a matrix that couples two states
 
 
 class Ticks(NamedTuple):
-    """The motion of an aircraft over a tick, for each choice of the late inputs."""
+    """The motion of an aircraft over a tick: a matrix for each choice of the late inputs."""
 
     maps: FloatArray  # (2^m, s, s)
     u: IntArray  # places of u of this tick among the states
@@ -49,7 +51,7 @@ class Ticks(NamedTuple):
 
 
 class Attack(NamedTuple):
-    """A sequence of delays and how its fastest mode grows."""
+    """A periodic sequence of delays, and the growth of its fastest mode."""
 
     growth: float  # factor over the whole sequence
     frequency: float  # rad a tick
@@ -57,7 +59,7 @@ class Attack(NamedTuple):
 
     @property
     def leaves(self) -> bool:
-        """Whether the loop is unstable, if the sequence is repeated."""
+        """Whether the loop is unstable if the sequence is repeated."""
         return self.growth > RADIUS ** len(self.choices)
 
 
@@ -72,8 +74,9 @@ class Leaving(NamedTuple):
 def ticks_of(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, late: float) -> Ticks:
     """Compute the motion over a tick. `late` is at most a period, s.
 
-    The states are x, actuators, u of this tick and of the tick before, u that is on its way, and
-    the law. A tick begins when its u arrives in time, so the next u is computed within it.
+    The states are, in this order, x and the actuators, u of this tick, u of the tick before, any
+    further u that is on its way, and the states of the law. A tick begins at the instant at which
+    its u arrives if it is in time, so the next u is computed within the tick.
     """
     n, m = plant.B.shape
     q, T = len(law.A), loop.period
@@ -104,7 +107,7 @@ def ticks_of(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, late: float) 
 
 
 def loops_of(ticks: Ticks) -> list[Ticks]:
-    """Split the states into the parts that are strongly connected, and have inputs among them."""
+    """Split the states into strongly connected parts, and keep the parts that contain inputs."""
     from scipy.sparse import csr_array  # noqa: PLC0415 - a flight starts without it
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
@@ -123,7 +126,10 @@ def loops_of(ticks: Ticks) -> list[Ticks]:
 
 
 def ascended(ticks: Ticks, choices: IntArray) -> Attack:
-    """Change the choices of a sequence as long as its fastest mode grows."""
+    """Improve a sequence of delays until its fastest mode grows no further.
+
+    `choices` has the index of a matrix for each tick.
+    """
     attack, values = _attack(ticks, choices)
     for _ in range(ROUNDS):
         best = values.argmax(axis=1)
@@ -144,7 +150,11 @@ def ascended(ticks: Ticks, choices: IntArray) -> Attack:
 
 
 def _attack(ticks: Ticks, choices: IntArray) -> tuple[Attack, FloatArray]:
-    """Return the fastest mode of a sequence, and to what each choice of a tick changes it."""
+    """Compute the fastest mode of a sequence, and how each other choice would change it.
+
+    The second result has the size of the mode if tick k gets choice c, (ticks, choices), to first
+    order.
+    """
     from scipy.linalg import eig  # noqa: PLC0415 - a flight starts without it
 
     sequence = ticks.maps[choices]
@@ -172,7 +182,10 @@ def _attack(ticks: Ticks, choices: IntArray) -> tuple[Attack, FloatArray]:
 
 
 def attacked(ticks: Ticks, known: IntArray | None = None) -> Attack | None:
-    """Search for a sequence of delays that leaves. `known` is one from which the search starts."""
+    """Search for a sequence of delays that makes the loop unstable, or return None.
+
+    The search starts from the sequence `known`, if it is given, and then from random sequences.
+    """
     rng = np.random.default_rng(0)
     choices, parts = len(ticks.maps), loops_of(ticks)
     known_first = [] if known is None else [ascended(part, known) for part in parts]

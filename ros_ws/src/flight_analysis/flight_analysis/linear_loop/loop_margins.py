@@ -87,7 +87,7 @@ class LinearLoop(NamedTuple):
 
     @property
     def plant_states(self) -> tuple[str, ...]:
-        """States of the aircraft, and u[INPUT] for each actuator whose lag deviates."""
+        """States of the aircraft, and u[INPUT] as the state of each actuator whose lag deviates."""
         entries = () if self.box is None else self.box.names
         lags = [name for name in entries if name.startswith(LAG_ENTRY)]
         return (*self.states, *(f"u{name.removeprefix(LAG_ENTRY)}" for name in lags))
@@ -222,7 +222,7 @@ def _assessed_by_search(linear: LinearLoop, box: Box) -> LoopMargins:
 
 
 def _least_delay(linear: LinearLoop, nominal: float) -> float:
-    """Find the smallest delay margin of the aircraft of a loop, s.
+    """Find the smallest delay margin among the N aircraft of a loop, s.
 
     The result is at most `nominal`, the nominal margin. All aircraft are tried together. The delay
     rises in steps of half a period, or of 1/12 of the nominal margin if this is longer.
@@ -277,14 +277,14 @@ def scenario_loop(
 
 
 def as_compared(linear: LinearLoop, scenario: Scenario, comparison: Comparison) -> LinearLoop:
-    """Return the loop with the differences of a comparison, and with `off` of its scenario."""
+    """Return the loop with the differences of a comparison, and with `off` of the aircraft."""
     return _with_deviation(linear._replace(differences=comparison.differences), scenario)
 
 
 def _with_deviation(linear: LinearLoop, scenario: Scenario) -> LinearLoop:
-    """Return the loop with `off`, how far the scenario's aircraft is from its airframe file.
+    """Return the loop with `off`: how far the scenario's aircraft is from its airframe file.
 
-    `off` is 0 if the airframe flies as in this file. It is infinite if the scenario changes an
+    `off` is 0 if the aircraft flies as in this file. It is infinite if the scenario changes an
     entry that is exact in the box.
     """
     if linear.box is None or scenario.aircraft.is_jsbsim:
@@ -344,7 +344,7 @@ def with_box(
     seed: int,
     spread: Spread,
 ) -> LinearLoop:
-    """Return the loop with the box that contains its nominal and its drawn aircraft.
+    """Return the loop with a box: intervals of entries that contain all its aircraft.
 
     The box is None if nothing deviates. If a lag deviates, its actuator becomes a state of the
     plant, and the lag becomes 0 in the timing of the loop:
@@ -363,11 +363,11 @@ def with_box(
 def of_matrices_and_lags(
     spread: Spread, timing: LoopTiming, inputs: Sequence[str]
 ) -> tuple[Spread, dict[int, float]]:
-    """Separate the entries of A and B in `spread` from the entries of lags.
+    """Separate the entries of A and B in `spread` from those of lags, named 1/lag[INPUT].
 
-    The entry of a lag is named 1/lag[INPUT]. It is returned as a relative deviation of 1 / lag, in
-    a dict by the index of the law's input. Raises ParameterError for an unknown entry, a lag below
-    LEAST_LAG periods, and a deviation outside [0, 1).
+    The second result has the relative deviation of 1 / lag by the index of the law's input. Raises
+    ParameterError for an unknown entry, a lag below LEAST_LAG periods, and a deviation outside [0,
+    1).
     """
     least = LEAST_LAG * timing.period
     known = {
@@ -436,7 +436,7 @@ def box_of(
     uncertainty: float,
     spread: Spread = UNIFORM,
 ) -> Box:
-    """Return the box of the aircraft that `nominal_and_sampled` draws around an airframe file.
+    """Return the box (intervals of the entries of A and B) that `nominal_and_sampled` draws from.
 
     Its channels are in the law's order. If there is an allocation, B of every effector is
     uncertain. If `spread.zeros` is above 0, entries that are 0 in the file deviate as well, by this
@@ -488,7 +488,7 @@ def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airf
 
 
 def distribution(airframe: Airframe, controller: ControllerConfig) -> FloatArray:
-    """Return the allocation matrix T, (p, m), with a row for each input of an airframe, in order.
+    """Return the allocation matrix T, (p, m), with its rows in the order of the airframe's inputs.
 
     T is the identity if no allocation drives these inputs.
     """

@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prove that every aircraft of a box settles, whatever the limits of one input.
 
-The aircraft gets a = phi(u) instead of u, so that w = u - a is cut off. phi can be any curve whose
-slope lies between 0 and 1. Take any taps h_j >= 0 at earlier and later ticks j, whose sum is at
-most 1. Then
+A box has an interval for each uncertain entry of A and B. The aircraft gets a = phi(u) instead of
+u, so that w = u - a is cut off. phi can be any curve whose slope lies between 0 and 1. Take any
+taps h_j >= 0 at earlier and later ticks j, whose sum is at most 1. Then
 
     sum over ticks k of w_k (a_k - sum_j h_j a_(k-j)) >= 0
 
-(Zames-Falb). The loop has the sensitivity S at this input, and m = 1 - sum_j h_j z^-j. If Re(m S) >
+(Zames-Falb). The loop has the sensitivity S at this input. Let m = 1 - sum_j h_j z^-j. If Re(m S) >
 0 at each frequency, every aircraft settles. If this holds only above a lowest frequency, no
-aircraft oscillates faster than that. docs/theory.md has both theorems.
+aircraft oscillates faster than this frequency. docs/theory.md has both theorems.
 
 A linear program finds the taps for some aircraft. The box is then covered by regions with scalings
 D and G of the entries, as in a proof without a limit. Within the frequencies of a step, the
@@ -75,7 +75,7 @@ BATCH = 200  # samples on each side of a frequency, at most
 
 
 class LimitGuarantee(NamedTuple):
-    """A guarantee for every aircraft of a box, whatever the limits of one input."""
+    """A guarantee for every aircraft of a box that holds whatever the limits of one input are."""
 
     input: str
     uncertainty: float  # largest relative deviation in the box
@@ -87,7 +87,7 @@ class LimitGuarantee(NamedTuple):
 
     @property
     def settles(self) -> bool:
-        """Whether every motion settles. Otherwise the guarantee only excludes oscillations."""
+        """Whether every motion settles. If not, the guarantee only excludes fast oscillations."""
         return not self.multiplier.slowest
 
     @property
@@ -96,7 +96,7 @@ class LimitGuarantee(NamedTuple):
         return self.size >= self.uncertainty
 
     def as_json(self) -> dict[str, Any]:
-        """Return everything except the proof."""
+        """Return the guarantee as a mapping for JSON, without the proof and the taps."""
         return {
             "input": self.input,
             "uncertainty": self.uncertainty,
@@ -127,10 +127,10 @@ class Multiplier(NamedTuple):
 
 
 def guarantee_with_limit(linear: LinearLoop, name: str) -> LimitGuarantee | None:
-    """Find the largest part of the box in which every aircraft settles, or none oscillates.
+    """Find the largest scaled box in which every aircraft settles, or none oscillates.
 
-    `name` is the input with the limits. Returns None if there is no such part. Raises
-    ParameterError if the loop has no such input, or no box.
+    The box is scaled down until a guarantee is found. `name` is the input with the limits. Returns
+    None if no guarantee is found. Raises ParameterError if the loop has no such input, or no box.
     """
     for part in TRIED:
         for slowest in (0.0, SLOWEST):
@@ -145,8 +145,8 @@ def limit_guarantee(
 ) -> LimitGuarantee | None:
     """Prove the guarantee for the box scaled by `part`, or return None if no proof is found.
 
-    The proof covers the frequencies from `slowest`, rad/s, on. If this is 0, the proof shows that
-    every aircraft settles. `name` is the input with the limits. Raises ParameterError as
+    The proof covers the frequencies from `slowest`, rad/s, upwards. If `slowest` is 0, the proof
+    shows that every aircraft settles. `name` is the input with the limits. Raises ParameterError as
     `guarantee_with_limit` does.
     """
     require(name in linear.inputs, "limit", name, f"an input: {', '.join(linear.inputs)}")
@@ -172,7 +172,10 @@ def limit_guarantee(
 def _proof(
     parts: list[Channels], multiplier: Multiplier, size: float
 ) -> list[dict[str, Any]] | None:
-    """Prove each part of the loop for a size, or return None. Only the first part has the limit."""
+    """Prove each part of the loop for a size of the box, or return None if one proof fails.
+
+    Only the first part contains the limited input.
+    """
     proof = []
     for number, part in enumerate(parts):
         steps = limit_proof(part, multiplier, size, has_limit=number == 0)
@@ -183,10 +186,10 @@ def _proof(
 
 
 def _with_limit(part: Channels) -> Channels:
-    """Turn a part with a disk in one input into a part with a limit of that input.
+    """Turn a part of the loop with a disk in one input into a part with a limit of that input.
 
-    The inputs of the result are those of the entries, and last the part of u that the limit cuts
-    off. The outputs are those of the entries, and last a, which is u less this part.
+    The inputs of the result are those of the entries, and last w, what the limit cuts off from u.
+    The outputs are those of the entries, and last a = u - w, what is left of u.
     """
     W, D = part.W.copy(), part.D.copy()
     D[-1, -1] += 0.5
@@ -198,20 +201,20 @@ def _with_limit(part: Channels) -> Channels:
 def sensitivity(part: Channels, w: FloatArray, radius: float) -> ComplexArray:
     """Compute S at the input with the limit, for the aircraft in the middle of the box.
 
-    w has the frequencies, rad/s, and `radius` is abs(z).
+    w has the frequencies, rad/s. S is computed on the circle abs(z) = radius.
     """
     last = np.array([len(part.D) - 1])
     return np.asarray(-part.some(last).response(w, radius)[:, 0, 0])
 
 
 def multiplier_for(part: Channels, size: float, slowest: float) -> Multiplier | None:
-    """Find taps that serve the middle of a box and its worst corners.
+    """Find taps with which the middle of a box and its worst corners meet the inequality.
 
     The room of an aircraft, by which it meets the inequality, is the least Re(m S) / abs(S) over
     the frequencies, divided by `_expected`. A corner is an aircraft with each entry at an end of
     its range. A linear program finds the taps that leave the most room to some aircraft. A search
     then adds the corners with the least room, until these have at least ENOUGH of the room in the
-    program. Returns None if no taps serve all of them.
+    program. Returns None if no taps leave room to all these aircraft.
     """
     k = len(part.entries)
     generator = np.random.default_rng(SEED)
@@ -235,8 +238,9 @@ def multiplier_for(part: Channels, size: float, slowest: float) -> Multiplier | 
 def _expected(slowest: float, w: FloatArray) -> FloatArray:
     """Return the Re(m S) / abs(S) that counts as a room of 1 at the frequencies w, rad/s.
 
-    If `slowest` is 0, it is 1 at all frequencies. Otherwise it falls below KNEE, because an
-    integrator in the loop turns S away from the positive real axis towards 0 rad/s.
+    If `slowest` is 0, the result is 1 at all frequencies. Otherwise it falls below the frequency
+    KNEE, because an integrator in the loop turns S away from the positive real axis towards 0
+    rad/s.
     """
     return np.minimum(w / KNEE, 1.0) ** 2 if slowest else np.ones(len(w))
 
@@ -257,9 +261,9 @@ def _worst_corners(
 ) -> FloatArray:
     """Search for the corners of a box with the least `_rooms`, starting from N corners, (N, k).
 
-    Only the CLIMBERS starts with the least room are used. Each step of a search changes the sign of
-    the one deviation with whose other sign the room is least. The search ends when the room no
-    longer shrinks, or after LONGEST_CLIMB steps.
+    The search only uses the CLIMBERS starts with the least room. Each step changes the sign of one
+    deviation, the one for which the room becomes least. The search ends when the room no longer
+    shrinks, or after LONGEST_CLIMB steps.
     """
     flips = 1.0 - 2.0 * np.eye(len(part.entries))
     found = []
@@ -277,9 +281,10 @@ def _worst_corners(
 def _program(
     part: Channels, aircraft: FloatArray, slowest: float
 ) -> tuple[Multiplier | None, float]:
-    """Find the taps for which the least of the `_rooms` of N aircraft is largest.
+    """Find the taps that leave the most room, in the sense of `_rooms`, to the worst of N aircraft.
 
-    Returns the taps and this room. `aircraft` has the deviations of each aircraft, (N, k).
+    Returns the taps and the room of the worst aircraft, or None and 0 if this room is too small.
+    `aircraft` has the deviations of each aircraft, (N, k).
     """
     from scipy.optimize import linprog  # noqa: PLC0415 - a flight starts without it
 
@@ -380,7 +385,8 @@ def limit_proof(
 def _as_complex_channel(M: ComplexArray, m: complex) -> ComplexArray:
     """Return M with m a + w in place of a, and m a - w in place of w.
 
-    In these signals the limit is a complex channel of size 1.
+    Between these two signals the limit is a complex channel of size 1, so `least_bound_at` can
+    bound it.
     """
     A, B, C, s = M[:-1, :-1], M[:-1, -1:], m * M[-1:, :-1], m * M[-1, -1]
     by_z, by_w = -C / (s - 1.0), 1.0 / (s - 1.0)
@@ -397,7 +403,7 @@ def _plain_step(scaling: Scaling) -> dict[str, Any]:
 
 
 def _step(scaling: Scaling, mS: complex, factor: float) -> dict[str, Any]:
-    """Return t, g and s of a step, with the s that brings Re(m S) in the middle of the box to 1."""
+    """Return the scalings t, g and s of a step. s makes Re(m S) 1 in the middle of the box."""
     t = scaling.t[:-1] - scaling.t[-1] - np.log(2.0 * factor) / 2.0
     s = np.log(2.0 * max(mS.real, 1e-300)) / 2.0
     return {"t": _rounded(t), "g": _rounded(scaling.g[:-1]), "s": _rounded(np.array([s]))[0]}
@@ -435,7 +441,7 @@ def _interval(
 def _samples(w: float, end: float, farthest: float) -> Iterator[float]:
     """Yield at most BATCH frequencies from w to `end`, without w itself, rad/s.
 
-    `farthest` is the largest step from one to the next, rad/s.
+    `farthest` is the largest distance between neighbours, rad/s.
     """
     side = float(np.sign(end - w))
     for _ in range(BATCH):

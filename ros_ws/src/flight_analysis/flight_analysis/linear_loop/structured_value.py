@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Upper bound of the structured singular value of a loop, over intervals of frequency.
+"""Bound the structured singular value of a loop from above, over intervals of frequency.
 
 mu(M) is the reciprocal of the size of the least Delta = diag(delta_i) for which det(I - M Delta) =
 0, with delta_i real or complex. For any real t and G = diag(g), with g_i = 0 at complex channels,
 
     mu(M)^2 <= lambda_max(N* N + j (G N - N* G)),    N = exp(t) M exp(-t)
 
-With X = exp(2 t), this is M* X M + j (X G M - M* X G) <= mu^2 X. Every X and G gives a valid bound,
-so ending the search early only costs tightness. Source: M. K. H. Fan, A. L. Tits, J. C. Doyle, IEEE
-Transactions on Automatic Control 36(1), 1991.
+With X = exp(2 t), this inequality is M* X M + j (X G M - M* X G) <= mu^2 X. Every X and G gives a
+valid bound, so a search that ends early only makes the bound larger. Source: M. K. H. Fan, A. L.
+Tits, J. C. Doyle, IEEE Transactions on Automatic Control 36(1), 1991.
 """
 
 from typing import NamedTuple
@@ -56,10 +56,10 @@ class Scaling(NamedTuple):
 
 
 def balancing_t(M: ComplexArray, share: FloatArray | None = None) -> FloatArray:
-    """Find the t = log(X) / 2 that makes row and column of each factor of X about equally large.
+    """Find the t = log(X) / 2 with which row and column of each factor of X are about equal.
 
-    t has the shape (p,). `share` maps the factors of X to the channels, (p, f); each channel has
-    its own if it is not given. The method is Osborne's iteration.
+    t has the shape (p,). `share` maps the f factors of X to the p channels, (p, f). Without
+    `share`, each channel has a factor of its own. The method is Osborne's iteration.
     """
     share = np.eye(len(M)) if share is None else share
     t = np.zeros(share.shape[1])
@@ -81,11 +81,11 @@ def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
 
 
 def is_below_one(M: ComplexArray, scaling: Scaling) -> NDArray[np.bool_]:
-    """Return for each of the matrices (N, p, p) whether its bound is below 1.
+    """Return a mask of the matrices (N, p, p) whose bound is below 1.
 
     The bound is below 1 if I minus the matrix of `_form` is positive definite. Cholesky's
     factorisation of all these differences shows this in a fraction of the time that eigenvalues
-    take. Eigenvalues are only computed if a difference has no factor.
+    take. Eigenvalues are only computed if a difference has no such factorisation.
     """
     H = _form(M, scaling)
     try:
@@ -153,11 +153,14 @@ def least_bound(
 def least_bound_at(
     part: Channels, w: float, scaled: ComplexArray, near: Scaling | None
 ) -> tuple[float, Scaling]:
-    """Bound a scaled M(w) of a part of the loop, as `least_bound` does for the target 1.
+    """Bound a scaled M(w) of a part of the loop, and return the bound with its X and G.
 
-    At first the search for X and G has only the channels of the means over a period. The channels
-    of the second coefficients get the X that balances their rows and columns. If the bound with
-    this X and G is below 1, or w is low, it is returned. Otherwise a second search has all
+    The search is that of `least_bound` with the target 1. M(w) is scaled to the sizes of its
+    channels. `near` has the X and G of a similar matrix.
+
+    To save time, the search first has only the channels of the means over a period. The channels of
+    the second Legendre coefficients get the X that balances their rows and columns. If the bound
+    with this X and G is below 1, or w is low, it is returned. Otherwise a second search has all
     channels.
     """
     k = len(part.entries)
@@ -182,9 +185,10 @@ def least_bound_at(
 
 
 class Centre(NamedTuple):
-    """X and G of the linear matrix inequality, at a step of the search for its centre.
+    """A pair X and G on the way to the centre of the set that meets the linear matrix inequality.
 
-    They are those of N, so X is 1 at the scalings t with which the search begins.
+    X and G refer to the scaled matrix N = exp(t) M exp(-t) of `least_bound`. So X = 1 means the
+    scalings t with which the search begins.
     """
 
     X: FloatArray  # diagonal, (p,)
@@ -192,13 +196,13 @@ class Centre(NamedTuple):
     free: FloatArray  # map from f free factors to X, (p, f); equal factors share a column
 
     def inequality(self, N: ComplexArray, level: float) -> ComplexArray:
-        """Compute the matrix F of the inequality, (p, p)."""
+        """Compute F = level X - N* X N - j (G N - N* G), the matrix of the inequality F > 0."""
         skew = 1j * np.r_[self.g, np.zeros(len(N) - len(self.g))][:, None] * N
         right = (N.conj().T * self.X) @ N + skew + skew.conj().T
         return np.asarray(level * np.diag(self.X) - right)
 
     def bound(self, N: ComplexArray) -> float:
-        """Return the least level at which the inequality F > 0 can hold for this X and G."""
+        """Return the least level for which F > 0 can hold with this X and G: the bound squared."""
         root = np.sqrt(self.X)
         return -float(np.linalg.eigvalsh(self.inequality(N, 0.0) / root[:, None] / root)[0])
 
@@ -236,12 +240,12 @@ class Centre(NamedTuple):
         return self, 0.0  # no length helps: only rounding is left
 
     def after(self, step: FloatArray) -> "Centre":
-        """Move X and G by a step, (p + real_count,)."""
+        """Return X and G moved by a step, whose entries are the factors of X and then G."""
         f = self.free.shape[1]
         return Centre(self.X + self.free @ step[:f], self.g + step[f:], self.free)
 
     def is_inside(self, N: ComplexArray, level: float) -> bool:
-        """Return whether the inequality and the limits of X and G hold, and all is finite."""
+        """Return whether F > 0, X > 0 and abs(g_i) < LARGEST_G hold, and all numbers are finite."""
         if not (self.X.min() > 0.0 and np.abs(self.g).max(initial=0.0) < LARGEST_G):
             return False
         F = self.inequality(N, level)

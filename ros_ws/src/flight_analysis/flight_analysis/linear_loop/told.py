@@ -3,9 +3,10 @@
 """Compare what the controller was told of its aircraft with the aircraft that flies.
 
 The section `controller` of a scenario has the lags and the delay that the controller was told. The
-section `aircraft` has the true ones, and a log the measured ones. `compare` finds the differences,
-and the timing of the loop that flies. Margins and guarantees refer to this timing. If something
-acts that no linear loop contains, such as a fault, no guarantee is stated.
+section `aircraft` has those of the simulated aircraft, and a log shows those that were measured.
+`compare` finds the differences, and the timing of the loop that flies. Margins and guarantees refer
+to this timing. If something acts that no linear loop contains, such as a fault, no guarantee is
+stated.
 """
 
 from dataclasses import replace
@@ -74,7 +75,7 @@ OUTSIDE_LOOP = frozenset(
 
 
 class Standing(Enum):
-    """The consequence of a difference for margins and guarantee."""
+    """What a difference means for the margins and the guarantee of a loop."""
 
     TAKEN = auto()  # the loop uses the value of the aircraft
     # no linear loop contains the fact: margins leave it out, and no guarantee is stated
@@ -97,12 +98,12 @@ class Difference(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """The fact, and what it means for margins and guarantee."""
+        """Sentence with the fact, and with its consequence for margins and guarantee."""
         return f"{self.fact}; {MEANING[self.standing]}"
 
 
 class FlightFacts(NamedTuple):
-    """Facts about a flight that only its log contains. A fact is None if the log lacks it."""
+    """Facts about a flight that only its log can show. A fact is None if the log lacks it."""
 
     is_simulated: bool = True  # whether the aircraft of the scenario flew
     tick: float | None = None  # s, median period of the ticks
@@ -125,7 +126,7 @@ class Comparison(NamedTuple):
 
 
 def loop_of(controller: ControllerConfig) -> LoopTiming:
-    """Return the timing of the loop as the controller was told it."""
+    """Return the lags, the delay and the period that the controller was told."""
     lag = np.array(controller.lag, dtype=np.float64)
     return LoopTiming(lag, controller.delay, 1.0 / controller.rate)
 
@@ -133,9 +134,9 @@ def loop_of(controller: ControllerConfig) -> LoopTiming:
 def compare(
     scenario: Scenario, controller: ControllerConfig, flight: FlightFacts = PLANNED
 ) -> Comparison:
-    """Compare what a controller was told with the aircraft that flies.
+    """Compare what a controller was told of lags, delay and effects with the aircraft that flies.
 
-    If the two agree, the timing is that of the controller to the last bit.
+    If the two agree, the timing of the result is that of the controller to the last bit.
     """
     timing = loop_of(controller)
     differences = [*_of_log(controller, flight)]
@@ -152,13 +153,13 @@ def compare(
 
 
 def lag_through(effect: FloatArray, T: FloatArray, lag: FloatArray) -> FloatArray:
-    """Return the lags of the inputs v of a law behind u = T v, (m,), s.
+    """Return the lags of the inputs v of a law whose allocation is u = T v, (m,), s.
 
         lag_i = sum_j effect_ij T_ji lag_j / sum_j effect_ij T_ji,  exact to first order in the lags
 
-    `effect` (m, p) is the effect of the p effectors on the outputs, T has the shape (p, m), and
-    `lag` (p,) has the lags of the effectors, s. If the effectors have no effect on an output, the
-    longest lag counts.
+    `effect` (m, p) is the effect of the p effectors u on the outputs, T has the shape (p, m), and
+    `lag` (p,) has the lags of the effectors, s. If the effectors have no effect on an output, its
+    lag is the longest one.
     """
     share = effect * T.T
     total = share.sum(axis=1)
@@ -185,8 +186,8 @@ def _compare_lags(
 ) -> tuple[FloatArray, list[Difference]]:
     """Compare the lags of the actuators, and return the actual lags, (m,), s, and the differences.
 
-    A model of JSBSim contains actuators, whose lag is not among the keys of the aircraft. The
-    controller can therefore be told a longer lag than the keys state, but not a shorter lag.
+    A model of JSBSim contains actuators of its own, whose lag is not among the parameters of the
+    scenario. So the controller can be told a longer lag than these parameters, but no shorter one.
     """
     lag = np.array(controller.lag, dtype=np.float64)
     flown = flown_lag(scenario.aircraft, controller)
@@ -211,8 +212,9 @@ def _compare_delays(
 
     In simulation, y waits for the next tick and u for the next step of the aircraft, each up to a
     period of the aircraft. Any controller.delay within this range is accepted. For any other
-    controller.delay, the longest delay of the range is assumed. For an aircraft of the user, the
-    delay of its sensors and actuators is unknown, and the told delay is accepted.
+    controller.delay, the longest delay of the range is assumed. For a user's own aircraft, the
+    delay of its sensors and actuators is unknown, so the delay that the controller was told is
+    accepted.
 
     The law steps with each y. If y comes less often than the ticks, the delay of one and a half
     ticks becomes one and a half periods of y.
@@ -250,7 +252,7 @@ def _is_within(value: float, least: float, most: float) -> bool:
 
 
 def _of_log(controller: ControllerConfig, flight: FlightFacts) -> list[Difference]:
-    """Compare the period and the parameters of the controller with what a log shows."""
+    """Return the differences between the period and the parameters of the controller and a log."""
     differences = []
     period = 1.0 / controller.rate
     if flight.tick is not None and abs(flight.tick - period) > SAME_PERIOD * period:
@@ -266,7 +268,7 @@ def _of_log(controller: ControllerConfig, flight: FlightFacts) -> list[Differenc
 
 
 def _beyond_loop(scenario: Scenario, controller: ControllerConfig) -> list[Difference]:
-    """Return the differences in end stops, rate limits, signs, and what no linear loop contains.
+    """Return the differences in end stops, rate limits and signs, and what no linear loop contains.
 
     A linear loop cannot contain, for example, the faults of an aircraft.
     """
@@ -293,7 +295,8 @@ def _beyond_loop(scenario: Scenario, controller: ControllerConfig) -> list[Diffe
 def _other_effect(scenario: Scenario) -> list[str]:
     """Return a sentence for each output whose row in allocation.effect differs from its row in C B.
 
-    Rows are compared up to a positive factor, because input_scale contains this factor.
+    Two rows agree if they differ only by a positive factor, because input_scale contains this
+    factor.
     """
     controller = scenario.controller
     allocation = controller.allocation
@@ -317,7 +320,7 @@ def _other_effect(scenario: Scenario) -> list[str]:
 
 
 def _effect(aircraft: AircraftConfig, controller: ControllerConfig) -> FloatArray:
-    """Return C B of the airframe file, (m, p), for the outputs of the law and the effectors."""
+    """Return C B of the airframe file, (m, p): the effect of the effectors on the law's outputs."""
     airframe = load_airframe(aircraft.airframe)
     rows = [airframe.outputs.index(name) for name in controller.outputs]
     columns = [list(airframe.inputs).index(name) for name in controller.effectors]

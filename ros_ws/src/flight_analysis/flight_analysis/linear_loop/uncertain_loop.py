@@ -50,7 +50,7 @@ PATTERN_PARTS = (1e-3, 1e-2, 0.06, 0.25)
 
 
 class Box(NamedTuple):
-    """The k uncertain entries of a plant, d_i in [-1, 1].
+    """The box of an uncertain plant: its k uncertain entries, each with a deviation d_i in [-1, 1].
 
     d_i changes A by E_i d_i F_i, and B by E_i d_i G_i. An entry is named A[STATE,STATE] or
     B[STATE,EFFECTOR]. T maps the m inputs of the law to the p effectors.
@@ -70,14 +70,15 @@ class Box(NamedTuple):
     def largest(self) -> float:
         """Largest relative deviation of an entry in the box.
 
-        If only entries deviate that are 0 in the airframe file, it is relative to `row_sizes`.
+        Entries that are 0 in the airframe file have no relative deviation. If only such entries
+        deviate, the result is a fraction of their `row_sizes`.
         """
         is_zero = np.isin(self.names, self.zeros)
         return float(np.max(self.part[~is_zero], initial=0.0)) or float(self.part.max())
 
     @property
     def largest_zero(self) -> float:
-        """Largest deviation of entries that are 0 in the airframe file, relative to `row_sizes`."""
+        """Largest deviation of entries that are 0 in the airframe file, as a part of their row."""
         return float(np.max(self.part[np.isin(self.names, self.zeros)], initial=0.0))
 
 
@@ -88,9 +89,10 @@ def plants_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:
 
 
 class Channels(NamedTuple):
-    """A loop, or a part of one, as zeta+ = A zeta + W w, z = Z zeta + D w.
+    """A loop, or a part of one, with open channels: zeta+ = A zeta + W w, z = Z zeta + D w.
 
-    The real channels of the entries come first, TERMS for each. The channels of a delay follow, and
+    A channel i leads from w_i to z_i, and a deviation closes it by w_i = delta_i z_i. The real
+    channels of the entries come first, TERMS for each entry. The channels of a late u follow, and
     then disks in inputs. A disk adds v to u and reads u + v / 2, so that the transfer function from
     v to its reading is S - I / 2.
     """
@@ -108,12 +110,12 @@ class Channels(NamedTuple):
 
     @property
     def uncertain(self) -> int:
-        """Number of the real channels, TERMS for each entry."""
+        """Number of the real channels: TERMS for each entry."""
         return TERMS * len(self.entries)
 
     @property
     def parameters(self) -> IntArray:
-        """Index in `entries` for each of the `uncertain` channels."""
+        """Index in `entries` of the entry to which each of the real channels belongs."""
         return np.tile(np.arange(len(self.entries)), TERMS)
 
     @property
@@ -127,9 +129,10 @@ class Channels(NamedTuple):
         return self._replace(W=self.W[:, channels], Z=self.Z[channels], D=D)
 
     def response(self, w: FloatArray | float, radius: float) -> ComplexArray:
-        """Compute M(z) at abs(z) = radius and at the frequencies w, rad/s.
+        """Compute M(z), the transfer matrix from w to z, on the circle abs(z) = radius.
 
-        w has the shape (F,) or (), and M has (F, p, p) or (p, p).
+        The argument `w` has the frequencies, rad/s, in the shape (F,) or (). M has (F, p, p) or (p,
+        p).
         """
         z = radius * np.exp(1j * np.asarray(w) * self.period)
         motion = z[..., None, None] * np.eye(len(self.A)) - self.A
@@ -138,16 +141,18 @@ class Channels(NamedTuple):
     def at(self, d: FloatArray) -> "Channels":
         """Return the channels centred on the aircraft with deviations d.
 
-        d has the shape (..., k), for the k entries of this part of the loop.
+        In the result, w = 0 means this aircraft. d has the shape (..., k), for the k entries of
+        this part of the loop.
         """
         c = np.zeros((*d.shape[:-1], len(self.D)))
         c[..., : self.uncertain] = np.tile(d, TERMS)
         return self.centred(c)
 
     def centred(self, c: FloatArray) -> "Channels":
-        """Return the channels centred on w = diag(c) z in place of w = 0.
+        """Return the channels of the loop closed by w = diag(c) z.
 
-        c has the shape (..., p), and its leading axes are a batch.
+        In the result, w = 0 means this closed loop. c has the shape (..., p), and its leading axes
+        are a batch.
         """
         columns = c[..., None, :]
         inverse = np.linalg.inv(np.eye(len(self.D)) - self.D * columns)
@@ -216,10 +221,10 @@ def uncertain_loop(
 
 
 def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
-    """Return the rows that map the state to the Legendre coefficients of k channels z.
+    """Return the rows that map the state to the Legendre coefficients of the k signals z.
 
-    The coefficients follow from the integrals of z and from the integrals of these integrals. The
-    rows of `matrix` give the n states first, and then these integrals.
+    The coefficients follow from the integrals of z over a period, and from the integrals of these
+    integrals. The rows of `matrix` give the n states first, and then these integrals.
     """
     once = matrix[n : n + k]
     twice = matrix[n + k : n + 2 * k]
@@ -227,17 +232,17 @@ def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
 
 
 def _blocks(D: FloatArray, V: FloatArray) -> FloatArray:
-    """Return D with disks in all inputs appended, where V leads from the disks to the channels."""
+    """Append a disk in each input to D. V is the effect of the disks on the channels of D."""
     m = V.shape[1]
     return np.block([[D, V], [np.zeros((m, len(D))), np.eye(m) / 2.0]])
 
 
 def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int) -> Channels:
-    """Add the channels of a delay to a loop with n states of the aircraft and k entries.
+    """Add the channels of a late u to a loop with n states of the aircraft and k entries.
 
-    The loop becomes that of e_j = 0. `ramps` is the motion that an input causes which rises over
-    the period. The states of the loop are followed by the c states that the rising inputs of
-    earlier ticks need, and then by u of earlier ticks.
+    The loop with w = 0 becomes the loop with e_j = 0. `ramps` is the motion that an input causes
+    which rises over the period. The loop gets further states: first the c states that the rising
+    inputs of earlier ticks need, and then u of earlier ticks.
     """
     E, U, K = exact.W[:, : exact.uncertain], exact.W[:, exact.disks], exact.Z[exact.disks]
     m, q = K.shape
@@ -292,8 +297,9 @@ def sensitivity_slopes(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Compute S and its slopes along d at the frequencies w, rad/s.
 
-    Both belong to the aircraft with the deviations d, (k,). w has the shape (F,), S has (F, m, m),
-    and the slopes have (F, k, m, m). The loop must have disks in all inputs, and no late u.
+    S and its slopes are those of the aircraft with the deviations d, (k,). w has the shape (F,), S
+    has (F, m, m), and the slopes have (F, k, m, m). The loop must have disks in all inputs, and no
+    late u.
     """
     around = loop.at(d)
     p, k = loop.uncertain, len(d)
@@ -312,7 +318,7 @@ def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
     """Split the loop into its strongly connected parts, and reduce each part.
 
     If `inputs` are given, the loop keeps the disks in these inputs, and only parts with a disk are
-    returned. To bound the parts is enough, because the structured singular value of a block
+    returned. It is enough to bound the parts, because the structured singular value of a block
     triangular matrix is the largest one of its blocks.
     """
     from scipy.sparse import csr_array  # noqa: PLC0415 - a flight starts without it

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Search a box for the worst aircraft, with the least unstable deviation or the least margins.
 
-The search walks over the corners of the box. Each entry moves to the side at which a figure, such
-as a margin, is smaller. The gradient of the figure shows this side. The gradient is computed from
-the loop with the entries pulled out.
+A box has an interval for each uncertain entry of A and B. The search walks over the corners of the
+box. Each entry moves to the end of its interval at which a figure, such as a margin, is smaller.
+The gradient of the figure shows this end. The gradient is computed from the loop whose entries are
+pulled out as channels.
 """
 
 from typing import Any, NamedTuple
@@ -56,7 +57,7 @@ REAL = 1e-9  # fraction of an eigenvalue up to which its imaginary part counts a
 def first_unstable(
     part: Channels, entries: int, largest: float, *, quick: bool = False
 ) -> list[FloatArray]:
-    """Find unstable aircraft of a part of the loop, with deviations up to a largest size.
+    """Find unstable aircraft of a part of the loop, with deviations up to the size `largest`.
 
     The search looks for a divergence at 0 rad/s, and then for modes near one frequency after the
     other, up to pi / T. A `quick` search has FEW_STARTS and no climbs. The deviations of an
@@ -155,8 +156,8 @@ def _nearer(
 ) -> tuple[float, FloatArray]:
     """Find a smaller size by climbs a little below `level`, and return the size and its corner.
 
-    As long as a climb ends at an unstable aircraft, the size of that aircraft is the next level.
-    If no climb does, the function returns `found`.
+    If a climb ends at an unstable aircraft, the size of this aircraft is the next level. If no
+    climb does, the function returns `found`, which is a size and its corner.
     """
     while True:
         corner, radius = _climbed(part, starts, frequency, (1.0 - FALL) * level)
@@ -244,7 +245,7 @@ def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float)
 def _growth(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
     """Compute the slopes d log abs(z) / d d_i of the largest mode near a frequency, (N, k).
 
-    They are evaluated at the deviations d, (N, k).
+    They are evaluated at the deviations d, (N, k), one row for each of N aircraft.
     """
     around = part.at(d)
     z, X = np.linalg.eig(around.A)
@@ -267,7 +268,7 @@ WALKED = 6  # largest number of rounds of the walk over the corners
 
 
 class WorstCase(NamedTuple):
-    """The least margins that were found in a box. Each margin can belong to another aircraft."""
+    """The least margins that a search has found in a box. Each can belong to another aircraft."""
 
     worst: Margins
     corners: FloatArray  # deviations of all aircraft that were tried, (N, k)
@@ -278,9 +279,9 @@ class WorstCase(NamedTuple):
 def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box) -> WorstCase:
     """Search the corners of a box around a plant, A (n, n), for the least margins.
 
-    The search is made for each figure, such as the phase margin of an input. From the corners where
-    the figure is least, it goes to the corner to which the slope of the figure points, until it
-    finds no new corner. The margins are computed by `input_margins`.
+    The search is made for each figure, such as the phase margin of an input. It starts at corners
+    where the figure is least, and goes to the corner to which the slope of the figure points, until
+    it finds no new corner. The margins are computed by `input_margins`.
     """
     rng = np.random.default_rng(SEED)
     k = len(box.names)
@@ -317,9 +318,9 @@ def _corners(slopes: FloatArray) -> FloatArray:
 
 
 def _figures(margins: Margins) -> FloatArray:
-    """Stack the margins of N aircraft as figures, (N, 4 m + 3), of which a smaller one is worse.
+    """Stack the margins of N aircraft as figures, (N, 4 m + 3). A smaller figure is a worse one.
 
-    The order is that of `_slopes`.
+    The order of the figures is the order of the rows of `_slopes`.
     """
     all_inputs = (1.0 / margins.sensitivity_all, margins.disk_all, margins.damping)
     return np.concatenate(
@@ -399,7 +400,7 @@ def _crossed(
 ) -> tuple[FloatArray, ComplexArray]:
     """Find the zero of `values`, (F, m), with the least `distance`, (F - 1, m), for each input.
 
-    Returns the frequencies of the zeros, rad/s, and d log L / d w there, each (m,). If there is no
+    Returns the frequency of this zero, rad/s, and d log L / d w at it, each (m,). If there is no
     zero, the lowest frequency is returned.
     """
     columns = np.arange(values.shape[1])
@@ -415,10 +416,9 @@ def _crossed(
 
 
 def _damping_slope(uncertain: Channels, d: FloatArray) -> FloatArray:
-    """Compute the slope of the least damping ratio of a slow mode along the deviations.
+    """Compute the slope of the least damping ratio of a slow mode along the deviations, at d, (k,).
 
-    The slope is taken at d, and has the shape (k,). The damping ratio is zeta = -cos(angle(log z)).
-    The slope is known only up to a factor.
+    The damping ratio is zeta = -cos(angle(log z)). The slope is known only up to a positive factor.
     """
     around = uncertain.at(d)
     z, X = np.linalg.eig(around.A)

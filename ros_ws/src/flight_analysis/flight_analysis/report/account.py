@@ -37,9 +37,10 @@ STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight inte
 
 
 class ProcessAccount(NamedTuple):
-    """When a process of the flight began, and what it sent.
+    """When a process of the flight began and what it sent.
 
-    Times are flight times in s. A time is None if it is unknown, or if the process sent nothing.
+    The times are flight times in s. A time is None if it is unknown, or if the process sent
+    nothing.
     """
 
     ready: float | None  # when its event loop began
@@ -50,7 +51,7 @@ class ProcessAccount(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Commands:
-    """The commands of a flight, without the legs of a route."""
+    """How many commands a flight had. The legs of a route do not count."""
 
     given: int  # edges of the scenario's commands and of u_m
     flown: int  # edges that began before the end of the flight
@@ -59,7 +60,7 @@ class Commands:
 
 
 class Account(NamedTuple):
-    """What the log of a flight holds. Each sentence in `lacks` names a part that is missing."""
+    """What the log of a flight holds and lacks. Each sentence in `lacks` names a missing piece."""
 
     end: float  # s, flight time of the end
     topics: dict[str, TopicAccount]
@@ -80,9 +81,9 @@ class Account(NamedTuple):
         return Starvation(self.starved)
 
     def over(self, *topics: str) -> str:
-        """Return which share of each topic the log has, as in "over 49 % of truth".
+        """Say how much of each of these topics the log has, as in "over 49 % of truth".
 
-        Topics that the log has in full are left out. Returns "" if none remains.
+        Topics that the log has in full are left out. Returns "" if it has all of them in full.
         """
         accounts = {name: self.topics[name] for name in topics if name in self.topics}
         parts = [
@@ -93,7 +94,7 @@ class Account(NamedTuple):
         return f"over {', '.join(parts)}" if parts else ""
 
     def notes(self) -> tuple[str, ...]:
-        """Return the sentences that a user of the log should read."""
+        """Return the sentences about missing samples that a user of the log should read."""
         lacks = [lack for lack in self.lacks if lack not in self.lost_parts]
         busy = (self.busy,) if self.busy else ()
         return (*busy, *(f"the log lacks {lack}" for lack in lacks))
@@ -111,7 +112,7 @@ class Account(NamedTuple):
 
 
 def best_error_over(tape: Tape) -> tuple[str, Signal]:
-    """Return the name and the signal of the best error on a tape.
+    """Return the name and the signal of the most accurate error on a tape.
 
     This is the true error if the tape has it, else the measured error.
 
@@ -140,7 +141,7 @@ def best_error_over(tape: Tape) -> tuple[str, Signal]:
 
 
 def planned_end_ns(tape: Tape) -> int | None:
-    """Return the stamp at which the flight was to end, or None if the log does not have it."""
+    """Return the stamp at which the flight should have ended, or None if it is unknown."""
     duration = tape.duration
     if isinstance(tape.scenario, Scenario):
         duration = tape.scenario.flight.duration
@@ -200,11 +201,12 @@ def account(
 
 
 def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bool) -> Span:
-    """Return the time span that the account covers.
+    """Return the time over which the samples of the flight are counted.
 
-    If the flight was simulated and its planned end is known, the span begins at t = 0. Otherwise
-    each topic counts from its first sample. A flight that begins at t = 0, and did not end early,
-    counts up to the planned end. Any other flight counts up to its last sample.
+    If the flight was simulated and its planned end is known, this time begins at t = 0. Otherwise
+    it begins, for each topic, at the first sample of the topic. A flight that begins at t = 0, and
+    did not end early, is counted up to the planned end. Any other flight is counted up to its last
+    sample.
     """
     lasts = [
         int(signal.stamp_ns.max())
@@ -219,10 +221,10 @@ def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bo
 
 
 def _processes(tape: Tape) -> dict[str, ProcessAccount]:
-    """Return what is known of the processes of a flight, by name, with times in flight time.
+    """Return when each process of a flight began and what it sent, by name.
 
-    In lockstep the stamps are no times of day, so the time at which a process was ready is unknown.
-    A process of which no time is known, such as a recorder in lockstep, is left out.
+    In lockstep the stamps are no times of day, so it is unknown when a process was ready. A process
+    is left out if nothing is known of it, such as a recorder in lockstep.
     """
 
     def flight_time(stamp_ns: int | None) -> float | None:
@@ -247,7 +249,7 @@ def _too_busy(parts: Sequence[str]) -> str:
 
 
 def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
-    """Return a sentence for each of y, y_m and u that lacks channels of the scenario."""
+    """Return a sentence for each of the topics y, y_m and u whose channels are not complete."""
     if scenario is None:
         return []
     outputs = scenario.controller.outputs
@@ -265,8 +267,9 @@ def _late_first_u(
 ) -> float | None:
     """Return the time of the first u, s, if it is more than SILENCE after the first possible y.
 
-    Returns None if u came in time. If the log begins later than u, the first u follows from the
-    number of the first tick. If a user activates the controller, no time is too late.
+    Returns None if u came in time. If the log begins later than u, the time of the first u follows
+    from the number of the first tick in the log. If a user activates the controller, the result is
+    always None.
     """
     if scenario is None or not (scenario.controller.autostart and scenario.controller.start_active):
         return None
@@ -285,9 +288,9 @@ def _late_first_u(
 def _lack(
     name: str, topic: TopicAccount, end: float, leeway: Leeway, *, late_u: bool
 ) -> str | None:
-    """Return what a topic lacks, as the object of "the log lacks", or None if it lacks nothing.
+    """Say what a topic lacks, as the object of "the log lacks", or return None if it is complete.
 
-    `late_u` says that the first u of the flight was late.
+    `late_u` is True if the first u of the flight was late.
     """
     facts = []
     missing = not topic.holds(topic.found + topic.unsent) or (
@@ -333,11 +336,12 @@ def _is_of_host(
     end: float,
     leeway: Leeway,
 ) -> bool:
-    """Return whether the host alone is the cause of what a topic lacks.
+    """Return whether a busy host is the only cause of the samples that a topic lacks.
 
-    There are three conditions. No message was lost and no stamp is wrong, so that what is missing
-    was never sent. The topic lasts to the `end`, s, except for its leeway. It began in time, or it
-    began late while the host starved the nodes.
+    Three conditions must hold. First, no message was lost and no stamp is wrong, so the missing
+    samples were never sent. Second, the topic lasts to the `end` of the flight, s, except for its
+    leeway. Third, it began in time, or it began late while the host starved the nodes of processor
+    time.
     """
     is_whole = tape.recording.get(name, Recording(0)).lost == 0
     has_stamps = not (topic.step or topic.unset or topic.left_out or topic.repeated)
@@ -352,7 +356,7 @@ def _is_of_host(
 
 
 def account_of_json(summary: Mapping[str, Any]) -> Account | None:
-    """Return the account in a summary, or None if it has none."""
+    """Return the account that is stored in a summary, or None if the summary has none."""
     content = summary.get("account")
     if content is None:
         return None

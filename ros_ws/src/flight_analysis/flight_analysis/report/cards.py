@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Build the cards of a flight. Each has a claim in plain words, and a command to check it."""
+"""Build the cards of a flight's page: each has a claim in plain words and a command to check it."""
 
 import math
 
@@ -131,7 +131,7 @@ def _guarantee_card(guarantee: Guarantee | None, command: str) -> Card:
 
 
 def _changed_card(flown: FlownLoops) -> Card:
-    """Return the card that says how many of a flight's several linear loops are stable."""
+    """Return the card for a flight with several linear loops: how many of them are stable."""
     is_stable = [bool(each.margins.nominal.stable) for each in flown.loops]
     count = len(flown.loops)
     sentence = (
@@ -150,9 +150,9 @@ def _changed_card(flown: FlownLoops) -> Card:
 
 
 def _learned_card(flight: RecordedFlight) -> Card:
-    """Return the card about the learned models.
+    """Return the card about the models, A and B, that were learned in flight.
 
-    It says which of them flew, and how the error changed.
+    It says how many of them flew, and how the error changed.
     """
     spans = flight.summary["models"]
     learned = learned_spans(flight)
@@ -193,7 +193,7 @@ def _learned_card(flight: RecordedFlight) -> Card:
 
 
 def _replay_card(flight: RecordedFlight) -> Card:
-    """Return the card that says how to check that the log has every input of the controller."""
+    """Return the card with the command that checks the log by computing the ticks again."""
     ticks = len(flight.tape["internals"].stamp_ns)
     return Card(
         title="Replay",

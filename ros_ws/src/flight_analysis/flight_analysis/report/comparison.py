@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compare several flights, with their channels matched by name.
+"""Compare several flights, whose channels are matched by name.
 
-This gives the ratios of metrics to the first flight, and a list of the conditions that differ.
+The result has the ratio of each metric to that of the first flight, and the conditions that differ.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ EQUAL_RATIO_TOLERANCE = 0.05  # metrics count as equal if their ratio differs fr
 
 
 class ComparisonRow(NamedTuple):
-    """A metric of every flight, and its ratio to the first flight if there is one."""
+    """A metric of every flight, and its ratio to the metric of the first flight, if it has one."""
 
     name: str
     texts: tuple[str, ...]
@@ -44,10 +44,10 @@ class ComparisonRow(NamedTuple):
     alike: tuple[bool, ...] = ()
 
     def verdict(self, flight: int) -> str:
-        """Compare a flight with the first: "better", "worse" or "same".
+        """Compare a flight with the first one: "better", "worse" or "same".
 
-        The result is "same" if the flight had other conditions, or if a smaller value of the metric
-        is not better.
+        The result is also "same" if no judgement is possible: if the flight had other conditions,
+        or if a smaller value of this metric is not better.
         """
         ratio = self.ratios[flight]
         if self.alike and not self.alike[flight]:
@@ -58,7 +58,7 @@ class ComparisonRow(NamedTuple):
 
 
 class ComparisonTable(NamedTuple):
-    """The metrics of one channel, or of the controller's ticks, in several flights."""
+    """A table of one channel, or of the controller's ticks: rows of metrics, columns of flights."""
 
     caption: str
     rows: tuple[ComparisonRow, ...]
@@ -86,7 +86,8 @@ UNLIKE = "the conditions differ: a ratio between unlike flights says nothing of 
 def conditions(flights: Sequence[RecordedFlight]) -> list[Condition]:
     """Return the parameters that differ between the flights, and the pace if it differs.
 
-    Parameters of the wind come first, then all other parameters, and then the pace.
+    The pace says whether a flight was in real time. Parameters of the wind come first, then all
+    other parameters, and then the pace.
     """
     values = [_parameters(flight) for flight in flights]
     keys = sorted(
@@ -98,7 +99,7 @@ def conditions(flights: Sequence[RecordedFlight]) -> list[Condition]:
 
 
 def _parameters(flight: RecordedFlight) -> dict[str, str]:
-    """Return the parameters of a flight as text, by full name."""
+    """Return the parameters and the pace of a flight as text, by full dotted name."""
     if flight.scenario is None:
         return {}
     tree = {
@@ -110,7 +111,7 @@ def _parameters(flight: RecordedFlight) -> dict[str, str]:
 
 
 def _shortened(texts: Sequence[str]) -> tuple[str, ...]:
-    """Shorten each long list of numbers to its count, with a mark if the lists differ."""
+    """Replace each long list of numbers by its count, and add ", others" to one that differs."""
     counts = [f"{text.count(',') + 1} values" if len(text) > LONG else text for text in texts]
     return tuple(
         f"{count}, others" if texts.index(text) and count in counts[: texts.index(text)] else count
@@ -135,7 +136,7 @@ def has_same_conditions(
 ) -> tuple[bool, ...]:
     """Return whether each flight had the conditions of the first, except for the controller.
 
-    If `timed`, the flights must also have the same pace, such as real time.
+    If `timed` is True, it must also have had the same pace, such as real time.
     """
     rows = [
         row
@@ -158,8 +159,8 @@ def comparison_tables(
 ) -> list[ComparisonTable]:
     """Return a table for each channel, with metrics from "errors" or "inputs" of the summaries.
 
-    `key` is "errors" or "inputs". A table has a row for each metric of `columns` that has a value.
-    By default `units` are those of the flights.
+    `key` is "errors" or "inputs". A table has a row for each metric of `columns` that has a value
+    in a flight. By default `units` are the display units of the flights.
     """
     display = common_units(flights) if units is None else units
     same = has_same_conditions(flights)
@@ -203,7 +204,7 @@ def _settling_rows(flights: Sequence[RecordedFlight], channel: str) -> list[Comp
 
 
 def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
-    """Return the table of the controllers' timing, alone in a list, or [] if all times are 0."""
+    """Return one table, the timing of the controllers' ticks, or none if all times are 0."""
     same = has_same_conditions(flights, timed=True)
     summaries = [flight.summary for flight in flights]
     rows = []
@@ -215,7 +216,10 @@ def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
 
 
 def _row(figures: Sequence[Mapping[str, Any]], column: Column, unit: DisplayUnit) -> ComparisonRow:
-    """Return the row of a table with one metric of every flight, in `unit`."""
+    """Return a table's row with one metric of every flight, and its ratios to the first.
+
+    `figures` has the metrics of each flight. The row shows them in `unit`.
+    """
     values = [column.value(each) for each in figures]
     first = values[0]
     ratios = tuple(None if value is None or not first else value / first for value in values)

@@ -25,10 +25,10 @@ from flight_analysis.report.tables import TIMES, MetricTable
 
 
 def comparison_page(flights: Sequence[RecordedFlight], tolerances: Mapping[str, float]) -> Page:
-    """Return the page of several flights, each with a colour and compared with the first.
+    """Return the page of several flights, each with its own colour and compared with the first one.
 
-    If one of them is an imported log, signals of the same name are drawn over each other.
-    `tolerances` has the allowed difference of each channel, SI.
+    If one of them is an imported log, without a scenario, the page only draws signals of the same
+    name over each other. `tolerances` has the allowed difference of each channel, SI.
     """
     context = figures.plot_context(flights)
     colours = {label: run.colour for label, run in context.runs.items()}
@@ -88,9 +88,9 @@ def _verdict(flight: RecordedFlight, label: str, colour: str) -> Verdict:
 
 
 def _common_trim(scenarios: Sequence[Scenario]) -> dict[str, str]:
-    """Return the axis label of V, by the name "V".
+    """Return the axis label of V in a mapping with the key "V".
 
-    The label states the trim speed if all flights have the same.
+    The label states the trim speed if all flights have the same trim speed.
     """
     trims = [about_trim(scenario) for scenario in scenarios]
     return trims[0] if all(each == trims[0] for each in trims) else {"V": "V about trim (m/s)"}
@@ -118,7 +118,7 @@ def _tracks(flights: Sequence[RecordedFlight], colours: Mapping[str, str]) -> li
 def _metrics(
     flights: Sequence[RecordedFlight], context: PlotContext, palette: Sequence[str]
 ) -> Figures:
-    """Return the tables of a comparison. `palette` has the colours of the flights."""
+    """Return the tables of metrics of a comparison. `palette` has the colours of the flights."""
     units = (context.units, display_units.in_radians(context.units))
     errors, errors_in_radians = (comparison.error_tables(flights, each) for each in units)
     inputs, inputs_in_radians = (
@@ -142,7 +142,7 @@ def _metrics(
 
 
 def _conditions(flights: Sequence[RecordedFlight], labels: Sequence[str]) -> list[TableGroup]:
-    """Return a table of the parameters that differ, if any do."""
+    """Return a table of the parameters that differ between the flights, or [] if none differs."""
     rows = comparison.conditions(flights)
     if not rows:
         return []
@@ -158,7 +158,7 @@ def _overlay_page(
     verdicts: Sequence[Verdict],
     differences: TableGroup,
 ) -> Page:
-    """Return the page of logs drawn over each other, with the differences from the first."""
+    """Return the page that draws logs over each other, with the differences from the first log."""
     has_references = all("y_m" in flight.tape for flight in flights)
     return Page(
         title=f"{len(flights)} logs over each other",

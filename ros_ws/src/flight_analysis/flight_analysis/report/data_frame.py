@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Turn a flight into a data frame of polars."""
+"""Turn a flight into a polars data frame."""
 
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # polars takes some tenths of a second to load
 
 
 def data_frame(tape: Tape) -> "pl.DataFrame":
-    """Return the signals as a table, SI, with a column "topic.channel" for each channel.
+    """Return a flight's signals as a table, SI, with a column "topic.channel" for each channel.
 
     There is a row for each instant at which any topic has a sample. The first columns are
     "stamp_ns" (int64) and "t" = (stamp_ns - start) / 1e9. A topic that has no sample at an instant
@@ -24,7 +24,7 @@ def data_frame(tape: Tape) -> "pl.DataFrame":
         tape: A flight.
 
     Returns:
-        A data frame of polars, in SI and radians.
+        A polars data frame, in SI and radians.
 
     Raises:
         ParameterError: `tape` is no Tape, or has no topic.

@@ -65,9 +65,9 @@ def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
 
 
 def about_trim(scenario: Scenario) -> dict[str, str]:
-    """Return the axis label of V for a figure of y, by the name "V".
+    """Return the axis label of V for a figure of y, in a mapping with the key "V".
 
-    The label says that the trim speed is subtracted.
+    y has the deviation from trim, so the label says that the trim speed is subtracted.
     """
     channels = scenario.aircraft.channels()
     return {"V": f"V - {channels.speed:g} (m/s)"} if "V" in channels.outputs else {}
@@ -100,7 +100,7 @@ def plain_number(value: float, digits: int = 2) -> str:
 def unlike_numbers(first: float, second: float) -> tuple[str, str]:
     """Return two numbers as texts, with the fewest digits that tell them apart.
 
-    Each has at least 2 digits, and at most 6 even if the texts are then the same.
+    Each text has 2 to 6 digits. If 6 digits are not enough, the texts are the same.
     """
     for digits in range(2, 7):
         texts = (plain_number(first, digits), plain_number(second, digits))
@@ -112,7 +112,7 @@ def unlike_numbers(first: float, second: float) -> tuple[str, str]:
 def aligned_numbers(first: float, second: float) -> tuple[str, str]:
     """Return two numbers as texts with the same number of decimals.
 
-    The smaller number has two digits, or up to 6 if it takes more to tell the numbers apart.
+    The smaller number has two digits, or up to 6 if two digits do not tell the numbers apart.
 
     Examples:
         >>> aligned_numbers(1.0, 3.21), aligned_numbers(0.3012, 0.3021), aligned_numbers(9.0, 123.4)

@@ -22,9 +22,9 @@ DPI = 120
 
 
 def signal_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
-    """Return the table of a flight, or of several flights.
+    """Return the samples of one or several flights as one table.
 
-    The table has a column for each channel. For several flights, its first column "run" has the
+    The table has a column for each channel. For several flights, its first column, "run", has the
     name of the flight.
     """
     import polars as pl  # noqa: PLC0415

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draw the figures of a flight from its tape. A figure is None if the tape lacks its signals.
 
-The figures do not depend on the aircraft: channels are drawn under their own names.
+The figures do not depend on the kind of aircraft: channels are drawn under their own names.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -132,7 +132,7 @@ def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
 
 
 def runs_of(flights: Sequence[RecordedFlight]) -> dict[str, Run]:
-    """Return the tapes of flights by label, each with the colour of its curves."""
+    """Return the tape of each flight by its label, with the colour of its curves."""
     colours = cycle(COLOURS) if len(flights) > 1 else (PLANT,)
     return {
         label: Run(tape=flight.tape, period_ns=flight.period_ns, colour=colour)
@@ -143,10 +143,10 @@ def runs_of(flights: Sequence[RecordedFlight]) -> dict[str, Run]:
 def _curves(
     context: PlotContext, name: str, signal: Callable[[Tape], Signal | None], **style: Any
 ) -> dict[str, Curve]:
-    """Return the curves of a signal for all flights that have it.
+    """Return a curve for each flight that has a signal. `signal` takes this signal from a tape.
 
-    The curve of a single flight is called `name`. Those of several flights have the labels of the
-    flights.
+    The curve of a single flight is called `name`. The curves of several flights have the labels of
+    the flights.
     """
     curves = {}
     for label, run in context.runs.items():
@@ -178,7 +178,7 @@ def _references(context: PlotContext) -> dict[str, Curve]:
 
 
 def _is_same_curve(first: Curve, second: Curve) -> bool:
-    """Return whether two references are equal over the time that they share.
+    """Return whether two curves of y_m are equal over the time that they share.
 
     They may differ by the fraction SAME_CURVE_TOLERANCE of the largest value.
     """
@@ -199,8 +199,8 @@ def tracking_figure(
 ) -> Figure:
     """Draw y and y_m of every output.
 
-    For several flights, y of each flight is drawn over every different y_m. `labels` has axis
-    labels that replace those of their channels.
+    For several flights, the figure has y of each flight, and each y_m that differs from the others.
+    `labels` has axis labels that replace the names of channels.
     """
     y = _curves(context, "y", lambda tape: tape.signals.get("y"))
     return time_series_figure(context, _references(context) | y, labels=labels)
@@ -217,9 +217,9 @@ def overlay_figure(context: PlotContext, topic: str) -> Figure | None:
 def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None) -> Figure:
     """Draw e = y - y_m of every output.
 
-    If the tape of one flight has errors of the sensors, the true error is drawn over the measured
-    one. For several flights, only the best error of each is drawn. `floors` has the noise floors by
-    channel, SI. They are lines above and below 0 if they are wide enough to see.
+    For one simulated flight with errors of the sensors, the true error is drawn over the measured
+    one. For several flights, only the most accurate error of each is drawn. `floors` has the noise
+    floors by channel, SI. They are lines above and below 0 if they are wide enough to see.
     """
     if context.is_comparison:
         errors = _curves(context, "e", lambda tape: best_error(tape)[1])
@@ -246,8 +246,8 @@ def input_figure(
 ) -> Figure | None:
     """Draw the command u and the actuator positions, or only u for several flights.
 
-    `limits` are drawn as lines, for at most two kinds of limits. Marks show where an input was
-    saturated.
+    `limits` has the limits of the inputs by kind. At most two kinds are drawn, as lines. Marks show
+    where an input was saturated.
     """
     curves = _curves(context, "u", lambda tape: tape.signals.get("u"), steps=True)
     if context.is_comparison or not curves:
@@ -297,7 +297,7 @@ def input_figure(
 
 
 def input_limits(scenario: Scenario, tape: Tape) -> dict[str, Limits]:
-    """Return the lower and upper limits of u in a mapping by kind and by input.
+    """Return the lower and upper limit of each input, by the kind of limit.
 
     The kinds are the limits of the controller and, if the actuators are simulated, their end stops.
     """
@@ -328,7 +328,7 @@ def _limit_pairs(names: Sequence[str], lower: Sequence[float], upper: Sequence[f
 
 
 def integral_figure(context: PlotContext) -> Figure | None:
-    """Draw the two integrals of the law, that of e and that of the sign, for each output."""
+    """Draw the two integrals of the law for each output: the integral of e, and Pi."""
     if "internals" not in context.tape:
         return None
     internals = context.tape["internals"]
@@ -352,10 +352,10 @@ def integral_figure(context: PlotContext) -> Figure | None:
 
 
 def spectrum_figure(context: PlotContext) -> Figure | None:
-    """Draw the amplitude spectral density of u of all runs, in a subplot for each channel.
+    """Draw the amplitude spectral density of u of all flights, in a subplot for each channel.
 
-    Both axes are logarithmic. A run with fewer than MIN_SPECTRUM_SAMPLES is left out. Returns None
-    if no run remains.
+    Both axes are logarithmic. A flight with fewer than MIN_SPECTRUM_SAMPLES is left out. Returns
+    None if no flight remains.
     """
     units = context.units
     runs = {
@@ -391,7 +391,7 @@ def spectrum_figure(context: PlotContext) -> Figure | None:
 
 
 def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
-    """Return the samples of each timing quantity of the controller, ms, if it is not always 0."""
+    """Return samples of the controller's timing, ms, by quantity, without those that are 0."""
     samples: dict[str, FloatArray] = {}
     if "internals" in tape:
         periods = tick_periods(tape)
@@ -410,9 +410,9 @@ def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
 
 
 def timing_figure(context: PlotContext) -> Figure | None:
-    """Draw histograms of the controller's timing, ms, or return None if all values are 0.
+    """Draw histograms of the controller's timing, ms, or return None if all times are 0.
 
-    Each quantity has a subplot, in which the runs share their bins. The counts are logarithmic.
+    Each quantity has a subplot, in which the flights share their bins. The counts are logarithmic.
     """
     runs = context.runs
     timing = {label: _timing_samples(run.tape, run.period_ns) for label, run in runs.items()}
@@ -460,8 +460,8 @@ def state_figure(
 ) -> Figure | None:
     """Draw the states of a simulated aircraft, beginning with those that are outputs.
 
-    `units` has the unit of each state. `labels` has axis labels that replace those of their
-    channels. Returns None if the tape has no states.
+    `units` has the unit of each state. `labels` has axis labels that replace the names of channels.
+    Returns None if the tape has no states.
     """
     x = _truth_group(context.tape, "x")
     outputs = {name: units[name] for name in context.units if name in units}
@@ -472,10 +472,7 @@ def state_figure(
 
 
 def sensor_figure(context: PlotContext) -> Figure | None:
-    """Draw the error of every sensor that has one.
-
-    The error is y less the true output.
-    """
+    """Draw the error of every sensor that has one: y less the true output."""
     noise = _nonzero_group(context.tape, "noise")
     if noise.names:
         return time_series_figure(
@@ -505,14 +502,14 @@ def tick_figure(context: PlotContext) -> Figure | None:
 
 
 def _truth_group(tape: Tape, group: str) -> Signal:
-    """Return the channels "group.name" of `truth`, or no channels if the tape lacks `truth`."""
+    """Return the channels "group.NAME" of the topic `truth`, or none if the tape lacks it."""
     if "truth" in tape:
         return tape["truth"].group(group)
     return Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))
 
 
 def _nonzero_group(tape: Tape, group: str) -> Signal:
-    """Return the channels "group.name" of `truth` that are not always 0."""
+    """Return the channels "group.NAME" of the topic `truth` that are not always 0."""
     signal = _truth_group(tape, group)
     nonzero = np.flatnonzero(signal.values.any(axis=0))
     return Signal(
@@ -521,7 +518,10 @@ def _nonzero_group(tape: Tape, group: str) -> Signal:
 
 
 def _saturated(tape: Tape, name: str, kind: Saturation) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return the instants of `internals`, and the mask of one kind of saturation of an input."""
+    """Return when one input was saturated in one way.
+
+    The result has the times of the ticks, s, and a mask of the ticks with this kind of saturation.
+    """
     channel = f"limited.{name}"
     if "internals" not in tape or channel not in tape["internals"].names:
         return np.zeros(0), np.zeros(0, dtype=bool)
@@ -529,7 +529,7 @@ def _saturated(tape: Tape, name: str, kind: Saturation) -> tuple[FloatArray, NDA
 
 
 def _axis_range(values: FloatArray, bounds: FloatArray) -> tuple[float, float]:
-    """Return the range of an axis that shows all values, and the bounds that are near them."""
+    """Return the range of an axis that shows all values, and the bounds near the values."""
     low = float(values.min(initial=0.0))
     high = float(values.max(initial=0.0))
     near = [

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Build the head of a flight's page, with name, time, verdict and a tile for each output."""
+"""Build the head of a flight's page: name, time, verdict, and a tile for each output."""
 
 import shlex
 from collections.abc import Mapping
@@ -31,14 +31,14 @@ from flight_log.clock import SINCE_EPOCH_NS
 
 
 def title_of(flight: RecordedFlight) -> str:
-    """Return the title of a flight, which is its scenario or the log that it was imported from."""
+    """Return the title of a flight: its scenario, or the log from which it was imported."""
     if flight.scenario is not None:
         return flight.scenario.name
     return str(flight.summary["source"]["log"])
 
 
 def meta_lines(flight: RecordedFlight, scenario: Scenario) -> list[str]:
-    """Return the lines on when and how a flight was flown, with airframe, law, speed and pace."""
+    """Return the lines below the title: date, airframe, law, duration, speed, pace and run."""
     is_known = is_simulated(flight.tape) or "engagements" in flight.summary
     aircraft = scenario.aircraft.airframe if is_known else "an aircraft outside of the scenario"
     parts = [
@@ -58,7 +58,7 @@ def meta_lines(flight: RecordedFlight, scenario: Scenario) -> list[str]:
 
 
 def started(flight: RecordedFlight) -> str:
-    """Return as text the date and time at which a flight began, or "" if the log lacks them."""
+    """Return the date and time at which a flight began, as text, or "" if the log lacks them."""
     start = (flight.summary["flight"] or {}).get("started")
     try:
         return f"{datetime.fromisoformat(start):%-d %b %Y, %H:%M} UTC" if start else ""
@@ -67,7 +67,7 @@ def started(flight: RecordedFlight) -> str:
 
 
 def pace(flight: RecordedFlight) -> str:
-    """Return the pace of a flight as text, such as "in real time"."""
+    """Say whether a flight was in real time, in simulated time, or by the clock of a simulator."""
     if flight.tape.is_by_clock:
         return "by /clock"
     if flight.tape.start_ns > SINCE_EPOCH_NS:
@@ -91,7 +91,10 @@ flight again."""
 
 
 def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
-    """Return the verdict on a flight: a headline, a colour, more text, and the next step."""
+    """Return the verdict on a flight: a headline, a colour, more text, and the next step.
+
+    The next step is the command that the user should try after this flight.
+    """
     outcome = flight.summary["outcome"]
     sentence = f"{outcome['sentence'][:1].upper()}{outcome['sentence'][1:]}."
     injected = _injected(scenario)
@@ -149,10 +152,10 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
 
 
 def _next_step(outcome: Mapping[str, Any], scenario: Scenario, name: str, otherwise: Step) -> Step:
-    """Return the next step for a flight that falls short, chosen by its gravest shortfall.
+    """Return the step that the user should try after a flight that falls short.
 
-    `name` is the argument that stands for the scenario in commands. The result is `otherwise` if no
-    step is known for this shortfall.
+    It is chosen by the gravest shortfall. `name` is the argument that stands for the scenario in
+    commands. The result is `otherwise` if no step is known for this shortfall.
     """
     order = list(Aim)
     aims = sorted((Aim(each["aim"]) for each in outcome["shortfalls"]), key=order.index)
@@ -167,7 +170,7 @@ def _next_step(outcome: Mapping[str, Any], scenario: Scenario, name: str, otherw
 
 
 def _route_text(flight: RecordedFlight) -> str:
-    """Say how a guided flight followed its route. Returns "" without a route."""
+    """Say how a guided flight followed its route. Returns "" if it had no route."""
     legs = (flight.summary["guidance"] or {}).get("legs") or ()
     if not legs:
         return ""
@@ -195,16 +198,16 @@ def _models_text(flight: RecordedFlight) -> str:
 
 
 def learned_spans(flight: RecordedFlight) -> list[Mapping[str, Any]]:
-    """Return the spans in which the law had a learned model.
+    """Return the spans of time in which the law flew with a model that was learned in flight.
 
-    Spans with the parameters of the start, or with the model of the airframe file, are left out.
+    The spans before the first learned model, or with the model of the airframe file, are left out.
     """
     _, *later = flight.summary["models"]
     return [span for span in later if span["name"] != FILE_MODEL]
 
 
 def _injected(scenario: Scenario) -> str:
-    """Say which faults the scenario injects, because they can explain an error."""
+    """Say which actuator faults the scenario injects, because they can explain an error."""
     faults = scenario.aircraft.actuators.read_faults()
     parts = [
         f"{fault.subject}{f' ({fault.extent})' if fault.extent else ''} at t = {fault.at:g} s"
@@ -214,10 +217,10 @@ def _injected(scenario: Scenario) -> str:
 
 
 def scenario_argument(flight: RecordedFlight, scenario: Scenario) -> str:
-    """Return the argument with which a command flies the same scenario again.
+    """Return the command argument that names the scenario of a flight, to fly it again.
 
     If the flight had the parameters of a shipped scenario, this is the scenario's name. Otherwise
-    it is the file, in the folder of the run, with the parameters that flew.
+    it is the file in the folder of the run that has the parameters of the flight.
     """
     if scenario.name in scenarios():
         shipped = find_scenario(scenario.name)
@@ -227,7 +230,7 @@ def scenario_argument(flight: RecordedFlight, scenario: Scenario) -> str:
 
 
 def gains_command(verb: str, scenario: Scenario, name: str) -> str:
-    """Return the command that applies `verb` to the gains of a scenario.
+    """Return the command `rise-di gains VERB` for the gains of a scenario.
 
     `name` is the argument that stands for the scenario in commands.
     """
@@ -235,7 +238,7 @@ def gains_command(verb: str, scenario: Scenario, name: str) -> str:
 
 
 def run_argument(flight: RecordedFlight) -> str:
-    """Return the argument that names the run of a flight in commands."""
+    """Return the command argument that names the run of a flight: its folder."""
     return shlex.quote(f"runs/{flight.name}")
 
 
@@ -246,11 +249,11 @@ NAMES = {"q": "pitch rate q", "p": "roll rate p", "r": "yaw rate r", "V": "airsp
 
 
 def tiles_of(flight: RecordedFlight) -> list[Tile]:
-    """Return a tile for each output.
+    """Return a tile with the rms error of each output.
 
     A tile compares the error in the worst part of the flight with the error allowed there. If the
-    errors were not judged, the tile has the error over the whole flight. This happens if a flight
-    ended early, or if the host starved the nodes.
+    errors were not judged, the tile has the error over the whole flight. Errors are not judged if a
+    flight ended early, or if the host starved the nodes of processor time.
     """
     units = flight.units
     outcome = flight.summary["outcome"]

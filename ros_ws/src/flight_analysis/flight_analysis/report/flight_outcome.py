@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find the outcome of a flight from its log."""
+"""Find how a flight ended from the signals in its log."""
 
 from dataclasses import replace
 
@@ -15,18 +15,18 @@ NEVER_ENGAGED = never_flew("the controller never engaged")
 
 
 def has_ticks(tape: Tape) -> bool:
-    """Return whether the log holds a u or a tick, which shows that the controller engaged."""
+    """Return whether the log has a sample of u or `internals`, so that the controller engaged."""
     return any(name in tape and len(tape[name].stamp_ns) for name in TICKS)
 
 
 def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcome:
     """Return the outcome of a flight, found from its signals.
 
-    This is for a log without an outcome, as after a flight whose nodes were started singly. The
-    flight is completed if y, y_m and u last for its whole duration. The duration comes from the log
-    or, if the log lacks it, from the scenario. If the log has only a part of the flight, the
-    outcome is UNKNOWN. If the flight is not simulated, u does not count, because an autopilot may
-    end the last engagement earlier.
+    This is for a log without an outcome, for example if the nodes were started singly. The flight
+    is completed if y, y_m and u last for its whole duration. The duration comes from the log or, if
+    the log lacks it, from the scenario. If the log has only a part of the flight, the outcome is
+    UNKNOWN. If the flight is not simulated, u does not count, because an autopilot may disengage
+    the controller before the end.
     """
     is_part = bool(tape.lost_parts) or any(
         recording.step_ns for recording in tape.recording.values()
@@ -50,7 +50,7 @@ def until_last_tick(tape: Tape) -> Tape:
 
     Later samples belong to the shutdown of the processes. If u ends more than LATE_TICK_NS earlier
     than planned, and y or y_m goes on, the log has a gap. In this case the tape is cut only at the
-    planned end. In any other case in which both go on for more than SILENCE, nothing is cut.
+    planned end. Otherwise, if both y and y_m go on for more than SILENCE, nothing is cut.
     """
     ticks = [
         int(tape[name].stamp_ns[-1]) for name in TICKS if name in tape and len(tape[name].stamp_ns)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find which parameters the controller had in a flight, and their linear loops.
+"""Find which parameters the controller had during a flight, and build their linear loops.
 
-A loop has the aircraft of the airframe file, or the true aircraft of a simulation.
+Each loop is around the aircraft of the airframe file, or around the true aircraft of a simulation.
 """
 
 import re
@@ -43,7 +43,10 @@ TRUE = "true"
 
 
 class FlownController(NamedTuple):
-    """Parameters of a controller, and the first and last time, s, of each span they flew."""
+    """A set of parameters of the controller, and the spans of time in which it flew.
+
+    A span is the time, s, of the first and of the last tick with these parameters.
+    """
 
     name: str  # "start", "file", "model 1"
     spans: tuple[tuple[float, float], ...]
@@ -51,13 +54,13 @@ class FlownController(NamedTuple):
 
     @property
     def times(self) -> str:
-        """The spans as text, in s."""
+        """The spans of time as text, s."""
         return ", ".join(f"{start:.1f} to {stop:.1f}" for start, stop in self.spans)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlownLoop:
-    """The linear loop of an aircraft and of controller parameters that flew."""
+    """The linear loop of an aircraft with controller parameters that flew."""
 
     name: str  # name of the parameters; empty if they flew the whole flight
     times: str  # when the parameters flew, as text, s
@@ -73,9 +76,10 @@ class FlownLoop:
 def flown_controllers(
     tape: Tape, start: ControllerConfig, changes: Sequence[Change]
 ) -> tuple[FlownController, ...]:
-    """Return the parameters that flew, in order, from the start and after each change in flight.
+    """Return the controller's parameters that flew, in order, and when each of them flew.
 
-    The digest of the parameters in each tick shows when they flew.
+    `start` has the parameters of the start, and `changes` has the changes in flight. The digest of
+    the parameters in each tick shows when they flew.
     """
     by_digest = {start.digest(): start}
     latest = start
@@ -93,7 +97,7 @@ def flown_controllers(
 
 
 class FlownLoops(NamedTuple):
-    """The linear loops of a flight, with sentences about them."""
+    """The linear loops of a flight, and in what the controller was told wrong values."""
 
     loops: list[FlownLoop]  # empty without a linear model, or if it is unknown what flew
     sentences: tuple[str, ...]  # how the aircraft differs from what the controller was told
@@ -111,10 +115,11 @@ def flown_loops(
     controllers: Sequence[FlownController],
     later: Sequence[AircraftConfig] = (),
 ) -> FlownLoops:
-    """Return the linear loops of a flight.
+    """Return the linear loops of a flight, one for each set of parameters that flew.
 
-    They have the lags and the delay of the aircraft that flew. `later` has the aircraft after each
-    change in flight.
+    They have the lags and the delay of the aircraft that flew. If the true aircraft of a simulation
+    differs from its file, there is a second loop around it. `later` has the parameters of the
+    aircraft after each change in flight.
     """
     loops = []
     sentences: list[str] = []
@@ -145,7 +150,7 @@ def facts_of(
     controllers: Sequence[FlownController],
     later: Sequence[AircraftConfig] = (),
 ) -> FlightFacts:
-    """Return the facts about a flight that its log has but its scenario lacks."""
+    """Return facts about a flight that its log shows but its scenario does not."""
     known = {start.digest(), *(each.controller.digest() for each in controllers)}
     age = age_metrics(tape)
     return FlightFacts(
@@ -177,7 +182,10 @@ def _period_of(tape: Tape, topic: str) -> float | None:
 
 
 def true_airframe(tape: Tape, scenario: Scenario) -> Airframe | None:
-    """Return the simulated airframe before a drift, or None if it is that of the airframe file."""
+    """Return the airframe that was simulated, before any drift, if it differs from the file.
+
+    Returns None if it does not differ, or if no airframe file was simulated.
+    """
     aircraft = scenario.aircraft
     uncertainty = aircraft.uncertainty
     differs = uncertainty.A > 0.0 or uncertainty.B > 0.0 or bool(uncertainty.entries)
@@ -195,10 +203,11 @@ def _loop_around(
 
 
 def learned_lines(tape: Tape, scenario: Scenario) -> dict[str, dict[str, float]]:
-    """Return the known values of the entries of A and B that `learned` names, SI, by label.
+    """Return the true and the nominal values of the entries of A and B that were learned, SI.
 
-    The label FILE has the values of the airframe file. If the flight was simulated, the label TRUE
-    has those of the true aircraft. For an aircraft of JSBSim no values are known.
+    The topic `learned` names the entries. The label FILE has the values of the airframe file. If
+    the flight was simulated, the label TRUE has the values of the true aircraft. For an aircraft of
+    JSBSim no values are known.
     """
     if "learned" not in tape or scenario.aircraft.is_jsbsim:
         return {}
@@ -215,7 +224,10 @@ def learned_lines(tape: Tape, scenario: Scenario) -> dict[str, dict[str, float]]
 
 
 def _entry(airframe: Airframe, name: str) -> float | None:
-    """Return the value of an entry, SI, or None if the airframe has no such entry."""
+    """Return the entry of A or B with a name such as "B[q, elevator]", SI.
+
+    Returns None if the airframe has no such entry.
+    """
     parts = ENTRY.fullmatch(name)
     if parts is None:
         return None

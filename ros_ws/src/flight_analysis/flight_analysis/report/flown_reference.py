@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Check whether the y_m of a flight is that of the scenario.
+"""Check that the y_m of a flight is the one that its scenario commands.
 
 The error e = y - y_m does not show that the reference model hangs or flies other commands, because
 y follows any y_m. Therefore this module computes y_m again, by the code of the node. Until the
@@ -75,7 +75,7 @@ class ReferenceErrors(NamedTuple):
 
 
 class _Command(NamedTuple):
-    """A u_m of the log."""
+    """A u_m of the log, with its time and the attitude that it commands."""
 
     t_ns: int  # flight time of its stamp
     u_m: FloatArray
@@ -83,16 +83,16 @@ class _Command(NamedTuple):
 
 
 class _History(NamedTuple):
-    """A hypothesis on which u_m of the log the reference model has received so far."""
+    """A hypothesis on how many u_m of the log have arrived at the reference model so far."""
 
     reference: Reference
     taken: int  # number of u_m, in order, that have been taken or are too old
 
 
 def reference_errors(tape: Tape, scenario: Scenario) -> ReferenceErrors | NotCompared:
-    """Compute y_m again, and return the difference of the logged y_m from it.
+    """Compute y_m again, and return how far the y_m of the log is from it.
 
-    Returns the reason if they cannot be compared.
+    Returns a NotCompared if they cannot be compared.
     """
     if (reason := _reason_in_signal(tape, scenario)) is not None:
         return reason
@@ -117,7 +117,10 @@ def reference_errors(tape: Tape, scenario: Scenario) -> ReferenceErrors | NotCom
 
 
 def reference_shortfalls(tape: Tape, scenario: Scenario) -> list[Shortfall]:
-    """Return a shortfall for the channel of y_m that is farthest off, if any is off."""
+    """Return a shortfall if y_m is not the one that the scenario commands, else [].
+
+    It names the channel of y_m that is farthest off.
+    """
     errors = reference_errors(tape, scenario)
     if not isinstance(errors, ReferenceErrors):
         return []
@@ -144,7 +147,8 @@ def reference_shortfalls(tape: Tape, scenario: Scenario) -> list[Shortfall]:
 def reason_not_compared(tape: Tape, scenario: Scenario) -> NotCompared | None:
     """Return why y_m cannot be compared with the scenario, or None if it can.
 
-    y_m is only computed if the log does not tell when t = 0 was.
+    The answer usually follows from the log. Only if the log does not tell when t = 0 was, y_m is
+    computed to find it out.
     """
     reason = _reason_in_signal(tape, scenario)
     if reason is not None or _has_known_start(tape):
@@ -154,7 +158,7 @@ def reason_not_compared(tape: Tape, scenario: Scenario) -> NotCompared | None:
 
 
 def _reason_in_signal(tape: Tape, scenario: Scenario) -> NotCompared | None:
-    """Return why the signal y_m of a log cannot be compared, whatever its values are."""
+    """Return why y_m cannot be compared, judged only by its presence, sender and channels."""
     if "y_m" not in tape or not len(tape["y_m"].stamp_ns):
         return NotCompared.ABSENT
     if not is_sent_by_stack(tape, "y_m"):
@@ -165,23 +169,23 @@ def _reason_in_signal(tape: Tape, scenario: Scenario) -> NotCompared | None:
 
 
 def _is_whole(tape: Tape) -> bool:
-    """Return whether the log shows which u_m acted. In real time, a lost message hides this."""
+    """Return whether the log shows which u_m acted. In real time, a lost message hides it."""
     if "u_m" not in tape or tape.start_ns < SINCE_EPOCH_NS:
         return True
     return all(name in tape.recording and tape.recording[name].lost == 0 for name in ("y_m", "u_m"))
 
 
 def _has_known_start(tape: Tape) -> bool:
-    """Return whether t = 0 of the tape is t = 0 of the reference model.
+    """Return whether t = 0 of the tape is known to be t = 0 of the reference model.
 
-    It is in a flight in one process, whose tape has the scenario, and in a flight that was started
-    as a whole, whose log states the duration.
+    It is known for a flight in one process, whose tape has the scenario. It is also known for a
+    flight whose nodes were started together, because its log states the duration.
     """
     return tape.scenario is not None or tape.duration is not None
 
 
 def _commands(tape: Tape, outputs: Sequence[str], start_ns: int) -> list[_Command]:
-    """Return the u_m of the log in order, with stamps in flight time."""
+    """Return the u_m of the log in order, with their stamps converted to flight time."""
     if "u_m" not in tape or not set(outputs) <= set(tape["u_m"].names):
         return []
     log = tape["u_m"]
@@ -201,10 +205,11 @@ def _explained(
     y_m: FloatArray,
     commands: Sequence[_Command],
 ) -> FloatArray:
-    """Return y_m of the reference model at the instants t_ns, (N, m).
+    """Return the y_m that best explains the log, at the instants t_ns, (N, m).
 
-    In a single process each u_m acts at once. One history then has all bits of `y_m`, and the
-    search among many is left out.
+    The result is y_m of the reference model with `commands`. In a flight in one process each u_m
+    acts at once. One history (order of arrival of the u_m) then gives every bit of `y_m`, the y_m
+    of the log. Only if it does not, many histories are searched.
     """
     expected = _computed(parameters, t_ns, y_m, commands, most=1)
     if (expected != y_m).any():
@@ -222,8 +227,8 @@ def _computed(
 ) -> FloatArray:
     """Return y_m of the reference model at the instants t_ns, (N, m), by at most `most` histories.
 
-    `y_m` is that of the log, (N, m). It only serves to find between which two samples a u_m
-    arrived.
+    A history says which u_m had arrived before which sample. `y_m` is the y_m of the log, (N, m).
+    It only serves to choose the histories that give the right bits.
     """
     histories = [_History(Reference(parameters), 0)]
     max_age_ns = nanoseconds(parameters.live.max_age)
@@ -254,10 +259,11 @@ def _computed(
 def _next_histories(
     history: _History, commands: Sequence[_Command], before_ns: int, max_age_ns: int
 ) -> list[_History]:
-    """Return the histories that can follow a history.
+    """Return the histories that can follow a history, up to the next sample of y_m.
 
-    Since `before_ns`, one or more of the next u_m may have arrived. For each of them, there is a
-    history in which it is the newest. In the last history, none has arrived.
+    Since `before_ns`, the time of the last sample, one or more of the next u_m may have arrived.
+    For each of these u_m, there is a history in which it is the newest. In a further history, none
+    of them has arrived.
     """
     arrived = history.taken
     while arrived < len(commands) and commands[arrived].t_ns <= before_ns + AHEAD_NS:
@@ -275,7 +281,7 @@ def _next_histories(
 
 
 def _distinct(histories: Sequence[_History]) -> list[_History]:
-    """Leave out the histories with the same state as a history earlier in the list."""
+    """Remove each history whose state equals the state of an earlier one in the list."""
     if len(histories) == 1:
         return list(histories)
     by_state: dict[tuple[int, bytes, bytes], _History] = {}
@@ -287,6 +293,6 @@ def _distinct(histories: Sequence[_History]) -> list[_History]:
 
 
 def _take(reference: Reference, command: _Command) -> None:
-    """Hand a u_m to the reference model. As in the node, the model may refuse it."""
+    """Give a u_m to the reference model, which may refuse it, as the node does."""
     with suppress(ChannelError):
         reference.take(command.t_ns, command.u_m, command.attitude)

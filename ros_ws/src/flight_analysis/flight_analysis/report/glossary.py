@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Explain the words of tables and cards.
+"""Explain the words that tables and cards use.
 
 In a terminal, the meanings are printed below a table. On a page, the heading of a column shows its
 meaning, and all meanings are listed at the end.
@@ -98,7 +98,7 @@ GLOSSARY = MappingProxyType(
 
 
 def words_in(texts: Iterable[str]) -> tuple[str, ...]:
-    """Return the texts that the glossary explains, without repetition."""
+    """Return those of the texts that the glossary explains, without repetition."""
     return tuple(dict.fromkeys(text for text in texts if text in GLOSSARY))
 
 

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute the metrics of a guided flight.
 
-A flight is split into segments by mode and leg. For each segment, the metrics are the errors of the
-quantities that guidance held.
+A flight is split into segments, in which guidance keeps its modes and commands. The metrics of a
+segment are the errors of the quantities that guidance held, such as altitude and course.
 """
 
 import math
@@ -63,7 +63,7 @@ PATHS = (Lateral.ORBIT, Lateral.ROUTE, Lateral.PLACE)
 
 @dataclass(frozen=True, kw_only=True)
 class HoldErrors(ErrorMetrics):
-    """The errors of a held quantity over a segment, in SI.
+    """The errors of a quantity that guidance held over a segment, in SI.
 
     Overshoot and settling are None if the segment begins inside the settling band.
     """
@@ -88,7 +88,7 @@ class FlownLeg(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """A part of the flight in which modes, commands and leg stay the same."""
+    """A span of time in which guidance keeps its modes, its commands and its leg."""
 
     start: float  # s
     stop: float  # s
@@ -99,9 +99,9 @@ class Segment:
 
 
 def segments(tape: Tape) -> list[Segment]:
-    """Return the segments of a guided flight, which follow from the topic `guidance`.
+    """Return the segments of a guided flight, found in the topic `guidance`.
 
-    If commands come less than SETTLING_DWELL apart, they begin a single segment.
+    If several commands come less than SETTLING_DWELL apart, they begin only one segment.
     """
     t = tape.time("guidance")
     errors = control_errors(tape)
@@ -151,7 +151,10 @@ def segments(tape: Tape) -> list[Segment]:
 
 
 def flown_legs(tape: Tape) -> list[FlownLeg]:
-    """Return the legs that the topic `guidance` shows, in order, each with its result."""
+    """Return the legs of routes that guidance flew, in order, each with its result.
+
+    They are found in the topic `guidance`.
+    """
     t = tape.time("guidance")
     log = tape["guidance"]
     legs = np.where(log["mode.lateral"] == Lateral.ROUTE, log["leg"], -1.0)
@@ -181,7 +184,7 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
 
 
 def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
-    """Return the numbers of the legs that have not been flown when the flight ends.
+    """Return the numbers of the legs of the route that are not flown yet when the flight ends.
 
     The leg under way counts as not flown. The last leg of a route is left out, because it is an
     orbit without an end. The result is empty if a command replaced the route, or if the route is
@@ -205,7 +208,7 @@ def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
 
 
 def orbit_missed_by(tape: Tape, section: GuidanceConfig) -> float:
-    """Return how far the flight ends from the circle of its last orbit, m.
+    """Return how far the aircraft is from the circle of the last orbit when the flight ends, m.
 
     The result is 0 if this distance is so small that a leg would count as flown. It is also 0 if
     the flight does not end on the last orbit of a route.
@@ -222,9 +225,9 @@ def orbit_missed_by(tape: Tape, section: GuidanceConfig) -> float:
 
 
 def touched_beside(tape: Tape, section: GuidanceConfig) -> float:
-    """Return how far from the touch-down zone the flight ends, m.
+    """Return how far the aircraft is from the touch-down zone when the flight ends, m.
 
-    The result is 0 if the flight ends inside the zone, or if there is no zone.
+    The result is 0 if the aircraft is inside the zone, or if there is no zone.
     """
     pose = best_pose(tape)
     if section.touchdown is None or pose is None:
@@ -238,7 +241,7 @@ SCREEN = 15.24
 
 
 class Touch(NamedTuple):
-    """The sink rate, position and speed at a touch-down, from the true pose if logged."""
+    """The sink rate, position and speed at a touch-down, from the true pose if the log has it."""
 
     sink: float  # m/s
     sideways: float  # speed across the heading, m/s
@@ -283,16 +286,17 @@ def landing_touch(tape: Tape, section: GuidanceConfig | None) -> Touch | None:
 
 
 class Outside(NamedTuple):
-    """How long and how far the aircraft was outside of limits while guidance flew."""
+    """How long and how far the aircraft was outside its limits while guidance flew."""
 
     outside_s: float
     farthest_m: float  # largest distance from the limits, m; 0 if always inside
 
 
 def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
-    """Return the time outside of the fence from the first step of guidance on.
+    """Return how long and how far the aircraft was outside the fence while guidance flew.
 
-    Returns None if there is no fence, or no pose from the first step on.
+    The time counts from the first step of guidance on. Returns None if there is no fence, or no
+    pose from this step on.
     """
     fence = None if section is None else section.fence_zones()
     pose = _guided_pose(tape)
@@ -302,10 +306,10 @@ def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
 
 
 def altitude_excess(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
-    """Return the time above the ceiling or below the altitude floor.
+    """Return how long and how far the aircraft was above its ceiling or below its altitude floor.
 
-    The time counts from the first step of guidance on. Returns None if there are no limits, or no
-    pose from the first step on.
+    The time counts from the first step of guidance on. Returns None if there are no such limits, or
+    no pose from this step on.
     """
     pose = _guided_pose(tape)
     if section is None or (section.ceiling is None and section.altitude_floor is None):
@@ -329,9 +333,10 @@ def _guided_pose(tape: Tape) -> Signal | None:
 
 
 def _outside(tape: Tape, pose: Signal, inside: FloatArray) -> Outside:
-    """Return how long and how far the aircraft was outside of the limits.
+    """Return how long and how far the aircraft was outside its limits.
 
-    `inside` has the distance to the limits at each pose, (N,), m, which is negative outside.
+    `inside` has, for each pose, the distance by which the aircraft is inside the limits, (N,), m.
+    It is negative outside.
     """
     t = (pose.stamp_ns - tape.start_ns) / NANOSECONDS
     lasted = float(np.sum(np.diff(t)[inside[:-1] < 0.0]))
@@ -341,9 +346,9 @@ def _outside(tape: Tape, pose: Signal, inside: FloatArray) -> Outside:
 def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[str, Any]:
     """Return what a map shows of a mission, ready for JSON, with lengths in m.
 
-    `route` has the points of the line, and `legs` has [number, north, east] for each leg. `to_end`
-    has, for each leg of the last route, the length of the path from its end to the last orbit.
-    `fence` and `home` come from the section.
+    `route` has the points of the line of all routes, and `legs` has [number, north, east] for each
+    leg. `to_end` has, for each leg of the last route, the length of the path from the end of this
+    leg to the last orbit. `fence` and `home` come from the section `guidance` of the scenario.
     """
     legs: list[list[float]] = []
     outline: list[Any] = []
@@ -361,7 +366,7 @@ def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[st
 
 
 def leg_results(legs: Sequence[Mapping[str, Any]]) -> str:
-    """Say with which result each leg in a summary was flown. Returns "" without legs.
+    """Say with which result each leg in a summary was flown. Returns "" if there are no legs.
 
     An example is "legs: 0 flown, 1 missed by 321 m, 2 not ended".
     """
@@ -373,7 +378,7 @@ def leg_results(legs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def landing_results(landing: Mapping[str, Any] | None) -> str:
-    """Say how a `Touch` in a summary was, in a sentence. Returns "" without a landing."""
+    """Describe the touch-down in a summary in a sentence. Returns "" if there was no landing."""
     if landing is None:
         return ""
     side = "right" if landing["beside"] > 0.0 else "left"
@@ -391,10 +396,10 @@ def landing_results(landing: Mapping[str, Any] | None) -> str:
 
 
 def control_errors(tape: Tape) -> dict[str, FloatArray]:
-    """Return the measured minus the commanded quantities of guidance, shape (N,) each.
+    """Return the errors of the quantities that guidance holds: measured less commanded, (N,) each.
 
-    There is a value for each sample of `guidance`. The cross-track error comes from the log, and is
-    positive to the right. Errors of angles lie within half a turn.
+    There is a value for each sample of the topic `guidance`. The cross-track error comes from the
+    log, and is positive to the right. Errors of angles lie within half a turn.
     """
     log = tape["guidance"]
     pose = tape["guidance"].group("pose")
@@ -426,18 +431,18 @@ def distance(tape: Tape) -> float | None:
 
 
 def top_speed(tape: Tape, trim: float) -> float | None:
-    """Return the largest airspeed, m/s, or None if y has no V.
+    """Return the largest airspeed of a flight, m/s, or None if y has no V.
 
-    It is `trim` plus the largest V in y, which is a deviation from trim.
+    V in y is a deviation from trim, so the result is `trim` plus the largest V.
     """
     y = tape.signals.get("y")
     return None if y is None or "V" not in y.names else trim + float(np.max(y["V"]))
 
 
 def flown_speed(tape: Tape, trim: float) -> FloatArray:
-    """Return the airspeed at the samples of `guidance`, m/s: the trim speed plus V of y.
+    """Return the airspeed at the samples of the topic `guidance`, m/s: the trim speed plus V of y.
 
-    If y has no V, as for a multicopter, it is the speed over ground.
+    If y has no V, as for a multicopter, the result is the speed over ground.
     """
     log = tape["guidance"]
     over_ground: FloatArray = np.hypot(log["pose.v_north"], log["pose.v_east"])

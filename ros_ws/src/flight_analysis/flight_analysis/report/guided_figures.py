@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draw the figures of a guided flight.
 
-These are the ground track, altitude, airspeed and attitude over their commands, and the cross-track
+They are the ground track, altitude, airspeed and attitude with their commands, and the cross-track
 error.
 """
 
@@ -52,7 +52,10 @@ Bounds = Mapping[str, tuple[float, float]]
 
 
 def guided_context(context: PlotContext) -> PlotContext:
-    """Add the units of the held quantities, and the times of a stale pose, to a context."""
+    """Add what figures of guidance need to a context: units, and the times of a stale pose.
+
+    The units are those of the quantities that guidance holds.
+    """
     t = context.tape.time("guidance")
     mode = context.tape["guidance"]["mode"]
     stale = []
@@ -66,7 +69,7 @@ def guided_context(context: PlotContext) -> PlotContext:
 
 
 def bounds_of(scenario: Scenario | None) -> Bounds:
-    """Return the limits of the commands of guidance."""
+    """Return the limits of guidance's commands: airspeed, altitude, bank and pitch."""
     if scenario is None or scenario.guidance is None:
         return {}
     limits = scenario.guidance.params().limits
@@ -79,9 +82,9 @@ def bounds_of(scenario: Scenario | None) -> Bounds:
 
 
 def flown_routes(scenario: Scenario | None, tape: Tape) -> list[Route]:
-    """Return the routes that flew, according to the topic `guidance`.
+    """Return the routes that were flown, according to the topic `guidance`.
 
-    They come from the scenario and from the topic `route`.
+    The routes themselves are in the scenario and on the topic `route`.
     """
     if scenario is None or scenario.guidance is None:
         return []
@@ -98,8 +101,8 @@ def track_figure(
 ) -> Figure:
     """Draw the ground track, the routes with their fillets, and arrows of the wind.
 
-    The two axes have the same scale. The legs are numbered, start and end are marked, and the fence
-    is drawn with home. `speed` is the trim speed V0, m/s.
+    The two axes have the same scale. The legs are numbered, and start and end are marked. If there
+    is a fence, it is drawn with the home position. `speed` is the trim speed V0, m/s.
     """
     figure = tracks_figure({"flown": (tape, PLANT)}, routes)
     pose = tape["guidance"].group("pose")
@@ -122,7 +125,7 @@ def _add_mark(
 
 
 def _add_numbers(figure: Figure, route: Route) -> None:
-    """Write the numbers of the legs. If called last, they lie over the arrows of the wind."""
+    """Write the numbers of the legs. Call this last, so that they lie over the wind arrows."""
     for number, (north, east) in enumerate(leg_places(route)):
         place = {"x": east, "y": north, "text": f"{number}", "showarrow": False}
         box = {"bgcolor": PAPER, "bordercolor": REFERENCE, "borderwidth": 1.5, "borderpad": 2}
@@ -145,9 +148,9 @@ def _add_fence(figure: Figure, fence: Fence) -> None:
 
 
 def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route]) -> Figure:
-    """Draw ground tracks over routes, with the same scale on both axes.
+    """Draw the ground tracks of several flights over routes, with the same scale on both axes.
 
-    `tracks` holds the tape and the colour of each guided flight, by label.
+    `tracks` has the tape and the colour of each guided flight, by label.
     """
     figure = Figure(1, 1, TRACK_HEIGHT)
     for route in routes:
@@ -170,11 +173,11 @@ def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route
 
 
 def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
-    """Return the mean wind, north and east, over equal parts of the flight, m/s, (parts, 2).
+    """Return the mean wind, north and east, in each of equal parts of the flight, m/s, (parts, 2).
 
-    The wind is the velocity over ground less the velocity through the air. The latter has the size
-    (V0 + V) cos(gamma), with V of y, and the direction psi + beta. `speed` is the trim speed V0,
-    m/s. For a multicopter, the log has the wind.
+    The wind is the velocity over ground less the velocity through the air. The velocity through the
+    air has the size (V0 + V) cos(gamma), with V of y, and the direction psi + beta. `speed` is the
+    trim speed V0, m/s. For a multicopter, the log has the wind.
     """
     log = tape["guidance"]
     pose = log.group("pose")
@@ -217,7 +220,7 @@ AIRSPEED = "airspeed"  # name of the absolute speed, because V is the deviation 
 
 
 def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figure:
-    """Draw altitude and airspeed over their commands, with the limits of the commands.
+    """Draw altitude and airspeed with their commands, and the limits of these commands.
 
     `speed` is the trim speed V0, m/s.
     """
@@ -235,7 +238,7 @@ def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figur
 
 
 def attitude_figure(context: PlotContext, bounds: Bounds) -> Figure:
-    """Draw bank and pitch over their commands, with the limits of the commands."""
+    """Draw bank and pitch with their commands, and the limits of these commands."""
     log = context.tape["guidance"]
     names = ("phi", "theta")
     return _over_commands(

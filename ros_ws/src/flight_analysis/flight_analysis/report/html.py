@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Build and write the page of a flight, of an imported log, or of a linear loop.
 
-`comparison_page` builds the page of several flights, and `page` turns any of these pages into HTML.
+The module `comparison_page` builds the page of several flights. The module `page` turns any of
+these pages into HTML.
 """
 
 from collections.abc import Mapping, Sequence
@@ -77,9 +78,9 @@ def write_page(
     flights: Sequence[RecordedFlight],
     tolerances: Mapping[str, float] = MappingProxyType({}),
 ) -> None:
-    """Write the page of a flight, or of a comparison if there are several.
+    """Write the page of a flight, or the page that compares several flights.
 
-    `tolerances` has the allowed difference between several flights by channel, SI.
+    `tolerances` has the allowed difference between the flights by channel, SI.
     """
     if len(flights) > 1:
         page = comparison_page(flights, tolerances)
@@ -96,7 +97,10 @@ def _write(path: Path, page: Page) -> None:
 
 
 def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
-    """Write the page of a linear loop, flown or not, with margins, Bode and Nyquist plots."""
+    """Write the page of a linear loop, with its margins, Bode and Nyquist plots.
+
+    The loop need not have flown.
+    """
     differences = [each.sentence for each in loop.differences]
     table = margin_figures.margin_table(loop_margins(loop), kept_guarantee(loop), differences)
     figures_of_loop = Figures(groups=[TableGroup([table])])
@@ -236,7 +240,7 @@ def _motion(flight: RecordedFlight, scenario: Scenario, context: PlotContext) ->
 def _causes(
     flight: RecordedFlight, scenario: Scenario, context: PlotContext, flown: FlownLoops
 ) -> list[Block]:
-    """Return the figures that show causes: models, wind, states, the law, its loop, its ticks."""
+    """Return the figures that show causes: models, wind, states, the law and its loop, timing."""
     trim = about_trim(scenario)
     about = ABOUT_V if trim else ""
     spectrum = figures.spectrum_figure(context)
@@ -301,13 +305,13 @@ def _parameter_table(scenario: Scenario) -> tables.MetricTable:
 
 
 def _law(scenario: Scenario) -> str:
-    """Return the text on the law and its rate."""
+    """Return a text that names the control law and its rate."""
     controller = scenario.controller
     return f"At {controller.rate:g} Hz with the {controller.summary()}"
 
 
 def _margin_tables(flown: FlownLoops) -> list[tables.MetricTable]:
-    """Return the margins of a single loop by input, or the least margins of several loops."""
+    """Return a table of one loop's margins by input, or of several loops' least margins."""
     if not flown.loops:
         return []
     if len(flown.loops) > 1:
@@ -318,7 +322,10 @@ def _margin_tables(flown: FlownLoops) -> list[tables.MetricTable]:
 
 
 def _drawn_loops(loops: Sequence[FlownLoop]) -> dict[str, LinearLoop]:
-    """Return the loops of a flight by name, around the true aircraft if it is known."""
+    """Return the loops that Bode and Nyquist plots show, by name.
+
+    They are around the true aircraft if it is known.
+    """
     aircraft = TRUE if any(each.aircraft == TRUE for each in loops) else FILE
     return {each.name: each.loop for each in loops if each.aircraft == aircraft}
 

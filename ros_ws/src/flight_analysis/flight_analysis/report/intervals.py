@@ -65,7 +65,7 @@ def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
 
 
 def fault_intervals(flight: RecordedFlight, end: float) -> list[Interval]:
-    """Return the faults that the scenario injects, each from its start to the end of the flight."""
+    """Return the faults that the scenario injects: each lasts from its start to the end."""
     if flight.scenario is None:
         return []
     return [
@@ -76,7 +76,7 @@ def fault_intervals(flight: RecordedFlight, end: float) -> list[Interval]:
 
 
 def starved_intervals(flight: RecordedFlight) -> list[Interval]:
-    """Return the spans in which the host was too busy for a flight in real time."""
+    """Return the intervals in which the host was too busy to fly in real time."""
     spans = (flight.summary.get("account") or {}).get("starved", ())
     return [
         Interval(label="host too busy", start=start, stop=stop, colour=STARVED, labelled=False)
@@ -85,9 +85,9 @@ def starved_intervals(flight: RecordedFlight) -> list[Interval]:
 
 
 def gap_intervals(tape: Tape) -> list[Interval]:
-    """Return the intervals without a sample of y.
+    """Return the gaps: long intervals without a sample of y.
 
-    They are longer than SHOWN_GAP, and than MIN_GAP_PERIODS times the median period of y.
+    A gap is longer than SHOWN_GAP, and longer than MIN_GAP_PERIODS times the median period of y.
     """
     if "y" not in tape or len(tape["y"].stamp_ns) < 2:
         return []

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Draw the entries of A and B that were identified in a flight."""
+"""Draw the entries of A and B that a learner identified in a flight."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -21,9 +21,9 @@ LEARNED_LINES: tuple[dict[str, Any], ...] = (
 def learned_figure(context: PlotContext, lines: Mapping[str, Mapping[str, float]]) -> Figure | None:
     """Draw the identified entries of A and B over time, with bars of two standard deviations.
 
-    A mark is open if the identification led to no proposal. `lines` has known values of the
-    entries, by label and entry. Only `known_entries` are drawn. Returns None if nothing was
-    learned.
+    A mark is open if no parameters were proposed after the identification. `lines` has known values
+    of the entries, by label and entry. Only the entries of `known_entries` are drawn. Returns None
+    if nothing was learned.
     """
     if "learned" not in context.tape:
         return None

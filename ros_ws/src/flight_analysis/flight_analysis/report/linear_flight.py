@@ -1,20 +1,20 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fly the linear loop with the commands, noise and wind of a log, to find the error to expect.
+"""Simulate the linear loop with the commands, noise and wind of a log, to find the error to expect.
 
     x+ = A x + B u + integral_0^T exp(A s) ds d,  e = C x - y_m,  u = law(e + noise)
 
-y_m, the noise of the sensors and d come from the log, where d is the part of x_dot that depends
-neither on x nor on u. Three things are left out: the limits of u, faults of the effectors and the
-part of f that depends on the state. In the scenarios of the package, the error of a flight is 0.8
-to 1.3 times the error of the linear loop.
+y_m, the noise of the sensors and d come from the log. d is the part of x_dot that depends neither
+on x nor on u. Three things are left out: the limits of u, faults of the effectors and the part of f
+that depends on the state. In the scenarios of the package, the error of a flight is 0.8 to 1.3
+times the error of the linear loop.
 
 Because the loop is linear, e is the sum of three errors, which the commands, the noise and the wind
 cause. An error of the flight is excused if these three explain it. Noise and wind must not excuse
 too much, so only a part of them counts. Noise counts only up to the declared noise of the sensor,
 and only as far as the actuators can follow the law's response to it. Wind counts only as far as the
-travel of the actuators can counter it. Gravity acts along the path of y_m, so that a pitch that was
-not commanded is no excuse.
+travel of the actuators can counter it. Gravity acts along the path of y_m, not along the path that
+was flown, so a pitch angle that was not commanded excuses no error.
 """
 
 from typing import NamedTuple
@@ -90,10 +90,10 @@ class ErrorPair(NamedTuple):
 
 
 class LinearErrors(NamedTuple):
-    """Absolute errors of the linear loop, (N, m), SI, or 0 if no linear loop is stable.
+    """Absolute errors of the linear loop, (N, m), SI, or 0 if the linear loop is unstable.
 
-    If the aircraft drifts, each error is the larger one of two, for the aircraft before and after
-    the drift.
+    If the aircraft drifts, there are two loops: one with the aircraft before the drift, and from
+    its start on also one with the aircraft after it. Each error is the larger one of the two.
     """
 
     whole: FloatArray
@@ -103,7 +103,7 @@ class LinearErrors(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """How far and how fast the actuators let each input of the law go, (m,), in its unit.
+    """How far and how fast the actuators can move each input of the law, (m,), in its unit.
 
     The values are infinite if there is no limit.
     """
@@ -153,7 +153,7 @@ def error_pair(
 
 
 def _has_feedback(controller: ControllerConfig) -> bool:
-    """Return whether u depends on y. In a law for identification it does not."""
+    """Return whether u depends on y, as in every law except those that only excite the aircraft."""
     if is_literal(controller):
         return True
     law = linear_law(controller.tuned_law(), len(controller.outputs), 1.0 / controller.rate)
@@ -166,7 +166,10 @@ def _has_feedback(controller: ControllerConfig) -> bool:
 
 
 def _airframes(tape: Tape, aircraft: AircraftConfig | None) -> list[Airframe]:
-    """Return the simulated airframes before and after a drift, or no airframe if it is unknown."""
+    """Return the simulated airframe, and the airframe after a drift, if there is one.
+
+    The result is empty if the airframe is unknown.
+    """
     if aircraft is None or aircraft.is_jsbsim or "truth" not in tape:
         return []
     names = {f"{group}.{state}" for group in "xf" for state in aircraft.sampled_airframe().states}
@@ -178,7 +181,7 @@ def _airframes(tape: Tape, aircraft: AircraftConfig | None) -> list[Airframe]:
 
 
 def _has_wind(tape: Tape, aircraft: AircraftConfig | None) -> bool:
-    """Return whether the log is of a simulation and holds the wind."""
+    """Return whether the log comes from a simulation and has the wind that acted."""
     if aircraft is None or "truth" not in tape:
         return False
     return bool(_airframes(tape, aircraft)) or {"x.theta", WIND} <= set(tape["truth"].names)
@@ -193,7 +196,10 @@ def _linear_errors(
     y_m: FloatArray,
     e_0: FloatArray,
 ) -> LinearErrors:
-    """Fly the linear loop around the aircraft, and around the drifted aircraft, if any."""
+    """Simulate the linear loop around the aircraft and, after a drift, around the changed aircraft.
+
+    `e_0` is the error of the flight at its first tick.
+    """
     config = controller
     if is_literal(controller):
         # The literal sign is the limit of the implicit sign, which has a linear law.
@@ -265,10 +271,11 @@ def _reach(controller: ControllerConfig, aircraft: AircraftConfig | None) -> Rea
 
 
 def _share_within(reach: Reach, u: FloatArray, period: float) -> FloatArray:
-    """Return the fraction of u that the actuators can follow, (m,), at most 1.
+    """Return the fraction of a noisy u that the actuators can follow, (m,), at most 1.
 
-    u has the shape (N, m). NOISE_PEAK times the standard deviation of this fraction of u lies
-    within the travel of the actuators. The same holds for its rate.
+    u has the shape (N, m). The result is a factor: NOISE_PEAK standard deviations of u times this
+    factor lie within the travel of the actuators, and those of its rate lie within their rate
+    limit.
     """
     if len(u) < 2:
         return np.ones(u.shape[1])
@@ -289,7 +296,7 @@ def _share_within_travel(reach: Reach, u: FloatArray) -> FloatArray:
 def _known_loop(
     controller: ControllerConfig, airframe: Airframe
 ) -> tuple[LinearPlant, LinearLaw, LoopTiming]:
-    """Return the loop around the airframe of a simulation."""
+    """Return the linear loop around a known airframe."""
     A = airframe.matrix_a()[None]
     B = airframe.matrix_b()[None] @ distribution(airframe, controller)
     linear = linear_loop(controller, through_allocation(airframe, controller), A, B)
@@ -297,9 +304,9 @@ def _known_loop(
 
 
 def _bare_loop(controller: ControllerConfig) -> tuple[LinearPlant, LinearLaw, LoopTiming]:
-    """Return the loop around y_dot = Omega u with abs(Omega_ii) = omega / input_scale.
+    """Return the linear loop around y_dot = Omega u, for an aircraft that is unknown.
 
-    It is used if the aircraft is unknown. Omega is then what the controller was told.
+    Omega is what the controller was told: abs(Omega_ii) = omega / input_scale.
     """
     if controller.vanes:
         controller = controller.without_vanes()
@@ -313,7 +320,7 @@ def _bare_loop(controller: ControllerConfig) -> tuple[LinearPlant, LinearLaw, Lo
 
 
 class _LinearFlight(NamedTuple):
-    """The error and the input of the linear loop at the ticks."""
+    """The error and the input of the linear loop at each tick."""
 
     e: FloatArray  # (N, m)
     u: FloatArray  # (N, m)
@@ -330,9 +337,10 @@ def _flight(
     e_0: FloatArray,
     probed: ControllerConfig | None = None,
 ) -> _LinearFlight:
-    """Fly the linear loop, x_dot = A x + B u + d, with d (N, n) and noise (N, m).
+    """Simulate the linear loop, x_dot = A x + B u + d, with d (N, n) and noise (N, m).
 
-    The flight begins with the error `e_0`. `probed` is the controller if its probe acts.
+    The simulation begins with the error `e_0`. If the probe of a controller acts on u, this
+    controller is given as `probed`.
     """
     plant, law, loop = parts
     n, m = plant.B.shape
@@ -369,9 +377,9 @@ def _at(tape: Tape, topic: str, name: str, ticks: FloatArray) -> FloatArray:
 
 
 def _between(tape: Tape, signal: Signal, values: FloatArray, ticks: FloatArray) -> FloatArray:
-    """Interpolate values at the samples of a signal, (K,), to the ticks, (N,).
+    """Interpolate the values of a signal's samples, (K,), to the ticks, (N,).
 
-    Only finite values count. If there is none, the result is 0.
+    Only finite values are used. If there is none, the result is 0.
     """
     is_finite = np.isfinite(values)
     if not is_finite.any():
@@ -385,10 +393,9 @@ def _noise(
 ) -> FloatArray:
     """Return the noise of the sensors in the log, (N, m), in the units of y.
 
-    It is the error of each sensor less its moving mean over NOISE_TIME, or 0 if the log has no
-    errors of sensors. Bias and drift do not count as noise, because the law follows them and the
-    aircraft is off by as much. An error beyond the declared one is a fault, and does not count,
-    either.
+    The noise is the error of each sensor less its moving mean over NOISE_TIME, or 0 if the log has
+    no errors of sensors. Bias and drift do not count as noise, because the law follows them, so the
+    aircraft is off by as much. The noise is limited to the declared one, because more is a fault.
     """
     count = max(round(NOISE_TIME * controller.rate), 1)
     noise = np.zeros((len(ticks), len(controller.outputs)))
@@ -415,7 +422,7 @@ def _moving_mean(values: FloatArray, count: int) -> FloatArray:
 
 
 def _declared_noise(aircraft: AircraftConfig) -> list[float]:
-    """Return the largest error that the sensor of each output is declared to have, SI.
+    """Return the largest noise of each output that the sensor's parameters declare, SI.
 
     It is DECLARED sqrt(noise^2 + drift^2 rate NOISE_TIME) + quantisation.
     """
@@ -430,7 +437,7 @@ def _declared_noise(aircraft: AircraftConfig) -> list[float]:
 def _disturbance(
     tape: Tape, aircraft: AircraftConfig | None, ticks: FloatArray, n: int
 ) -> FloatArray:
-    """Return the disturbance d, (N, n): f(x, t) in `truth` less the part that depends on x."""
+    """Return the disturbance d, (N, n): f of the topic `truth` less its part that depends on x."""
     truth: Signal = tape["truth"]
     d = np.zeros((len(ticks), n))
     if aircraft is None:
@@ -444,11 +451,11 @@ def _disturbance(
 
 
 def _slope_of_wind(tape: Tape, controller: ControllerConfig, ticks: FloatArray) -> FloatArray:
-    """Return the disturbance of y_dot = Omega u + d by the wind of JSBSim, (N, m).
+    """Compute the disturbance d that the wind of JSBSim causes in y_dot = Omega u + d, (N, m).
 
         V_dot = -W_dot
 
-    The disturbance is 0 for the rates. It is 0 throughout if the log has no wind.
+    d is 0 for the rates q, p, r. It is 0 for V as well if the log has no wind.
     """
     d = np.zeros((len(ticks), len(controller.outputs)))
     if _has_path(tape, controller) and len(ticks) > 1:
@@ -460,13 +467,13 @@ def _slope_of_wind(tape: Tape, controller: ControllerConfig, ticks: FloatArray) 
 def _gravity_along_path(
     tape: Tape, controller: ControllerConfig, ticks: FloatArray, y_m: FloatArray
 ) -> FloatArray:
-    """Return the d of y_dot = Omega u + d that the weight causes along the path of y_m, (N, m).
+    """Compute the disturbance d that gravity causes in y_dot = Omega u + d along y_m, (N, m).
 
         theta_dot = q_m cos(phi) - r_m sin(phi),   V_dot = -g sin(theta)
 
     theta is the deviation from trim, and its first value comes from the log. phi comes from the log
-    throughout. An aircraft without a rudder has no r_m, and its true r is used instead. If the law
-    has an integral of e, it keeps the true theta within 0.01 rad of this theta, whatever the gusts.
+    throughout. An aircraft without a rudder has no r_m, so its true r is used there. If the law has
+    an integral of e, it keeps the true theta within 0.01 rad of this theta, whatever the gusts.
     """
     d = np.zeros((len(ticks), len(controller.outputs)))
     names = controller.outputs
@@ -494,10 +501,10 @@ def _has_path(tape: Tape, controller: ControllerConfig) -> bool:
 
 
 def _flown(tape: Tape, ticks: FloatArray, *, may_pause: bool) -> NDArray[np.bool_]:
-    """Return the mask of the ticks from the first engagement on.
+    """Return a mask of the ticks from the first engagement on.
 
     If `may_pause` is True, the ticks of an inactive controller are left out. If the log has no
-    `internals`, no tick counts.
+    topic `internals`, no tick counts.
     """
     if "internals" not in tape:
         return np.zeros(len(ticks), dtype=bool)
@@ -512,6 +519,6 @@ def _flown(tape: Tape, ticks: FloatArray, *, may_pause: bool) -> NDArray[np.bool
 
 
 def _sampled(t: FloatArray, ticks: FloatArray) -> NDArray[np.bool_]:
-    """Return the mask of the ticks, (N,), that do not lie in a gap between the samples at t."""
+    """Return a mask of the ticks, (N,), that lie in no gap between the samples at the times t."""
     after = np.clip(np.searchsorted(t, ticks), 1, len(t) - 1)
     return t[after] - t[after - 1] <= LONGEST_INTERVAL

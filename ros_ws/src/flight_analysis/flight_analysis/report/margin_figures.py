@@ -41,16 +41,16 @@ BOUND = "#444444"
 
 
 def decibels(factor: FloatArray | float) -> FloatArray:
-    """Return 20 log10 of a factor."""
+    """Convert a factor to decibels: 20 log10 of the factor."""
     with np.errstate(divide="ignore"):
         return np.asarray(20.0 * np.log10(factor))
 
 
 def margin_rows(margins: LoopMargins) -> list[list[str]]:
-    """Return a row for each input, then one for ALL_INPUTS, with the cells of MARGIN_COLUMNS.
+    """Return a row of cells for each input, and a last row for ALL_INPUTS.
 
-    A cell has the value of the nominal aircraft, and then the worst of the uncertain ones in
-    parentheses.
+    The cells are those of MARGIN_COLUMNS. A cell has the value of the nominal aircraft, and in
+    parentheses the value of the worst uncertain aircraft.
     """
     columns = _values(margins.nominal, (*margins.channel_delay, margins.delay))
     uncertain = columns
@@ -74,7 +74,7 @@ def margin_rows(margins: LoopMargins) -> list[list[str]]:
 
 
 def _values(margins: Margins, delay: Sequence[float]) -> list[list[float]]:
-    """Return a row of values for each of MARGIN_COLUMNS, in its unit, with NaN for no value."""
+    """Return a row of margins for each of MARGIN_COLUMNS, in its unit. NaN means no value."""
     phase = np.append(margins.phase, disk_phase(margins.disk_all))
     gain = np.append(margins.gain, disk_gain(margins.disk_all))
     return [
@@ -88,7 +88,7 @@ def _values(margins: Margins, delay: Sequence[float]) -> list[list[float]]:
 
 
 def _cell(value: float, worst: float | None, form: str) -> str:
-    """Write a value, followed by that of the worst aircraft in parentheses."""
+    """Write a value, followed in parentheses by the value of the worst aircraft."""
 
     def text(number: float) -> str:
         if math.isnan(number):
@@ -113,7 +113,7 @@ inputs at once."""
 
 
 def least_margins(margins: LoopMargins | None) -> list[str]:
-    """Return the values of LEAST_MARGINS as text, with the worst aircraft in parentheses."""
+    """Return the margins of LEAST_MARGINS as text, with the worst aircraft in parentheses."""
     if margins is None:
         return [NO_VALUE] * len(LEAST_MARGINS)
     nominal = _least(margins.nominal, margins.delay)
@@ -124,7 +124,7 @@ def least_margins(margins: LoopMargins | None) -> list[str]:
 
 
 def _least(margins: Margins, delay: float) -> list[float]:
-    """Return the values of LEAST_MARGINS, each in the unit that its name states."""
+    """Return the margins of LEAST_MARGINS, each in the unit that its name states."""
     phase = np.degrees(margins.phase.min())
     gain = decibels(margins.gain.min())
     values = (
@@ -139,7 +139,7 @@ def _least(margins: Margins, delay: float) -> list[float]:
 
 
 def modes_text(margins: LoopMargins) -> str:
-    """Write the slow modes that have little damping as a sentence."""
+    """Write a sentence on the slow modes that have little damping."""
     every = zip(margins.modes.frequency, margins.modes.damping, strict=True)
     slow_modes = [(w, zeta) for w, zeta in every if zeta < SHOWN_DAMPING]
     modes = ", ".join(f"{w:.3g} rad/s {zeta:.2f}" for w, zeta in slow_modes)
@@ -257,12 +257,12 @@ def guarantee_text(guarantee: Guarantee) -> list[str]:
 
 
 def proved_percent(part: float) -> str:
-    """Write as a percentage, rounded down, which part of a box is proved."""
+    """Write a proved deviation as a percentage, rounded down."""
     return f"{math.floor(1e3 * part) / 10.0:.1f} %"
 
 
 def found_percent(part: float) -> str:
-    """Write as a percentage, rounded up, how far an unstable aircraft deviates."""
+    """Write the deviation of an unstable aircraft as a percentage, rounded up."""
     return f"{math.ceil(1e3 * part) / 10.0:.1f} %"
 
 
@@ -275,9 +275,10 @@ def _first_found(first: Unstable | None) -> str:
 
 
 def guarantee_rows(guarantee: Guarantee, margins: LoopMargins) -> list[tuple[str, float, float]]:
-    """Return a row for each input, and one for ALL_INPUTS at the end.
+    """Return a row for each input, and a last row for ALL_INPUTS.
 
-    A row has the input, the guaranteed disk margin, and the least disk margin that was found.
+    A row has the name of the input, the guaranteed disk margin, and the least disk margin that a
+    search has found.
     """
     worst = margins.worst
     least_disks = [math.nan] * (len(guarantee.disk) + 1)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find when the controller flew which parameters, and the errors in each such span."""
+"""Find when the controller flew which parameters, and the error in each of these spans of time."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from flight_core.tape import Tape
 
 
 class ParameterSpan(NamedTuple):
-    """A span of a flight in which the controller had the same parameters."""
+    """A span of time in which the controller had the same parameters."""
 
     digest: int
     name: str  # name of the parameters, as in `model_names`
@@ -23,7 +23,7 @@ class ParameterSpan(NamedTuple):
 
 
 class ModelSpan(NamedTuple):
-    """The error over a span of a flight in which the controller had the same parameters."""
+    """The error over a span of time in which the controller had the same parameters."""
 
     name: str  # name of the parameters, as in `model_names`
     model: int  # index of the parameters; 0 for those at the start
@@ -38,7 +38,7 @@ class ModelSpan(NamedTuple):
 
 
 class KeptGuarantee(NamedTuple):
-    """The guarantee of a proposal, as the log has it."""
+    """The guarantee of a learner's proposal, as it is in the log."""
 
     stable: float  # number of stated deviations, as in `ModelSpan`
     loop: str
@@ -59,9 +59,9 @@ def guarantees(tape: Tape) -> dict[int, KeptGuarantee]:
 def model_names(first: Sequence[float], proposals: Sequence[float]) -> list[str]:
     """Name the sets of parameters that flew, given the times at which they first flew, s.
 
-    The times in `first` ascend, and the first set is named "start". A set that first flew before
-    the first of the `proposals` of a learner, s, is "file", "file 2" and so on. The later ones are
-    "model 1", "model 2" and so on.
+    The times in `first` ascend, and the first set is named "start". `proposals` has the times of a
+    learner's proposals, s. A set that first flew before all of them is "file", "file 2" and so on.
+    The other sets are "model 1", "model 2" and so on.
     """
     names = ["start"]
     for time in first[1:]:
@@ -73,7 +73,10 @@ def model_names(first: Sequence[float], proposals: Sequence[float]) -> list[str]
 
 
 def parameter_spans(tape: Tape) -> list[ParameterSpan]:
-    """Return the spans with the same parameters of the controller, or [] without `internals`."""
+    """Return the spans of time in which the controller had the same parameters.
+
+    The result is empty if the log has no topic `internals`.
+    """
     if "internals" not in tape or "parameters" not in tape["internals"].names:
         return []
     t = tape.time("internals")
@@ -96,7 +99,7 @@ def parameter_spans(tape: Tape) -> list[ParameterSpan]:
 
 
 def errors_by_model(tape: Tape) -> list[ModelSpan]:
-    """Return the rms of `best_error` in each span with the same parameters of the controller.
+    """Return the rms of `best_error` for each span of time with the same parameters.
 
     The result is empty if nothing was learned. Only the time in which the law is engaged counts.
     """

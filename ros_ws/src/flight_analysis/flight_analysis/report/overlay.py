@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compare the signals that several logs have in common, even if other programs wrote them.
+"""Compare the signals that several logs have in common, even if other programs wrote the logs.
 
-The difference of a signal is taken at the instants of the first log. The other log must have
-samples at most LONGEST_INTERVAL apart there. Between these, y and pose are interpolated linearly,
-and u is held. A value that is not finite is not compared. The table states which part was compared.
-The tolerance of a signal can be given by its name. Otherwise it is the fraction TOLERANCE of the
-largest absolute value in the first log.
+The difference of a signal is taken at the instants of the first log. At these instants the other
+log must have samples at most LONGEST_INTERVAL apart. Between its samples, y and pose are
+interpolated linearly, and u is held. A value that is not finite is not compared. The table states
+which part was compared. The tolerance of a signal can be given by its name. Otherwise it is the
+fraction TOLERANCE of the largest absolute value in the first log.
 """
 
 from collections.abc import Mapping, Sequence
@@ -107,8 +107,8 @@ def difference_table(
 ) -> MetricTable:
     """Return the differences of each later log from the first, with a row for each common signal.
 
-    `tolerances` has the tolerances of channels by name, SI. Raises ParameterError for a channel
-    that no two logs have in common.
+    `tolerances` has the tolerances of channels by name, SI. Raises ParameterError if it names a
+    channel that no two logs have in common.
     """
     first, *others = flights
     rows = []
@@ -142,7 +142,7 @@ def difference_table(
 
 
 def _cells(found: Difference | None, unit: DisplayUnit) -> list[str]:
-    """Return the cells of a row in the unit of the signal, or empty ones for None."""
+    """Return the cells of a row in the unit of the signal, or empty cells for None."""
     if found is None:
         return [*[NO_VALUE] * 5, "0.0"]
     rms, most, tolerance = (

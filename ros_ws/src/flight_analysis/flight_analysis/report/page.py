@@ -38,7 +38,7 @@ HERE = Path(__file__).parent
 
 
 class Colour(StrEnum):
-    """The colour of a verdict, which shows whether the flight, the host or nothing fell short."""
+    """The colour of a verdict: whether all is well, or the host or the flight fell short."""
 
     GOOD = "good"  # green: nothing is wrong
     HOST = "host"  # amber: the host was too busy, and nothing is wrong with the aircraft
@@ -72,9 +72,9 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class Tile:
-    """The error of an output beside the allowed error, as text and as a bar.
+    """A tile on the page: the error of an output beside the allowed error, as text and as a bar.
 
-    If there is no limit, the tile has no bar, because the error was not judged.
+    If there is no allowed error, because nothing was judged, the tile has no bar.
     """
 
     name: str
@@ -104,7 +104,7 @@ def anchor(title: str) -> str:
 
 
 class Section(NamedTuple):
-    """A figure with a heading. If there is no figure, the section is left out."""
+    """A block with a figure and a heading. Without a figure, the block is left out."""
 
     title: str
     hint: str
@@ -120,7 +120,7 @@ class Section(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Card:
-    """A claim about a flight, with its range of validity and a way to check it.
+    """A claim about a flight, with the conditions under which it holds and a way to check it.
 
     `words` are the words of the claim that the glossary explains.
     """
@@ -152,7 +152,7 @@ class ReplayBlock:
 
 
 class MessageLine(NamedTuple):
-    """A message of the log as text."""
+    """A line with a message of the log, as text."""
 
     time: str
     kind: str
@@ -173,7 +173,7 @@ Tables = Sequence[MetricTable] | Sequence[ComparisonTable]
 
 
 class TableGroup(NamedTuple):
-    """Tables that are shown together, and the same tables in radians.
+    """Tables that are shown together, and the same tables with angles in radians.
 
     In a comparison, `colours` has the colours of the flights.
     """
@@ -187,7 +187,7 @@ class TableGroup(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Figures:
-    """The block with groups of tables. A reader can fold it on the page of a flight."""
+    """A block with groups of tables of numbers. On the page of a flight, a reader can fold it."""
 
     kind: ClassVar[str] = "tables"
     groups: Sequence[TableGroup]
@@ -219,7 +219,7 @@ class Page(NamedTuple):
 
     @property
     def contents(self) -> list[tuple[str, str]]:
-        """The entries in the line of contents, each with anchor and name."""
+        """The entries of the line of contents: anchor (link target) and name of each block."""
         entries = [(anchor(block.title), block.contents) for block in self.shown if block.contents]
         return [*entries, *([("words", "Words")] if self.words else [])]
 
@@ -253,12 +253,12 @@ class Page(NamedTuple):
 
     @property
     def has_times(self) -> bool:
-        """Whether the page has figures over time, which are zoomed together."""
+        """Whether the page has figures over time, which are all zoomed together."""
         return any(isinstance(block, Section) and block.over_time for block in self.shown)
 
     @property
     def has_angles(self) -> bool:
-        """Whether the page can show its angles both in deg and in rad."""
+        """Whether the page can switch its angles between deg and rad."""
         groups = [
             group for block in self.blocks if isinstance(block, Figures) for group in block.groups
         ]
@@ -296,7 +296,7 @@ def page_parts(page: Page) -> Iterator[str]:
 
 @cache
 def _template() -> Template:
-    """Return the template of a page, compiled once because this takes longer than to fill it."""
+    """Return the template of a page. It is compiled only once, because this takes long."""
     environment = Environment(
         loader=FileSystemLoader(HERE),
         autoescape=True,
@@ -314,7 +314,7 @@ def _template() -> Template:
 
 
 def script_json(value: Any) -> Markup:
-    """Write JSON for a script element, with "<" as an escape, since it only occurs in strings."""
+    """Write JSON for a script element. Each "<" is escaped, so that no tag can end it."""
     content = finite_or_null(
         {"data": value.data, "layout": value.layout} if isinstance(value, Figure) else value
     )
@@ -323,7 +323,7 @@ def script_json(value: Any) -> Markup:
 
 
 def _typed_array(array: FloatArray | NDArray[np.float32]) -> dict[str, str]:
-    """Return an array for plotly.js, as its type "f8" or "f4" and its bytes, little endian."""
+    """Return an array for plotly.js: its type, "f8" or "f4", and its bytes, little endian."""
     return {"dtype": array.dtype.str[1:], "bdata": base64.b64encode(array.tobytes()).decode()}
 
 

@@ -134,7 +134,10 @@ def last_instant(flights: Sequence[RecordedFlight]) -> float:
 def draw_channel(
     axes: "Axes", flights: Sequence[RecordedFlight], name: str, line_width: float = LINE_WIDTH
 ) -> None:
-    """Draw a channel of each flight, with the reference and the gusts of the first flight."""
+    """Draw a channel of each flight, over y_m and the gusts of the first flight.
+
+    If the name is "e.NAME", the error of the output NAME is drawn.
+    """
     units = common_units(flights)
     channel = name.removeprefix("e.")
     is_error = name != channel

@@ -60,7 +60,7 @@ DARK = {PAPER: "#1b1f24", INK: "#d3d9df", GRID: "#2c323a", ZERO: "#4b545e"}
 
 @dataclass(frozen=True, kw_only=True)
 class Instants:
-    """The instants at which a curve is drawn."""
+    """The instants at which a curve is drawn, with its gaps."""
 
     # Instants of the drawn samples, ns since the start of the flight, and a further one where a gap
     # begins. If samples are drawn in bins, each bin has two instants.
@@ -70,7 +70,7 @@ class Instants:
 
 
 class SampleStore:
-    """The packed samples of the long curves of a page.
+    """The samples of the long curves of a page, packed to be stored in the page.
 
     Equal arrays are stored once, under a hash of their content.
     """
@@ -87,7 +87,7 @@ class SampleStore:
 
     @property
     def packed(self) -> dict[str, str]:
-        """The arrays of a page, by name."""
+        """The packed arrays of the page, by name."""
         return {name: packed.result() for name, packed in self._packed.items()}
 
     def instants(self, stamp_ns: NDArray[np.int64], start_ns: int, *, steps: bool) -> Instants:
@@ -102,8 +102,8 @@ class SampleStore:
     def times(self, t_ns: NDArray[np.int64]) -> str:
         """Store instants, and return the name of the stored array.
 
-        It has the first instant, and then the steps from each instant to the next, ns, float64,
-        because equal steps compress well.
+        The array has the first instant, and then the steps from each instant to the next, ns,
+        float64, because equal steps compress well.
         """
         if id(t_ns) not in self._times:
             self._times[id(t_ns)] = (
@@ -150,7 +150,7 @@ def pack(content: bytes | NDArray[Any], width: int = 1) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Interval:
-    """An interval of time, s, that is shaded."""
+    """An interval of time, s, that figures shade, such as a gust."""
 
     label: str
     start: float
@@ -161,7 +161,7 @@ class Interval:
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """A flight as the figures of a page draw it."""
+    """A flight with what figures need to draw it: its signals, its period and its colour."""
 
     tape: Tape
     period_ns: int  # period of the controller's ticks
@@ -169,7 +169,7 @@ class Run:
 
 
 class PlotContext(NamedTuple):
-    """The flights, units, intervals and samples that the figures of a page share."""
+    """What the figures of a page share: flights, units, shaded intervals and samples."""
 
     runs: Mapping[str, Run]  # by label; a single flight, or several to compare
     units: Mapping[str, DisplayUnit]  # units by channel
@@ -202,7 +202,7 @@ class Curve(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Extent:
-    """The smallest and the largest value of a curve in a subplot, in the unit shown."""
+    """The smallest and the largest value of a curve in a subplot, in the displayed unit."""
 
     index: int  # index of the subplot
     name: str
@@ -211,7 +211,7 @@ class Extent:
 
 
 def _finite(values: Any) -> FloatArray:
-    """Return the finite values of a trace, or no values if it has other data than numbers."""
+    """Return the finite values of a plotly trace, or no values if its data are not numbers."""
     try:
         array = np.asarray([] if values is None else values, dtype=np.float64).ravel()
     except (TypeError, ValueError):
@@ -252,9 +252,10 @@ class Figure:
             self.layout |= {axis(f"{letter}axis", index): value for index, value in enumerate(axes)}
 
     def add(self, trace: dict[str, Any], index: int = 0, values: FloatArray | None = None) -> None:
-        """Add a trace to a subplot.
+        """Add a trace (plotly's word for a curve or bars) to a subplot.
 
-        If the page holds the samples of the trace, `values` gives them, and the trace has none.
+        If the page holds the samples of the trace, the trace itself has none, and `values` gives
+        them.
         """
         self.data.append(trace | {"xaxis": axis("x", index), "yaxis": axis("y", index)})
         shown = trace.get("y") if values is None else values
@@ -304,8 +305,7 @@ def time_series_figure(
 ) -> Figure:
     """Draw a subplot of `height` pixels for each channel, with all curves of this channel.
 
-    Two columns are filled row by row. `labels` has axis labels that replace those of their
-    channels.
+    Two columns are filled row by row. `labels` has axis labels that replace the names of channels.
     """
     names = dict.fromkeys(chain.from_iterable(curve.signal.names for curve in curves.values()))
     channels = in_order(names, context.units)
@@ -380,7 +380,7 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
 
 
 def first_in_legend(figure: Figure, label: str) -> bool:
-    """Return whether no trace has this label yet, because the legend shows it only once."""
+    """Return whether a label is new to the figure. The legend shows each label only once."""
     return all(trace["name"] != label for trace in figure.data)
 
 
@@ -438,7 +438,8 @@ def _drawn(
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Return instants and scaled values of a channel, with a NaN where a gap begins.
 
-    The values are multiplied by `factor`. A long curve has two values for each bin.
+    The values are multiplied by `factor`. A long curve is reduced to two values for each bin of
+    time.
     """
     start_ns = context.tape.start_ns if curve.start_ns is None else curve.start_ns
     drawn = context.samples.instants(curve.signal.stamp_ns, start_ns, steps=curve.steps)
@@ -450,7 +451,7 @@ def _drawn(
 def _extremes_of_bins(values: FloatArray, width: int) -> FloatArray:
     """Return the smallest and the largest value of each bin, in the order in which they occur.
 
-    If a bin has a gap, its second value is NaN.
+    A bin has `width` samples. If a bin has a gap, its second value is NaN.
     """
     bins = _bins(values, width)
     gaps = np.isnan(bins)
@@ -463,7 +464,7 @@ def _extremes_of_bins(values: FloatArray, width: int) -> FloatArray:
 
 
 def _bins(values: NDArray[T], width: int) -> NDArray[T]:
-    """Return the values in bins, (N, width). The last value is repeated to fill the last bin."""
+    """Split values into bins, (N, width). The last value is repeated to fill the last bin."""
     return np.append(values, np.full(-len(values) % width, values[-1])).reshape(-1, width)
 
 
@@ -507,7 +508,7 @@ def _shade_intervals(figure: Figure, intervals: Sequence[Interval], columns: int
 
 
 def _mark_messages(figure: Figure, times: Sequence[float], columns: int) -> None:
-    """Draw a dotted line over every subplot for each message of the log."""
+    """Draw a dotted line through every subplot at the time of each message of the log."""
     for time, column in product(times, range(columns)):
         position = {"type": "line", "xref": axis("x", column), "yref": "paper", "y0": 0, "y1": 1}
         figure.layout["shapes"].append(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Read a run back, and summarise its flight."""
+"""Read a recorded run, and summarise its flight."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -51,7 +51,7 @@ from flight_log.tape_reader import AIRCRAFT_TOPICS, RecordedRun, read_run
 
 
 class UnflownError(ParameterError):
-    """A log lacks y or y_m, so that only the `outcome` of the flight can be reported."""
+    """Raised if a log lacks y or y_m, so that only the `outcome` of the flight can be reported."""
 
     def __init__(self, sentence: str, outcome: Outcome) -> None:
         super().__init__(sentence)
@@ -110,18 +110,18 @@ def read_flight(
 ) -> RecordedFlight:
     """Read a recorded flight and summarise it, without writing a file.
 
-    If no outcome is given, the outcome in the run's summary is kept. `namespace`, `scenario` and
-    `remaps` have the same meaning as in `read_run`. Raises ParameterError if the log cannot be read
-    or holds no scenario.
+    If `outcome` is None, the flight keeps the outcome that its summary states. `namespace`,
+    `scenario` and `remaps` have the same meaning as in `read_run`. Raises ParameterError if the log
+    cannot be read or holds no scenario.
     """
     return flight_of(read_run(run, namespace, scenario, remaps), run, outcome)
 
 
 def log_account(recorded: RecordedRun) -> Account | None:
-    """Return the account of what a log holds and lacks.
+    """Return an account of what a log holds and what it lacks.
 
-    Returns None if the log has no flight. An imported log needs no scenario. For any other log,
-    returns None if it has no scenario that can be read.
+    Returns None if the log has no flight, or has no scenario that can be read. An imported log
+    needs no scenario.
     """
     if not {*AIRCRAFT_TOPICS} & {*recorded.tape.signals}:
         return None
@@ -139,7 +139,7 @@ def log_account(recorded: RecordedRun) -> Account | None:
 
 
 def scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
-    """Return the scenario that is stored in a log, with a path beside the log.
+    """Return the scenario that is stored in a log. Its path is beside the log.
 
     Raises ParameterError if the log has no valid scenario.
     """
@@ -164,7 +164,7 @@ def flight_of(recorded: RecordedRun, run: Path, outcome: Outcome | None = None) 
 
 
 def _imported_flight(recorded: RecordedRun, name: str, source: Mapping[str, str]) -> RecordedFlight:
-    """Return the flight of an imported log, of which only y and u can be summarised."""
+    """Return the flight of an imported log. Only its y and u can be summarised."""
     recorded.require("y", "u")
     is_alone = recorded.scenario is None
     expected = "none: nothing of a scenario was flown"
@@ -179,7 +179,7 @@ def _imported_flight(recorded: RecordedRun, name: str, source: Mapping[str, str]
 
 
 def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedFlight:
-    """Return the flight of a user's aircraft, given a log that describes only the controller."""
+    """Return the flight of a user's own aircraft, whose log only describes the controller."""
     recorded.require("y", "u")
     controller = recorded_parameters(recorded.scenario_file(), recorded.namespace)
     summary = summarise_own(recorded.tape, controller.law, name, outcome)
@@ -193,7 +193,7 @@ def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedF
 def _scenario_flight(
     recorded: RecordedRun, run: Path, name: str, scenario: Scenario, outcome: Outcome
 ) -> RecordedFlight:
-    """Return the flight of a scenario."""
+    """Return a flight whose log has a scenario, with its summary."""
     log = _with_times_of_messages(recorded)
     engagements = recorded.engagements
     if outcome.end is End.COMPLETED and engagements is None and not has_ticks(log):
@@ -233,9 +233,9 @@ def _scenario_flight(
 def _with_cause(
     error: ParameterError, recorded: RecordedRun, run: Path, outcome: Outcome
 ) -> ParameterError:
-    """Return an UnflownError with the last messages of the nodes if the log lacks y or y_m.
+    """Turn an error into an UnflownError with the last messages of the nodes.
 
-    If the log has y and y_m, return the error itself.
+    This is only done if the log lacks y or y_m. Otherwise the error itself is returned.
     """
     if {"y", "y_m"} <= set(recorded.tape.signals):
         return error
@@ -250,8 +250,7 @@ def _with_cause(
 def _with_times_of_messages(recorded: RecordedRun) -> Tape:
     """Return the tape with the latency and the age of u as further signals.
 
-    In lockstep and in one process there is no latency, because the nodes wait for each other,
-    however long the host takes.
+    In lockstep and in one process there is no latency, because the nodes wait for each other.
     """
     latency = recorded.latency if is_real_time(recorded.tape) else None
     timed = {"latency": latency, "age_of_u": recorded.age_of_u}
@@ -262,7 +261,7 @@ def _with_times_of_messages(recorded: RecordedRun) -> Tape:
 def _controllers(
     recorded: RecordedRun, tape: Tape, scenario: Scenario
 ) -> tuple[FlownController, ...]:
-    """Return the parameters that flew, or () if they did not change in flight."""
+    """Return the controller's parameters that flew, or () if they did not change in flight."""
     if len({span.digest for span in parameter_spans(tape)}) < 2:
         return ()
     changes = recorded_changes(recorded, scenario.controller)
@@ -270,9 +269,9 @@ def _controllers(
 
 
 def _engaged(tape: Tape, engagements: Sequence[Engagement]) -> Tape:
-    """Return the engaged part of a flight with a bridge, from which the metrics are computed.
+    """Return the engaged part of a flight behind a bridge. The metrics are computed from this part.
 
-    If there was no engagement, return the whole tape, so that the duration is known.
+    If there was no engagement, the whole tape is returned, so that the duration is known.
     """
     end_ns = max(
         (int(signal.stamp_ns[-1]) for signal in tape.signals.values() if len(signal.stamp_ns)),
@@ -288,7 +287,7 @@ def _engaged(tape: Tape, engagements: Sequence[Engagement]) -> Tape:
 
 
 def _engagement(tape: Tape, engagement: Engagement) -> dict[str, Any]:
-    """Return when an engagement began and ended, in flight time, s, and why it ended."""
+    """Return the beginning and the end of an engagement, flight time in s, and why it ended."""
     start, stop = (
         (time_ns - tape.start_ns) / NANOSECONDS if time_ns else None
         for time_ns in (engagement.start_ns, engagement.stop_ns)
@@ -297,20 +296,20 @@ def _engagement(tape: Tape, engagement: Engagement) -> dict[str, Any]:
 
 
 def _identity(recorded: RecordedRun) -> dict[str, Any]:
-    """Return the values that identify a flight.
+    """Return the values by which a flight is recognised.
 
-    They are the stamp of t = 0, ns, and the time of day at which the flight started, if it is
-    logged.
+    They are the stamp of t = 0, ns, and the time of day at which the flight started, if the log has
+    it.
     """
     started = recorded.metadata.get(FLIGHT, {}).get("start")
     return {"start_ns": recorded.tape.start_ns, "started": started}
 
 
 def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scenario) -> Outcome:
-    """Return the outcome of a flight from the log, the summary, a launch, or the samples.
+    """Return the outcome of a flight that was stated earlier, or find it from the samples.
 
-    The first of these that has an outcome counts. If nodes were started by hand, only the samples
-    in the log show the outcome.
+    The log, the summary and a launch can state an outcome, and the first of them that does so
+    counts. If nodes were started by hand, only the samples of the log show how the flight ended.
     """
     stated = _stated_outcomes(recorded, folder)
     known = next((outcome for outcome in stated if outcome.end is not End.UNKNOWN), None)
@@ -321,7 +320,7 @@ def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scen
 
 
 def _stated_outcomes(recorded: RecordedRun, folder: Path | None) -> Iterator[Outcome]:
-    """Yield the outcomes that the log, the summary and a launch state."""
+    """Yield the outcomes that the log, the summary and the file of a launch state."""
     if folder is None:
         yield recorded.tape.outcome
         return
@@ -342,7 +341,7 @@ def _stated_outcomes(recorded: RecordedRun, folder: Path | None) -> Iterator[Out
 
 
 def _outcome_in_summary(recorded: RecordedRun, folder: Path) -> Outcome | None:
-    """Return the outcome in the summary of a run, or None if it has no summary of this flight."""
+    """Return the outcome in a run's summary, or None if the summary is not of this flight."""
     with suppress(OSError, ValueError, TypeError, KeyError):
         summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
         if summary["flight"] == _identity(recorded):

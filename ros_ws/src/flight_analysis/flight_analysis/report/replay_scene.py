@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Build the 3-D replay of a report page from the scene of the live view.
+"""Build the 3-D replay of a report page, with the scripts of the live view.
 
-The replay uses the samples of the figures.
+The replay uses the samples that the page holds for its figures.
 """
 
 import re
@@ -32,7 +32,7 @@ MAX_POSES = 6000
 
 
 class Replay(NamedTuple):
-    """What a page needs for the replay, except the samples."""
+    """What a page needs for the 3-D replay, except the samples."""
 
     data: dict[str, Any]
     code: str  # packed scripts
@@ -40,7 +40,7 @@ class Replay(NamedTuple):
 
 
 def replay_of(flight: RecordedFlight, context: PlotContext) -> Replay | None:
-    """Return the replay of a flight, or None if its attitude is not logged.
+    """Return the 3-D replay of a flight, or None if its attitude is not logged.
 
     The poses are added to the samples of the page.
     """
@@ -97,7 +97,7 @@ def _topic(context: PlotContext, signal: Signal, channels: dict[str, str]) -> di
 
 
 def _thinned(pose: Signal) -> Signal:
-    """Return the pose thinned to POSE_RATE, or further to at most MAX_POSES rows."""
+    """Return the pose with fewer samples: at most POSE_RATE, and at most MAX_POSES in all."""
     count = len(pose.stamp_ns)
     span = (pose.stamp_ns[-1] - pose.stamp_ns[0]) / 1e9 if count > 1 else 0.0
     rows = np.unique(
@@ -110,9 +110,9 @@ def _thinned(pose: Signal) -> Signal:
 
 
 def _code() -> str:
-    """Return the scripts as a single JavaScript function that calls itself.
+    """Return the scripts of the replay as a single JavaScript function that calls itself.
 
-    It is made of modules, of which imports, exports, lines of comment and indentation are left out.
+    It joins modules, without their imports, exports, comment lines and indentation.
     """
     text = "\n".join(path.read_text(encoding="utf-8") for path in SCRIPTS)
     text = re.sub(r"^(import |\s*//).*\n|^\s+", "", text, flags=re.MULTILINE)

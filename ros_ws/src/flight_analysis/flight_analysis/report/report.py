@@ -145,7 +145,10 @@ def report(
 
 
 def _require_no_figure(channels: str | Sequence[str], width: str | float) -> None:
-    """Raise ParameterError if channels or a width are given, but no figure that uses them."""
+    """Check that no channels and no width are given. They need a figure.
+
+    Raises ParameterError otherwise.
+    """
     key = "channels" if channels else "width"
     is_default = not channels and width == WIDTH
     require(is_default, key, "no figure to use it for", "a path for figure too")

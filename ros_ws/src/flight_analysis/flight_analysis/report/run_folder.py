@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Create the folder of a run with the attachments of its log, before its flight."""
+"""Create the folder of a run before its flight, with the files that its log attaches."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -47,7 +47,7 @@ def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
 
 
 def remove_empty(*runs: Path) -> None:
-    """Remove the folders of runs that hold no file.
+    """Remove those of the runs' folders that are empty.
 
     The flights of such runs were interrupted before they began.
     """
@@ -63,13 +63,13 @@ def attachments_for(
     further: Sequence[Path] = (),
     replaced: Sequence[str] = (),
 ) -> LogAttachments:
-    """Return the attachments of the log of a flight, and write those that are no files yet.
+    """Return the files that the log of a flight attaches, and write those that do not exist yet.
 
     They are the scenario, the airframe or the user's model of JSBSim, every parameter after
-    validation, the `further` files, and the provenance. The written ones lie in the folder of the
-    run. `overrides` are parameters of the scenario's nodes by the name of the node, or None for a
-    flight without nodes. `replaced` names the nodes of the stack that other nodes replaced, and the
-    attachments state this. Raises ParameterError if a file cannot be written.
+    validation, the `further` files, and the provenance. The new files are written into the folder
+    of the run. `overrides` are parameters of the scenario's nodes by the name of the node, or None
+    for a flight without nodes. `replaced` names the nodes of the stack that other nodes replaced,
+    and the attachments state this. Raises ParameterError if a file cannot be written.
     """
     unflown = {
         name: comment([f"did not fly: {name}; another node took its place"]) for name in replaced

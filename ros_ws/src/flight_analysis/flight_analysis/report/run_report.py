@@ -21,7 +21,7 @@ from flight_log.tape_reader import RecordedRun, read_run
 
 
 class FlightResult(NamedTuple):
-    """A recorded flight with its log and its report.
+    """A recorded flight, its log and its report.
 
     Attributes:
         flight: The flight with its tape and its metrics.
@@ -35,7 +35,7 @@ class FlightResult(NamedTuple):
 
 
 class UnwrittenReportError(ParameterError):
-    """A report could not be written, as on a full disk. `result` still has the flight."""
+    """Raised if a report cannot be written, as on a full disk. `result` still has the flight."""
 
     def __init__(self, sentence: str, result: FlightResult) -> None:
         super().__init__(sentence)
@@ -64,11 +64,11 @@ def rewrite_report(
 ) -> FlightResult:
     """Write scenario, summary.json and report.html of an earlier flight.
 
-    The files are written beside the log, or into the new folder `output`, and runs/latest stays. A
-    `scenario` that replaces the one in the log is not written. Raises ParameterError as
-    `read_flight` does, before any file is written, and UnwrittenReportError if a file cannot be
-    written. If the run lacks y or y_m, summary.json gets the outcome alone, and UnflownError is
-    raised.
+    The files are written beside the log, or into the new folder `output`. The link runs/latest does
+    not change. A `scenario` that replaces the one in the log is not written. Raises ParameterError
+    as `read_flight` does, before any file is written, and UnwrittenReportError if a file cannot be
+    written. If the run lacks y or y_m, only summary.json is written, with the outcome alone, and
+    UnflownError is raised.
     """
     recorded = read_run(run, namespace, scenario, remaps)
     folder = output or folder_of(run)
@@ -95,8 +95,8 @@ def _written(
 ) -> FlightResult:
     """Write the files of a report into a folder, and return the flight with its paths.
 
-    `kept_scenario` is the scenario of the log if it becomes a file. `is_latest` says whether
-    runs/latest becomes a link to the folder. Raises UnwrittenReportError.
+    `kept_scenario` is the scenario of the log, or None if it is not written to a file. If
+    `is_latest` is True, runs/latest becomes a link to the folder. Raises UnwrittenReportError.
     """
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
 
@@ -116,7 +116,7 @@ def _written(
 
 
 def write_empty_summary(run: Path, scenario: Scenario, outcome: Outcome) -> dict[str, Any]:
-    """Write summary.json of a flight that ended before its first sample.
+    """Write summary.json of a flight that ended before its first sample, and return its content.
 
     The log does not change. Raises ParameterError if the file cannot be written.
     """
@@ -135,7 +135,7 @@ def _write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
 def extract_scenario(run: Path, namespace: str | None = None) -> Scenario:
     """Write the scenario that is stored in a log to a file beside the log, and return it.
 
-    Raises ParameterError if the log holds none.
+    Raises ParameterError if the log has no scenario.
     """
     recorded = read_run(run, namespace)
     scenario = scenario_in(recorded, run)

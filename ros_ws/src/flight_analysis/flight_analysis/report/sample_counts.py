@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Count how many samples of each topic of a flight were planned, logged and never sent."""
+"""Count, for each topic of a flight, the samples that were planned, logged and never sent."""
 
 import math
 import re
@@ -42,7 +42,7 @@ SHORT_RUN = 6
 
 
 class TopicAccount(NamedTuple):
-    """The numbers of samples of a topic.
+    """How many samples of a topic were planned, logged and never sent.
 
     Times are flight times in s, and None if there is no sample.
     """
@@ -70,10 +70,11 @@ class TopicAccount(NamedTuple):
         return None if self.expected is None else min(self.found / max(self.expected, 1), 1.0)
 
     def holds(self, count: int) -> bool:
-        """Return whether `count` samples are the whole topic, or the expected number is unknown.
+        """Return whether `count` samples are as good as all that were expected.
 
-        In a short topic one missing sample does not count. The reason is that the first instant may
-        lie just before the beginning of the flight, or the last one just after its end.
+        This is also the case if the expected number is unknown. In a short topic one missing sample
+        does not count, because the first instant may lie just before the beginning of the flight,
+        or the last one just after its end.
         """
         return self.expected is None or count >= min(
             WHOLE * self.expected, max(self.expected - 1, 1)
@@ -81,7 +82,7 @@ class TopicAccount(NamedTuple):
 
 
 class Span(NamedTuple):
-    """The time span of a flight that an account covers."""
+    """The part of a flight in which samples are counted, from its beginning or first sample on."""
 
     end_ns: int  # stamp of the end
     from_start: bool  # whether it begins at t = 0, not at the first sample of a topic
@@ -89,7 +90,7 @@ class Span(NamedTuple):
 
 
 class Leeway(NamedTuple):
-    """How far inside the span of a flight the samples of a topic may begin and end, s."""
+    """How late the first sample of a topic may come, and how early its last one, s."""
 
     begin: float = 0.0  # time from the beginning of the span to the first sample
     # time from the last sample to the end of the span; None if it may be any time
@@ -99,11 +100,11 @@ class Leeway(NamedTuple):
 def topic_accounts(
     tape: Tape, scenario: Scenario | None, span: Span
 ) -> tuple[dict[str, TopicAccount], dict[str, Leeway]]:
-    """Return the account of each topic, and the leeway of the topics that have one.
+    """Return the counts of each topic, and the leeway of each topic that has one.
 
-    The expected number of samples is rate times time. The rate is that of the scenario if a node of
-    the stack sends the samples in the host's time. Otherwise it is that of the log. Ticks of the
-    controller count from the first tick. If a controller or a publisher outside of the stack leaves
+    The expected number of samples is rate times time. If a node of the stack sends the samples in
+    the host's time, the rate comes from the scenario, otherwise from the log. Ticks of the
+    controller count from the first tick on. If a controller or a publisher outside the stack leaves
     out up to a tenth of the samples, these do not count as missing.
     """
     periods = {} if scenario is None else _periods(tape, scenario, simulated=span.simulated)
@@ -141,7 +142,7 @@ def topic_accounts(
 def _expected(
     tape: Tape, scenario: Scenario, span: Span, periods: Mapping[str, int]
 ) -> dict[str, int]:
-    """Return how many samples the log should hold, for each topic for which this is known."""
+    """Return how many samples of each topic the log should hold, if this is known."""
     sensors = scenario.aircraft.sensors
     pose = scenario.aircraft.pose
     expected = {}
@@ -186,7 +187,7 @@ def is_real_time(tape: Tape) -> bool:
 def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, int]:
     """Return the period of each topic that has samples at a fixed rate, ns.
 
-    An aircraft outside of the stack may have no truth and no pose. Commands u_m from outside of the
+    An aircraft outside the stack may publish no truth and no pose. Commands u_m from outside the
     stack have no rate.
     """
     y_m_ns = period_ns(scenario.reference_model.rate, "reference_model.rate")
@@ -208,10 +209,10 @@ def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, in
 
 
 def is_sent_by_stack(tape: Tape, name: str) -> bool:
-    """Return whether a node of the stack sent a topic, as the names of the processes show.
+    """Return whether a node of the stack sent a topic. The log names the nodes that flew.
 
-    A flight in one process has no such names, and counts as the stack's. A controller outside of
-    the stack publishes no `internals`.
+    A flight in one process has no such names, and counts as one of the stack. A controller outside
+    the stack publishes no topic `internals`.
     """
     if name in TICKS and ("internals" in tape or "u" not in tape):
         return True
@@ -230,8 +231,9 @@ def is_simulated(tape: Tape) -> bool:
 def _period(tape: Tape, name: str, nominal_ns: int) -> int:
     """Return the period of the samples of a topic, ns.
 
-    In the host's time, a node of the stack has the period from its parameters. By /clock, a node
-    skips the instants between two messages of the clock, so its period can be longer.
+    In the host's time, a node of the stack has the period of its parameters. If the time comes from
+    the topic /clock, a node skips the instants between two messages of the clock, so its period can
+    be longer.
     """
     is_of_stack = is_sent_by_stack(tape, name)
     if is_of_stack and not tape.is_by_clock:
@@ -244,12 +246,12 @@ def _period(tape: Tape, name: str, nominal_ns: int) -> int:
 
 
 def period_of(stamp_ns: NDArray[np.int64], lost: int, otherwise_ns: int) -> int:
-    """Return the period at which a publisher sent samples, ns, given their stamps, (N,).
+    """Estimate the period at which a publisher sent samples, ns, given their stamps, (N,).
 
     `lost` is the number of lost messages. A steady publisher takes the same time for any STEADY_RUN
     samples, to within an interval, even if a coarse clock makes the intervals differ. If samples
-    are missing, these times scatter. In this case the quickest tenth of short runs shows the
-    period. If there are too few samples, the result is `otherwise_ns`.
+    are missing, these times scatter, so the period follows from the quickest tenth of short runs.
+    If there are too few samples, the result is `otherwise_ns`.
     """
     stamp_ns = np.unique(stamp_ns)
     intervals_ns = np.diff(stamp_ns)
@@ -270,11 +272,11 @@ def period_of(stamp_ns: NDArray[np.int64], lost: int, otherwise_ns: int) -> int:
 
 
 def _with_unsent(tape: Tape, name: str, topic: TopicAccount, step_ns: int) -> TopicAccount:
-    """Return the account of a topic with `unsent`, the samples that its publisher left out.
+    """Return the account of a topic with `unsent`, the number of samples that were never sent.
 
-    `unsent` counts the instants between the first and the last sample without a sample, less the
-    messages that were lost, as their numbers show. Samples with unusable stamps were sent, so they
-    do not count.
+    This is the number of instants without a sample between the first and the last sample, less the
+    messages that were lost, as the numbers of the messages show. Samples with unusable stamps were
+    sent, so they do not count.
     """
     recording = tape.recording.get(name, Recording(0))
     if (
@@ -290,10 +292,10 @@ def _with_unsent(tape: Tape, name: str, topic: TopicAccount, step_ns: int) -> To
 
 
 def _of_foreign(topic: TopicAccount) -> TopicAccount:
-    """Return the account of a topic whose publisher is outside of the stack.
+    """Return the account of a topic whose publisher is outside the stack.
 
-    Its planned samples are unknown. What it sent counts as the whole topic if it left out at most a
-    tenth of the samples, and no gap is longer than SILENCE.
+    It is unknown how many samples such a publisher planned. What it sent counts as complete if it
+    left out at most a tenth of the samples, and no gap is longer than SILENCE.
     """
     is_silent = topic.gap is not None and topic.gap > SILENCE
     if topic.expected is None or is_silent or topic.unsent > (1.0 - LEAST) * topic.expected:
@@ -316,7 +318,7 @@ def ends_last(tape: Tape, name: str) -> bool:
 
 
 def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
-    """Return for how many instants, from the last sample to the end, a publisher sent nothing.
+    """Return at how many instants, from the last sample to the end, a publisher sent nothing.
 
     The result is 0 unless the log proves that the publisher did not send. For this, the numbers of
     the messages must show that none was lost, and the topic must have a sample after the end. A
@@ -347,8 +349,8 @@ def _ticks(tape: Tape, scenario: Scenario, span: Span) -> tuple[int, float]:
     """Return the number of the controller's ticks up to the end, and the engaged time, s.
 
     Each controller numbers its ticks from 1, so the ticks are counted for each publisher. If y and
-    y_m come from nodes of the user, the controller can fly before t = 0. Such ticks do not count in
-    an account from t = 0.
+    y_m come from nodes of the user, the controller can fly before t = 0. If the flight is counted
+    from t = 0 on, such ticks do not count.
     """
     end_ns = span.end_ns
     step_ns = period_ns(scenario.controller.rate, "controller.rate")
@@ -395,9 +397,9 @@ def _ticks(tape: Tape, scenario: Scenario, span: Span) -> tuple[int, float]:
 def _instants_with_y(tape: Tape, internals: Signal, step_ns: int) -> int:
     """Return the number of ticks that have a new y or are in a failsafe.
 
-    The controller publishes u only if there is a new y. An aircraft outside of the stack has
-    another rate of y, and a sensor may be declared to drop samples. Samples that the log lost are
-    counted as well, because the controller received them.
+    Only in these ticks the controller publishes u. They are counted if an aircraft outside the
+    stack has another rate of y, or if a sensor is declared to drop samples. A y that only the log
+    lost is counted as well, because the controller received it.
     """
     age_ns = internals["age"] * NANOSECONDS
     first_tick_ns = internals.stamp_ns[0] + age_ns[0]
@@ -439,9 +441,9 @@ def _topic(
 
 
 def _leeways(scenario: Scenario) -> dict[str, Leeway]:
-    """Return the leeway of each topic with a delay.
+    """Return the leeway of each topic whose samples are delayed.
 
-    The leeway is the delay of the topic. For the pose, a period of the pose is added.
+    The leeway is the delay of the topic. The pose also has a leeway of one of its periods.
     """
     aircraft = scenario.aircraft
     of_y = aircraft.sensors.delay

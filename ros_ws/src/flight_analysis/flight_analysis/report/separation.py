@@ -23,7 +23,7 @@ PLACE = ("north", "east", "altitude")  # m
 
 
 class Track(NamedTuple):
-    """The positions of an aircraft over time, in the channels PLACE, and the origin of its map."""
+    """The positions of an aircraft over time, in the channels of PLACE, and its map's origin."""
 
     start_ns: int  # stamp of t = 0 of this aircraft's flight
     place: Signal
@@ -39,7 +39,10 @@ class Approach:
 
 
 def place_of(tape: Tape) -> Signal | None:
-    """Return where an aircraft was, from the true pose if logged, or None without a pose."""
+    """Return where an aircraft was: the true position if it is logged, else the measured one.
+
+    Returns None if there is no pose.
+    """
     pose = best_pose(tape)
     if pose is None or not set(PLACE) <= set(pose.names):
         return None
@@ -49,9 +52,9 @@ def place_of(tape: Tape) -> Signal | None:
 def approach(first: Signal, second: Signal) -> Approach | None:
     """Return the least distance of two aircraft, or None if they have no time in common.
 
-    Between two samples each aircraft moves in a straight line. Let d_0 and d_1 be the differences
-    of their positions at the ends of such an interval, and v = d_1 - d_0. They are nearest at the
-    fraction -d_0 v / v^2 of the interval, if this lies between 0 and 1.
+    Between two samples each aircraft is taken to move in a straight line. Let d_0 and d_1 be the
+    differences of the two positions at the ends of such an interval, and v = d_1 - d_0. The
+    aircraft are nearest at the fraction -d_0 v / v^2 of the interval, if this lies between 0 and 1.
     """
     begin_ns = max(int(first.stamp_ns[0]), int(second.stamp_ns[0]))
     end_ns = min(int(first.stamp_ns[-1]), int(second.stamp_ns[-1]))
@@ -76,7 +79,7 @@ def approach(first: Signal, second: Signal) -> Approach | None:
 
 
 def _at(signal: Signal, t: FloatArray, begin_ns: int) -> FloatArray:
-    """Return the positions at the times t, (N, 3), where t is in ns since `begin_ns`."""
+    """Interpolate the positions to the times t, (N, 3), where t is in ns since `begin_ns`."""
     own = (signal.stamp_ns - begin_ns).astype(float)
     return np.column_stack([np.interp(t, own, signal[name]) for name in PLACE])
 

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Judge whether a completed or landed flight did what it should, and name its shortfalls.
+"""Judge whether a flight that was completed or landed did what it should.
 
-A flight succeeds if
+What it did not do are its shortfalls. A flight succeeds if
 
 - the law was engaged in at least the fraction ENGAGED of the ticks in which it should fly,
-- y_m was that of the scenario (`flown_reference`),
-- the linear loop allows the error of each output (`tracking`),
+- y_m was the one that the scenario commands (`flown_reference`),
+- the error of each output is at most what the linear loop allows (`tracking`),
 - the airspeed stayed above the stall speed, and the aircraft above the ground and between the
   altitudes of guidance,
 - the aircraft stayed inside the fence, flew every leg of the route and joined the last orbit,
@@ -59,9 +59,9 @@ def judge(
     account: Account,
     controller: ControllerConfig | None = None,
 ) -> Outcome:
-    """Return the outcome of a flight with its shortfalls, or without any if it ended early.
+    """Return the outcome of a flight with its shortfalls. A flight that ended early has none.
 
-    Without a scenario, `controller` must be given. Without either, errors are not judged.
+    If `scenario` is None, `controller` must be given, or else errors are not judged.
     """
     starved = account.starvation
     seems_unflown = outcome.end is End.NEVER_FLEW or account.late is not None
@@ -115,7 +115,7 @@ def judge(
 
 
 def _incomplete(lack: str) -> Shortfall:
-    """Return what the log lacks as a shortfall."""
+    """Return a shortfall for something that the log lacks."""
     brief = f"log incomplete: {lack.partition(',')[0]}"
     return Shortfall(aim=Aim.LOG, sentence=f"log incomplete: {lack}", brief=brief)
 
@@ -130,7 +130,7 @@ def _never_flown_by_host(starved: Starvation, end: float) -> Outcome:
 def _may_pause(tape: Tape, scenario: Scenario | None) -> bool:
     """Return whether the law may be inactive at times, because somebody else decides about it.
 
-    Behind a bridge the autopilot decides, and with `start_active: false` the user. In any other
+    Behind a bridge the autopilot decides. With `start_active: false` the user decides. In any other
     simulated flight, the law must fly from its first u to the end.
     """
     if scenario is None or not is_simulated(tape):
@@ -187,7 +187,7 @@ def _height(
 
 
 def _guided(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Shortfall]:
-    """Return the shortfalls of a guided flight."""
+    """Return the shortfalls of a guided flight: stall, altitude, fence, route and touch-down."""
     shortfalls = [*_stall(tape, section)]
     altitude = altitude_excess(tape, section)
     if altitude is not None and altitude.outside_s:
@@ -215,7 +215,7 @@ def _guided(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Sh
 
 
 def _failed_steps(tape: Tape) -> list[Shortfall]:
-    """Return a shortfall if steps of guidance failed, so that the earlier commands went on."""
+    """Return a shortfall if steps of guidance failed, so that earlier commands were kept."""
     count = int(tape["guidance"]["failed"].max())
     if not count:
         return []
@@ -253,7 +253,7 @@ def _stall(tape: Tape, section: GuidanceConfig) -> list[Shortfall]:
 
 
 def _route(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Shortfall]:
-    """Return the shortfalls for missed legs, legs not flown, and a last orbit not joined."""
+    """Return shortfalls for legs that were missed or not flown, and a last orbit not joined."""
     shortfalls = []
     for leg in flown_legs(tape):
         if leg.missed:

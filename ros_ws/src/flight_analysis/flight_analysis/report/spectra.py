@@ -18,10 +18,10 @@ MAX_WINDOW = 8192
 def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Return the frequencies, Hz, and each channel's amplitude spectral density, unit / sqrt(Hz).
 
-    The method is that of Welch (1967). The Hann windows overlap by half, and the mean of each is
+    The method is that of Welch (1967). The Hann windows overlap by half, and each has its mean
     removed. A window spans a tenth of the flight, but at most MAX_WINDOW. If a sample is missing,
-    the last one is repeated for at most LONGEST_INTERVAL, because a gap of the log can have any
-    length. The square of the density, integrated over the frequencies, is the variance.
+    the last one is repeated, but for at most LONGEST_INTERVAL, because a gap of the log can have
+    any length. The square of the density, integrated over the frequencies, is the variance.
     """
     places = np.round((signal.stamp_ns - signal.stamp_ns[0]) / period_ns).astype(np.int64)
     longest = max(round(LONGEST_INTERVAL * NANOSECONDS / period_ns), 1)
@@ -36,8 +36,8 @@ def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, Float
 def _welch(values: FloatArray, rate: float, window: int) -> tuple[FloatArray, FloatArray]:
     """Return the frequencies, Hz, and the one-sided power spectral density of each column, (F, m).
 
-    The result is that of `scipy.signal.welch`. scipy.signal is not used, because it takes half a
-    second to load. A whole flight in one process takes only ten times as long.
+    The result equals that of `scipy.signal.welch`. SciPy's function is not used, because loading it
+    takes half a second, a tenth of the time of a whole flight in one process.
     """
     hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(window) / window)
     # (parts, m, window)

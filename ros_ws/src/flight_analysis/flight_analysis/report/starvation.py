@@ -34,7 +34,10 @@ osprey has settled by then."""
 
 
 class Starvation(NamedTuple):
-    """The spans of a flight that say nothing about the law, s of flight time, in order."""
+    """The spans of a flight in which the host was too busy, flight time in s, in order.
+
+    These spans say nothing about the law.
+    """
 
     spans: tuple[tuple[float, float], ...] = ()
 
@@ -44,7 +47,7 @@ class Starvation(NamedTuple):
         return math.fsum(stop - start for start, stop in self.spans)
 
     def holds(self, t: FloatArray) -> NDArray[np.bool_]:
-        """Return the mask of the instants t, (N,), that lie within a span."""
+        """Return a mask of the instants t, (N,), that lie within a span."""
         inside = np.zeros(len(t), dtype=bool)
         for start, stop in self.spans:
             inside |= (t >= start) & (t <= stop)
@@ -56,9 +59,9 @@ def starvation(
 ) -> Starvation:
     """Return the spans in which the host was too busy to run the nodes.
 
-    Each span is longer by the time RECOVERY, in which the flight recovers. `end` is the length of
-    the flight, s. There are no such spans in lockstep, in one process or by the clock of a
-    simulator.
+    Each span is lengthened by RECOVERY, because the errors that it caused decay only after it.
+    `end` is the length of the flight, s. There are no such spans in lockstep, in one process or by
+    the clock of a simulator.
     """
     if not is_real_time(tape) or tape.is_by_clock or end <= 0.0:
         return Starvation()
@@ -93,7 +96,7 @@ def starvation(
 
 
 def _missing(tape: Tape, name: str, period: float, step: float, count: int) -> NDArray[np.bool_]:
-    """Return the mask of the instants k * step for which a node sent no sample, (count,).
+    """Return a mask of the instants k * step at which a node should have sent a sample, (count,).
 
     `period` is the period of the samples, s, and is at least a step.
     """
@@ -116,7 +119,7 @@ def _missing(tape: Tape, name: str, period: float, step: float, count: int) -> N
 
 
 def _windowed(is_missing: NDArray[np.bool_], length: int) -> FloatArray:
-    """Return how many of the `length` instants around each instant are missing, (N,)."""
+    """Count, for each instant, the missing ones among the `length` instants around it, (N,)."""
     total = np.concatenate([[0.0], np.cumsum(is_missing)])
     k = np.arange(len(is_missing))
     first = np.maximum(k - length // 2, 0)

@@ -75,9 +75,9 @@ from flight_log.log_messages import LogMessage
 
 
 def command_edges(scenario: Scenario) -> list[Transient]:
-    """Return the edges of the scenario's commands as transients, in order of time.
+    """Return the changes of the scenario's commands as transients, in order of time.
 
-    These are the edges of its pulses, doublets and ramps.
+    They are the edges of its pulses, doublets and ramps.
     """
     edges = [
         Transient(kind="command", name=name, start=edge.start, stop=edge.stop)
@@ -89,11 +89,11 @@ def command_edges(scenario: Scenario) -> list[Transient]:
 
 
 def transients(scenario: Scenario, tape: Tape, *, follows_scenario: bool = True) -> list[Transient]:
-    """Return the transients of a flight, which are engagements, commands and gusts.
+    """Return the transients of a flight: engagements, commands and gusts.
 
     From the first live command on, live commands replace those of the scenario. In a guided flight,
     turns and captures replace commands. If `follows_scenario` is False, y_m did not follow the
-    commands of the scenario, and they are left out.
+    scenario's commands, so these commands are left out.
     """
     windows = scenario.gust_windows() if is_simulated(tape) else {}
     gusts = [
@@ -116,7 +116,7 @@ def transients(scenario: Scenario, tape: Tape, *, follows_scenario: bool = True)
 class RecordedFlight(NamedTuple):
     """A recorded flight, with its tape, its scenario and its summary.
 
-    It has the name of the run. Figures, tables, exports and comparisons are made from it.
+    Its name is the name of the run. Figures, tables, exports and comparisons are made from it.
     """
 
     name: str
@@ -162,7 +162,7 @@ class RecordedFlight(NamedTuple):
 
 
 def labels(flights: Sequence[RecordedFlight]) -> list[str]:
-    """Return a label for each flight, which is its name, with a number if names are equal."""
+    """Return a label for each flight: its name, with a number if two names are equal."""
     names = [flight.name for flight in flights]
     return [
         f"{name} ({k})" if names.count(name) > 1 else name for k, name in enumerate(names, start=1)
@@ -256,7 +256,7 @@ def summarise(
 
 
 def _flown_scenario(tape: Tape, scenario: Scenario | None) -> Scenario:
-    """Return the given scenario or that of the tape. Raises ParameterError without a scenario."""
+    """Return `scenario`, or else the tape's scenario. Raises ParameterError without a scenario."""
     of_flight = as_tape(tape).scenario if scenario is None else scenario
     require(
         of_flight is not None,
@@ -268,7 +268,7 @@ def _flown_scenario(tape: Tape, scenario: Scenario | None) -> Scenario:
 
 
 def _require_topics(tape: Tape) -> None:
-    """Raise ParameterError if a tape lacks y or y_m."""
+    """Check that a tape has y and y_m. Raises ParameterError if it lacks one."""
     for topic in ("y", "y_m"):
         unset = " with a stamp" if topic in tape.recording and tape.recording[topic].unset else ""
         refusal = f" ({refusal_note(topic, tape.refused[topic])})" if topic in tape.refused else ""
@@ -277,15 +277,16 @@ def _require_topics(tape: Tape) -> None:
 
 
 def _finite(metrics: TickMetrics | LatencyMetrics | AgeMetrics | None) -> dict[str, Any] | None:
-    """Return metrics by name, or None if any is not finite."""
+    """Return metrics by name, or None if one of them is not finite."""
     return metrics._asdict() if metrics is not None and np.isfinite(metrics).all() else None
 
 
 def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
-    """Return the metrics of a flight that the stack did not fly.
+    """Return the metrics of an imported log, whose flight was not flown by this stack.
 
-    The result has metrics of y and u about trim, and an account of the topics. Such a flight has no
-    reference, so it has no error. `source` is the metadata record IMPORTED of `rise-di import`.
+    The result has metrics of y and u about trim, and the counts of samples by topic. Such a flight
+    has no reference y_m, so it has no error. `source` is the metadata record IMPORTED of `rise-di
+    import`.
     """
     flight_account = account(tape, None)
     deviations = {}
@@ -307,7 +308,7 @@ def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
 
 
 def summarise_own(tape: Tape, law: str, log: str, outcome: Outcome) -> dict[str, Any]:
-    """Return the metrics of a flight of a user's aircraft, which its log does not describe.
+    """Return the metrics of a flight of a user's own aircraft, which the log does not describe.
 
     The errors are computed from the measured y. Nothing is judged, because there is no model of the
     aircraft.
@@ -326,8 +327,8 @@ def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
     """Return a sentence if u at the aircraft is older than `controller.delay` by a period or more.
 
     The linear loop is computed with the delay that the controller was told. Any further delay uses
-    up the delay margin of this loop, which the sentence states. If there is no linear model, there
-    is no sentence.
+    up the delay margin of this loop. The sentence states this margin. If there is no linear model,
+    there is no sentence.
     """
     controller = scenario.controller
     if age is None or age.mean - controller.delay < 1.0 / controller.rate:
@@ -398,11 +399,11 @@ STANDS_STILL = 5.0  # s; a vane that stands still longer at the end of a flight 
 def _with_late_ticks(
     flight_account: Account, ticks: TickMetrics | None, scenario: Scenario
 ) -> Account:
-    """Return the account, which says that the host is too busy if too many ticks had no new y.
+    """Return the account with a sentence on the busy host if too many ticks had no new y.
 
     These ticks are the host's fault only if the log has every y, and if y comes at least about as
-    often as the controller ticks. In any other case, such as a y from outside of the stack, the
-    account stays.
+    often as the controller ticks. In any other case, for example if y comes from outside the stack,
+    the account is returned as it is.
     """
     log_complete = (
         not (flight_account.over("y", "internals") and not flight_account.busy)
@@ -458,7 +459,7 @@ def taken_over(summary: Mapping[str, Any], table: str) -> str:
 
 
 def is_in_host_time(summary: Mapping[str, Any]) -> bool:
-    """Return whether a flight was flown by the clock of its host, so that its delays are known."""
+    """Return whether a flight was flown by its host's clock, so that its delays are known."""
     return bool(summary["flight"]) and summary["flight"]["start_ns"] > SINCE_EPOCH_NS
 
 
@@ -468,10 +469,10 @@ def time_flown(summary: Mapping[str, Any]) -> str:
 
 
 def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
-    """Return sentences on the engagements of a flight with a bridge.
+    """Return sentences on the engagements of a flight behind a bridge.
 
-    `has_figures` is False if they are so short that no y lies in them. The metrics are then those
-    of the whole flight.
+    `has_figures` is False if the engagements are so short that no y lies in them. The metrics are
+    then those of the whole flight.
     """
     if not engagements:
         return ["never engaged: the figures are of an aircraft that this controller did not fly"]
@@ -492,7 +493,7 @@ def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: b
 
 
 def mode_notes(tape: Tape, part: str) -> list[str]:
-    """Return a sentence if, in more than 1 % of the ticks, the law was not engaged.
+    """Return a sentence if the law was not engaged in more than 1 % of the ticks.
 
     Ticks count from the first engagement on. `part` says which part of the ticks the log has, as in
     "over 49 % of internals", or is "" if it has all.
@@ -515,7 +516,10 @@ def mode_notes(tape: Tape, part: str) -> list[str]:
 
 
 def vane_notes(tape: Tape) -> list[str]:
-    """Return a sentence for each vane of an observer that stands still at the end of a flight."""
+    """Return a sentence for each vane that stands still at the end of a flight.
+
+    A vane measures angle of attack or sideslip for an observer.
+    """
     if "internals" not in tape:
         return []
     measures = tape["internals"].group("vane_measures")

@@ -26,7 +26,7 @@ MILLISECONDS = DisplayUnit(unit="ms", factor=1e3)
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """A column of a table, which shows a metric of a summary.
+    """A column of a table: how to find and write one metric of a summary.
 
     `head` is the heading of the column. `group` is the heading above it that neighbouring columns
     share. `path` has the keys that lead to the metric in a summary.
@@ -40,13 +40,13 @@ class Column:
 
     @property
     def label(self) -> str:
-        """The whole heading, including the group."""
+        """The whole heading: the group and then the head."""
         return f"{self.group} {self.head}".strip()
 
     def value(self, figures: Mapping[str, Any]) -> float | None:
         """Return the metric, SI, or None if there is none.
 
-        `path` leads to it from `figures`, a part of the summary.
+        `figures` is the part of the summary in which `path` begins.
         """
         value: Any = figures
         for key in self.path:
@@ -116,7 +116,10 @@ HELD_COLUMNS = (
 
 
 def _ms(group: str, topic: str, **heads: str) -> tuple[Column, ...]:
-    """Return columns for times, ms, of one topic of the summary, given a heading for each key."""
+    """Return columns for times, ms, in the entry `topic` of a summary.
+
+    `heads` has the heading of each column by the key of its metric.
+    """
     return tuple(
         Column(group=group, head=head, path=(topic, key), unit=MILLISECONDS, decimals=3)
         for key, head in heads.items()
@@ -143,7 +146,10 @@ TIMING_COLUMNS = (
 
 
 def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[Column, ...]:
-    """Return the columns with a value. A part of the flight that did not occur has no value."""
+    """Return those of the columns that have a value for a channel.
+
+    For example, a flight without gusts has no value in the columns of gusts.
+    """
     return tuple(
         column
         for column in columns
@@ -154,10 +160,11 @@ def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[
 def model_rows(
     models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]
 ) -> tuple[list[str], list[list[str]]]:
-    """Return the headings and rows of "models" in a summary.
+    """Return the headings and rows of a table of "models", the entry of a summary.
 
-    A row has the model, the times at which it flew, and the rms of the errors. If the log has the
-    guarantee of a learned model, a column has the deviations within which every aircraft is stable.
+    A row has the name of a model, the times at which it flew, and the rms of the errors. If the log
+    has the guarantee of a learned model, a further column has the number of standard deviations
+    within which every aircraft is stable.
     """
     channels = list(models[0]["rms"]) if models else []
     headings = ["from (s)", "to (s)", *(f"{name} ({units[name].unit})" for name in channels)]
@@ -174,7 +181,7 @@ def model_rows(
 
 
 def stated_deviations(number: float) -> str:
-    """Return as text the number of deviations within which something is proved, rounded down."""
+    """Write a proved number of standard deviations as text, rounded down."""
     return f"{math.floor(10.0 * number + 1e-9) / 10.0:.1f}"
 
 
@@ -193,10 +200,10 @@ def table_rows(
 
 
 def timing_rows(summary: Mapping[str, Any], *, is_timed: bool) -> list[tuple[str, str, str]]:
-    """Return the rows of the timing of the controller, one for all metrics with the same heading.
+    """Return the rows of a table of the controller's timing, one for all metrics of a group.
 
-    A row has the topic of the summary, the heading with its unit, and the values. If `is_timed` is
-    False, the host did not time the flight, and rows with times are left out.
+    A row has the entry of the summary, the heading with its unit, and the values. If `is_timed` is
+    False, the flight was not flown by the host's clock, and rows with times are left out.
     """
     rows = []
     shown = [column for column in TIMING_COLUMNS if is_timed or column.unit is not MILLISECONDS]
@@ -215,9 +222,10 @@ def timing_rows(summary: Mapping[str, Any], *, is_timed: bool) -> list[tuple[str
 def segment_table(
     segments: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]
 ) -> tuple[list[Column], list[list[str]]]:
-    """Return the columns and rows of a table on what guidance held in each segment.
+    """Return the columns and rows of a table of the quantities that guidance held in each segment.
 
-    A quantity without a unit in `units` has its unit from QUANTITY_UNITS.
+    A segment is a span of time with the same modes and commands. A quantity without a unit in
+    `units` has its unit from QUANTITY_UNITS.
     """
     units = {**QUANTITY_UNITS, **units}
     columns = [Column(group="", head=head) for head in ("from (s)", "to (s)")]

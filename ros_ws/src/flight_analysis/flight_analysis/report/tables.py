@@ -47,7 +47,7 @@ TIMES = ("jitter", "age of y", "age of u")  # words of the glossary
 
 
 class MetricTable(NamedTuple):
-    """A table whose first column has the names of the rows, and is followed by `columns`.
+    """A table whose first column has the names of the rows. `columns` describes the other columns.
 
     `note` has remarks on this table. The glossary explains its headings, and the words `of_rows`,
     which occur in the names of the rows.
@@ -88,7 +88,7 @@ class MetricTable(NamedTuple):
 
     @property
     def group_starts(self) -> list[bool]:
-        """Whether each column starts a group. A column without a group does."""
+        """Whether each column starts a group of columns. A column without a group always does."""
         groups = [column.group for column in self.columns]
         return [
             not group or group != before
@@ -102,10 +102,10 @@ NUMBER = re.compile(r"[-+>\s]*\d+(?:\.(\d+))?")
 
 
 def aligned(cells: Sequence[str]) -> list[str]:
-    """Return the cells of a column, with spaces for the decimals that a number lacks.
+    """Return the cells of a column, filled with spaces where a number has fewer decimals.
 
-    If the column is aligned right, its decimal points are then aligned as well. Cells that are not
-    numbers stay as they are.
+    So the decimal points are aligned if the column is aligned right. Cells that are not numbers
+    stay as they are.
     """
     numbers = [NUMBER.fullmatch(cell) for cell in cells]
     decimals = [len(number[1] or "") if number else 0 for number in numbers]
@@ -118,7 +118,7 @@ def aligned(cells: Sequence[str]) -> list[str]:
 
 
 class EventInterval(NamedTuple):
-    """A gust, a fault, a failsafe mode, a saturation or a vane that stands still.
+    """An event: a gust, a fault, a failsafe mode, a saturation, or a vane that stands still.
 
     It lasts from `start` to `stop`, s.
     """
@@ -130,10 +130,10 @@ class EventInterval(NamedTuple):
 
 
 def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.bool_]:
-    """Return the mask of the ticks in which a vane stands still, shape (N,).
+    """Return a mask of the ticks in which a vane stands still, shape (N,).
 
-    After an engagement, ticks count from the moment at which the vane has moved, or `time` s have
-    passed.
+    After an engagement, a vane is only said to stand still once it has moved, or once `time` s have
+    passed. `measures` is 1 in the ticks in which the vane is in use, and 0 while it stands still.
     """
     internals = tape["internals"]
     t = tape.time("internals")
@@ -207,7 +207,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
 def metric_tables(
     summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
 ) -> list[MetricTable]:
-    """Return the tables of error, inputs, guidance, models and ticks, if they have rows.
+    """Return the tables of error, inputs, guidance, models and timing. Empty tables are left out.
 
     Both the page and the terminal show these tables.
     """
@@ -302,7 +302,7 @@ def _guidance_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
 def model_table(
     models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit], part: str
 ) -> MetricTable:
-    """Return a table of the rms errors before the first learned model, and under every model.
+    """Return a table of rms errors: before the first learned model, and with each model.
 
     `part` is the end of the caption. If the log has only a part of the flight, it names this part.
     """
@@ -314,7 +314,7 @@ def model_table(
 
 
 def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
-    """Return the table of the controller's timing, or of only the tick counts in simulated time."""
+    """Return the table of the controller's timing. In simulated time it has only tick counts."""
     caption = f"Ticks of the controller{taken_over(summary, 'ticks')}"
     rows = []
     for topic, label, text in timing_rows(summary, is_timed=is_in_host_time(summary)):

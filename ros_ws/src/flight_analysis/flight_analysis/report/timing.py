@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measure the timing of the ticks of a flight, and the latency and the age of u."""
+"""Measure the timing of the controller's ticks, and the latency and the age of u."""
 
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ class TickMetrics(NamedTuple):
 
 
 class AgeMetrics(NamedTuple):
-    """The age of u at the aircraft, s, which is the delay of the whole loop from y to u."""
+    """The age of u at the aircraft, s: the delay of the whole loop from y to u."""
 
     mean: float
     max: float
@@ -44,7 +44,8 @@ class LatencyMetrics(NamedTuple):
 def tick_periods(tape: Tape) -> NDArray[np.int64]:
     """Return the time between successive ticks of the controller, ns, shape (N - 1,).
 
-    The instant of a tick is its stamp plus "age". It is also the deadline of the tick plus "late".
+    The instant of a tick is the stamp of its sample plus the channel "age". It is also the deadline
+    of the tick plus the channel "late".
     """
     internals = tape["internals"]
     return np.diff(internals.stamp_ns + np.round(internals["age"] * 1e9).astype(np.int64))
@@ -53,8 +54,8 @@ def tick_periods(tape: Tape) -> NDArray[np.int64]:
 def tick_metrics(tape: Tape, period_ns: int) -> TickMetrics | None:
     """Return the metrics of the controller's ticks, or None if there are fewer than two.
 
-    `internals` holds only ticks with a new y. A period without a tick there counts as one without a
-    new y, although the tick may have been missed.
+    The topic `internals` only has ticks with a new y. A period without such a tick counts as one
+    without a new y, although the controller may have missed the tick.
     """
     internals = tape["internals"]
     if len(internals.stamp_ns) < 2:

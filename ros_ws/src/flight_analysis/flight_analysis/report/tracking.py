@@ -83,7 +83,7 @@ SIDE = 0.1  # share of the ticks at either limit
 
 
 class Excess(NamedTuple):
-    """The rms error of an output over a part of a flight, and the allowed error there, SI."""
+    """The rms error of an output over a part of a flight, and the error allowed there, SI."""
 
     output: str
     start: float  # s
@@ -95,7 +95,7 @@ class Excess(NamedTuple):
 
 
 class TrackingVerdict(NamedTuple):
-    """The verdict on the errors of a flight."""
+    """The verdict on the tracking errors of a flight."""
 
     shortfalls: list[Shortfall]
     allowances: list[Allowance]
@@ -112,11 +112,11 @@ def tracking_verdict(
     may_pause: bool = True,
     starved: Starvation | None = None,
 ) -> TrackingVerdict:
-    """Return the outputs whose error is too large, and those that noise or wind excuses.
+    """Judge the tracking errors: return those that are too large, and those that are excused.
 
-    Each output comes with the worst part of the flight. If `may_pause` is True, ticks of an
-    inactive controller do not count. The spans `starved`, in which the host was too busy, do not
-    count either.
+    Noise or wind can excuse an error. Each error is that of an output in the worst part of the
+    flight. If `may_pause` is True, ticks of an inactive controller do not count. The spans
+    `starved`, in which the host was too busy, do not count either.
     """
     nothing = TrackingVerdict([], [])
     if not {"y", "y_m"} <= set(tape.signals):
@@ -134,7 +134,7 @@ def tracking_verdict(
 
 
 def _verdict(pair: ErrorPair, aircraft: AircraftConfig | None) -> TrackingVerdict:
-    """Return the verdict on the errors in the ticks that count."""
+    """Judge the errors in the ticks that count, which are those of `pair.is_flown`."""
     if not pair.is_flown.any():
         sentence = "no error in the log while the law was engaged"
         return TrackingVerdict([Shortfall(aim=Aim.LOG, sentence=sentence)], [])
@@ -178,7 +178,10 @@ def _has_engaged(tape: Tape) -> bool:
 
 
 def _floor(pair: ErrorPair, i: int, unit: str) -> float:
-    """Return the floor in the allowed error of output i, SI. `unit` is the unit of the output."""
+    """Return the floor of the allowed error of output i, SI: a part that is always allowed.
+
+    `unit` is the unit of the output.
+    """
     is_speed = quantity(unit).dimension == SPEED
     smallest = LEAST[AIRSPEED] if is_speed else LEAST_RATE
     if pair.knowledge.has_wind:
@@ -196,7 +199,7 @@ def _drag(pair: ErrorPair, i: int, speed: float) -> float:
 
 
 def _most(unit: str) -> float:
-    """Return the upper limit of the excuse, SI, for an output with this unit."""
+    """Return the largest excuse for noise and wind, SI, of an output with this unit."""
     return MOST[AIRSPEED] if quantity(unit).dimension == SPEED else MOST_RATE
 
 
@@ -204,8 +207,8 @@ def _excesses(pair: ErrorPair, i: int, group: list[int], limits: _Limits) -> lis
     """Return the worst parts of the flight for output i.
 
     There are up to two for each span in which the law flew, and two for the last END of the flight.
-    A span shorter than END is left out, unless all are. `group` holds the outputs of the same kind,
-    which are the airspeed or the rates.
+    Spans shorter than END are left out if there is a longer one. `group` holds the outputs of the
+    same kind as output i, which is the airspeed or the rates.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], pair.is_flown, [False]])))
     spans = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
@@ -271,13 +274,13 @@ def _ticks(pair: ErrorPair, length: float) -> int:
 
 
 def _sums(values: FloatArray, count: int) -> FloatArray:
-    """Return the sums over every `count` successive values."""
+    """Return the sum of every `count` successive values."""
     total = np.concatenate([[0.0], np.cumsum(values)])
     return np.asarray(total[count:] - total[:-count])
 
 
 def _shortfall(excess: Excess, pair: ErrorPair, i: int, unit: DisplayUnit) -> Shortfall:
-    """Return the shortfall for an error that is too large, with its period if it oscillates."""
+    """Return a shortfall for an error that is too large. If it oscillates, its cycle is stated."""
     rms, allowed = unlike_numbers(excess.rms * unit.factor, excess.allowed * unit.factor)
     brief = f"{excess.output} off by {rms} {unit.unit} rms, {allowed} allowed"
     sentence = f"{brief}, from t = {excess.start:.1f} to {excess.stop:.1f} s"
@@ -295,7 +298,7 @@ def _shortfall(excess: Excess, pair: ErrorPair, i: int, unit: DisplayUnit) -> Sh
 
 
 def _allowance(excess: Excess, unit: DisplayUnit) -> Allowance:
-    """Return the allowance for an error that noise or wind causes."""
+    """Return an allowance: a remark on an error that is allowed because of noise or wind."""
     rms = plain_number(excess.rms * unit.factor)
     cause = "sensor noise" if excess.is_noise else "wind"
     sentence = f"{excess.output} off by {rms} {unit.unit} rms, allowed for {cause}"
@@ -303,7 +306,7 @@ def _allowance(excess: Excess, unit: DisplayUnit) -> Allowance:
 
 
 def saturation_notes(tape: Tape) -> list[str]:
-    """Return sentences on inputs that go from limit to limit in most ticks of a WINDOW.
+    """Return sentences on inputs that jump between their two limits in most ticks of a WINDOW.
 
     Such an input is at a limit in at least the share SATURATED of the ticks, and at each of its two
     limits in at least the share SIDE. A throttle that is full in a climb is at one limit only, so
