@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lock a MAVLink link to the first autopilot.
+"""Accept the messages of only one autopilot on a MAVLink link.
 
 An autopilot is identified by the address of its packets, and by the time since boot in its
 messages.
@@ -15,13 +15,13 @@ CLOCK_TOLERANCE_NS = NANOSECONDS
 
 
 class AutopilotLock:
-    """Locks to the first autopilot until it is silent, and then to the next one.
+    """Admits one autopilot: the first one until it is silent, and then the next one.
 
-    Two autopilots behind the same address differ by the time since boot in their messages. In the
-    messages of one autopilot this time never goes back. It advances no faster than the clock of
-    this host, except after a message that was late. An autopilot that starts again counts as a
-    second sender at first. Once the messages of its earlier run have been missing for the time of a
-    silence, the lock goes to the new run.
+    Two autopilots behind the same address are told apart by the time since boot in their messages.
+    In the messages of one autopilot this time never goes back. It advances no faster than the clock
+    of this host, except after a message that was late. An autopilot that starts again counts as a
+    second sender at first. Once it has sent no message of its earlier run for the time of a
+    silence, the lock admits the new run.
     """
 
     def __init__(self, silence_ns: int) -> None:
@@ -40,22 +40,19 @@ class AutopilotLock:
 
     @property
     def address(self) -> str | None:
-        """Address of the autopilot; None until the first message."""
+        """Address of the admitted autopilot, or None before the first message."""
         return self._addresses.publisher
 
     def overran(self, duration_ns: int) -> None:
-        """Note a time, ns, in which the receiver did not run.
-
-        This time does not count as silence.
-        """
+        """Do not count as silence a time, ns, in which the receiver itself did not run."""
         self._addresses.overran(duration_ns)
         self._starts.overran(duration_ns)
 
     def check(self, address: str, since_boot_ns: int | None, now_ns: int) -> None:
         """Refuse a message of a second sender as long as the first one is not silent.
 
-        Raises ChannelError, reason "sender". `since_boot_ns` is None for a message without the time
-        since boot.
+        Raises ChannelError with the reason "sender". `since_boot_ns` is None for a message without
+        the time since boot.
         """
         try:
             self._addresses.check(address, now_ns)
@@ -77,7 +74,7 @@ class AutopilotLock:
             raise ChannelError(SENDER, sentence) from None
 
     def refresh(self, address: str, since_boot_ns: int | None, now_ns: int) -> bool:
-        """Lock to the sender of a message after `check`.
+        """Note a message that `check` has admitted, and lock to its sender.
 
         Returns whether the sender is new, or has started again.
         """

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge to an autopilot, without ROS: y from its messages, and setpoints from u.
+"""The bridge to an autopilot, without ROS: it makes y from messages, and setpoints from u.
 
 It has the engagement, the pilot override and the failsafe. It reads no clock, because every instant
-is an argument, in ns on the same clock. The watchdogs of y and u can end an engagement.
+is an argument, in ns on the same clock. An engagement can end because y or u is too old.
 """
 
 import math
@@ -35,7 +35,7 @@ END_WARNING_NS = 10 * NANOSECONDS
 
 
 class Phase(IntEnum):
-    """The phase of the engagement, which determines what the bridge sends."""
+    """The phase of the engagement. It determines what the bridge sends."""
 
     DISENGAGED = 0  # nothing is sent
     ENGAGED = 1  # u is sent
@@ -45,12 +45,15 @@ class Phase(IntEnum):
 
 
 def trim_key(name: str) -> str:
-    """Return the name under which `Bridge.take_output` takes the source of an input's trim."""
+    """Return the name of the channel with the trim of an input, for `Bridge.take_output`.
+
+    The map names the field of the autopilot from which this trim is read.
+    """
     return f"trim of {name}"
 
 
 class Bridge:
-    """The state of a bridge: the newest y and u, the phase and the pilot override.
+    """The state of a bridge: the newest y and u, the phase of the engagement, and pilot overrides.
 
     Only a call of `engage` engages the bridge. It never engages again by itself.
     """
@@ -102,11 +105,12 @@ class Bridge:
     # Inputs
 
     def take_output(self, name: str, raw: float, stamp_ns: int, now_ns: int) -> None:
-        """Take a value of a channel of y, of the pose or of a trim's source.
+        """Take a value of a channel of y, of a channel of the pose, or of the trim of an input.
 
         The channel becomes sign scale raw + offset, after the low-pass filter of its row if there
-        is one. Raises ChannelError, reason "stamp", if the stamp differs from the present by more
-        than the age limit. The reason is "order" if the stamp is not later than the previous one.
+        is one. Raises ChannelError with the reason "stamp" if the stamp differs from the present by
+        more than the age limit. The reason is "order" if the stamp is not later than the previous
+        one.
         """
         row = self._rows[name]
         if abs(now_ns - stamp_ns) > nanoseconds(row.max_age):
@@ -130,11 +134,11 @@ class Bridge:
         self._readings[name] = Reading(stamp_ns, value)
 
     def _u_timeouts_ns(self) -> tuple[int, int]:
-        """Return the silence of the publisher of u after which another may take over, ns.
+        """Return how long the publisher of u must be silent until another may take over, ns.
 
         The first value is for the same node in a new process, and the second for another node.
-        While the bridge is engaged, no publisher may take over, because u would jump. A timeout of
-        u ends the engagement instead.
+        While the bridge is engaged, no publisher may take over, because u would jump. In this phase
+        a u that is too old ends the engagement.
         """
         takeover_ns = sys.maxsize if self.phase is Phase.ENGAGED else self._max_age_ns
         return takeover_ns, takeover_ns
@@ -153,9 +157,9 @@ class Bridge:
         self._u = sample.value
 
     def take_effects(self, sample: StampedVector, now_ns: int) -> None:
-        """Take the effects of the inputs that the controller's probe found, (m,).
+        """Take how much effect each input has, (m,), as the controller's probe has found.
 
-        They are in the order of the map. If an input has no effect, an engagement ends.
+        The inputs are in the order of the map. If an input has no effect, an engagement ends.
         """
         stuck = reason_against_inputs(self.inputs, sample.value.tolist())
         if stuck and self.phase is Phase.ENGAGED:
@@ -175,7 +179,7 @@ class Bridge:
     def take_override(self, name: str, raw: float, now_ns: int) -> None:
         """Take a new value of the field on which a pilot override depends.
 
-        If it is beyond its threshold, the bridge disengages immediately.
+        If the value is beyond the threshold of the override, the bridge disengages immediately.
         """
         self.conditions.take_override(name, raw, now_ns)
         if self._is_active(name, now_ns):
@@ -192,16 +196,19 @@ class Bridge:
         return {name: reason for name in watched if (reason := self._staleness(name, now_ns))}
 
     def _staleness(self, name: str, now_ns: int) -> Stale | None:
-        """Return the fault of a stale channel; None if it is fresh or its last value is held."""
+        """Return the fault of a channel that is too old, or None if it is not.
+
+        A channel with `held` in the map is never too old, because y repeats its last value.
+        """
         row = self._rows[name]
         if isinstance(row, OutputRow) and row.held and name in self._readings:
             return None
         return staleness(row.topic, self._readings.get(name), row.max_age, now_ns)
 
     def _reason_against_values(self, section: str = "envelope") -> Refusal | None:
-        """Say which channels are outside their limits in a section of the map.
+        """Say which channels are outside the limits that a section of the map gives for them.
 
-        All channels of the section must have been received before.
+        All channels of the section must have been received before. Returns None if all are inside.
         """
         what = "the envelope" if section == "envelope" else section
         values = (
@@ -215,7 +222,7 @@ class Bridge:
         )
 
     def _reason_against_inputs(self, now_ns: int) -> Refusal | None:
-        """Say which inputs stay at a limit for longer than their rows allow.
+        """Say which inputs have stayed at a limit for longer than their rows allow, or return None.
 
         The aircraft does not answer to such an input any more. The limits of the law may be
         narrower than those of the map, so a large u that does not change also counts as being at a
@@ -240,7 +247,7 @@ class Bridge:
         return joined(reasons)
 
     def _reason_against_commands(self, now_ns: int) -> Refusal | None:
-        """Say why the autopilot must not be commanded any more, independent of y and u."""
+        """Say why the autopilot must not be commanded any more, whatever y and u are."""
         violations = (
             self.conditions.violation(now_ns, awaited=awaited) for awaited in (False, True)
         )
@@ -251,10 +258,10 @@ class Bridge:
         return self.conditions.is_active(name, now_ns, engaged=is_engaged)
 
     def _lack(self, now_ns: int) -> Refusal | None:
-        """Say of what an engaged bridge warns; None if it warns of nothing.
+        """Return the warning of an engaged bridge, or None.
 
-        It warns of the end by `max_engaged`, of `problem`, of overrides without messages, and if it
-        does not notice the loss of the transmitter.
+        It warns of the coming end by `max_engaged`, of `problem`, and of overrides without
+        messages. It also warns if it cannot notice the loss of the transmitter.
         """
         warning = None
         if self._end_ns is not None and now_ns >= self._end_ns - END_WARNING_NS:
@@ -270,7 +277,7 @@ class Bridge:
         return self.u_lock.timed_out(now_ns, self._max_age_ns)
 
     def _u_timeout(self, now_ns: int) -> Refusal | None:
-        """Say why u has timed out; None if it is fresh."""
+        """Say why u is too old or absent, or return None if it is fresh."""
         if self.u_lock.publisher is None:
             return Refusal("u not received yet")
         if self.u_timed_out(now_ns):
@@ -278,10 +285,10 @@ class Bridge:
         return None
 
     def reason_against_engagement(self, now_ns: int) -> Refusal | None:
-        """Say why `engage` would be refused now.
+        """Say why `engage` would be refused now, or return None.
 
         Conditions for which an engagement waits do not count. A dry run says first that it sends
-        nothing, and then the reason that there would be with `dry_run: false`.
+        nothing, and then the reason that would remain with `dry_run: false`.
         """
         checks: tuple[Callable[[], Refusal | None], ...] = (
             lambda: self.conflict,
@@ -329,16 +336,17 @@ class Bridge:
         return Refusal(f"pilot override active: {', '.join(active)}") if active else None
 
     def _stale_inputs(self, now_ns: int) -> Refusal | None:
-        """Say which inputs of the bridge are stale.
+        """Say which of the values that an engagement needs are stale, or return None.
 
-        The inputs are y, the envelope, the conditions engage_if, the sources of trims, and u.
+        They are y, the envelope, the conditions of `engage_if`, the trims that the autopilot sends,
+        and u.
         """
         keys = (*map(trim_key, self.channel_map.trims), *self.channel_map.engage_if)
         sources = {key: stale for key in keys if (stale := self._staleness(key, now_ns))}
         return joined((joined_faults(self.stale(now_ns) | sources), self._u_timeout(now_ns)))
 
     def _reason_against_u(self) -> Refusal | None:
-        """Say which input is too far from trim to engage; None if none is."""
+        """Say which input is too far from trim to engage, or return None."""
         limits = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
         for name, u, limit in zip(self.inputs, self._u, limits, strict=True):
             if abs(u) > limit:
@@ -349,9 +357,9 @@ class Bridge:
         return None
 
     def _reason_against_trim(self, name: str) -> Refusal | None:
-        """Say why the trim of a captured input is refused; None if it is not.
+        """Say why the trim of an input that the autopilot sends is refused, or return None.
 
-        It is refused if the trim plus a limit of u lies outside of the range of the field.
+        It is refused if the trim plus a limit of u lies outside the range of the field.
         """
         row = self.channel_map.inputs[name]
         trim = self.trim(name)
@@ -364,11 +372,11 @@ class Bridge:
         )
 
     def engage(self, now_ns: int, *, blind: bool = False) -> Refusal | None:
-        """Engage or begin to engage, or return the reason of a refusal.
+        """Engage or begin to engage, or return the reason why not.
 
-        The phase says whether the bridge is engaged or still begins to engage. If `blind`, the
-        engagement ignores a loss of the transmitter, and has no time limit. A request while the
-        bridge is engaged starts the time of `max_engaged` again.
+        The phase says whether the bridge is engaged already or still begins to engage. If `blind`
+        is True, the engagement ignores a loss of the transmitter, and has no time limit. A request
+        while the bridge is engaged starts the time of `max_engaged` again.
         """
         if self.phase is Phase.ENGAGED:
             self.conditions.blind |= blind
@@ -389,9 +397,9 @@ class Bridge:
         self._end_ns = None if bound is None else now_ns + nanoseconds(bound)
 
     def _continue_engagement(self, now_ns: int) -> None:
-        """Engage once the awaited conditions hold.
+        """Engage as soon as the conditions hold for which an engagement waits.
 
-        The bridge gives up when the time to wait is over, or if there is another refusal.
+        The bridge gives up when the time to wait is over, or if there is another reason against it.
         """
         self.reason = self.conditions.violation(now_ns, awaited=True)
         timed_out = now_ns - self._phase_ns > nanoseconds(self.channel_map.engage_timeout)
@@ -411,9 +419,10 @@ class Bridge:
             self._enter(Phase.ENGAGED, now_ns)
 
     def disengage(self, reason: Refusal, now_ns: int, *, by_pilot: bool = False) -> None:
-        """Disengage from any phase, which returns the channels to the autopilot.
+        """Disengage from any phase, and return the channels to the autopilot.
 
-        If `by_pilot`, the pilot has requested the disengagement, and the mode stays as it is.
+        If `by_pilot` is True, the pilot has requested this, and the autopilot's mode stays as it
+        is.
         """
         self._keeps_mode |= by_pilot
         if self.phase not in {Phase.DISENGAGED, Phase.RELEASE}:
@@ -425,9 +434,9 @@ class Bridge:
 
         ENGAGED becomes NEUTRAL if u has timed out. It becomes RELEASE if y is stale, if a value is
         outside the envelope, or if an input stays at its limit. It also becomes RELEASE if a
-        condition is lost, if a publisher conflicts, or if the time `max_engaged` is over. ENGAGING,
-        NEUTRAL and RELEASE end after their times. NEUTRAL also ends if a condition is lost or a
-        publisher conflicts.
+        condition is lost, if there is a second publisher, or if the time `max_engaged` is over.
+        ENGAGING, NEUTRAL and RELEASE end after their times. NEUTRAL also ends if a condition is
+        lost or if there is a second publisher.
         """
         if self.phase is Phase.ENGAGING:
             self._continue_engagement(now_ns)
@@ -458,9 +467,10 @@ class Bridge:
     # Outputs
 
     def y(self, now_ns: int) -> StampedVector | None:
-        """Return the sample of y at the stamp of the map's output `instant`.
+        """Return a new sample of y, stamped with the instant of one output.
 
-        Returns None if this sample has been returned before, or if a channel is stale.
+        The map names this output as `instant`. Returns None if this sample has been returned
+        before, or if a channel is stale.
         """
         newest = self._readings.get(self.channel_map.instant)
         if (
@@ -475,9 +485,9 @@ class Bridge:
         )
 
     def _value(self, name: str) -> float:
-        """Return the newest value of a channel.
+        """Return the newest value of a channel of y.
 
-        For a captured output, it is the change since the engagement, and 0 before the engagement.
+        A captured output is the change since the engagement. It is 0 before the engagement.
         """
         value = self._readings[name].value
         row = self.channel_map.outputs.get(name)
@@ -486,9 +496,9 @@ class Bridge:
         return value - self._zero[name] if self._is_captured() else 0.0
 
     def _is_captured(self) -> bool:
-        """Return whether the trims are those that the engagement has captured.
+        """Return whether the trims have the values at the engagement.
 
-        Otherwise the trims follow their sources.
+        In other phases the trims follow the values that the autopilot sends.
         """
         return self.phase in {Phase.ENGAGED, Phase.NEUTRAL, Phase.RELEASE} and bool(
             self._zero or self._trim
@@ -497,7 +507,8 @@ class Bridge:
     def trim(self, name: str) -> float:
         """Return the trim of an input.
 
-        If `trims` has a source for it, the trim follows the source until an engagement captures it.
+        If `trims` in the map has a field for it, the trim follows this field until the bridge
+        engages.
         """
         row = self.channel_map.inputs[name]
         source = self._readings.get(trim_key(name))
@@ -506,10 +517,11 @@ class Bridge:
         return row.trim if source is None else to_channel(source.value, row.line)
 
     def pose(self, now_ns: int) -> tuple[tuple[str, ...], StampedVector] | None:
-        """Return the names and values of the pose's fresh channels, at the stamp of the first row.
+        """Return the names and the values of the pose's fresh channels.
 
-        Returns None if this stamp is not new. psi is in -pi..pi. A channel is left out if it is
-        stale or has not been received yet.
+        Their stamp is that of the first row of the pose in the map. Returns None if this stamp is
+        not new. psi is in -pi..pi. A channel is left out if it is stale or has not been received
+        yet.
         """
         first = next(iter(self.channel_map.pose), None)
         newest = None if first is None else self._readings.get(first)
@@ -523,9 +535,9 @@ class Bridge:
         return names, StampedVector(newest.stamp_ns, np.array(list(values.values())))
 
     def raw_u(self) -> FloatArray:
-        """Return the raw values of the newest u after saturation, (m,).
+        """Return the newest u, limited and converted to the raw values of the fields, (m,).
 
-        These are the raw values of trim + min(max(u, lower), upper).
+        They are the raw values of trim + min(max(u, lower), upper).
         """
         u = np.minimum(np.maximum(self._u, self._lower), self._upper)
         return np.array(
@@ -536,19 +548,19 @@ class Bridge:
         return to_raw(self.trim(name) + u, self.channel_map.inputs[name].line)
 
     def raw(self) -> FloatArray:
-        """Return the raw values that are sent in this phase, (m,)."""
+        """Return the raw values of the inputs that are sent in this phase, (m,)."""
         if self.phase is Phase.ENGAGED:
             return self.raw_u()
         return np.array([self._resting(name, row) for name, row in self.channel_map.inputs.items()])
 
     def _resting(self, name: str, row: InputRow) -> float:
-        """Return the raw value of an input that does not follow u: neutral, or release value."""
+        """Return the raw value of an input outside the phase ENGAGED: neutral or release value."""
         if self.phase is not Phase.NEUTRAL:
             return math.nan if row.release is None else row.release
         return self._raw(name, 0.0) if row.neutral == "trim" else row.neutral
 
     def sends(self, name: str, now_ns: int) -> bool:
-        """Return whether a message of the map is sent now; a dry run sends no message."""
+        """Return whether a message of the map is sent in this phase. A dry run sends no message."""
         if self.dry_run:
             return False
         when = self.channel_map.messages[name].when

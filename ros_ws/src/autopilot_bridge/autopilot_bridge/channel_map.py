@@ -31,7 +31,7 @@ SEA_LEVEL_DENSITY = 1.225
 
 
 class LinearConversion(NamedTuple):
-    """The conversion between a raw value and a channel: channel = sign scale raw + offset.
+    """The conversion from a raw value to a channel: channel = sign scale raw + offset.
 
     The channel is in SI and radians, and the raw value is in the autopilot's unit.
     """
@@ -42,19 +42,19 @@ class LinearConversion(NamedTuple):
 
 
 def to_channel(raw: float, line: LinearConversion) -> float:
-    """Return the channel of a raw value, sign scale raw + offset."""
+    """Convert a raw value to a channel: sign scale raw + offset."""
     return line.sign * line.scale * raw + line.offset
 
 
 def to_raw(channel: float, line: LinearConversion) -> float:
-    """Return the raw value of a channel, sign (channel - offset) / scale."""
+    """Convert a channel to a raw value: sign (channel - offset) / scale."""
     return line.sign * (channel - line.offset) / line.scale
 
 
 def get_field(message: Any, path: str) -> Any:
     """Return the value at a path such as "twist.angular.y" or "axes[1]".
 
-    Raises ChannelError, reason "field", if there is no value at the path.
+    Raises ChannelError with the reason "field" if there is no value at the path.
     """
     value = message
     for name, place in STEP.findall(path):
@@ -70,8 +70,8 @@ def get_field(message: Any, path: str) -> Any:
 def set_field(message: Any, path: str, value: Any) -> None:
     """Set the value at a path.
 
-    A number for an integer field is rounded. NaN, infinity and values outside the range of the type
-    are refused for an integer field. Raises ChannelError, reason "field" or "range".
+    If the field is an integer, a number is rounded, and NaN, infinity and values outside the range
+    of the type are refused. Raises ChannelError with the reason "field" or "range".
     """
     current = get_field(message, path)
     if isinstance(current, int | np.integer) and isinstance(value, float):
@@ -173,7 +173,7 @@ COMPONENTS: Mapping[str, str] = MappingProxyType(
 
 
 def _turned(message: Any, path: str, attitude: str) -> float:
-    """Return a component of R(q) v, which is the vector v rotated from the body to the world.
+    """Return a component of R(q) v: the vector v rotated from the body to the world.
 
     `path` ends in .x, .y or .z after the path of v. `attitude` is the path of the quaternion q.
     R(q) v = v + 2 (w r x v + r x (r x v)) with q = (w, r), |q| = 1.
@@ -189,9 +189,10 @@ def _turned(message: Any, path: str, attitude: str) -> float:
 def read_raw(message: Any, path: str, function: str, turned_by: str | None = None) -> float:
     """Return the raw value of a row: `function` of the field at `path`.
 
-    If `turned_by` is given, it is the path of a quaternion, and the value is the component of the
-    vector that this quaternion rotates from the body to the world. Raises ChannelError, reason
-    "field" if the field is missing, and "finite" if its value is not finite.
+    If `turned_by` is given, it is the path of a quaternion that rotates a vector from the body to
+    the world. The raw value is then the component of the rotated vector that `path` names. Raises
+    ChannelError, with the reason "field" if the field is missing, and "finite" if its value is not
+    finite.
     """
     value = get_field(message, path)
     try:
@@ -209,7 +210,7 @@ def read_raw(message: Any, path: str, function: str, turned_by: str | None = Non
 def message_type(name: str, load: Callable[[str], Any] = importlib.import_module) -> type:
     """Return the class of "package/msg/Type" or "package/srv/Type".
 
-    Raises ParameterError, which names the package to install.
+    Raises ParameterError, whose message names the package to install.
     """
     package, section, kind = name.split("/")
     try:
@@ -226,10 +227,11 @@ def message_type(name: str, load: Callable[[str], Any] = importlib.import_module
 
 
 def versioned_topic(topic: str, version: int) -> str:
-    """Return the name of PX4's topic for a version of its definition, /fmu/.../NAME_vVERSION.
+    """Return the name of a PX4 topic for a version of its message definition.
 
-    Names of other topics stay as they are. A definition states its version as MESSAGE_VERSION.
-    Version 0 has no suffix. Source: PX4 guide, PX4 ROS 2 message translation node.
+    The name is /fmu/.../NAME_vVERSION, and version 0 has no suffix. Names of other topics stay as
+    they are. A definition states its version as MESSAGE_VERSION. Source: PX4 guide, PX4 ROS 2
+    message translation node.
     """
     if topic.startswith("/fmu/"):
         return VERSION.sub("", topic) + (f"_v{version}" if version else "")
@@ -237,7 +239,7 @@ def versioned_topic(topic: str, version: int) -> str:
 
 
 def version_fault(topic: str, message_class: Any) -> Refusal | None:
-    """Say why the version in the name of a PX4 topic is wrong; None if it is right."""
+    """Say why the version in the name of a PX4 topic is wrong, or return None if it is right."""
     version = getattr(message_class, "MESSAGE_VERSION", None)
     if version is None:
         return None
@@ -253,9 +255,9 @@ def version_fault(topic: str, message_class: Any) -> Refusal | None:
 def version_faults(
     topics: Iterable[tuple[str, str]], load: Callable[[str], Any] = importlib.import_module
 ) -> list[Refusal]:
-    """Return the `version_fault` of each topic whose message package is installed.
+    """Return the `version_fault` of each topic that has one.
 
-    The versions of the other topics cannot be checked.
+    Topics whose message package is not installed cannot be checked, so they are left out.
     """
     faults = []
     for topic, kind in dict.fromkeys(topics):
@@ -265,7 +267,7 @@ def version_faults(
 
 
 def no_publisher(environment: Mapping[str, str]) -> str:
-    """Return a sentence that says why a topic of an autopilot may have no publisher."""
+    """Say why a topic of an autopilot may have no publisher."""
     domain = environment.get("ROS_DOMAIN_ID") or "0"
     if domain != "0":
         return (

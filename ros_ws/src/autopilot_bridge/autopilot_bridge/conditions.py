@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Check the conditions and pilot overrides of a channel map.
+"""Check the conditions and the pilot overrides of a channel map.
 
-By them the autopilot and the pilot can refuse or end an engagement.
+With them the autopilot and the pilot can refuse or end an engagement.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from flight_core.rates import nanoseconds, seconds
 
 
 class Reading(NamedTuple):
-    """The newest value of a field, with the instant to which it belongs."""
+    """The newest value of a field, with its stamp."""
 
     stamp_ns: int
     value: float
@@ -24,15 +24,15 @@ class Reading(NamedTuple):
 
 @dataclass(frozen=True)
 class Stale(Refusal):
-    """The refusal of a field that is too old, or that was not received yet."""
+    """The fault of a field that is too old, or that was not received yet."""
 
     is_received: bool
 
 
 class Conditions:
-    """The newest fields of the conditions and overrides of a map.
+    """The newest values of the fields on which conditions and overrides of a map depend.
 
-    `blind` says whether an engagement continues without the transmitter.
+    The attribute `blind` says whether an engagement goes on if the pilot's transmitter is lost.
     """
 
     def __init__(self, channel_map: ChannelMap) -> None:
@@ -52,7 +52,7 @@ class Conditions:
         self._overrides[name] = Reading(now_ns, raw)
 
     def engage(self, now_ns: int) -> None:
-        """Store the present values of the overrides.
+        """Store the values of the overrides at the engagement.
 
         An override with `moved` becomes active when its value has moved away from the stored one.
         """
@@ -63,10 +63,10 @@ class Conditions:
         }
 
     def violation(self, now_ns: int, *, awaited: bool) -> Refusal | None:
-        """Say which conditions do not hold.
+        """Say which conditions do not hold, or return None.
 
-        If `awaited`, only the conditions for which an engagement waits are checked, otherwise only
-        the others.
+        If `awaited` is True, only the conditions for which an engagement waits are checked.
+        Otherwise only the other conditions are checked.
         """
         rows = (
             (name, row)
@@ -84,7 +84,7 @@ class Conditions:
         return Refusal(f"{row.sentence} ({row.field} is {reading.value:g})")
 
     def is_contradicted(self) -> bool:
-        """Return whether the last value of a condition contradicts the condition.
+        """Return whether the last received value contradicts a condition.
 
         If it does, the pilot or the autopilot chose another mode, or the aircraft has landed. A
         condition that shows the loss of the transmitter does not count, because then the pilot
@@ -99,7 +99,8 @@ class Conditions:
     def is_active(self, name: str, now_ns: int, *, engaged: bool) -> bool:
         """Return whether a pilot override is active.
 
-        An override ends if its topic is silent, so that an old value does not block an engagement.
+        An override is not active if its topic is silent, so that an old value does not block an
+        engagement.
         """
         row = self._map.overrides[name]
         reading = self._overrides.get(name)
@@ -114,7 +115,7 @@ class Conditions:
         return staleness(row.topic, self._overrides.get(name), row.max_age, now_ns) is not None
 
     def silent_overrides(self, now_ns: int) -> Refusal | None:
-        """Say which overrides have no effect, because their topics are silent."""
+        """Say which overrides have no effect because their topics are silent, or return None."""
         silent = [
             f"no message on {row.topic} for {row.max_age:g} s"
             for name, row in self._map.overrides.items()
@@ -123,10 +124,10 @@ class Conditions:
         return Refusal(f"a pilot override has no effect: {'; '.join(silent)}") if silent else None
 
     def blindness(self, *, bounded: bool) -> Refusal | None:
-        """Warn if an engagement does not notice the loss of the transmitter; else return None.
+        """Return a warning if an engagement does not notice the loss of the transmitter, else None.
 
         The sentence also says what can still end the engagement. `bounded` says whether
-        `max_engaged` ends the engagement.
+        `max_engaged` ends it.
         """
         if self.watches_transmitter and not self.blind:
             return None
@@ -154,7 +155,7 @@ class Conditions:
 
 
 def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) -> Stale | None:
-    """Return the fault in the age of a field; None if the field is fresh."""
+    """Say how old a field is or that it was not received, or return None if it is fresh."""
     if reading is None:
         return Stale(f"not received yet ({topic})", is_received=False)
     age_ns = now_ns - reading.stamp_ns
@@ -164,7 +165,7 @@ def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) 
 
 
 def joined_faults(faults: Mapping[str, Stale]) -> Refusal | None:
-    """Join the faults of channels, by name, to one sentence.
+    """Join the faults of several channels, by name, to one sentence, or return None without any.
 
     Channels with the same fault are named together.
     """

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Check which rows of a channel map hold for a release of an autopilot.
+"""Check which rows of a channel map are right for a release of an autopilot.
 
-A row holds if the message definition has its field, with the components that its function needs.
+A row is right if the message definition has its field, with the components that its function needs.
 For PX4, the topic must also have the version of the definition. If the source of a condition names
-a constant, this constant must be one of the values of the condition.
+a constant, the value of this constant must be one of the values of the condition.
 """
 
 import re
@@ -38,9 +38,9 @@ VERSION = "MESSAGE_VERSION"  # the constant in definitions of PX4
 
 
 class CheckedRow(NamedTuple):
-    """A field that a row of a map reads or sets.
+    """The result of checking a field that a row of a map reads or sets.
 
-    `faults` has for each release why the row does not hold, or None if it holds.
+    `faults` has an entry for each release: why the row is wrong, or None if it is right.
     """
 
     key: str
@@ -50,10 +50,10 @@ class CheckedRow(NamedTuple):
 
 
 def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
-    """Return the definitions of the types `kinds`, and of all types that they contain.
+    """Return the definitions of the message types `kinds`, read from packages below a folder.
 
-    They are read from the packages below a folder. Types that no package has are left out. Raises
-    ParameterError if there is no package.
+    The result also has all types that these types contain. Types that no package has are left out.
+    Raises ParameterError if there is no package.
     """
     expected = (
         "a folder with the sources of a message package: package.xml, msg/*.msg and srv/*.srv"
@@ -84,11 +84,11 @@ def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
 
 
 def installed_definitions(kinds: Iterable[str]) -> Types:
-    """Return the definitions of the types `kinds`, and of all types that they contain.
+    """Return the definitions of the message types `kinds`, as they are installed.
 
-    They come from the installed message packages and, for MAVLink, from pymavlink. Types that are
-    not installed are left out. Raises ParameterError for a type of MAVLink if
-    pymavlink is not installed.
+    The result also has all types that these types contain. The definitions come from the installed
+    message packages and, for MAVLink, from pymavlink. Types that are not installed are left out.
+    Raises ParameterError for a type of MAVLink if pymavlink is not installed.
     """
     types: dict[str, tuple[Any, Any]] = {}
     for kind in kinds:
@@ -108,7 +108,7 @@ def installed_definitions(kinds: Iterable[str]) -> Types:
 
 
 def check_map(channel_map: ChannelMap, releases: Iterable[Types]) -> list[CheckedRow]:
-    """Check each field that a map uses against the definitions of some releases.
+    """Check each field that a map uses against the message definitions of several releases.
 
     A definition that states no version has version 0.
     """
@@ -131,7 +131,7 @@ def is_known(types: Types, kind: str) -> bool:
 
 
 def _parsed(text: str, kind: str) -> Types:
-    """Return the types that the text of a definition contains; for a service, only its request."""
+    """Return the types in the text of a definition. For a service, this is only the request."""
     try:
         if "/srv/" in kind:
             (request,) = get_types_from_msg(REQUEST.split(text)[0], kind).values()
@@ -144,7 +144,7 @@ def _parsed(text: str, kind: str) -> Types:
 
 
 def _element(field: Any) -> tuple[Nodetype, Any]:
-    """Return the type of a field; for an array, that of its elements."""
+    """Return the type of a field. For an array, this is the type of its elements."""
     node, content = field
     return content[0] if node in {Nodetype.ARRAY, Nodetype.SEQUENCE} else (node, content)
 

@@ -63,7 +63,7 @@ Value = bool | Integer | Raw | str | tuple[Integer, ...] | tuple[Raw, ...]
 
 
 class Row(Config):
-    """The base of a map's rows: channel = sign scale raw + offset, with frame and source."""
+    """Base of a row of a map that converts a channel: channel = sign scale raw + offset."""
 
     field: str = Field(
         description="the path of the field in the message, such as twist.angular.y or axes[1]"
@@ -87,16 +87,16 @@ class Row(Config):
 
 
 class MovingRow(Row):
-    """A row whose sign can be checked by a motion of the aircraft in flight."""
+    """A row whose sign can be checked in flight, by the motion of the aircraft."""
 
     positive: Motion = Field(description="motion of the aircraft for an increasing raw value")
 
     @property
     def motion(self) -> tuple[str, int]:
-        """The output, a key of UNITS, that changes as the channel grows, and its sign.
+        """The output that changes as the channel grows, a key of UNITS, and the sign of the change.
 
-        The sign is +1 if the output grows, and -1 if it falls. `positive` is for a growing raw
-        value, so `sign` is applied to it.
+        The sign is +1 if the output grows, and -1 if it falls. `positive` describes the motion for
+        a growing raw value, so `sign` is applied to it.
         """
         output, sign = MOTIONS[self.positive]
         return output, sign * self.sign
@@ -305,7 +305,7 @@ class OverrideRow(WatchedRow):
     def is_active(self, raw: float, at_engagement: float | None) -> bool:
         """Return whether the override is active at a raw value.
 
-        `at_engagement` is the value at engagement; None if the bridge is not engaged.
+        `at_engagement` is the raw value at the engagement, or None if the bridge is not engaged.
         """
         raw = self.masked(raw)
         if self.moved is not None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Connect to an autopilot by MAVLink, as a source and a sink of messages of a channel map.
+"""Connect to an autopilot by MAVLink, to receive and send the messages of a channel map.
 
 A thread receives messages, sends a heartbeat each second, requests the rates of messages and reads
 parameters. It sends as a companion computer of the autopilot. Only the messages of the map have the
@@ -72,16 +72,17 @@ Address = tuple[Any, ...]
 
 
 class MavlinkMessage(NamedTuple):
-    """A message, and the instant of its arrival, ns by the system clock."""
+    """A received message, and the instant of its arrival, ns by the system clock."""
 
     message: Any
     received_ns: int
 
 
 def mavlink_type(name: str) -> Any:
-    """Return a class that has a message's numeric fields, all zero, and their names in `fields`.
+    """Return a class for a MAVLink message, whose numeric fields are all zero.
 
-    Raises ParameterError if there is no such message.
+    Its attribute `fields` has the names of these fields. Raises ParameterError if there is no such
+    message.
     """
     require_package("pymavlink")
     from pymavlink.dialects.v20 import ardupilotmega as dialect  # noqa: PLC0415 - an extra
@@ -145,11 +146,11 @@ def _connection(config: LinkConfig) -> Any:
 
 
 class Link:
-    """A MAVLink connection, which receives from the call of `start` on.
+    """A MAVLink connection, which receives messages after `start` is called.
 
-    Only messages of the sender in `AutopilotLock` are taken, and over UDP no other address gets
-    messages. `parameters` are the names of the autopilot's parameters to read. `further` are names
-    of more parameters, which some releases lack. If there is a passphrase, each message is signed,
+    It only takes messages of the sender that `AutopilotLock` admits, and over UDP it sends to no
+    other address. `parameters` names parameters of the autopilot that the link reads. `further`
+    names more of them, which some releases lack. If there is a passphrase, each message is signed,
     and messages without a valid signature are refused. Source: MAVLink guide, message signing. The
     key is derived from the passphrase as MAVProxy and Mission Planner do.
     """
@@ -191,7 +192,7 @@ class Link:
 
     @property
     def conflict(self) -> Refusal | None:
-        """A reason that prevents an engagement or ends it.
+        """A reason that prevents an engagement or ends it, or None.
 
         It names who else sends as the autopilot or as the bridge, or a setting of the autopilot
         that prevents every engagement.
@@ -204,7 +205,7 @@ class Link:
         return self._queues.setdefault(name, deque(maxlen=QUEUE))
 
     def start(self) -> None:
-        """Begin to receive; call this after the last `listen`."""
+        """Begin to receive. Call this after the last `listen`."""
         self._thread.start()
 
     def send(self, message: Any) -> None:
@@ -225,7 +226,7 @@ class Link:
         self._connection.close()
 
     def problem(self, name: str | None = None) -> Refusal | None:
-        """Say what is wrong with the link, or with the messages of one name."""
+        """Say what is wrong with the link, or with the messages called `name`, or return None."""
         now = time.monotonic()
         silent = now - max(self._alive, self._began) > SILENCE
         if silent or (self._refused and not self._alive):
@@ -245,7 +246,7 @@ class Link:
         return joined((self.conflict, *slow, *denied, TAKEN if slow else None))
 
     def reason_against_engagement(self) -> Refusal | None:
-        """Say why an engagement would lack the rates of the map, or would have no effect."""
+        """Say why an engagement would lack messages or have no effect, or return None."""
         unknown = self._rates.unknown(time.monotonic())
         rates = Refusal(f"the rate of {', '.join(unknown)} is not known yet") if unknown else None
         return self.problem() or self._dropped_overrides() or rates
@@ -262,7 +263,7 @@ class Link:
         return range(int(first), int(last) + 1)
 
     def _dropped_overrides(self) -> Refusal | None:
-        """Say why the autopilot drops the RC overrides; None if it takes them."""
+        """Say why the autopilot drops the bridge's RC overrides, or return None if it does not."""
         numbers = self._station_numbers()
         system = self._config.source_system
         if system in numbers:
@@ -276,7 +277,7 @@ class Link:
         )
 
     def end_reason(self) -> Refusal | None:
-        """Say what ends an engagement: a rate that stays slow, or a silent ground station."""
+        """Say why an engagement must end: slow messages, or a silent ground station."""
         now = time.monotonic()
         limit = self._config.station_silence
         silence = None
@@ -289,9 +290,9 @@ class Link:
         return joined((self._rates.lasting(now), silence))
 
     def station(self) -> str:
-        """Say which ground station the failsafe FS_GCS_ENABL of the autopilot watches.
+        """Say which ground station the autopilot's failsafe FS_GCS_ENABL watches.
 
-        The sentence holds while RC overrides are sent.
+        The sentence is true while RC overrides are sent.
         """
         system = self._stations_text()
         limit = self._config.station_silence
@@ -311,7 +312,7 @@ class Link:
         return str(numbers[0]) if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]}"
 
     def _send(self, message: Any, system: int) -> None:
-        """Send a message with a system number, as the component COMPANION."""
+        """Send a message with a system number, and the component number COMPANION."""
         with self._sending:
             try:
                 self._connection.mav.srcSystem = system
@@ -344,7 +345,7 @@ class Link:
                 self._take(message, address, received_ns)
 
     def _packet(self) -> tuple[bytes, Address]:
-        """Return the next bytes and their sender; no bytes after a silence of POLL.
+        """Receive bytes, and return them with their sender. After a silence of POLL there are none.
 
         For TCP and for a serial line, the sender is the URL.
         """
@@ -356,9 +357,9 @@ class Link:
         return self._connection.recv(self._parser.bytes_needed()), (self._config.url,)
 
     def _parsed(self, data: bytes, address: Address) -> Sequence[Any]:
-        """Return the messages in a packet.
+        """Return the messages in received bytes.
 
-        Messages that span several packets are only read from the locked sender.
+        Only for the sender that the lock admits, a message may span several packets.
         """
         if not self._is_udp or _text(address) == self._lock.address:
             return self._parser.parse_buffer(data) or ()
@@ -441,9 +442,9 @@ class Link:
             queue.append(MavlinkMessage(message, received_ns))
 
     def _admits(self, message: Any, address: Address, now: float) -> bool:
-        """Return whether a message of the autopilot comes from the locked sender.
+        """Return whether a message of the autopilot comes from the sender that the lock admits.
 
-        The link requests rates from a new sender.
+        If the sender is new, the link requests the rates of its messages.
         """
         sender = _text(address)
         before = self._lock.address
@@ -535,7 +536,7 @@ class Link:
 
 
 class MavlinkReader:
-    """The messages of one name on a link, in place of a subscription."""
+    """The received messages of one name, read as from a subscription."""
 
     def __init__(self, link: Link, topic: Any) -> None:
         self.link = link
@@ -546,12 +547,12 @@ class MavlinkReader:
         self._queue = link.listen(self.message_name)
 
     def take(self) -> list[MavlinkMessage]:
-        """Return the messages since the last call, the oldest first."""
+        """Return the messages that arrived since the last call, the oldest first."""
         return [self._queue.popleft() for _ in range(len(self._queue))]
 
 
 class MavlinkPublisher:
-    """Sends messages on a link, in place of a publisher."""
+    """Sends messages on a link, with the interface of a publisher."""
 
     def __init__(self, link: Link, topic: str) -> None:
         self._link = link

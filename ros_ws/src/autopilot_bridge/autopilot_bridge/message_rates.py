@@ -26,7 +26,7 @@ GAPS = 3  # number of gaps between the newest messages, whose mean gives the pre
 
 
 class MessageRates:
-    """Counts the messages of each name; `requested` has the requested rates, Hz."""
+    """Counts the messages of each name, and compares their rates with the `requested` ones, Hz."""
 
     def __init__(self, requested: Mapping[str, float], now: float) -> None:
         self._requested = dict(requested)
@@ -35,21 +35,21 @@ class MessageRates:
     def begin(self, now: float) -> None:
         """Begin to count again, because the autopilot may have started again.
 
-        All rates are then requested again.
+        The caller then requests all rates again.
         """
         self._rates = {name: _Rate(rate, now) for name, rate in self._requested.items()}
         self._last_step = now
 
     def take(self, name: str, now: float) -> None:
-        """Count a message of a name."""
+        """Count a message with this name."""
         if (rate := self._rates.get(name)) is not None:
             rate.take(now)
 
     def step(self, now: float) -> dict[str, float]:
-        """Judge the rate of each message, once in JUDGED s.
+        """Judge the rate of each message, at most once every JUDGED s.
 
-        Returns the rates that must be requested again, Hz, by name. After a pause of the host,
-        nothing is judged, so that the messages of the pause are counted first.
+        Returns the rates that must be requested again, Hz, by the name of the message. After a
+        pause of the host, nothing is judged, so that the messages of the pause are counted first.
         """
         elapsed = now - self._last_step
         if elapsed < JUDGED:
@@ -60,16 +60,16 @@ class MessageRates:
         return {name: rate.requested for name, rate in self._rates.items() if rate.step(now)}
 
     def slow(self, now: float) -> dict[str, Refusal]:
-        """Return the faults of slow messages, by name.
+        """Say how slow each slow message is, by name.
 
-        A message counts as slow if its rate is slow now. A message that came at the requested rate
-        before also counts as slow if its rate was slow less than REMEMBERED ago.
+        A message counts as slow if its rate is slow now. A message that has once reached the
+        requested rate also counts as slow if its rate was slow less than REMEMBERED ago.
         """
         reasons = {name: rate.slowness(name, now) for name, rate in self._rates.items()}
         return {name: reason for name, reason in reasons.items() if reason is not None}
 
     def lasting(self, now: float) -> Refusal | None:
-        """Say which messages have been slow for SLOW_ENDS or longer."""
+        """Say which messages have been slow for SLOW_ENDS or longer, or return None."""
         reasons = joined(
             rate.slowness(name, now) for name, rate in self._rates.items() if rate.lasts(now)
         )
@@ -86,7 +86,7 @@ class MessageRates:
 
 
 class _Rate:
-    """The rate of the messages of one name."""
+    """The counted rate of the messages of one name."""
 
     def __init__(self, requested: float, now: float) -> None:
         self.requested = requested  # Hz
@@ -132,7 +132,7 @@ class _Rate:
         return True
 
     def slowness(self, name: str, now: float) -> Refusal | None:
-        """Say how slow the messages of a name are, or were."""
+        """Say how slow the messages of a name are, or recently were, or return None."""
         rate = f"at {self._lowest:.2g} Hz, requested are {self.requested:g} Hz"
         if self._slow_since is not None:
             return Refusal(f"{name} comes {rate}")

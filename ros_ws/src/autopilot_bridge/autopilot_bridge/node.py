@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge node, which replaces the aircraft node.
+"""The bridge node, which takes the place of the aircraft node.
 
-By a channel map, it makes y from the messages of an autopilot, and the autopilot's setpoints from
-u.
+With a channel map, it makes y from the messages of an autopilot, and setpoints from u.
 """
 
 import os
@@ -76,7 +75,7 @@ NamedRow = tuple[str, MeasuredRow | WatchedRow]
 
 
 class BridgeNode(FlightNode[BridgeConfig]):
-    """The node of `Bridge`.
+    """The ROS node around a `Bridge`.
 
     At each tick it polls the autopilot's topics, publishes a new y, takes the newest u and sends
     the messages that are due.
@@ -148,7 +147,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._engagement = self.create_publisher(ENGAGEMENT.type, ENGAGEMENT.name, PUBLISH)
 
     def _open_link(self) -> mavlink_link.Link | None:
-        """Open the MAVLink link of the map; return None if the map has no link."""
+        """Open the MAVLink link of the map, or return None if the map has no link."""
         if self._map.link is None:
             return None
         key = f"{self.get_name()}.use_sim_time"
@@ -249,7 +248,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._warn_stale_inputs(now_ns)
 
     def _take_effects(self, sample: StampedVector, now_ns: int) -> None:
-        """Take the effects of the inputs, if they come from the controller whose u flies."""
+        """Take the effects of the inputs if their sender is the controller that sends u."""
         controller = self._bridge.u_lock.publisher
         if controller is None:
             # Nothing flies yet.
@@ -260,7 +259,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _pause_ns(self) -> int:
         """Return the time since the previous tick began.
 
-        A time in which the host was suspended counts too, although the clock of the ticks stops.
+        A time in which the host was suspended counts, although the clock of the ticks stops in it.
         """
         return self._boot_ns() - self._began_ns
 
@@ -270,7 +269,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return self.simulated.time_ns()
 
     def _arrived_ns(self, arrival: Any, now_ns: int) -> int:
-        """Return when a message without a stamp arrived, ns by the clock of the stamps."""
+        """Return the arrival of a message, ns, by the clock with which headers are stamped."""
         if not arrival.received_ns:
             return now_ns + self.clock_step_ns()
         return int(
@@ -282,7 +281,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _disengage_after_pause(self, now_ns: int) -> None:
         """Disengage if the bridge did not run for a while.
 
-        The autopilot or its pilot may have flown without it in the meantime.
+        In this time the autopilot or its pilot may have flown without it.
         """
         pause_ns = self._pause_ns()
         self._began_ns += pause_ns
@@ -301,7 +300,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
     ) -> None:
         """Give the fields of a message to the bridge.
 
-        Its stamps are by the system clock, which is ahead of the ticks' time by `step_ns`.
+        The message's stamps are by the system clock, which is ahead of the ticks' time by
+        `step_ns`.
         """
         if isinstance(subscription, MavlinkReader):
             message = raw
@@ -371,7 +371,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return response
 
     def _activate(self, active: bool) -> None:
-        """Ask the controller to be active, or not to be.
+        """Ask the controller to become active or inactive.
 
         The controller is active only while engaged, so that its integrals do not wind up.
         """
@@ -399,10 +399,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._bridge.disengage(ACTIVATION_TIMED_OUT, now_ns)
 
     def _report(self, now_ns: int) -> None:
-        """Publish, once a second, the phase, its reason, and the reason against an engagement.
+        """Publish the phase, its reason, and the reason against an engagement.
 
-        Also has a controller deactivated that has just appeared, and activates the controller for
-        which an engaged bridge waits.
+        This is called once a second. It also deactivates a controller that has just appeared, and
+        activates the controller for which an engaged bridge waits.
         """
         bridge = self._bridge
         self._report_ns = now_ns
@@ -478,7 +478,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self.warn_no_publisher(self._u.subscription)
 
     def _require_first_y(self, now_ns: int) -> None:
-        """Raise FlightEnded with the reasons if y is not complete in time."""
+        """Raise FlightEnded, with the reasons, if y is not complete in the time `first_y`."""
         self._start_ns = self._start_ns or now_ns
         limit = self.parameters.first_y
         if self._first_y or limit == 0.0 or now_ns - self._start_ns < nanoseconds(limit):
@@ -492,7 +492,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         raise FlightEnded(f"no y after {limit:g} s: {'; '.join(sentences)}")
 
     def _cause(self, subscription: PolledSubscription | MavlinkReader) -> str:
-        """Return a sentence on why no sample of a topic was accepted."""
+        """Say why no sample of a topic was accepted."""
         name = subscription.topic.name
         refusals = [what for what in self.refusals.counts if what.startswith(f"{name}: ")]
         if isinstance(subscription, MavlinkReader):
@@ -505,7 +505,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return str((*faults, *refusals, "no sample of its publisher arrives")[0])
 
     def graph_checks(self) -> list[Callable[[], None]]:
-        """Return the checks of the graph, also of the topics that the autopilot must receive.
+        """Return checks of the ROS graph, also of the topics that the autopilot must receive.
 
         The autopilot cannot receive a topic if it subscribes with another type or an incompatible
         quality of service. A second publisher of a topic ends the engagement.
@@ -518,7 +518,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return [*super().graph_checks(), *outgoing, self._find_conflicts]
 
     def _find_conflicts(self) -> None:
-        """Tell the bridge which topics have two publishers.
+        """Tell the bridge which topics have a second publisher.
 
         With two autopilots, y would be mixed, and both autopilots would be flown. So the topics
         that the bridge reads, and those of setpoints, are checked. Overrides and requests of a mode

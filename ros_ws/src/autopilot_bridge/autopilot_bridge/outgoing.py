@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Send the bridge's messages to an autopilot, and check the fields of its messages."""
+"""Send the bridge's messages to an autopilot, and check that messages have a map's fields."""
 
 from typing import Any
 
@@ -14,21 +14,24 @@ from flight_core.vectors import ChannelError
 
 
 class ServiceCaller:
-    """A service of the autopilot, in place of a publisher."""
+    """A service of the autopilot, called with the interface of a publisher."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
         self.topic_name = str(client.srv_name)
 
     def publish(self, request: Any) -> None:
-        """Send a request, and do not wait for the answer. Raises ChannelError without a service."""
+        """Send a request without waiting for the answer.
+
+        Raises ChannelError if the service is not there.
+        """
         if not self._client.service_is_ready():
             raise ChannelError("service", f"{self.topic_name}: no such service")
         self._client.call_async(request)
 
 
 class OutgoingMessage:
-    """A message to the autopilot with its publisher; its constant fields are set only once."""
+    """A message to the autopilot with its publisher. Its constant fields are set only once."""
 
     def __init__(
         self, publisher: Any, message: Any, row: MessageRow, inputs: list[tuple[int, InputRow]]
@@ -48,7 +51,10 @@ class OutgoingMessage:
         return now_ns - self._sent_ns >= self._period_ns - slack_ns
 
     def send(self, now_ns: int, raw: list[float]) -> None:
-        """Send the message with its inputs; `raw` has the raw values of all inputs."""
+        """Send the message with the values of its inputs.
+
+        `raw` has the raw values of all inputs.
+        """
         for number, row in self._inputs:
             set_field(self._message, row.field, raw[number])
         if self.row.stamped:
@@ -61,9 +67,10 @@ class OutgoingMessage:
 def prepare_message(
     channel_map: ChannelMap, name: str, row: MessageRow
 ) -> tuple[Any, list[tuple[int, InputRow]]]:
-    """Return a message of a map with its constant fields, and its inputs with their places in u.
+    """Return a message of a map with its constant fields set, and the inputs that it carries.
 
-    Raises ParameterError if a field is missing, or cannot hold its constant value.
+    An input comes with its place in u. Raises ParameterError if a field is missing, or cannot hold
+    its constant value.
     """
     kind = field_type(row.type)
     message = kind.Request() if row.is_service else kind()
@@ -89,13 +96,13 @@ def prepare_message(
 
 
 def field_type(name: str) -> Any:
-    """Return the class of a message that a map names, from a message package or from MAVLink."""
+    """Return the class of a message that a map names, from a ROS package or from MAVLink."""
     package, _, kind = name.split("/")
     return mavlink_link.mavlink_type(kind) if package == MAVLINK else message_type(name)
 
 
 def require_field(empty: Any, name: str, row: MeasuredRow | WatchedRow) -> None:
-    """Raise ParameterError if a field is missing.
+    """Check that a message has the fields of a row. Raises ParameterError if one is missing.
 
     A field inside a sequence is checked only when the first message comes.
     """

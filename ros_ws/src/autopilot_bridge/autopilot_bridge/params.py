@@ -40,7 +40,7 @@ PARAMETER = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
 
 @dataclass(frozen=True, kw_only=True)
 class UsedField:
-    """A field of a message that a row of a map reads or sets."""
+    """A message field that a row of a map reads or sets."""
 
     key: str  # key of the row
     topic: str
@@ -50,7 +50,7 @@ class UsedField:
 
 
 class ChannelMap(Config):
-    """A channel map, which states the topic and the field of each channel of y and u."""
+    """A channel map: a file that states the topic and the field of each channel of y and u."""
 
     name: str
     source: str = Field(
@@ -225,7 +225,7 @@ class ChannelMap(Config):
             )
 
     def _check_limits(self) -> None:
-        """Check the limits of watched channels."""
+        """Check the sections `envelope` and `engage_if`, which have limits of channels."""
         watched = [*self.pose, *self.outputs, *self.sensors]
         for section, limits in (("envelope", self.envelope), ("engage_if", self.engage_if)):
             for name, (lower, upper) in limits.items():
@@ -333,7 +333,7 @@ class ChannelMap(Config):
 
     @property
     def recorded_topics(self) -> list[str]:
-        """Topics that are recorded in the log.
+        """List the topics that the log records.
 
         They are the topics with a quality of service, and the topics of MAVLink messages.
         """
@@ -344,7 +344,7 @@ class ChannelMap(Config):
         return [*self.topics, *dict.fromkeys(mavlink_topics)]
 
     def _readers(self) -> dict[str, Mapping[str, Any]]:
-        """Return the sections whose rows read a field of a topic."""
+        """Return the sections of the map whose rows read a field of a topic."""
         kinds = ("outputs", "pose", "sensors", "trims", "conditions", "overrides")
         return {kind: getattr(self, kind) for kind in kinds}
 
@@ -399,7 +399,7 @@ def find_map(name: str) -> Path:
 
 
 def load_map(name: str) -> ChannelMap:
-    """Load a channel map by its name in the library or its path. Raises ParameterError."""
+    """Load a channel map, given its name in the library or its path. Raises ParameterError."""
     path = find_map(name)
     content = read_yaml(path, f"map {path}", "a channel map")
     require(isinstance(content, dict), f"map {path}", type(content).__name__, "a mapping")
