@@ -478,7 +478,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self.warn_no_publisher(self._u.subscription)
 
     def _require_first_y(self, now_ns: int) -> None:
-        """Raise FlightEnded, with the reasons, if y is not complete in the time `first_y`."""
+        """Raise FlightEnded, with the reasons, if y is incomplete after the time `first_y`."""
         self._start_ns = self._start_ns or now_ns
         limit = self.parameters.first_y
         if self._first_y or limit == 0.0 or now_ns - self._start_ns < nanoseconds(limit):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Check the network between hosts, and write the profile that a host needs for it."""
+"""Check the network between hosts, and write the middleware profile that a host needs for it."""
 
 import os
 import time
@@ -44,12 +44,12 @@ def write_profile(peers: str, file: Path) -> tuple[str, tuple[str, ...], Mapping
 
 
 def domain_ports() -> tuple[int, int]:
-    """Return the first and the last UDP port of this shell's domain."""
+    """Return the first and the last UDP port of the ROS domain that this shell uses."""
     return ports(int(os.environ.get("ROS_DOMAIN_ID") or 0))
 
 
 class NetworkClient(Client):
-    """Exchanges clocks with the same command that runs on the other hosts."""
+    """Exchanges clock readings with the same command that runs on the other hosts."""
 
     def __init__(self, own_host: str, peers: Sequence[str]) -> None:
         super().__init__("network", rosout=False)
@@ -57,10 +57,10 @@ class NetworkClient(Client):
         self._clocks = PeerClocks(self._node, _instance(own_host), self._refused)
 
     def exchange(self, timeout: float) -> tuple[set[str], dict[str, ClockOfPeer]]:
-        """Exchange clocks until this host has the clock of every other host.
+        """Exchange clock readings until this host has one of every other host.
 
-        This takes at most `timeout` s. Returns the hosts whose messages arrive at this host, and
-        the clocks of those of them at which the messages of this host arrive, too.
+        This takes at most `timeout` s. Returns the hosts whose messages arrive at this host. Also
+        returns the clock of each of them that receives the messages of this host.
         """
         heard_hosts: set[str] = set()
         clocks: dict[str, ClockOfPeer] = {}

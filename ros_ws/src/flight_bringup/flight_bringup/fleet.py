@@ -41,9 +41,10 @@ Overrides = dict[str, dict[str, object]]
 
 
 def is_fleet(name: FilePath) -> bool:
-    """Return whether a path is that of a fleet file, which has the aircraft by name.
+    """Return whether a path leads to a fleet file.
 
-    A scenario has a section `aircraft` too, but this section contains `ros__parameters`.
+    A fleet file has a mapping `aircraft` with the aircraft by name. A scenario file has a section
+    `aircraft` as well, but this section contains `ros__parameters`.
     """
     with suppress(ParameterError):
         content = read_yaml(Path(name), str(name), A_FLEET)
@@ -54,7 +55,7 @@ def is_fleet(name: FilePath) -> bool:
 
 
 class AircraftOfFleet(Config):
-    """An aircraft of a fleet, as the file of the fleet describes it."""
+    """An aircraft of a fleet, as the fleet file describes it."""
 
     scenario: str | None = Field(
         default=None, description="name or path of a scenario; by default that of the fleet"
@@ -74,7 +75,7 @@ class AircraftOfFleet(Config):
 
 
 class FleetConfig(Config):
-    """A fleet, as its file describes it; paths are relative to the folder of this file."""
+    """The content of a fleet file. Its paths are relative to the folder of this file."""
 
     scenario: str = Field(
         default="osprey_route", description="scenario of the aircraft that name none"
@@ -140,10 +141,10 @@ class Fleet:
 def read_fleet(
     file: FilePath, duration: float | None = None, *, use_sim_time: bool = False
 ) -> Fleet:
-    """Read the file of a fleet.
+    """Read a fleet file.
 
-    `duration`, s, replaces the duration in the file. With `use_sim_time` the fleet flies by /clock.
-    Raises ParameterError.
+    `duration`, s, replaces the duration in the file. If `use_sim_time` is True, the fleet flies by
+    the topic /clock. Raises ParameterError.
     """
     path = as_path(file, "fleet", A_FLEET)
     content = read_yaml(path, str(path), A_FLEET)
@@ -218,10 +219,10 @@ def _scenario(
 def _nested(
     scenario: Scenario, changes: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """Return the changes, completed so that each replaces a whole group.
+    """Return the changes of a scenario, completed so that each replaces a whole group.
 
-    If a change is a mapping, it changes only some keys of a group. The other keys of the group are
-    added, with their values in the scenario.
+    A change that is a mapping gives new values only to some parameters of a group. The other
+    parameters of the group are added, with their values in the scenario.
     """
 
     def merged(old: Any, new: Any) -> Any:
@@ -241,7 +242,7 @@ def _nested(
 
 @dataclass
 class _Flight:
-    """The flight of one aircraft of a fleet."""
+    """The flight of one aircraft of a fleet, from its start to its end."""
 
     member: Member
     run: Path
@@ -255,8 +256,8 @@ class _Flight:
     def start(self, fleet: Fleet, pause: Callable[[float], None]) -> None:
         """Start the processes, and in real time wait until they are ready.
 
-        `pause` sleeps for a duration, s, between two checks. The flights of a fleet start one after
-        another, because a host should not start many processes at once.
+        `pause` sleeps for a duration, s, between two checks. The flights of a fleet are started one
+        after the other, because a host should not start many processes at once.
         """
         self.progress(0.0, "starting")
         try:
@@ -279,9 +280,10 @@ class _Flight:
                 self.begin((0.0, 0.0))
 
     def begin(self, start: tuple[float, float]) -> None:
-        """Set t = 0 of the fleet to `start`, s by the system clock and by the monotonic clock.
+        """Begin the flight, given t = 0 of the fleet in `start`.
 
-        In lockstep this has no effect, because the flight has begun already.
+        `start` has t = 0 by the system clock and by the monotonic clock, s. In lockstep nothing
+        more happens here, because the flight has begun already.
         """
         if self.processes is None or self.stopping is not None:
             return
@@ -292,7 +294,7 @@ class _Flight:
             self.steps = follow(self.processes, self.progress)
 
     def step(self) -> bool:
-        """Check the flight once, and return whether it continues."""
+        """Check the flight once, and return whether it goes on."""
         if self.steps is not None:
             try:
                 next(self.steps)
@@ -301,9 +303,9 @@ class _Flight:
         return self.steps is not None
 
     def end(self, outcome: Outcome) -> None:
-        """Stop the processes of the flight in another thread.
+        """End the flight with an outcome, and stop its processes in another thread.
 
-        A recorder takes a while to close its log, and the fleet flies on in the meantime.
+        A recorder takes a while to close its log, and in the meantime the other flights go on.
         """
         self.outcome = outcome
         self.steps = None
@@ -319,14 +321,14 @@ class _Flight:
         self.progress(self.member.scenario.flight.duration, f"{self.outcome}; {line}")
 
     def join(self) -> None:
-        """Wait until the processes have stopped."""
+        """Wait until the processes of the flight have stopped."""
         if self.stopping is not None:
             self.stopping.join()
 
 
 @dataclass(frozen=True)
 class MemberFlight:
-    """The outcome of the flight of an aircraft in a fleet, and the folder of its run."""
+    """The result of one aircraft's flight in a fleet: its outcome, and the folder of its run."""
 
     member: Member
     run: Path
@@ -345,7 +347,7 @@ def fly_fleet(
 
     `progress` is called with the name of an aircraft, its flight time, s, and a text.
 
-    In real time the aircraft share t = 0, which is set once every node is ready. An aircraft with a
+    In real time the aircraft share t = 0, which is set when every node is ready. An aircraft with a
     delay begins later by its delay. If an aircraft ends early, or never begins, the others fly on.
     Ctrl-C ends all flights. Raises ParameterError if no aircraft can begin.
     """
@@ -389,7 +391,7 @@ def fly_fleet(
 
 
 def _begin(flights: Sequence[_Flight], fleet: Fleet) -> None:
-    """Begin the flights with a common t = 0, if they are in real time."""
+    """Begin all flights with a common t = 0, except in lockstep, where they have begun already."""
     if not fleet.lockstep:
         start = start_instants(LEAD + BEGIN_TIME * len(flights), flights[0].monitor)
         for flight in flights:

@@ -78,16 +78,16 @@ def fly_over_topics(
 ) -> Outcome:
     """Fly a scenario over topics, record the bag into `run`, and return the outcome.
 
-    The nodes are separate processes, or share one if `one_process` is set. By default they fly in
+    The nodes are separate processes, or share one if `one_process` is True. By default they fly in
     real time. With `lockstep` they fly as fast as the machine allows, and with `use_sim_time` by
-    /clock. All nodes are in the `namespace`, such as "/uav1". An `autopilot` takes the place of the
-    aircraft, in real time only.
+    the topic /clock. All nodes are in the `namespace`, such as "/uav1". An `autopilot` takes the
+    place of the simulated aircraft, in real time only.
 
-    `announce` gets a line when the engagement or its reason changes, except if only a number in the
-    reason changes. It also gets a line on what became of a learner's proposal, and when a process
-    had to be killed. If `engaged_for`, s, is given, the flight ends this long after its first
-    engagement. It ends earlier if the engagement ends. It also ends earlier if the law has not
-    engaged when less than `engaged_for` of the duration is left.
+    `announce` is called with a line when the phase of an engagement or its reason changes, except
+    if only a number in the reason changes. It also gets a line on what became of a learner's
+    proposal, and on a process that had to be killed. If `engaged_for`, s, is given, the flight ends
+    this long after its first engagement, or when the engagement ends. It also ends if the law is
+    not engaged yet when only `engaged_for` of the duration is left.
 
     The outcome is COMPLETED, LANDED, INTERRUPTED (by Ctrl-C, SIGTERM or SIGHUP), or names the
     process that ended early.
@@ -129,7 +129,7 @@ def fly_over_topics(
 
 
 def last(steps: Steps, pause: Callable[[float], None]) -> Outcome:
-    """Follow a flight to its end, with a `pause` between steps, and return the outcome."""
+    """Follow a flight to its last step, with a `pause` between steps, and return the outcome."""
     while True:
         try:
             next(steps)
@@ -145,9 +145,9 @@ def follow(
     announce: Callable[[str], None] = lambda line: None,
     engaged_for: float = math.inf,
 ) -> Steps:
-    """Follow a flight that has begun, one step every POLL_PERIOD.
+    """Return the steps by which a flight that has begun is followed, one every POLL_PERIOD.
 
-    The arguments are those of `fly_over_topics`.
+    Each step checks the flight once. The arguments are those of `fly_over_topics`.
     """
     if processes.lockstep:
         return _follow_lockstep(processes, progress, announce)
@@ -176,11 +176,11 @@ class _Phase(Enum):
 
 
 class _Span:
-    """Determines when a flight in real time has begun, and when it is over.
+    """Tells when a flight in real time has begun, and when it is over.
 
-    A flight has begun once the aircraft takes u. It is over once the log holds y, y_m and u up to
+    A flight has begun when the aircraft takes u. It is over when the log holds y, y_m and u up to
     its end. With an autopilot, or with a controller that a user activates, there may never be a u.
-    In this case `begins` is False, and the phase is OPEN to the end.
+    In these cases `begins` is False, and the phase is OPEN to the end.
     """
 
     def __init__(
@@ -199,12 +199,12 @@ class _Span:
         self._phase = _Phase.WAITING if begins else _Phase.OPEN
 
     def note_u(self) -> None:
-        """Note that the controller has published."""
+        """Note that the controller has published u."""
         if self._phase is _Phase.WAITING:
             self._phase = _Phase.PUBLISHED
 
     def outcome(self, t: float) -> Outcome | None:
-        """Return the outcome once the log holds the flight or has stopped growing; else None."""
+        """Return the outcome if the log has the whole flight or no longer grows, else None."""
         if (
             stamp := self._monitor.recorded()
         ) is not None and stamp - self._processes.start_time > self._until:
@@ -221,7 +221,7 @@ class _Span:
         return log_ends_at(self._until, self._duration)
 
     def failed(self, t: float) -> Outcome | None:
-        """Return why the flight has not begun; None if it has, still may, or need not begin."""
+        """Return the outcome of a flight that should have begun by now but has not, else None."""
         if self._phase.is_awaited and self._processes.is_flying():
             self._phase = _Phase.FLYING
         if not self._phase.is_awaited or t < FIRST_U:
@@ -285,7 +285,10 @@ def _announce_learned(
     start_time: float,
     announce: Callable[[str], None],
 ) -> None:
-    """Announce what became of proposals since the last call, and the end of the learner."""
+    """Announce what became of the learner's proposals since the last call, and its end.
+
+    The end of the learner's process is announced because the flight goes on without it.
+    """
     for instant, sentence in processes.monitor.learned():
         announce(f"t = {instant - start_time:.2f} s: {sentence}")
     if (outcome := processes.pop_end_of_learner()) is not None:
@@ -299,8 +302,8 @@ def _follow_lockstep(
 ) -> Steps:
     """Follow a lockstep flight from its first instant to its last.
 
-    The real-time factor counts from the first instant in the log. The flight ends when the aircraft
-    has taken the last u and the log is complete.
+    The text of `progress` has the real-time factor, which counts from the first instant in the log.
+    The flight ends when the aircraft has taken the last u and the log is complete.
     """
     scenario = processes.scenario
     # The last instant is the beginning of the aircraft's last whole period.
@@ -341,7 +344,7 @@ def fly_in_process(
     """Fly in one process without ROS, write the bag into `run`, and return the outcome.
 
     The flight is as fast as the machine allows. `learn` makes the learner if the scenario has one.
-    The actions of the learner are announced and written to log/learner.log, a line each.
+    Each action of the learner is announced as a line, and written to log/learner.log.
     """
     interrupt = DeferredInterrupt()
 
@@ -382,12 +385,12 @@ def fly_and_report(
 ) -> FlightResult:
     """Fly a scenario in one process, with log and report in a new folder of `runs`.
 
-    `rise-di fly --in-process` does the same. A scenario that differs from its file is written
-    beside the log. The log holds the outcome of a flight that ended early.
+    The command `rise-di fly --in-process` does the same. A scenario that differs from its file is
+    written beside the log. If the flight ended early, the log holds this outcome.
 
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
-        runs: Folder for the folder of the run.
+        runs: Folder in which the folder of the run is created.
         progress: Called with the flight time, s, once per simulated second.
         learn: Makes the learner, if the scenario has one, as for `simulate`.
 
@@ -418,7 +421,7 @@ def fly_and_report(
 
 
 def _is_its_file(scenario: Scenario) -> bool:
-    """Return whether a scenario is equal to the content of its file."""
+    """Return whether a scenario still equals the content of its file."""
     try:
         return load_scenario(scenario.path) == scenario
     except ParameterError:
@@ -426,10 +429,10 @@ def _is_its_file(scenario: Scenario) -> bool:
 
 
 def as_file(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
-    """Return the scenario with a file that nodes in the namespace can read.
+    """Return the scenario with a parameter file that the nodes in the namespace can read.
 
-    If the scenario equals its file, this is the file of `as_flown`. Otherwise it is a new file in
-    the folder of the run. Raises ParameterError.
+    If the scenario equals its own file, the result is that of `as_flown`. Otherwise it is written
+    to a new file in the folder of the run. Raises ParameterError.
     """
     if _is_its_file(scenario):
         return as_flown(scenario, run, namespace)

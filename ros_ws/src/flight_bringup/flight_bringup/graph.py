@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Say which nodes a flight has, in which order they start, and with which parameters.
+"""Define which nodes a flight has, in which order they start, and with which parameters.
 
-The launch files and the process runner share this module.
+The launch files and `rise-di fly` share this module.
 """
 
 import re
@@ -19,7 +19,7 @@ from rise_di_controller.learning.proposals import AUTHORITY_TICKS
 
 
 class NodeSpec(NamedTuple):
-    """A process of a flight, by its package and its executable."""
+    """A node of a flight, or all nodes in one process, by package and executable."""
 
     package: str
     executable: str  # also the name of the node, and of its section in a scenario
@@ -52,7 +52,7 @@ NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")
 
 
 def absolute_namespace(namespace: str) -> str:
-    """Return the namespace of an aircraft in the form "/uav1"; "" is the root.
+    """Return the namespace of an aircraft in the form "/uav1". The root namespace is "".
 
     Raises ParameterError if ROS 2 does not permit the name.
     """
@@ -68,7 +68,7 @@ def absolute_namespace(namespace: str) -> str:
 
 
 class Autopilot(NamedTuple):
-    """An autopilot that takes the aircraft's place."""
+    """An autopilot that takes the place of the simulated aircraft."""
 
     channel_map: ChannelMap
     map_path: Path
@@ -76,7 +76,7 @@ class Autopilot(NamedTuple):
 
     @property
     def topics(self) -> list[str]:
-        """The topics to record: those of the map, and those of the bridge."""
+        """The topics to record: those of the channel map, and those of the bridge."""
         return [*self.channel_map.recorded_topics, *topics.recorded_with("bridge")]
 
 
@@ -86,12 +86,12 @@ def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:
 
 
 def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
-    """Raise ParameterError if the controller may command more than the map sends.
+    """Check that the bridge can send all that the controller may command.
 
-    The bridge would clip u, and the anti-windup of the law would not know of it. The limits of the
-    scenario are not narrowed instead, because the log must hold the parameters that flew. A dry run
-    sends nothing, so it passes. A controller that holds u while it is inactive is refused too,
-    because the bridge engages only if u is near trim.
+    Otherwise the bridge would clip u, and the anti-windup of the law would not know of it. The
+    limits of the scenario are not narrowed, because the log must hold the parameters that flew. A
+    dry run sends nothing, so it passes. The check also fails for a controller that holds u while it
+    is inactive, because the bridge engages only if u is near trim. Raises ParameterError.
     """
     if autopilot.dry_run:
         return
@@ -131,11 +131,11 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
 
 
 def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec, ...]:
-    """Return the second stage of a scenario.
+    """Return the nodes that start second, when the recorder and the controller are ready.
 
-    The stage has the aircraft or the bridge, the reference model, and guidance and a learner if the
+    They are the aircraft or the bridge, the reference model, and guidance and a learner if the
     scenario has them. Raises ParameterError if guidance cannot fly the simulated aircraft, or if a
-    bridge is to fly with a learner.
+    learner is to fly with a bridge.
     """
     if not bridge:
         require_guidable(scenario)
@@ -160,7 +160,7 @@ LEAD = 0.5  # s from the message of t = 0 on `start` to t = 0, within which a bu
 
 
 def start_lead(startup: float) -> float:
-    """Return the time from the start of the second stage to t = 0, s.
+    """Return how long after the start of the second stage t = 0 is, s.
 
     `startup` is the time, s, from the start of the first stage until it was ready. The second stage
     gets 1.5 times this time, and half a second in which the nodes discover each other.
@@ -169,7 +169,7 @@ def start_lead(startup: float) -> float:
 
 
 def start_instant(lead: float, now: float) -> float:
-    """Return the time of t = 0, s, which is `lead` from `now`.
+    """Return the time of t = 0, s, which is `lead` after `now`.
 
     It is a whole multiple of 0.01 s, so that nodes with and without `start_time` tick together.
     """
@@ -177,7 +177,7 @@ def start_instant(lead: float, now: float) -> float:
 
 
 def _airframe(scenario: Scenario) -> ParameterOverrides:
-    """Return the path of the airframe as an override, if it is absolute; else {}.
+    """Return the path of the airframe as an override if it is absolute, else no override.
 
     The path is absolute if the file lies beside the scenario, in a folder that the nodes do not
     know.
@@ -197,22 +197,22 @@ def parameter_overrides(
     autopilot: Autopilot | None = None,
     replaced: Collection[NodeSpec] = (),
 ) -> ParameterOverrides:
-    """Return the parameters of a process that its section of the scenario file lacks.
+    """Return the parameters that a process needs beside its section of the scenario file.
 
     For several nodes in one process the keys are "node:name". Each parameter goes to the nodes that
     need it:
 
-    - In real time the nodes with a t = 0 get its instant, or ON_START.
+    - In real time the nodes that begin at t = 0 get its instant, or ON_START.
     - In lockstep the aircraft gets the rate of u and the duration, controller and guidance get the
       rate of y, and the reference model gets the rate of u_m.
-    - Guidance gets the numbers that follow by rule. The learner gets the scenario.
-    - The recorder gets the files to attach to the log. This function writes them into the
-      folder of the run.
-    - With an autopilot the bridge gets the channel map, the recorder the topics of the
-      autopilot, and the controller starts inactive.
+    - Guidance gets the parameters of `guidance_by_rule`. The learner gets the scenario.
+    - The recorder gets the files to attach to the log. This function writes them into the folder of
+      the run.
+    - With an autopilot the bridge gets the channel map, the recorder the topics of the autopilot,
+      and the controller starts inactive.
     - With `use_sim_time` every node ticks by /clock.
 
-    Nodes of the user fly in place of the `replaced` ones.
+    `replaced` has the nodes in whose place nodes of the user fly.
     """
     clock: ParameterOverrides = {"use_sim_time": True} if use_sim_time else {}
     if spec is BRIDGE:
@@ -247,9 +247,10 @@ def parameter_overrides(
 
 
 def _stage_overrides(scenario: Scenario, *, lockstep: bool) -> dict[NodeSpec, ParameterOverrides]:
-    """Return the parameters of both stages that the sections of the scenario lack.
+    """Return the parameters that the nodes of both stages need beside the scenario file, by node.
 
-    Among them are the parameters of guidance that follow by rule, and the learner's scenario file.
+    Among them are the parameters of guidance that follow from other sections, and the learner's
+    scenario file.
     """
     stages = (*FIRST_STAGE, *SECOND_STAGE, *_optional(scenario))
     overrides: dict[NodeSpec, ParameterOverrides] = {
@@ -285,7 +286,7 @@ def _recording(scenario: Scenario, run: Path, autopilot: Autopilot | None) -> Pa
 
 
 def _lockstep_rates(scenario: Scenario) -> dict[NodeSpec, ParameterOverrides]:
-    """Return, for each node, the rates of the inputs that it awaits in lockstep.
+    """Return, for each node, the rates of the inputs for which it waits in lockstep.
 
     The aircraft also gets the duration of the flight.
     """
@@ -309,7 +310,7 @@ def _attachments(
     autopilot: Autopilot | None,
     replaced: Collection[NodeSpec],
 ) -> ParameterOverrides:
-    """Write the files that the recorder attaches to the log, and return their paths."""
+    """Write the files that the recorder attaches to the log, and return its parameters for them."""
     maps = () if autopilot is None else (autopilot.map_path,)
     others = replaced if autopilot is None else (AIRCRAFT,)
     names = [spec.executable for spec in others]
@@ -327,10 +328,10 @@ def replayed_topics(
     namespace: str = "",
     autopilot: Autopilot | None = None,
 ) -> list[str]:
-    """Return the full names of a log's topics that none of the nodes publishes, in order.
+    """Return the topics of a log that none of the nodes publishes, with full names, in order.
 
-    `namespace` is that of the nodes. A bridge among them also publishes the messages of its channel
-    map.
+    `namespace` is the namespace of the nodes. A bridge among them also publishes the messages of
+    its channel map.
     """
     prefix = f"/{namespace.strip('/')}/".replace("//", "/")
     names = {name for node in nodes for name in topics.published_by(node.executable)}

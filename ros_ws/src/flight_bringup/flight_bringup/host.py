@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measure whether this host can fly in real time.
+"""Measure whether this host is fast enough to fly in real time.
 
 For half a second, as many processes compute as the flight will have, and each reports which share
-of a core it got. Two other measures do not serve: the load of the host, and the time by which a
-sleeping process wakes late. They look alike on a host that can fly and on one that cannot.
+of a core it got. Two other measures are of no use: the load of the host, and the delay with which a
+sleeping process wakes. They look alike on a host that can fly and on one that cannot.
 """
 
 import subprocess
@@ -59,10 +59,10 @@ def processes_of(scenario: Scenario, *, composed: bool) -> int:
 def shortage(
     scenarios: Sequence[Scenario], cores_given: CoresGiven, *, composed: bool = False
 ) -> Refusal | None:
-    """Say which share of the cores is missing for flying scenarios together in real time.
+    """Say how many cores are missing to fly scenarios together in real time, or return None.
 
     The text continues a sentence that begins with "this host", as in "gives 0.5 of the 1.4 cores
-    that a flight in real time needs". None means that nothing is missing.
+    that a flight in real time needs". `cores_given` measures what the host gives.
     """
     processes = sum(processes_of(scenario, composed=composed) for scenario in scenarios)
     needed = processes * (CORES_A_PROCESS if composed else CORES_A_NODE)
@@ -74,7 +74,7 @@ def shortage(
 
 
 def cores_given(processes: int) -> float:
-    """Return how many cores the host gives to processes that spin together for LOOK.
+    """Measure how many cores the host gives to processes that compute together for LOOK.
 
     Raises ParameterError if they cannot be started.
     """

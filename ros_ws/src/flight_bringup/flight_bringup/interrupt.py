@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Convert SIGINT, SIGTERM and SIGHUP to a KeyboardInterrupt at places where it does no harm."""
+"""Convert SIGINT, SIGTERM and SIGHUP to a KeyboardInterrupt where it does no harm."""
 
 import os
 import signal
@@ -17,9 +17,10 @@ from flight_core.signals import handle_shutdown
 
 @contextmanager
 def handle_signals(handler: Any) -> Iterator[None]:
-    """Handle the signals of `handle_shutdown` within the block.
+    """Call `handler` for the signals of `handle_shutdown` within a with block.
 
-    Python lets only the main thread set handlers, so in another thread this changes nothing.
+    Python lets only the main thread set handlers, so in another thread this function changes
+    nothing.
     """
     before = (
         handle_shutdown(handler) if threading.current_thread() is threading.main_thread() else {}
@@ -46,7 +47,7 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
 
 class DeferredInterrupt:
-    """Handles signals, but interrupts only outside the blocks of `deferred`.
+    """A signal handler that interrupts only outside the blocks of `deferred`.
 
     For example, a signal waits while the log is written. With `only_in_pauses` a signal interrupts
     only in `pause`. The reason is that a module in C, such as rclpy while it makes a message, can
@@ -66,7 +67,7 @@ class DeferredInterrupt:
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """Make a signal wait until the block ends."""
+        """Make a signal wait until a with block ends."""
         self._is_deferred = True
         try:
             yield

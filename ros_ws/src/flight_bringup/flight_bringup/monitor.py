@@ -46,7 +46,7 @@ MODES = {float(mode): mode.name for mode in Mode}
 class FlightMonitor(Client):
     """Follows a flight by the states of its nodes and the progress of its log.
 
-    In real time it also follows the internals of the controller and the engagement of a bridge.
+    In real time it also follows the topic `internals` of the controller and a bridge's engagement.
     """
 
     def __init__(
@@ -89,11 +89,11 @@ class FlightMonitor(Client):
         return self._simulated is None or self._simulated.known()
 
     def ahead(self, lead: float) -> float:
-        """Return the flight time, s, in which at least `lead` s pass on the host."""
+        """Return how much flight time, s, passes while at least `lead` s pass on the host."""
         return lead if self._simulated is None else lead * max(self._simulated.speed(), 1.0)
 
     def end_of_clock(self) -> Outcome | None:
-        """Return the outcome if the simulation behind /clock is over; None while it continues."""
+        """Return the outcome if the simulator behind /clock has ended or restarted, else None."""
         if self._simulated is None or not self._simulated.known():
             return None
         try:
@@ -106,9 +106,9 @@ class FlightMonitor(Client):
         return ended_early("ended early: /clock has no publisher: its simulator ended")
 
     def is_ready(self, node: str, pid: int) -> bool:
-        """Return whether the loop of a node runs.
+        """Return whether the event loop of a node runs.
 
-        The process id distinguishes it from a node of the same name in another flight.
+        The process id tells the node from a node of the same name in another flight.
         """
         return self._state(node, pid) in {*NodeState}
 
@@ -117,7 +117,7 @@ class FlightMonitor(Client):
         return self._state(node, pid) in {*NodeState} - {NodeState.READY}
 
     def start(self, start_time: float) -> None:
-        """Publish the system time of t = 0, s, for the nodes."""
+        """Publish t = 0, as a system time in s, for the nodes."""
         self._publish_start(instant(nanoseconds(start_time)))
 
     def is_flying(self, node: str, pid: int) -> bool:
@@ -134,7 +134,7 @@ class FlightMonitor(Client):
         return self._states.get(f"{self._namespace}/{node}#{pid}", "")
 
     def newest(self) -> tuple[str, FloatArray] | None:
-        """Return mode and e of the controller's newest sample since the last call, or None."""
+        """Return mode and e in the newest tick of the controller, or None without a new tick."""
         status = None
         for sample in self._decoded(self._internals, self._decoder.decode):
             if sample is not None:
@@ -142,16 +142,16 @@ class FlightMonitor(Client):
         return status
 
     def engagement(self) -> list[tuple[str, str]]:
-        """Return the phases of a bridge and their reasons since the last call, in order."""
+        """Return the phases of a bridge since the last call, in order, each with its reason."""
         messages = () if self._engagement is None else self._engagement.take()
         return [
             (bounded(arrival.message.key), bounded(arrival.message.value)) for arrival in messages
         ]
 
     def learned(self) -> list[tuple[float, str]]:
-        """Return what has become of a learner's proposals since the last call.
+        """Return what became of a learner's proposals since the last call.
 
-        Each element is an instant by the clock of the stamps, s, and a sentence.
+        Each element has an instant by the clock of the stamps, s, and a sentence.
         """
         return [
             (seconds(report.stamp_ns), bounded(report.sentence))
@@ -161,17 +161,17 @@ class FlightMonitor(Client):
     def recorded(self) -> float | None:
         """Return the instant up to which the log is complete, s.
 
-        It is a flight time in lockstep, and a time by the clock of the stamps in real time. Returns
+        In lockstep it is a flight time, and in real time a time by the clock of the stamps. Returns
         None if nothing has changed since the last call.
         """
         stamps = self._decoded(self._recorded, stamp_of)
         return seconds(stamps[-1]) if stamps else None
 
     def require_free_domain(self) -> None:
-        """Raise ParameterError if the namespace already has an aircraft or a reference model.
+        """Check that the namespace has no aircraft and no reference model yet.
 
-        Only this domain is checked. The check waits until DISCOVERY_TIME after the monitor was
-        made, because publishers are not known earlier.
+        Raises ParameterError if it has one. Only this ROS domain is checked. The check waits until
+        DISCOVERY_TIME after the monitor was made, because publishers are not known earlier.
         """
         remaining = self._created + DISCOVERY_TIME - time.monotonic()
         require_no_publishers(self._node, LOOP_INPUTS, FREE_DOMAIN, remaining)

@@ -64,9 +64,9 @@ class Player(Client):
 
         The first message is sent immediately. Each further message is sent when its time since the
         first, divided by `rate`, has passed. Deadlines are absolute on the monotonic clock, so
-        delays do not add up. If `stamps_now`, the stamps are moved to the present. The age of a
-        message by the system clock is then its age in the log, divided by `rate`. `progress` is
-        called ten times a second with the instant of the log, ns.
+        delays do not add up. If `stamps_now` is True, the stamps are moved to the present. The age
+        of a message by the system clock is then its age in the log, divided by `rate`. `progress`
+        is called ten times a second with the instant of the log, ns.
         """
         begin_ns = begin_system_ns = first_ns = clock_ns = progress_ns = 0
         for message in messages:
@@ -109,10 +109,9 @@ def _sleep_until(deadline_ns: int) -> None:
 
 
 def unsendable(types: Mapping[str, str]) -> dict[str, str]:
-    """Return the topics that cannot be sent, each with its type.
+    """Return the topics that cannot be published, each with its type.
 
-    This means that the message type is not installed, or that ROS does not permit the name of the
-    topic.
+    Either their message type is not installed, or ROS does not permit their name.
     """
     lacking = {}
     for topic, name in types.items():

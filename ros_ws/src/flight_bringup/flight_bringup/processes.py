@@ -74,16 +74,16 @@ POLL_PERIOD = 0.005  # s, time between two checks while nodes start
 
 
 def end_with_parent() -> list[str]:
-    """Return words to put before a command, so that it gets SIGTERM when this process dies.
+    """Return the beginning of a command, by which it gets SIGTERM when this process dies.
 
-    The list is empty if the host has no setpriv of util-linux.
+    The result is empty if the host has no setpriv of util-linux.
     """
     setpriv = shutil.which("setpriv")
     return [setpriv, "--pdeathsig", "TERM"] if setpriv else []
 
 
 def start_instants(lead: float, monitor: "FlightMonitor") -> tuple[float, float]:
-    """Return t = 0 by the clock of the stamps, and by the clock of the ticks, s.
+    """Return t = 0 by the clock of the stamps and by the clock of the ticks, s.
 
     t = 0 is `lead` s from now by the host's clock.
     """
@@ -108,13 +108,13 @@ CAUSE = re.compile(r"\[FATAL\]|error: ")
 
 
 class NotReadyError(ParameterError):
-    """Raised if a node was not ready in time, or ended before, although its input was valid."""
+    """Raised if a node is not ready in time, or ends before, although its parameters are valid."""
 
 
 class NodeProcess:
-    """One node as a process.
+    """A process that runs a node, or several nodes.
 
-    The output of the process goes to a file. `lines` has the last lines. `cause` is the line that
+    The output of the process goes to a file. `lines` has its last lines. `cause` is the line that
     says why the process ended, even if a long traceback follows this line.
     """
 
@@ -179,7 +179,7 @@ class NodeProcess:
                 self._log.flush()
 
     def finish(self) -> int:
-        """Read the rest of the output, and return the exit status."""
+        """Wait for the end of the process, read the rest of its output, and return its status."""
         status = self.popen.wait()
         self._reader.join(timeout=1.0)
         with suppress(OSError):
@@ -193,9 +193,10 @@ class FlightProcesses:
     """All processes of one flight, as a context manager that stops them when it exits.
 
     `monitor` reports which nodes are ready, and must be in the same `namespace`. With an autopilot,
-    the bridge starts in place of the aircraft. A flight in real time with an aircraft gets its t =
-    0 from `begin`, once `match` has found that it is ready. `announce` gets a line if processes had
-    to be killed. `pause` sleeps for a duration, s, between two checks of nodes that start.
+    the bridge starts in place of the simulated aircraft. In real time with a simulated aircraft,
+    `match` waits until the flight is ready, and `begin` then sets t = 0. `announce` gets a line if
+    processes had to be killed. `pause` sleeps for a duration, s, between two checks of nodes that
+    start.
     """
 
     def __init__(
@@ -278,7 +279,7 @@ class FlightProcesses:
     def begin(self, start: tuple[float, float] | None = None) -> Outcome | None:
         """Set t = 0 after `match`. Returns an outcome if the flight cannot begin, else None.
 
-        `start` has the system time and the monotonic time of t = 0, s. It is given if several
+        `start` has t = 0 by the system clock and by the monotonic clock, s. It is given if several
         flights share t = 0. By default t = 0 is LEAD from now.
         """
         leave_real_time_priority()  # the nodes have this priority
@@ -300,7 +301,7 @@ class FlightProcesses:
         return nodes
 
     def _unmatched(self) -> list[str]:
-        """Return a sentence for each node for which the flight waits before t = 0."""
+        """Say of each node for which the flight still waits what it lacks."""
         names = self._nodes()
         ready = {name: self.monitor.is_ready(name, pid) for name, pid in names}
         unmatched = [name for name, pid in names if not self.monitor.is_matched(name, pid)]
@@ -358,8 +359,8 @@ class FlightProcesses:
         """Return the outcome if a process or the simulated time has ended, else None.
 
         In real time the end of a learner is no outcome, because the law flies on. On a busy host
-        several processes may have ended since the last call. In this case a landing counts as the
-        cause, and a process that only lost contact with another process does not.
+        several processes may have ended since the last call. In this case a landing is taken as the
+        cause, and a process that only lost contact with another process is not.
         """
         processes = [
             process for process in self.processes if self.lockstep or process.node is not LEARNER
@@ -372,7 +373,7 @@ class FlightProcesses:
         return self.monitor.end_of_clock()
 
     def pop_end_of_learner(self) -> Outcome | None:
-        """Return how the learner has ended. Later calls, and calls before, return None."""
+        """Return how the learner has ended, but only once. Otherwise return None."""
         for process in self.processes:
             if process.node is LEARNER and process.popen.poll() is not None:
                 self.processes.remove(process)
@@ -380,7 +381,7 @@ class FlightProcesses:
         return None
 
     def waiting(self) -> list[str]:
-        """Return the nodes that are not ready yet."""
+        """Return the names of the nodes that are not ready yet."""
         return [name for name, pid in self._nodes() if not self.monitor.is_ready(name, pid)]
 
     def is_flying(self) -> bool:
@@ -392,7 +393,7 @@ class FlightProcesses:
         )
 
     def is_completed(self) -> bool:
-        """Return whether the aircraft has completed a lockstep flight with the last u."""
+        """Return whether the aircraft has completed a lockstep flight by taking the last u."""
         return any(
             self.monitor.is_completed(name, pid)
             for name, pid in self._nodes()
@@ -400,7 +401,7 @@ class FlightProcesses:
         )
 
     def last_words(self, node: NodeSpec) -> str | None:
-        """Return the last line in which a node awaits a topic or refuses a sample, or None."""
+        """Return the last line in which a node waits for a topic or refuses a sample, or None."""
         lines: list[str] = []
         for process in self.processes:
             if node.executable in self._names(process):
@@ -453,7 +454,7 @@ class FlightProcesses:
 
 
 def _outcome(process: NodeProcess) -> Outcome:
-    """Return the outcome of a flight in which a process has ended."""
+    """Return the outcome of a flight, given the process that ended it."""
     name = process.node.executable
     status = process.finish()
     if status < 0:

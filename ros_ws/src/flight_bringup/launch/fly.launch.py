@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a scenario on a full ROS 2: ros2 launch flight_bringup fly.launch.py scenario:=osprey_servo.
 
-The graph and the scenario file are those of `rise-di fly`. The flight begins once each node is
-ready and matched. It ends once the log holds the duration of the scenario, or in lockstep once the
-aircraft has completed this duration. It ends early with exit status 1 if a node ends or is not
-ready, or if no u reaches the aircraft. If another launch file includes this one, the end of the
-flight ends only its own nodes.
+The nodes and the scenario file are those of `rise-di fly`. The flight begins when each node is
+ready and each of its inputs has a publisher. It ends when the log holds the duration of the
+scenario, or in lockstep when the aircraft has completed this duration. It ends early with exit
+status 1 if a node ends or is not ready, or if no u reaches the aircraft. If another launch file
+includes this one, the end of the flight ends only its own nodes.
 """
 
 from collections.abc import Sequence
@@ -159,7 +159,7 @@ def _fly(context: LaunchContext) -> list[Action]:
 
 
 def _scenario(context: LaunchContext, namespace: str) -> Scenario:
-    """Return the scenario of the arguments, with the values of a `params_file`."""
+    """Return the scenario that the arguments name, with the values of a `params_file`."""
     duration = yaml.safe_load(argument(context, "duration"))
     scenario = find_scenario(argument(context, "scenario"), duration)
     further = argument(context, "params_file")
@@ -169,7 +169,7 @@ def _scenario(context: LaunchContext, namespace: str) -> Scenario:
 def _require_possible(
     own: Sequence[str], *, lockstep: bool, by_rosbag2: bool, is_simulated: bool
 ) -> None:
-    """Raise ParameterError if arguments exclude each other.
+    """Check that no two arguments exclude each other. Raises ParameterError if they do.
 
     `own` are the arguments by which users add other nodes or values to a flight.
     """

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Play a recorded flight on a full ROS 2, beside nodes that answer it.
+"""Play a recorded flight on a full ROS 2, while some nodes compute again.
 
 ros2 launch flight_bringup replay.launch.py run:=runs/latest
 
 Like `rise-di play`, it publishes the topics of the log with their timing, and /clock with the time
 of the log. It plays only topics that none of the nodes publishes, so that a controller answers the
-recorded y and y_m with a new u. The playback begins once all nodes are ready, and ends with the
+recorded y and y_m with a new u. The playback begins when all nodes are ready, and ends with the
 log. If a node ends earlier, the exit status is 1.
 """
 
@@ -148,7 +148,7 @@ def _play(context: LaunchContext) -> list[Action]:
 
 
 def _player(flight: Flight, topics: str) -> ExecuteProcess:
-    """Return `rise-di play` with the launch's arguments; the launch completes when it ends."""
+    """Return the process `rise-di play` with the launch's arguments. Its end ends the launch."""
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action] | None:
         if event.returncode != 0:

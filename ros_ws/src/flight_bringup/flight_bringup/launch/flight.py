@@ -31,13 +31,13 @@ SIM_TIME = "use_sim_time"
 
 
 class Flight:
-    """One flight of a launch, with the arguments in its scope and its processes.
+    """One flight of a launch, with its processes and the arguments that are valid for it.
 
     A launch file may include several flights, each in a group. When a node of the flight starts,
     the scope of its group may have ended. So the flight copies the launch configurations of the
     group once, and uses the copy for all that it starts later. The copy has the arguments of the
     flight, and the effects of PushRosNamespace, SetParameter and SetRemap in the group. At its end
-    a flight stops only its own processes. If the launch then has nothing else to do, it ends too.
+    a flight stops only its own processes. If the launch then has nothing else to do, it also ends.
     """
 
     _of_launch: ClassVar[WeakKeyDictionary[LaunchContext, list["Flight"]]] = WeakKeyDictionary()
@@ -62,20 +62,20 @@ class Flight:
 
     @property
     def has_sim_time(self) -> bool:
-        """Whether SetParameter of the scope gives all nodes the time of /clock."""
+        """Whether a SetParameter in the launch file makes all nodes fly by /clock."""
         values = dict(each for each in self._given_parameters() if isinstance(each, tuple))
         return values.get(SIM_TIME) is True
 
     @property
     def is_by_clock(self) -> bool:
-        """Whether the argument `use_sim_time` or SetParameter asks for /clock."""
+        """Whether the flight is by /clock, by the argument `use_sim_time` or by a SetParameter."""
         return self.argument(SIM_TIME) == "true" or self.has_sim_time
 
     def given_to_nodes(self) -> list[str]:
-        """Return what the scope gives to all of its nodes, such as "SetRemap y", except their time.
+        """List what the launch file gives to all nodes of the flight, such as "SetRemap y".
 
-        SetParameter, SetParametersFromFile and SetRemap reach only the nodes that the launch
-        starts, and no nodes of another process.
+        `use_sim_time` is left out. SetParameter, SetParametersFromFile and SetRemap reach only the
+        nodes that the launch starts, and no nodes of another process.
         """
         names = []
         for each in self._given_parameters():
@@ -86,7 +86,7 @@ class Flight:
         return names + [f"SetRemap {name}" for name, _ in self.configurations.get("ros_remaps", ())]
 
     def _given_parameters(self) -> Sequence[tuple[str, Any] | str]:
-        """Return the parameters of the scope in the form of launch_ros, as values or paths."""
+        """Return the parameters that the launch file gives to all nodes: values, or paths."""
         given: Sequence[tuple[str, Any] | str] = self.configurations.get("global_params", ())
         return given
 
@@ -96,11 +96,14 @@ class Flight:
         return self._is_stopped or bool(self.context.is_shutdown)
 
     def argument(self, name: str) -> str:
-        """Return the value of an argument in the scope of the flight."""
+        """Return the value of a launch argument of this flight."""
         return str(self.configurations[name])
 
     def in_scope(self, actions: Sequence[Action]) -> list[Action]:
-        """Run actions with the launch configurations of the flight, and stop them at its end."""
+        """Return actions that run others with the launch configurations of this flight.
+
+        The processes among `actions` are stopped when the flight ends.
+        """
         self._processes += [each for each in actions if isinstance(each, (ExecuteProcess, Node))]
         restore = _Restore(self.configurations)
         return [PushLaunchConfigurations(), restore, *actions, PopLaunchConfigurations()]
@@ -110,7 +113,7 @@ class Flight:
     ) -> TimerAction:
         """Return an action that calls a function after a period, s.
 
-        The function is not called if the flight has ended by then.
+        If the flight has ended by then, the function is not called.
         """
 
         def call(context: LaunchContext) -> list[Action] | None:
@@ -123,18 +126,18 @@ class Flight:
     def complete(
         self, reason: str = "flight completed", outcome: Outcome = COMPLETED
     ) -> list[Action]:
-        """Return the actions that complete a flight.
+        """Return the actions that end a flight that was completed.
 
-        The recorder closes the log with the outcome.
+        The recorder writes the outcome into the log and closes it.
         """
         leave_outcome(self.run, outcome)
         report = f"; now: ros2 run flight_cli rise-di report {shlex.quote(str(self.run))}"
         return [LogInfo(msg=reason + (report if self.run.name else "")), *self._stop()]
 
     def fail(self, outcome: Outcome) -> list[Action]:
-        """End the flight early, and leave the outcome in the folder of the run.
+        """Return the actions that end the flight early, and write its outcome to the run's folder.
 
-        Other flights of the launch continue undisturbed. If this was the last flight, raises
+        Other flights of the launch go on undisturbed. If this was the last flight, raises
         RuntimeError, so that the launch ends with exit status 1.
         """
         leave_outcome(self.run, outcome)
@@ -160,16 +163,16 @@ class Flight:
 
 
 class _Restore(Action):
-    """An action that restores the launch configurations of a scope that has ended."""
+    """An action that brings back the launch configurations of a scope that has ended."""
 
     def __init__(self, configurations: Mapping[str, Any]) -> None:
         super().__init__()
         self.configurations = configurations
 
     def execute(self, context: LaunchContext) -> None:
-        """Replace the configurations of the launch.
+        """Replace the launch configurations by the stored ones.
 
-        The actions of `Flight.in_scope` push the previous ones before, and pop them afterwards.
+        `Flight.in_scope` saves the present ones before, and brings them back afterwards.
         """
         context.launch_configurations.clear()
         context.launch_configurations.update(self.configurations)
@@ -181,7 +184,7 @@ def argument(context: LaunchContext, name: str) -> str:
 
 
 def _namespace(context: LaunchContext) -> str:
-    """Return the absolute namespace of the nodes, as launch_ros computes it; "" is the root."""
+    """Return the absolute namespace of the nodes, as launch_ros computes it. The root is ""."""
     base = context.launch_configurations.get("ros_namespace")
     own = context.launch_configurations.get("namespace", "")
     return str(make_namespace_absolute(prefix_namespace(base, own))).rstrip("/")

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the nodes of a launch in stages.
 
-A stage waits until each node of the previous stage has published the `node_state` "ready".
+A stage starts when each node of the previous stage has published the state "ready" on the topic
+`node_state`.
 """
 
 import math
@@ -77,7 +78,7 @@ WAITED_FOR = "the lines of the nodes say what they wait for"
 
 
 class NodeStateEvent(Event):
-    """The event that a node of this launch has published its state."""
+    """Event of the launch: one of its nodes has published its state."""
 
     name = "flight_bringup.NodeStateEvent"
 
@@ -87,7 +88,7 @@ class NodeStateEvent(Event):
 
 
 class FlownEvent(Event):
-    """The event that the flight has reached its end."""
+    """Event of the launch: a flight has reached its end."""
 
     name = "flight_bringup.FlownEvent"
 
@@ -96,7 +97,7 @@ class FlownEvent(Event):
 
 
 def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgument:
-    """Declare the argument `scenario`; `otherwise` says what an empty value means."""
+    """Declare the launch argument `scenario`. `otherwise` says what an empty value means."""
     description = (
         f"name of a scenario ({', '.join(scenarios())}), or path of a scenario file "
         f"(.yaml){otherwise}"
@@ -105,21 +106,21 @@ def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgumen
 
 
 def boolean_argument(name: str, default: bool, description: str) -> DeclareLaunchArgument:
-    """Declare an argument that is "true" or "false"."""
+    """Declare a launch argument whose value is "true" or "false"."""
     return DeclareLaunchArgument(
         name, default_value=str(default).lower(), choices=BOOLEAN, description=description
     )
 
 
 def runs_argument() -> DeclareLaunchArgument:
-    """Declare the argument `runs`."""
+    """Declare the launch argument `runs`."""
     return DeclareLaunchArgument(
         "runs", default_value="runs", description="folder in which the folder of the run is created"
     )
 
 
 def recorder_argument(*further: str) -> DeclareLaunchArgument:
-    """Declare the argument `recorder`; its value may also be one of the words in `further`."""
+    """Declare the launch argument `recorder`. `further` has values that it may also have."""
     description = (
         "true: the stack's recorder; rosbag2: `ros2 bag record` into the folder rosbag2 of the run"
     )
@@ -132,14 +133,14 @@ def recorder_argument(*further: str) -> DeclareLaunchArgument:
 
 
 def watch_argument() -> DeclareLaunchArgument:
-    """Declare the argument `watch`."""
+    """Declare the launch argument `watch`."""
     return boolean_argument("watch", False, "serve the live page of the flight: docs/live-view.md")
 
 
 def watch_page(flight: Flight) -> list[Action]:
-    """Return the process that serves the live page of a run, if the user wants it.
+    """Return the process that serves the live page of a flight, if the user wants the page.
 
-    The flight does not depend on this process.
+    The flight goes on if this process ends.
     """
     if flight.argument("watch") != "true":
         return []
@@ -151,12 +152,12 @@ def watch_page(flight: Flight) -> list[Action]:
 def namespace_argument(
     description: str = "namespace of all nodes, a different one for each aircraft",
 ) -> DeclareLaunchArgument:
-    """Declare the argument `namespace`."""
+    """Declare the launch argument `namespace`."""
     return DeclareLaunchArgument("namespace", default_value="", description=description)
 
 
 def log_level_argument() -> DeclareLaunchArgument:
-    """Declare the argument `log_level`."""
+    """Declare the launch argument `log_level`."""
     return DeclareLaunchArgument(
         "log_level",
         default_value="info",
@@ -166,21 +167,21 @@ def log_level_argument() -> DeclareLaunchArgument:
 
 
 def sim_time_argument() -> DeclareLaunchArgument:
-    """Declare the argument `use_sim_time`."""
+    """Declare the launch argument `use_sim_time`."""
     return boolean_argument(
         SIM_TIME, False, "run `rise-di fly` by the /clock of a simulator: docs/ros.md"
     )
 
 
 def by_rise_di(flight: Flight, file: str, *, has_own_time: bool = False) -> list[Action]:
-    """Run `rise-di fly` of a scenario or of a fleet, with the arguments of the launch.
+    """Run the command `rise-di fly` for a scenario or fleet file, with the launch's arguments.
 
     The command flies in real time, because a launch file flies beside other nodes. If
-    `has_own_time`, it flies in the time that the file of the fleet says. If the command ends with
-    an error, because a flight was not completed, the launch ends with exit status 1.
+    `has_own_time` is True, the fleet file says whether it does. If the command ends with an error,
+    because a flight was not completed, the launch ends with exit status 1.
 
-    Raises ParameterError if the scope gives parameters or names to its nodes, because they would
-    not reach the nodes of the command.
+    Raises ParameterError if the launch file gives parameters or names to its nodes, because they
+    would not reach the nodes of the command.
     """
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action]:
@@ -215,7 +216,7 @@ def flight_node(
 ) -> Node:
     """Return the action that starts a node of a flight.
 
-    The node gets its section of the scenario, and then its overrides.
+    The node gets its section of the scenario file, and then `overrides`.
     """
     return Node(
         package=spec.package,
@@ -232,10 +233,11 @@ def flight_node(
 
 
 def rosbag2(flight: Flight, scenario: Scenario, overrides: ParameterOverrides) -> ExecuteProcess:
-    """Run `ros2 bag record` in place of the stack's recorder, with the same topics.
+    """Return the process `ros2 bag record`, which takes the place of the stack's recorder.
 
-    `overrides` are the parameters that the recorder would get. The files that it would attach to
-    its log become a separate log in the folder of the run.
+    It records the same topics. `overrides` are the parameters that the stack's recorder would get.
+    The files that this recorder would attach to its log are written to a separate log in the folder
+    of the run.
     """
     run = Path(overrides["directory"])
     with BagWriter(run) as bag:
@@ -271,7 +273,7 @@ def fail_on_exit(
 ) -> Sequence[Action] | None:
     """End the flight if a process ends before the flight does.
 
-    If the exit status says that the aircraft has landed, the flight is complete.
+    If the exit status says that the aircraft has landed, the flight is completed.
     """
     if flight.is_over:
         return None
@@ -281,7 +283,7 @@ def fail_on_exit(
 
 
 def say_on_exit(event: ProcessExited, context: LaunchContext, flight: Flight) -> list[Action]:
-    """Say that the learner has ended before the flight did."""
+    """Say that the learner has ended, if it ends before the flight does. The flight goes on."""
     sentence = (
         f"{event.process_name} ended before the flight did: the law flies on with the model "
         "that it has"
@@ -294,8 +296,8 @@ def on_state(
 ) -> Action:
     """Return an action that waits until a node has reached a state, and then runs `then` once.
 
-    If the node of this launch has reached the state or a later one already, `then` runs
-    immediately. This happens if nodes of the user publish the inputs of the node before it starts.
+    If this node has already reached the state or a later one, `then` runs immediately. This happens
+    if nodes of the user publish the inputs of the node before it starts.
     """
     node = f"{flight.namespace}/{spec.executable}"
     states = [*NodeState]
@@ -323,13 +325,13 @@ def start_in_stages(
     beside: Sequence[Action] = (),
     publishes: Collection[str] = LOOP_INPUTS,
 ) -> list[Action]:
-    """Start the first stage of a flight and `beside`, and then run the actions of `second`.
+    """Start the nodes `first` of a flight and `beside`, and then run the actions of `second`.
 
-    `second` is called once the nodes are ready, with the time until t = 0 and the system time of t
-    = 0, s. The flight ends early if a node is not ready after READY_TIMEOUT. It also ends early if
-    another flight is under way, which shows by a publisher of a topic in `publishes` before any
-    node starts. Raises ParameterError in simulated time, because the instant of t = 0 is unknown
-    then.
+    `second` is called when these nodes are ready. It gets the time until t = 0 and the system time
+    of t = 0, s. The flight ends early if a node is not ready after READY_TIMEOUT. It also ends
+    early if another flight is under way. This is seen if a topic in `publishes` has a publisher
+    before any node starts. Raises ParameterError in simulated time, because the instant of t = 0 is
+    unknown then.
     """
     require(
         not flight.has_sim_time,
@@ -375,12 +377,12 @@ def start_in_stages(
 def begin_when_matched(
     flight: Flight, nodes: Sequence[NodeSpec], duration: float, *, by_rosbag2: bool, flies: bool
 ) -> list[Action]:
-    """Begin the flight once each node is ready and each input has a publisher.
+    """Begin the flight when each node is ready and each of its inputs has a publisher.
 
-    t = 0 is published on the topic `start`. The flight ends once the log holds y, y_m and u up to
-    `duration`, s. With rosbag2 it ends once u has the stamp of this instant. The flight ends early
-    if a node is never ready and matched. If `flies`, the aircraft is a node of the stack, and the
-    flight also ends early if it takes no u.
+    t = 0 is published on the topic `start`. The flight ends when the log holds y, y_m and u up to
+    `duration`, s. With rosbag2 it ends when u has the stamp of this instant. The flight ends early
+    if a node is not ready, or lacks a publisher, for too long. If `flies` is True, the aircraft is
+    a node of the stack, and the flight also ends early if the aircraft takes no u.
     """
     begin = _Begin(flight, nodes, duration, flies=flies)
     return [
@@ -395,7 +397,7 @@ def begin_when_matched(
 
 
 class _Begin:
-    """Begins a flight by the topic `start`, and ends a flight that does not begin."""
+    """Begins a flight on the topic `start`, and ends a flight that cannot begin."""
 
     def __init__(
         self, flight: Flight, nodes: Sequence[NodeSpec], duration: float, *, flies: bool
@@ -411,7 +413,7 @@ class _Begin:
         self._publish = node.create_publisher(START.type, topic, offered(START)).publish
 
     def matched(self, spec: NodeSpec) -> Sequence[Action]:
-        """Note that a node is matched; after the last node, send t = 0."""
+        """Note that each input of a node has a publisher. After the last node, send t = 0."""
         del self._waiting[spec]
         if self._waiting:
             return []
@@ -428,12 +430,12 @@ class _Begin:
         return []
 
     def held(self, stamp_ns: int) -> bool:
-        """Note that the log is whole up to a stamp, and return whether this is the whole flight."""
+        """Note that the log is complete up to a stamp, and return whether the flight is over."""
         self._held_ns = stamp_ns
         return self._start_ns > 0 and stamp_ns >= self._start_ns + nanoseconds(self._duration)
 
     def require_matched(self, context: LaunchContext) -> Sequence[Action] | None:
-        """End the flight if a node has waited too long."""
+        """End the flight if a node still waits to be ready, or for a publisher of an input."""
         if not self._waiting:
             return None
         names = ", ".join(spec.executable for spec in self._waiting)
@@ -454,7 +456,7 @@ class _Begin:
 def end_with_log(
     flight: Flight, lead: float, end_time: float, duration: float, *, by_rosbag2: bool
 ) -> list[Action]:
-    """End a flight once the log holds y, y_m and u up to the system time `end_time`, s.
+    """End a flight when the log holds y, y_m and u up to the system time `end_time`, s.
 
     If the log lacks one of these topics, for example u while a bridge is not engaged, the flight
     ends `lead` plus `duration` s from now. If the log is still growing then, the flight ends
@@ -480,9 +482,9 @@ def end_with_log(
 def _complete_at(
     flight: Flight, held: Callable[[int], bool], *, by_rosbag2: bool
 ) -> RegisterEventHandler:
-    """Complete the flight once `held` is true for the stamp up to which the log is whole.
+    """Complete the flight when `held` is True for the stamp up to which the log is complete.
 
-    Up to this stamp the log holds y, y_m and u. With rosbag2 it is the stamp of u.
+    Up to this stamp the log holds y, y_m and u. With rosbag2 it is the stamp of the newest u.
     """
     context = flight.context
 
@@ -508,7 +510,7 @@ def _complete_at(
 
 
 def _subscribe_states(flight: Flight) -> None:
-    """Emit a NodeStateEvent whenever a node of this launch publishes its state.
+    """Emit a NodeStateEvent each time a node of this launch publishes its state.
 
     launch_ros.actions.LifecycleNode does the same with lifecycle states.
     """
@@ -536,9 +538,9 @@ def _subscribe_states(flight: Flight) -> None:
 
 
 def _is_descendant(pid: int) -> bool:
-    """Return whether this launch started a process, directly or behind a launch prefix.
+    """Return whether this launch has started a process, directly or behind a launch prefix.
 
-    A process of another flight is no descendant of this launch.
+    It has not started the processes of another flight in the same namespace.
     """
     with suppress(psutil.Error):
         return os.getpid() in {parent.pid for parent in psutil.Process(pid).parents()}
