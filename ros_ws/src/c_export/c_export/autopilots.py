@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Write a controller of body rates that runs inside an autopilot.
+"""Write a module that lets the exported controller fly body rates inside an autopilot.
 
-It has three parts: the exported C code, source/rates, which decides which controller flies, and the
-shell for the autopilot, source/px4 or source/ardupilot.
+The module has three parts. The first is the exported C code. The second, source/rates, decides
+whether this controller or the autopilot's own one flies. The third, source/px4 or source/ardupilot,
+connects the code to the autopilot, and is called the shell.
 """
 
 from collections.abc import Mapping
@@ -149,7 +150,7 @@ HEADER = """/* Axes, signs and sizes of the autopilot for the channels of the sc
 
 
 class Shell(NamedTuple):
-    """The shell that puts the code into an autopilot. Its files are in source/NAME."""
+    """The code that connects a controller to an autopilot. Its files are in source/NAME."""
 
     place: str  # place of the code in the folder
     axes: str  # outputs that the controller can have
@@ -180,14 +181,14 @@ def write_module(
     float32: bool,
     samples: int = SAMPLES,
 ) -> list[Path]:
-    """Write the module of an autopilot to a folder.
+    """Write the module for an autopilot, with the exported controller inside, to a folder.
 
     For PX4 the folder is EXTERNAL_MODULES_LOCATION. For ArduPlane it has files for the source tree,
     and hooks.txt with two lines to add to the tree. Raises ParameterError if the scenario does not
     suit the autopilot, or if a file cannot be written.
 
-    The outputs are body rates. If u is at the upper end stop of its actuator, the autopilot gets a
-    torque of 1 with the sign of D. In ArduPlane this torque is a deflection of 45 degrees. While
+    The outputs y are body rates. If u is at the upper end stop of its actuator, the autopilot gets
+    a torque of 1 with the sign of D. In ArduPlane this torque is a deflection of 45 degrees. While
     RISE-DI does not fly, PX4 flies by its fw_rate_control, or by mc_rate_control for a multicopter.
     """
     shell = SHELLS[autopilot]
@@ -219,10 +220,10 @@ def write_module(
 
 
 def _words_of_vehicle(shell: Shell, scenario: Scenario) -> Mapping[str, str]:
-    """Return the replacements of words in the shell for a multicopter; {} for a fixed wing.
+    """Return the words of the shell that a multicopter needs replaced, with their replacements.
 
-    A fixed wing has a trim speed. A multicopter has none, and its inputs are torques about the
-    axes. Raises ParameterError if the aircraft is neither.
+    The result is {} for a fixed wing. A fixed wing has a trim speed. A multicopter has none, and
+    its inputs are torques about the axes. Raises ParameterError if the aircraft is neither.
     """
     channels = scenario.aircraft.channels()
     has_torques = set(scenario.controller.inputs) <= TORQUES
@@ -243,7 +244,7 @@ def _words_of_vehicle(shell: Shell, scenario: Scenario) -> Mapping[str, str]:
 
 
 def _with_words(text: str, words: Mapping[str, str]) -> str:
-    """Replace each word of `words` in a text by its value."""
+    """Replace each word that is a key of `words` in a text by the value of this key."""
     for word, replacement in words.items():
         text = text.replace(word, replacement)
     return text

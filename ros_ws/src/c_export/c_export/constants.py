@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Write the parameters of the controller and the reference model in C.
+"""Write the parameters of the controller and the reference model for the C code.
 
-The result is rise_di_parameters.h, or the bytes of struct rise_di_parameters.
+They are written as rise_di_parameters.h, or as the bytes of struct rise_di_parameters.
 """
 
 import math
@@ -84,7 +84,7 @@ REALS: Mapping[str, float] = MappingProxyType(
 
 @dataclass(frozen=True, kw_only=True)
 class Constant:
-    """A member of struct rise_di_parameters.
+    """A member of struct rise_di_parameters, or of the struct for the reference model.
 
     Its value is one or several integers (int, tuple), or reals (array). A matrix is stored row by
     row.
@@ -96,7 +96,7 @@ class Constant:
 
 @dataclass(frozen=True, kw_only=True)
 class Sizes:
-    """The dimensions of the exported controller.
+    """The dimensions of an exported controller.
 
     p is 0 without an allocation, n is 0 without a feedforward, and s is 0 without an observer.
     """
@@ -136,11 +136,11 @@ IDLE_IN_C = frozenset(
 
 
 def exportable(controller: ControllerConfig) -> RiseDiConfig:
-    """Return the controller if it can be exported.
+    """Return the controller if it can be exported, or else raise ParameterError.
 
-    Raises ParameterError if its law is not RISE-DI, if its model can be replaced in flight (the
-    section `learn`), if another key that the C code lacks is not at its default, or if its observer
-    is switched off by a `part` of 0.
+    It cannot be exported if its law is not RISE-DI, or if its model can be replaced in flight (the
+    section `learn`). Any other key that the C code lacks must be at its default, and an observer
+    must not be switched off by a `part` of 0.
     """
     require(
         isinstance(controller, RiseDiConfig),
@@ -172,7 +172,7 @@ def sizes(controller: RiseDiConfig) -> Sizes:
 
 
 def constants(controller: RiseDiConfig) -> list[Constant]:
-    """Return the members of struct rise_di_parameters in the order of rise_di.h.
+    """Return the members of struct rise_di_parameters, in the order of rise_di.h.
 
     A limit that the controller does not have is infinite.
     """
@@ -251,13 +251,13 @@ def packed(controller: RiseDiConfig, *, float32: bool) -> bytes:
 
 
 def _finite(values: FloatArray, real: type[np.floating]) -> FloatArray:
-    """Replace infinity by the largest number of the type."""
+    """Replace infinity by the largest finite number of a floating-point type."""
     largest = float(np.finfo(real).max)
     return np.clip(values, -largest, largest)
 
 
 def reference_constants(reference: ReferenceModelConfig) -> list[Constant]:
-    """Return the members of struct rise_di_reference_parameters in the order of rise_di.h."""
+    """Return the members of struct rise_di_reference_parameters, in the order of rise_di.h."""
     live = reference.live_params()
     model = reference.model()
     period = period_ns(reference.rate, "rate")
@@ -281,9 +281,9 @@ def header(
     float32: bool,
     samples: int = SAMPLE_BUFFER_SIZE,
 ) -> str:
-    """Return the text of rise_di_parameters.h, without reference model if `reference` is None.
+    """Return the text of rise_di_parameters.h. If `reference` is None, it has no reference model.
 
-    The code keeps `samples` samples of y, and as many of y_m.
+    The C code stores the last `samples` samples of y, and as many of y_m.
     """
     r = 0 if reference is None else len(reference.model().A_m)
     suffix = "F" if float32 else ""
@@ -337,7 +337,7 @@ def header(
 
 
 def _names_and_sizes(controller: RiseDiConfig, r: int, samples: int, *, float32: bool) -> list[str]:
-    """Return the lines with the channel names, the dimensions, and the switches for compilation."""
+    """Return the lines of the header with channel names, dimensions and compile-time switches."""
     dimensions = sizes(controller)
     m, p, n, s = dimensions.m, dimensions.p, dimensions.n, dimensions.s
     effectors = [f"#define RISE_DI_EFFECTORS {_strings(controller.effectors)}"] if p else []
@@ -369,7 +369,10 @@ def _macro(name: str, parts: list[str], *, braces: bool = True) -> list[str]:
 
 
 def _rows(members: list[Constant], numbers: Callable[[FloatArray], str]) -> list[str]:
-    """Return the rows of the parameter table in C, in the order of the reals of the struct."""
+    """Return the rows of the C table that gives unit, place, size and bounds of each parameter.
+
+    The rows are in the order of the reals of the struct.
+    """
     rows = []
     place = 0
     for member in members:
@@ -383,10 +386,10 @@ def _rows(members: list[Constant], numbers: Callable[[FloatArray], str]) -> list
 
 
 def _initialiser(member: Constant, numbers: Callable[[FloatArray], str]) -> str:
-    """Return the C initialiser of a number, or of a list in braces.
+    """Return the C initialiser of a member: a number, or a list in braces.
 
-    The limits are a nested struct. Its braces open before the list of `lower`, which is its first
-    member, and close after that of `rate`, which is its last.
+    The limits are a nested struct. Its braces open before the list of `lower`, its first member,
+    and close after the list of `rate`, its last member.
     """
     value = member.value
     if isinstance(value, int):
@@ -401,7 +404,7 @@ def _initialiser(member: Constant, numbers: Callable[[FloatArray], str]) -> str:
 
 
 def _strings(names: tuple[str, ...]) -> str:
-    """Return names as string literals of C.
+    """Return names as C string literals, separated by commas.
 
     If a character is not a letter, a digit or one of "_. ", each of its bytes becomes an octal
     escape. The names of a parameter set have no such characters.
@@ -417,5 +420,8 @@ def _octal(character: str) -> str:
 
 
 def _comment(names: tuple[str, ...]) -> str:
-    """Return names for a comment in C. The escapes of `_strings` keep it from ending early."""
+    """Return names for a C comment, separated by commas.
+
+    They have the escapes of `_strings`, so that no name can end the comment early.
+    """
     return ", ".join("".join(map(_octal, name)) for name in names)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Draw random inputs for the proof.
+"""Draw random inputs with which C and Python are compared.
 
 They are calls of a controller with any timing, and single steps from any state.
 """
@@ -45,7 +45,7 @@ EPOCH_NS = 1_795_000_000_000_000_000
 def drawn_calls(
     sets: Sequence[RiseDiConfig], ticks: int, seed: int, samples: int = SAMPLE_BUFFER_SIZE
 ) -> Recording:
-    """Draw calls of a controller with faults of every kind.
+    """Draw random calls of a controller, with faults of every kind, and record them.
 
     The faults are jitter, lost, late and early samples, repeated stamps, errors of any size, jumps,
     new parameters and deactivation.
@@ -108,10 +108,10 @@ def drawn_calls(
 
 
 def _interval_ns(kind: float, size: float, period_ns: int) -> int:
-    """Return the time to the next tick, ns.
+    """Return a drawn time from one tick to the next, ns.
 
-    The time is a period with jitter, or far from a period, or a long pause. `kind` and `size`,
-    which are drawn from 0 to 1, determine it.
+    The time is a period with jitter, or far from a period, or a long pause. It follows from `kind`
+    and `size`, which are drawn from 0 to 1.
     """
     if kind < 0.9:
         return round(period_ns * (1.0 + 0.2 * (size - 0.5)))
@@ -122,7 +122,7 @@ def _interval_ns(kind: float, size: float, period_ns: int) -> int:
 
 
 def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
-    """Yield the offset by which each sample of y has jumped, (m,).
+    """Yield an offset for each sample of y, (m,): 0, or the size of a jump of the sensors.
 
     A jump begins at one sample in 50 and lasts for some samples. The offset is up to 10^5 times
     `unit`, so the controller does not take the first samples of a large jump.
@@ -140,7 +140,7 @@ def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
 def drawn_standstill(
     sets: Sequence[RiseDiConfig], ticks: int, seed: int, samples: int = SAMPLE_BUFFER_SIZE
 ) -> Recording:
-    """Draw samples of y with noise, and stretches of up to twelve equal samples.
+    """Draw noisy samples of y with stretches of up to twelve equal samples, as of a frozen sensor.
 
     The samples arrive at the ticks and half a period before the ticks.
     """
@@ -163,11 +163,9 @@ def drawn_standstill(
 
 
 def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int) -> Recording:
-    """Draw single steps of an engaged controller from any state.
+    """Draw single steps of an engaged controller from any state, and compute them all at once.
 
-    All steps are computed at once.
-
-    The parameters are those at `index` in `sets`. Errors are 0.001 to 300 widths of the softened
+    The controller has the parameters sets[index]. Errors are 0.001 to 300 widths of the softened
     sign. dt is 0.2 to 10 periods, so that up to 9 samples are missing. It is always short enough
     that the law does not engage again.
     """
@@ -210,10 +208,10 @@ def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int)
 
 
 def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Recording:
-    """Draw live commands for the reference model.
+    """Draw live commands u_m for the reference model, and record its steps.
 
-    Commands have any size, also beyond the bounds. They can be late, repeated, or lost for longer
-    than `max_age`.
+    The commands have any size, also beyond their bounds. They can be late, repeated, or lost for
+    longer than `max_age`.
     """
     rng = np.random.default_rng(seed)
     model = Reference(
@@ -254,7 +252,7 @@ def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Re
 
 
 def _rows(values: Mapping[str, FloatArray], groups: Sequence[str]) -> FloatArray:
-    """Return an array with a row for each step, in which the values of all groups are side by side.
+    """Return an array with a row for each step. A row has the values of all groups side by side.
 
     `values` has an array of the shape (values, steps) for each group.
     """
@@ -264,7 +262,7 @@ def _rows(values: Mapping[str, FloatArray], groups: Sequence[str]) -> FloatArray
 def _drawn_states(
     controller: RiseDiConfig, rng: np.random.Generator, dt_ns: NDArray[np.int64]
 ) -> tuple[dict[str, FloatArray], FloatArray, FloatArray]:
-    """Draw the states before the steps, by group, and the y and y_m that the steps take.
+    """Draw the states before the steps, by group of values, and the y and y_m of the steps.
 
     Each array has the shape (values, steps).
     """
@@ -312,7 +310,10 @@ def _states_after(
     y_m: FloatArray,
     dt_ns: NDArray[np.int64],
 ) -> dict[str, FloatArray]:
-    """Return the states after a step, computed by the guard's functions for all columns at once."""
+    """Compute the states after each step, all columns at once, by the functions of the guard.
+
+    A column is one of the drawn steps.
+    """
     guard = controller.guard()
     law = controller.tuned_law()
     period = seconds(guard.period_ns)
@@ -371,7 +372,7 @@ def _feedforward_step(
     y_m: FloatArray,
     dt: FloatArray,
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return u_ff after a step of the feedforward, and its states by name.
+    """Compute u_ff after a step of the feedforward, and the feedforward's states by name.
 
     Each array has a column for each of the drawn steps.
     """
@@ -393,10 +394,10 @@ def _feedforward_step(
 def _effector_values(
     u: FloatArray, before: FloatArray | None, dt: FloatArray, params: Allocation | None
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Allocate the demanded u of many steps, one step in each column.
+    """Allocate u to the effectors for many steps, one in each column.
 
-    Returns the u that the effectors give, and their commands. Without an allocation, these are the
-    demanded u and None.
+    Returns the u that the effectors can give, and their commands. Without an allocation, these are
+    `u` and None.
     """
     if params is None or before is None:
         return u, None
@@ -414,7 +415,7 @@ def _columns(params: Any) -> Any:
 
 
 def _where(mask: NDArray[np.bool_], here: Any, otherwise: Any) -> Any:
-    """Return, for each step, the state `here` if the mask is true, else `otherwise`."""
+    """Return, for each step, the state `here` if the mask is True, else the state `otherwise`."""
     if hasattr(here, "_asdict"):
         return type(here)(*(_where(mask, *pair) for pair in zip(here, otherwise, strict=True)))
     return np.where(mask, here, otherwise)

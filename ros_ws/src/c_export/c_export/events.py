@@ -56,9 +56,9 @@ NOTHING = np.zeros(0)
 
 
 class Recording(NamedTuple):
-    """The events of a controller or a reference model, and its state after each of T ticks.
+    """The calls of a controller or a reference model as events, with its state after each tick.
 
-    The states are computed by the Python code.
+    The T ticks and their states are computed by the Python code.
     """
 
     name: str
@@ -81,7 +81,7 @@ def event_type(m: int) -> np.dtype[np.void]:
 
 
 def real_groups(controller: RiseDiConfig) -> dict[str, int]:
-    """Return the groups of reals in a state with their sizes, in the order of proof.c."""
+    """Return the size of each group of reals in a state, by name, in the order of proof.c."""
     dimensions = sizes(controller)
     m, p, n, s = dimensions.m, dimensions.p, dimensions.n, dimensions.s
     groups = dict.fromkeys(("u", "u_free", "u_trim", "u_ff", "u_failsafe"), m)
@@ -99,7 +99,7 @@ def real_groups(controller: RiseDiConfig) -> dict[str, int]:
 
 
 def state_names(controller: RiseDiConfig) -> tuple[str, ...]:
-    """Return the names of the integers and the reals in a state."""
+    """Return a name for each integer and each real of a state."""
     return (*INTEGERS, *numbered(real_groups(controller)))
 
 
@@ -111,7 +111,7 @@ def numbered(groups: Mapping[str, int]) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class GuardSample:
-    """The sample that a tick of the guard takes."""
+    """The y and y_m that a tick of the guard uses, with their stamps."""
 
     stamp_ns: int
     y: FloatArray
@@ -120,12 +120,12 @@ class GuardSample:
 
 
 class Recorder(Controller):
-    """A controller that records its calls and its states.
+    """A controller that records its calls as events, and its state after each tick.
 
-    `sets` are the parameter sets that `retune_to` can choose, and the recorder starts with the
-    first set. `before_tick` is called before each tick with the recorder and the instant. It
-    returns whether the controller is active. `samples` is the number of samples of y, and of y_m,
-    that are kept.
+    `sets` are the parameter sets from which `retune_to` chooses. The recorder starts with the first
+    of them. `before_tick` is called before each tick with the recorder and the instant. It returns
+    whether the controller is active. The controller keeps the last `samples` samples of y, and as
+    many of y_m.
     """
 
     def __init__(
@@ -166,20 +166,20 @@ class Recorder(Controller):
         self._events.append((kind, now_ns, stamp_ns, flag, offset_ns, *values))
 
     def begin(self) -> None:
-        """Begin a new controller with the first parameters."""
+        """Begin again as a new controller with the first parameters."""
         self._reset(self.sets[0])
         self._refused = 0
         self._add(START)
 
     def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """Hand a sample of y to the controller, or lose it if y is in `silent`."""
+        """Give a sample of y to the controller. If `silent` contains y, the sample is lost."""
         if "y" in self.silent:
             return None
         self._add(TAKE_Y, now_ns, sample.stamp_ns, y=sample.value)
         return self._note_refusal(super().take_y, sample, now_ns)
 
     def take_y_m(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """Hand a sample of y_m to the controller, or lose it if y_m is in `silent`."""
+        """Give a sample of y_m to the controller. If `silent` contains y_m, the sample is lost."""
         if "y_m" in self.silent:
             return None
         self._add(TAKE_Y_M, now_ns, sample.stamp_ns, y_m=sample.value)
@@ -201,7 +201,7 @@ class Recorder(Controller):
         return refusal
 
     def retune_to(self, index: int) -> None:
-        """Take the parameters at an index of `sets`."""
+        """Change to the parameters sets[index], and record the change."""
         self._add(RETUNE, flag=index)
         self.retune(self.sets[index])
 
@@ -221,7 +221,7 @@ class Recorder(Controller):
     def guard_tick(self, now_ns: int, sample: GuardSample | None, *, active: bool) -> None:
         """Compute a tick of the guard with a given sample, and record it.
 
-        `sample` is None if there are no samples.
+        `sample` is None if the tick has no sample of y and y_m.
         """
         y = None
         y_m = []
@@ -271,7 +271,7 @@ class Recorder(Controller):
         self._reals.append(row)
 
     def recording(self, name: str) -> Recording:
-        """Return the events and states so far as a recording with a name."""
+        """Return the events and states so far as a recording called `name`."""
         events = np.array(self._events, dtype=event_type(len(self._none)))
         integers = np.array(self._integers, dtype=np.int64).reshape(-1, len(INTEGERS))
         reals = np.array(self._reals).reshape(len(integers), -1)
@@ -283,7 +283,7 @@ class Recorder(Controller):
 def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
     """Return the given parameters, and then sets in which some parameters have other valid values.
 
-    The changes concern gains, limits, signs, times, the schedule, the observer and stops.
+    The changes concern gains, limits, signs, times, the schedule, the observer and end stops.
     """
     widths = np.array(controller.input_scale) * controller.law_params().eps
     bound = np.minimum(10.0 * widths, 0.1 * np.array(controller.upper or 10.0 * widths)).tolist()
@@ -346,7 +346,7 @@ def _flight(name: str, scenario: Scenario, recorder: Recorder) -> Recording:
 
 
 def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder, int], bool]:
-    """Return a function that injects the faults of a flight before a tick."""
+    """Return a function that injects the faults of a flight. It is called before each tick."""
     controller = sets[0]
     within_hold = controller.max_age + 0.5 * controller.hold
     in_ramp = controller.max_age + controller.hold + 0.5 * controller.ramp
@@ -381,10 +381,11 @@ def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder
 
 
 def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]:
-    """Read from a log the parameter sets, the ticks, and the number of ticks that agree.
+    """Read the parameter sets and the ticks from a log, and compute the ticks again.
 
-    The sets are the parameters and their changes in flight. A tick agrees if its u is that of the
-    log. Raises ParameterError if the changes in the log do not lead to the parameters that flew.
+    Returns the sets, the recording, and the number of ticks whose u equals that of the log. The
+    sets are the parameters of the start and those after each change in flight. Raises
+    ParameterError if the changes in the log do not lead to the parameters that flew.
     """
     sets = [exportable(recorded_parameters(run.scenario_file()))]
     changes = [*recorded_changes(run, sets[0])]

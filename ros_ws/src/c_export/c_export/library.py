@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Build the exported code as a library for Python, or as a co-simulation unit of FMI 2.0."""
+"""Build the exported code as a library for Python, or as an FMI 2.0 co-simulation unit."""
 
 import ctypes
 import shutil
@@ -30,7 +30,7 @@ MOST = float(np.finfo(np.float64).max)  # number that stands for infinity in the
 class CController:
     """A controller in C with the methods of `rise_di_controller.controller.Controller`.
 
-    `p` is the number of values of u.
+    `p` is the number of channels of u.
     """
 
     def __init__(self, library: Path, p: int) -> None:
@@ -46,7 +46,7 @@ class CController:
             )
 
     def take_y(self, stamp_ns: int, value: FloatArray, now_ns: int) -> int:
-        """Take a sample of y, and return rise_di_status, which is 0 if the sample was taken."""
+        """Take a sample of y, and return its rise_di_status, which is 0 if it was accepted."""
         return self._take(1, stamp_ns, value, now_ns)
 
     def take_y_m(self, stamp_ns: int, value: FloatArray, now_ns: int) -> int:
@@ -67,9 +67,9 @@ class CController:
         return self._u.copy(), mode
 
     def replay(self, recording: Recording) -> FloatArray:
-        """Compute every tick of a log in C, and return the u of each tick, (T, p).
+        """Compute every tick of a recorded flight in C, and return the u of each tick, (T, p).
 
-        `recording` is the result of `run_recording`.
+        `recording` is a result of `run_recording`.
         """
         events = recording.events
         ticks = events[events["kind"] == GUARD_TICK]
@@ -88,7 +88,7 @@ class CController:
 
 
 def build_library(code: Path, compiler: Sequence[str], path: Path) -> Path:
-    """Compile exported code of float64 to a shared library for CController.
+    """Compile exported float64 code to a shared library, which `CController` can load.
 
     Raises ParameterError if the compiler fails.
     """
@@ -135,19 +135,19 @@ channel.
 
 
 class Units(NamedTuple):
-    """The SI units of the outputs and of the commands, in their order."""
+    """The SI units of the outputs and of the commands, in the order of the channels."""
 
     outputs: Sequence[str]
     commands: Sequence[str]
 
 
 def si_units(units: Sequence[str]) -> tuple[str, ...]:
-    """Return the SI units of an airframe file's units, for example "rad/s" for "deg/s"."""
+    """Convert the units of an airframe file to SI units, for example "deg/s" to "rad/s"."""
     return tuple(_unit_name(quantity(unit).dimension) for unit in units)
 
 
 def _unit_name(dimension: tuple[int, int, int, int]) -> str:
-    """Name the SI unit with these exponents of rad, m, s and kg."""
+    """Return the name of the SI unit whose exponents of rad, m, s and kg are given."""
     parts = list(zip(("rad", "m", "s", "kg"), dimension, strict=True))
     above = [_power(name, exponent) for name, exponent in parts if exponent > 0]
     below = [_power(name, -exponent) for name, exponent in parts if exponent < 0]
@@ -159,7 +159,7 @@ def _power(name: str, exponent: int) -> str:
 
 
 def _definitions(units: Units) -> list[str]:
-    """Return the lines of UnitDefinitions in modelDescription.xml."""
+    """Return the XML lines of UnitDefinitions in modelDescription.xml."""
     lines = []
     for name in sorted({*units.outputs, *units.commands}):
         dimension = quantity(name).dimension
@@ -170,7 +170,7 @@ def _definitions(units: Units) -> list[str]:
 
 
 def _channels(controller: RiseDiConfig, units: Units) -> list[str]:
-    """Return the lines with the variables of y, y_m, u, the flags and the mode."""
+    """Return the XML lines with the variables of y, y_m, u, the flags and the mode."""
     groups = {
         "y": (controller.outputs, units.outputs),
         "y_m": (controller.outputs, units.outputs),
@@ -196,7 +196,7 @@ def _channels(controller: RiseDiConfig, units: Units) -> list[str]:
 
 
 def _parameters(controller: RiseDiConfig) -> list[str]:
-    """Return the lines with a variable for each channel of each parameter in TUNABLE."""
+    """Return the XML lines with a variable for each channel of each parameter in TUNABLE."""
     variables = []
     place = VALUE_REFERENCES["parameter"]
     for member in constants(controller):
@@ -252,8 +252,8 @@ DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 def model_description(controller: RiseDiConfig, scenario: str, units: Units) -> str:
     """Return the text of modelDescription.xml.
 
-    The inputs of the unit are y, y_m, active, y_new and y_m_new. The outputs are u and mode, and
-    the parameters are those in TUNABLE. A step is a tick.
+    The inputs of the unit are y, y_m, active, y_new and y_m_new. Its outputs are u and mode, and
+    its parameters are those in TUNABLE. A step of the unit is a tick of the controller.
     """
     variables = _channels(controller, units)
     begin = 2 * len(controller.outputs) + 1
@@ -277,7 +277,7 @@ def build_fmu(
     path: Path,
     units: Units,
 ) -> Path:
-    """Compile exported code to a co-simulation unit of FMI 2.0 for this machine (linux64).
+    """Compile exported code to an FMI 2.0 co-simulation unit for this machine (linux64).
 
     The unit also contains the sources, for other machines. Raises ParameterError if the compiler
     fails.

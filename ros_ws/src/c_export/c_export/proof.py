@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compile the exported C code, and compare it with the controller in Python.
 
-Every u and every state of C is compared bit by bit.
+C gets the same calls as Python. Every u and every state of C is compared bit by bit.
 """
 
 import json
@@ -89,9 +89,9 @@ def write_code(
 ) -> list[Path]:
     """Write the C code of a controller and of a reference model to a folder.
 
-    The report and the FMI unit of earlier code in the folder are removed. The controller keeps
-    `samples` samples of y, and as many of y_m. Raises ParameterError if the files cannot be
-    written.
+    Report, FMI unit and certificate of earlier code in the folder are removed. The controller in C
+    stores the last `samples` samples of y, and as many of y_m. Raises ParameterError if the files
+    cannot be written.
     """
     require(samples >= LEAST_SAMPLES, "samples", samples, f"{LEAST_SAMPLES} or more")
     with writing("c", folder, "a folder that can"):
@@ -106,9 +106,10 @@ def write_code(
 
 
 def compilers(names: Sequence[str] = ()) -> list[list[str]]:
-    """Return the commands of the C compilers: `names`, or else those of COMPILERS on the PATH.
+    """Return the commands of the C compilers to use.
 
-    Raises ParameterError if there is no compiler.
+    They are `names` or, if this is empty, those of COMPILERS that are on the PATH. Raises
+    ParameterError if there is no compiler.
     """
     commands = [words(command) for command in names] or [
         [name] for name in COMPILERS if shutil.which(name)
@@ -145,14 +146,14 @@ def words(
 
 
 class Program:
-    """A program of proof.c and the exported code, compiled in a separate folder."""
+    """A program that replays recordings in C: proof.c and the exported code, compiled together."""
 
     def __init__(
         self, code: Path, compiler: Sequence[str], sets: Sequence[RiseDiConfig], folder: Path, *,
         float32: bool = False,
         flags: Sequence[str] = FLAGS, source: str | None = None, runner: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        """Compile the program.
+        """Compile the program in the folder `folder`.
 
         `source` replaces the text of rise_di.c, and `runner` is a command that starts the program.
         Raises ParameterError if the compiler fails.
@@ -173,16 +174,17 @@ class Program:
         build([*compiler, *flags, "-o", "proof", "proof.c"], folder)
 
     def take(self, sets: Sequence[RiseDiConfig]) -> None:
-        """Replace the parameter sets.
+        """Replace the parameter sets to which the program can change.
 
-        The program does not use the first set, but the parameters in the exported header.
+        The program ignores the first set, because it starts with the parameters of the exported
+        header.
         """
         self._sets = sets
         content = b"".join(packed(controller, float32=self._float32) for controller in sets)
         (self._folder / "sets").write_bytes(content)
 
     def run(self, recording: Recording) -> tuple[np.ndarray, FloatArray, Mapping[str, int]]:
-        """Run the program, and return the integers and the reals of its states.
+        """Run the program with a recording, and return the integers and the reals of its states.
 
         The integers and reals have the same form as in the recording. The third result has the
         numbers that the program prints, by name.
@@ -210,7 +212,7 @@ class Program:
         return states[:, :integers], reals, json.loads(process.stdout)
 
     def compare(self, recording: Recording) -> Comparison:
-        """Compare the states of C with the states of Python."""
+        """Run the program with a recording, and compare its states with those of Python."""
         integers, reals, _ = self.run(recording)
         m = len(self._sets[0].outputs)
         if len(integers) != recording.ticks:
@@ -249,7 +251,7 @@ class Program:
 
 
 class Proof(NamedTuple):
-    """The results of a proof, with compilers, comparisons and measured numbers."""
+    """The results of a proof: compilers, comparisons, and measured sizes and operations."""
 
     compilers: tuple[str, ...]  # versions of the compilers
     comparisons: tuple[Comparison, ...]  # comparisons of all recordings for each compiler
@@ -275,7 +277,8 @@ def prove(
 
     Every state of the C code is compared with the recorded state of the Python code. `runner`, such
     as qemu, starts the programs of a compiler for another machine. If g++ is installed and the code
-    is in float64, a further program finds the largest number of operations on reals in one call.
+    is in float64, a further program counts the operations on reals, and finds the largest number in
+    one call.
     """
     comparisons: list[Comparison] = []
     with tempfile.TemporaryDirectory(prefix="rise_di_export_") as name:
@@ -364,11 +367,12 @@ def version(compiler: Sequence[str]) -> str:
 
 
 def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, int]:
-    """Return the bytes of machine code with its constants, of global variables, and of the stack.
+    """Measure the memory of the exported code, in bytes.
 
-    FIGURES has their names. The bytes of the stack are the sum of the frames of all functions. No
-    function calls itself, so no chain of calls needs more than this sum. An unknown number is left
-    out.
+    The result has the bytes of machine code with its constants, of global variables, and of the
+    stack, under the names of FIGURES. The bytes of the stack are the sum of the frames of all
+    functions. No function calls itself, so no chain of calls needs more than this sum. An unknown
+    number is left out.
     """
     for name in (*CODE, PARAMETERS):
         shutil.copyfile(code / name, folder / name)
