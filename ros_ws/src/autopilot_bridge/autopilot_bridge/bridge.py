@@ -173,7 +173,7 @@ class Bridge:
         self.conditions.take_condition(name, raw, now_ns)
 
     def take_parameter(self, name: str, value: float) -> None:
-        """Take a parameter of the autopilot."""
+        """Take the value of a parameter of the autopilot."""
         self._parameters[name] = value
 
     def take_override(self, name: str, raw: float, now_ns: int) -> None:

@@ -211,7 +211,7 @@ class Link:
     def send(self, message: Any) -> None:
         """Send a message of `mavlink_type` to the autopilot.
 
-        It is sent with the system number of the ground station.
+        The message is sent with the system number of the ground station.
         """
         fields = message.packed.fieldnames
         values = {field: getattr(message, field) for field in fields}
@@ -254,7 +254,8 @@ class Link:
     def _station_numbers(self) -> range:
         """Return the numbers of the systems whose RC overrides the autopilot takes.
 
-        They come from its parameters, or from the map if the parameters are not known.
+        They come from the autopilot's parameters, or from the map if these parameters are not
+        known.
         """
         first = self.parameters.get(STATION, self.parameters.get(OLD_STATION))
         if first is None:

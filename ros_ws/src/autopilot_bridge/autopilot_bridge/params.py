@@ -154,10 +154,7 @@ class ChannelMap(Config):
         self._check_parameters()
 
     def _check_inputs(self) -> None:
-        """Check the fields of the inputs, and whether their values fit the ranges of the fields.
-
-        The values are those in trim and at the limits.
-        """
+        """Check the fields of the inputs, and that u fits them in trim and at its limits."""
         owners: dict[tuple[str, str], str] = {}
         for name, row in self.inputs.items():
             key = f"inputs.{name}"

@@ -339,10 +339,10 @@ def part_masks(
 
 
 def sample_times(stamp_ns: NDArray[np.int64]) -> FloatArray:
-    """Return the time that each sample stands for, (N,), s.
+    """Return the length of time that each sample represents, (N,), s.
 
     It is half the sum of the intervals to both neighbours, where an interval counts as at most
-    LONGEST_INTERVAL. The first and the last sample stand for a whole interval, so that equal
+    LONGEST_INTERVAL. The first and the last sample represent a whole interval, so that equal
     intervals give equal times.
     """
     if len(stamp_ns) < 2:

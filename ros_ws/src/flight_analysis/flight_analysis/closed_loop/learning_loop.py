@@ -188,7 +188,7 @@ def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown
 def proposed(
     learner: Learner, learning: Learning, controller: Controller, t_ns: int
 ) -> LearnerResult:
-    """Let the learner propose at a tick, hand the proposal to the controller, and return it."""
+    """Ask the learner for a proposal at a tick, give it to the controller, and return it."""
     proposal = learner.propose(controller.digest, outputs_without(controller.parameters))
     received = as_received(proposal, learning.start, t_ns, controller.digest)
     learning.receive(received, controller, t_ns)

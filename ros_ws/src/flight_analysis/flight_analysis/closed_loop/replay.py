@@ -192,16 +192,17 @@ def replay(
     others: ControllerConfig | None = None,
     changes: Sequence[Change] | None = None,
 ) -> ReplayResult:
-    """Compute every tick of `internals` again, and return the recorded and the computed values.
+    """Compute every recorded tick again, and return the recorded and the computed values.
 
-    A tick is (state, now, y, y_m) -> (state, u) by `guard.tick`. It takes y from the topic `y` at
-    its stamp. y_m, the instant of y_m, and whether the controller was active come from `internals`.
-    The results are dt, mode, e, the integrals, Pi and u.
+    The log of the ticks is the topic `internals`. A tick is (state, now, y, y_m) -> (state, u) by
+    `guard.tick`. It takes y from the topic `y` at its stamp. y_m, the instant of y_m, and whether
+    the controller was active come from `internals`. The results are dt, mode, e, the integrals, Pi
+    and u.
 
-    The state comes from the computation of the tick before. If that tick differs from the log, the
-    state comes from the log, so that each tick is judged by itself. After a gap in the log, the
-    state is the logged state of the first engaged tick. The ticks up to this one are not checked,
-    and u_ff is not checked until the next engagement.
+    The state before a tick is the computed state after the tick before it. If that tick differs
+    from the log, the state comes from the log, so that each tick is judged by itself. After a gap
+    in the log, the state is the logged state of the first engaged tick. The ticks up to this one
+    are not checked, and u_ff is not checked until the next engagement.
 
     Args:
         run: Folder or file of a run, a run as read, or a tape.
@@ -218,8 +219,8 @@ def replay(
         The recorded and the computed values of N ticks in k channels, shape (N, k), SI.
 
     Raises:
-        ParameterError: `internals` has other channels or comes from a version with fewer channels,
-            the changes are invalid, or the log was recorded with another arithmetic.
+        ParameterError: The topic `internals` has other channels or comes from a version with fewer
+            channels, the changes are invalid, or the log was recorded with another arithmetic.
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))

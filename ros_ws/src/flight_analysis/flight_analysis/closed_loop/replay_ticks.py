@@ -202,9 +202,10 @@ class Ticks:
     def tick(
         self, k: int, state: ControllerState, limits: GuardParams, law: TunedLaw
     ) -> tuple[ControllerState, FloatArray]:
-        """Compute tick k, and return the state after it and its values of the channels `names`.
+        """Compute tick k, and return the state after it and the values of its channels.
 
-        If the tick has no output, all values are NaN.
+        The channels are those of the attribute `names`. If the tick has no output, all values are
+        NaN.
         """
         stamp_ns = int(self.stamp_ns[k])
         y = None

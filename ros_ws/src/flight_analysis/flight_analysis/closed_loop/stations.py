@@ -246,7 +246,7 @@ class ControllerStation:
         topics.subscribe("y_m", controller.take_y_m, parameters.outputs)
 
     def step(self, t_ns: int) -> None:
-        """Take a tick of the controller, and publish u and the log if the tick has an output."""
+        """Compute a tick of the controller, and publish its u and its log if it has an output."""
         self.output = self.controller.tick(t_ns)
         if self.output is not None:
             self._topics.publish("u", StampedVector(self.output.stamp_ns, self.output.u), t_ns)

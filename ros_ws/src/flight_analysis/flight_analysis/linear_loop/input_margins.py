@@ -94,7 +94,7 @@ class Margins(NamedTuple):
         """Return the worst value of each margin among N aircraft.
 
         The margins of N aircraft have the shapes (N, m) and (N,), and the worst ones (m,) and ().
-        `crossover` is that of the aircraft with the smallest phase margin.
+        The crossover of an input comes from the aircraft with the smallest phase margin.
         """
         least = {name: np.asarray(value.min(axis=0)) for name, value in self._asdict().items()}
         most = {
@@ -149,7 +149,7 @@ def _slow_modes(eigenvalues: ComplexArray, period: float) -> SlowModes:
 def loop_transfer(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming, w: FloatArray
 ) -> ComplexArray:
-    """Compute L_i of an aircraft at F frequencies w, rad/s, up to pi / T. The shape is (F, m)."""
+    """Compute the loop transfer functions L_i, (F, m), at F frequencies w <= pi / T, rad/s."""
     form = schur_form(LinearPlant(plant.A[None], plant.B[None], plant.C), law, loop)
     S = _sensitivity(form, np.exp(1j * w * loop.period)[None])[0]
     return np.asarray(1.0 / np.einsum("...ii->...i", S) - 1.0)
@@ -188,8 +188,8 @@ def input_margins(
 def phase_margins(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> FloatArray:
     """Compute only the phase margins of `input_margins`, (..., m), rad, to 1e-8.
 
-    This is faster, because there is no search for gain margins and peaks. If the modes of a loop
-    are independent, S is evaluated as a sum over the modes.
+    This is faster than `input_margins`, because there is no search for gain margins and peaks. If
+    the modes of a loop are independent, S is evaluated as a sum over the modes.
     """
     parts = []
     for aircraft, its_law in _batches(plant, law):
@@ -264,10 +264,10 @@ def schur_form(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> SchurFor
 def _modal_form(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming
 ) -> tuple[SchurForm, NDArray[np.bool_]]:
-    """Return the loops as a `SchurForm` with a diagonal T, and whether it holds for each loop.
+    """Return the loops as a `SchurForm` with a diagonal T, and whether each loop permits it.
 
-    It holds if the modes of the loop are independent, which means that the condition number of
-    their eigenvectors is at most MOST_CONDITION.
+    A loop permits it if its modes are independent, which means that the condition number of their
+    eigenvectors is at most MOST_CONDITION.
     """
     A, B, K = _from_inputs_to_inputs(plant, law, loop)
     eigenvalues, modes = (part.astype(np.complex128) for part in np.linalg.eig(A))
@@ -361,7 +361,7 @@ def _stable(form: SchurForm) -> NDArray[np.bool_]:
 
 
 def on_grid(form: SchurForm, period: float) -> tuple[FloatArray, ComplexArray]:
-    """Choose frequencies for each aircraft, (N, F), rad/s, and return S there, balanced."""
+    """Return frequencies of each aircraft, (N, F), rad/s, and S there, balanced, (N, F, m, m)."""
     w = _frequencies(form.eigenvalues, period)
     return w, _balanced(_sensitivity(form, np.exp(1j * w * period)))
 

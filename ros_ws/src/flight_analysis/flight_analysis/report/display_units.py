@@ -46,7 +46,7 @@ DEGREES = {"rad": "deg", "rad/s": "deg/s"}
 
 
 def display_unit(unit: str) -> DisplayUnit:
-    """Return the unit in which to show a unit of the airframe file.
+    """Return the unit in which tables and figures show a unit of the airframe file.
 
     Radians are shown in deg, and rad/s in deg/s. Any other unit stays.
     """

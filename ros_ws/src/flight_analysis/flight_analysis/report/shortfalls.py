@@ -166,8 +166,8 @@ def _height(
 ) -> list[Shortfall]:
     """Return a shortfall if the aircraft was below the ground.
 
-    The ground is that of the scenario, or else that of the landing. It is unknown for an aircraft
-    of JSBSim.
+    The height of the ground comes from the scenario, or else from the landing. It is unknown for an
+    aircraft of JSBSim.
     """
     ground = None if aircraft is None or aircraft.is_jsbsim else aircraft.ground()
     if ground is None and section is not None and not (aircraft and aircraft.is_jsbsim):

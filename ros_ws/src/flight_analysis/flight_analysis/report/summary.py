@@ -190,7 +190,7 @@ def summarise(
     Args:
         tape: A flight with y and y_m.
         scenario: The scenario of the flight. If None, it is the scenario on the tape. The tape of a
-            log has none, so it needs the argument.
+            log has no scenario, so this argument is needed.
         outcome: How the flight ended. If None, it is the outcome on the tape.
         flight_account: The account of the whole flight, if the tape is only a part of it.
 

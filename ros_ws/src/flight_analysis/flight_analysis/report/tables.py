@@ -149,7 +149,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
     """Return gusts, faults, modes except ENGAGED, saturated inputs and vanes that stand still.
 
     They are sorted by their starts. By default the scenario is that of the tape. The tape of a log
-    has none, so it needs the argument.
+    has no scenario, so it needs this argument.
     """
     of_flight = scenario if scenario is not None else tape.scenario
     listed = []
