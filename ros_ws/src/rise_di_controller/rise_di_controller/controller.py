@@ -27,7 +27,7 @@ from rise_di_controller.params import ControllerConfig, as_controller
 
 
 class ControlOutput(NamedTuple):
-    """The output of a tick of the controller."""
+    """What `Controller.tick` returns: u, its stamp, and the values for the log."""
 
     stamp_ns: int  # stamp of the y from which u was computed
     u: FloatArray  # (p,), in the order of `effectors` of the parameters
@@ -47,8 +47,9 @@ class ControlOutput(NamedTuple):
 class Prepared(NamedTuple):
     """What a controller computes from new parameters before they take effect.
 
-    It can be computed before the tick at which the parameters change, and is a third of the work
-    of a change in flight. `Controller.retune` does the rest.
+    It is computed in advance, so that less work is left for the tick at which the parameters
+    change: a third of the work of a change is done before it, and `Controller.retune` does the
+    rest.
     """
 
     parameters: ControllerConfig
@@ -59,9 +60,9 @@ class Prepared(NamedTuple):
 
 
 def preparing(parameters: ControllerConfig) -> Generator[None, None, Prepared]:
-    """Prepare parameters as `prepared` does, but in parts of at most about 1 ms.
+    """Prepare parameters as `prepared` does, but in steps of at most about 1 ms.
 
-    The generator yields after each part.
+    The generator yields after each step, so that a controller can fly its ticks in between.
     """
     law = parameters.tuned_law()
     yield
@@ -77,7 +78,7 @@ def preparing(parameters: ControllerConfig) -> Generator[None, None, Prepared]:
 
 
 def prepared(parameters: ControllerConfig) -> Prepared:
-    """Compute what a controller needs before it can take new parameters."""
+    """Compute in advance what a controller needs to take new parameters."""
     parts = preparing(parameters)
     while True:
         try:
@@ -140,7 +141,7 @@ class Controller:
 
     @property
     def has_internals(self) -> bool:
-        """Whether the law has a state to log, which it has from the first engagement on."""
+        """Whether there is a state of the law to log. There is one from the first engagement on."""
         return self._state.law is not None
 
     @property
@@ -164,7 +165,7 @@ class Controller:
     def restart(self) -> None:
         """Engage the law again with the next fresh y and y_m, starting from the present u.
 
-        The transfer is bumpless. A failsafe that is under way continues.
+        u does not jump (bumpless transfer). If a failsafe is under way, it continues until then.
         """
         if self._state.mode is Mode.ENGAGED:
             self._state = self._state._replace(mode=Mode.WAITING)
@@ -172,11 +173,11 @@ class Controller:
     def retune(self, parameters: "ControllerConfig | Prepared") -> None:
         """Replace the parameters between two ticks, without a jump of u (bumpless transfer).
 
-        If the parameters are equal, nothing changes.
+        If the new parameters equal the old ones, nothing changes.
 
         Args:
-            parameters: The new parameters, or the result of `prepared` for them, so that this call
-                is short.
+            parameters: The new parameters. Give the result of `prepared` for them if this call
+                must be short.
 
         Raises:
             ParameterError: The channels of the log would change, because the law changes, or
@@ -206,10 +207,11 @@ class Controller:
         self._learned = _with_feedforward(new.parameters)
 
     def still_vanes(self) -> tuple[str, ...]:
-        """Return the names of the vanes that the observer leaves out because they stand still.
+        """Return the names of the vanes that the observer ignores because they stand still.
 
-        At each engagement the measurement of a vane's motion begins again at 0. Until the vane has
-        moved, or the averaging time has passed, the vane counts as before the engagement.
+        Each engagement starts a new measurement of how much the readings move. Until a vane has
+        moved, or the averaging time has passed, the vane is treated as it was before the
+        engagement.
         """
         return tuple(
             name
@@ -224,7 +226,7 @@ class Controller:
         return EffectTest(self._guard.probe, gain, parameters.probe.false_alarm)
 
     def _tested(self, inputs: guard.TickInputs) -> FloatArray | None:
-        """Return the measured effects of the inputs after a tick, or None if no test was due."""
+        """Return the effect of each input as the probe measured it, or None if no test was due."""
         if self._effects is None:
             return None
         if self.mode is not Mode.ENGAGED or inputs.dt == 0.0:
@@ -246,7 +248,7 @@ class Controller:
         self._vanes_still = np.where(counts, measures == 0.0, self._vanes_still)
 
     def diverging(self) -> tuple[str, ...]:
-        """Return the outputs that diverge under a model learned in flight."""
+        """Return the outputs whose error diverges under a model that was learned in flight."""
         if not self._has_learned_model:
             return ()
         diverging = divergence.diverging(self._errors, self._least, self._learned)
@@ -259,7 +261,8 @@ class Controller:
     def oscillations(self) -> dict[str, float]:
         """Return the period, s, of each output that oscillates under a model learned in flight.
 
-        An output counts only if it oscillates more than under the law of the start.
+        An output is included only if it oscillates more than it did under the law with which the
+        flight started.
         """
         if not self._has_learned_model or not self._oscillations.periods.any():
             return {}
@@ -274,23 +277,24 @@ class Controller:
         return parameters.models() == self._at_start.models()
 
     def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """Buffer a sample of y, with its channels in the law's order.
+        """Store a sample of y, with its channels in the law's order.
 
-        A sample that no aircraft can give (see `samples`) is lost, as if it had never arrived. A
-        sample with a value beyond its bound leaves no trace. Any other lost sample is remembered:
-        the next sample must have a later stamp, and later samples may confirm a jump of y. If they
-        do, the law engages again.
+        A sample that no aircraft can give (see `samples`) is dropped, as if it had never arrived.
+        If a value is beyond its bound, the sample is forgotten altogether. Any other dropped sample
+        is remembered: the next sample must have a later stamp, and if the next samples confirm a
+        jump of y, they are taken and the law engages again.
 
         Args:
             sample: The sample, shape (m,), or (m + k,) with k vanes, SI, deviations from trim.
             now_ns: The clock, ns.
 
         Returns:
-            The reason why the sample is lost, or None if it is taken.
+            The reason why the sample was dropped, or None if it was taken.
 
         Raises:
             ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
-                Reason "order": the stamp is not later than that of the last sample, lost or taken.
+                Reason "order": the stamp is not later than that of the last sample, even if that
+                sample was dropped.
         """
         m = len(self._parameters.outputs)
         outputs = sample._replace(value=sample.value[:m])
@@ -314,18 +318,18 @@ class Controller:
         return None
 
     def take_y_m(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """Buffer a sample of y_m as `take_y` does, except that y_m may jump or stand still.
+        """Store a sample of y_m as `take_y` does, except that y_m may jump or stand still.
 
         Args:
             sample: The sample, shape (m,), SI, deviations from trim.
             now_ns: The clock, ns.
 
         Returns:
-            The reason why the sample is lost, or None if it is taken.
+            The reason why the sample was dropped, or None if it was taken.
 
         Raises:
             ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
-                Reason "order": the stamp is not later than the stamp of the sample taken before.
+                Reason "order": the stamp is not later than that of the last sample taken.
         """
         last = self._y_m[-1] if self._y_m else None
         if (reason := self._reason_against(sample, last, now_ns)) is not None:
@@ -336,9 +340,9 @@ class Controller:
     def _reason_against(
         self, sample: StampedVector, last: StampedVector | None, now_ns: int
     ) -> Refusal | None:
-        """Return why a sample of m values is refused, if a value is beyond its bound, else None.
+        """Return a refusal if one of the m values of a sample is beyond its bound, else None.
 
-        Raises ChannelError if the stamp of the sample is in the future, or not newer than the stamp
+        Raises ChannelError if the stamp of the sample is in the future, or not later than the stamp
         of `last`.
         """
         require_not_future(sample.stamp_ns, now_ns, self._guard.max_age_ns)
@@ -347,9 +351,9 @@ class Controller:
         return samples.bound_violation(sample.value, self._parameters.outputs, self._guard.samples)
 
     def pop_restart_reason(self) -> Refusal | None:
-        """Return why the law engaged again since the last call of this method, and forget it.
+        """Return why the law has engaged again since the last call, and clear the reason.
 
-        Returns None if the law did not engage again, or only because of `restart`.
+        Returns None if the law did not engage again, or did so only because `restart` was called.
         """
         reason, self._restart_reason = self._restart_reason, None
         return reason
@@ -409,7 +413,7 @@ class Controller:
 
         Args:
             e: y - y_m, shape (m,), SI.
-            dt: Length of the tick, s.
+            dt: Time since the tick before, s.
         """
         self._errors = divergence.step(
             self._errors, e, dt, has_learned_model=self._has_learned_model
@@ -418,9 +422,10 @@ class Controller:
             self._oscillations.take(e, dt, self._learned if self._has_learned_model else None)
 
     def resume(self, state: guard.ControllerState) -> None:
-        """Continue from the state of a flight that was simulated with the same parameters.
+        """Continue from a state that was simulated elsewhere with the same parameters.
 
-        A campaign simulates the beginning of a flight without a controller.
+        A campaign simulates the beginning of a flight for many aircraft at once, without a
+        `Controller`.
 
         Args:
             state: State of the guard and of the law after the last tick.
@@ -428,28 +433,27 @@ class Controller:
         self._state = state
 
     def overrun(self, last_ns: int, now_ns: int) -> tuple[int, ...]:
-        """Return the instants of extra ticks that must come before the tick at `now_ns`.
+        """Return the instants of ticks that must be added before the tick at `now_ns`.
 
-        They are needed if the last tick is longer ago than the age limit.
-
-        Because u was missing, the aircraft has meanwhile started its own failsafe. Two ticks
-        without fresh inputs bring the controller's u to the same value as in the aircraft, so that
-        the law engages again without a bump.
+        Ticks are added if the last tick was longer ago than the age limit. As u was missing in the
+        meantime, the aircraft has started its own failsafe. Two ticks without fresh inputs bring
+        the u of the controller to the value that the aircraft has now, so that the law engages
+        again without a bump.
 
         Args:
             last_ns: Instant of the last tick, ns.
             now_ns: Instant of the tick, ns.
 
         Returns:
-            The instants, ns, or () if there was no overrun.
+            The instants, ns, or () if the last tick is recent enough.
         """
         begin_ns = last_ns + self._guard.max_age_ns
         return (begin_ns + self.period_ns, now_ns) if now_ns > begin_ns else ()
 
     def _newest_paired_y(self) -> StampedVector | None:
-        """Return the newest y that is at most a period newer than the newest y_m.
+        """Return the newest y that has a y_m: it is at most a period newer than the newest y_m.
 
-        If y_m comes late, an earlier y is used and no failsafe starts.
+        If y_m comes late, an earlier y is therefore used, and no failsafe starts.
         """
         newest = self._y[-1] if self._y else None
         if not self._y_m:
@@ -488,9 +492,9 @@ class Controller:
 
 
 def _with_feedforward(parameters: ControllerConfig) -> NDArray[np.bool_]:
-    """Return the mask of the channels with a feedforward, (m,).
+    """Return a mask, (m,), of the channels in which the feedforward acts.
 
-    In a learner's proposal, channels without a learned model have no feedforward.
+    In a model that a learner proposes, channels without a learned model have no feedforward.
     """
     some = None if parameters.feedforward is None else parameters.feedforward.inputs
     return np.array([some is None or name in some for name in parameters.inputs])

@@ -192,7 +192,7 @@ class ControllerSection(NodeConfig):
         )
 
     def models(self) -> tuple[Any, ...]:
-        """Return the sections that a learner may replace, because they hold a model."""
+        """Return the sections with a model. Only these sections may be replaced by a learner."""
         return self.feedforward, self.observer
 
     def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:
@@ -217,30 +217,29 @@ class ControllerSection(NodeConfig):
 
     @property
     def effectors(self) -> tuple[str, ...]:
-        """Channels of u as published.
+        """Channels of the published u.
 
-        They are the effectors of an allocation, or the inputs of the law if there is none.
+        They are the effectors of an allocation, or the inputs of the law if there is no allocation.
         """
         return self.inputs if self.allocation is None else self.allocation.effectors
 
     def effector_limits(self) -> Limits:
-        """Return the limits of u as published, in the order of `effectors`."""
+        """Return the limits of the published u, in the order of `effectors`."""
         guard = self.guard()
         return guard.limits if guard.allocation is None else guard.allocation.limits
 
     def given_up(self) -> FloatArray:
-        """Return 1 for each output whose learned model was given up, else 0, shape (m,).
+        """Return 1 for each output that no longer uses its learned model, else 0, shape (m,).
 
-        Such an output flies without a model until the engagement ends.
-
-        The array is empty if the controller does not learn.
+        A learned model that made its output diverge or oscillate is not used again until the
+        engagement ends. The array is empty if the controller does not learn.
         """
         return np.zeros(0)
 
     def history_ticks(self) -> int:
-        """Return over how many past ticks a new observer runs to get its estimates.
+        """Return how many past ticks are kept, over which a new observer runs to get its estimates.
 
-        It is 0 unless the law learns its models.
+        It is 0 unless models are learned in flight.
         """
         return 0
 
@@ -251,11 +250,11 @@ class ControllerSection(NodeConfig):
         return self.feedforward.nominal(self.outputs, self.inputs, self.D)
 
     def _flown_nominal(self) -> Nominal | None:
-        """Return the nominal model with which the feedforward follows y_m.
+        """Return the nominal model for the feedforward, which follows y_m with it.
 
-        If the `part` of the observer is 0, feedforward and observer do not act yet. A learner still
-        needs the states of the model, so with a learner the result is the model, but with no effect
-        on u. Without a learner the result is None.
+        If `observer.part` is 0, neither feedforward nor observer acts on u yet. The learner needs
+        the states of the model nevertheless. So with a learner the result is the model without any
+        effect on u, and without a learner it is None.
         """
         nominal = self.nominal()
         if nominal is None or self.observer is None or self.observer.part > 0.0:
@@ -277,10 +276,10 @@ class ControllerSection(NodeConfig):
         )
 
     def probe_gain(self) -> FloatArray:
-        """Compute abs(y_i / u_i) at the frequency of each sine of the probe, shape (m,).
+        """Compute the gain abs(y_i / u_i) at the frequency of the sine on each input, shape (m,).
 
-        It is 0 for an input without a sine. The response is that of C (j omega I - A - gravity)^-1
-        B if there is a nominal model, and 1 / (input_scale omega) otherwise. The lag of the
+        An input without a sine has the gain 0. If there is a nominal model, the response is that of
+        C (j omega I - A - gravity)^-1 B, and otherwise 1 / (input_scale omega). The lag of the
         actuator is included.
         """
         gain = np.zeros(len(self.outputs))
@@ -301,8 +300,8 @@ class ControllerSection(NodeConfig):
     def _probe(self) -> Probe | None:
         """Build the probe from the section `probe`, or return None without this section.
 
-        The section states the amplitudes of y. The amplitudes of the sines in u follow from them
-        by `probe_gain`.
+        The section states by how much each output may move. `probe_gain` converts that to the
+        amplitudes of the sines in u.
         """
         if self.probe is None:
             return None
@@ -324,13 +323,13 @@ class ControllerSection(NodeConfig):
         )
 
     def _authority(self) -> FloatArray:
-        """Compute the y_dot of each output at the limit of its input, (m,), units of y / s."""
+        """Compute the y_dot that each input gives its output at its limit, (m,), units of y / s."""
         limits = self._limits()
         full = np.minimum(np.maximum(-limits.lower, limits.upper), samples.UNLIMITED)
         return np.asarray(full / np.array(self.input_scale))
 
     def guard(self) -> GuardParams:
-        """Return the parameters of the guard, which are times, limits and the nominal model."""
+        """Return the parameters of the guard: times, limits, and the nominal model."""
         return GuardParams(
             period_ns=period_ns(self.rate, "rate"),
             max_age_ns=nanoseconds(self.max_age),

@@ -101,11 +101,11 @@ def values(
     parameters: int,
     given_up: FloatArray,
 ) -> FloatArray:
-    """Return the values of `internals` in the order of `names`.
+    """Return the values of the topic `internals`, in the order of `names`.
 
-    `given_up` is 1 for each output whose learned model was given up, (m,), and is empty without a
-    learner. With an allocation, an input counts as limited by MAGNITUDE if it or any effector is at
-    a stop. Raises ValueError if the law was never engaged.
+    `given_up` is 1 for each output that no longer uses its learned model, (m,), and is empty
+    without a learner. With an allocation, an input counts as limited by MAGNITUDE if it or any
+    effector is at a stop. Raises ValueError if the law was never engaged.
     """
     if state.law is None:
         raise ValueError(

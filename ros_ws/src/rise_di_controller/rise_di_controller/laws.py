@@ -88,16 +88,16 @@ def schema(name: object) -> type[ControllerConfig]:
 
 
 class AnyLaw(ControllerConfig):
-    """The section `controller` of a scenario.
+    """The section `controller` of a scenario, under any law.
 
     Its key `law` names the law, RISE-DI by default.
     """
 
     @classmethod
     def keys_beside(cls, values: Mapping[str, Any]) -> Set[str]:
-        """Return the keys of the law that `values` name.
+        """Return the keys of the law that `values` names.
 
-        If there is no such law, the keys are those that every law has.
+        If there is no such law, return the keys that every law has.
         """
         with suppress(ParameterError):
             return schema(values.get("law", DEFAULT)).model_fields.keys()
@@ -105,7 +105,7 @@ class AnyLaw(ControllerConfig):
 
     @classmethod
     def validate_mapping(cls, values: Mapping[str, Any], where: str) -> ControllerConfig:  # type: ignore[override]
-        """Build the parameters of the law that `values` name. Raises ParameterError if invalid."""
+        """Build the parameters of the law that `values` names. Raises ParameterError if invalid."""
         name = values.get("law", DEFAULT)
         try:
             config = schema(name)

@@ -63,10 +63,10 @@ two processors."""
 class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     """Takes y and y_m at every tick, steps the law and publishes u.
 
-    u has the stamp of y.
+    u has the stamp of the y from which it is computed.
 
-    In lockstep the number of samples of y gives the time. A tick waits for the y and the y_m of its
-    instant and publishes exactly one u, which has no channels if the controller has no output.
+    In lockstep, samples of y count the time. A tick waits for the y and the y_m of its instant, and
+    publishes exactly one u. This u has no channels if the controller has no output.
     """
 
     def __init__(self) -> None:
@@ -161,10 +161,10 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return self._y.subscription, self._y_m.subscription
 
     def start_ns(self) -> int:
-        """Return the start of the ticks, ns, which is BEHIND_NS after a whole period of the clock.
+        """Return when the ticks start, ns: BEHIND_NS after a whole period of the system clock.
 
-        If half a period is shorter than BEHIND_NS, the start is half a period after the whole
-        period. The clock is the system clock.
+        If half a period is shorter than BEHIND_NS, the ticks start half a period after the whole
+        period.
         """
         return self.next_period_ns() + min(BEHIND_NS, self.period_ns() // 2)
 
@@ -191,9 +191,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     def _taking(
         self, take: Callable[[StampedVector, int], Refusal | None]
     ) -> Callable[[StampedVector, int], None]:
-        """Wrap `take` so that it raises ChannelError for a sample that is lost.
+        """Wrap `take` so that it raises ChannelError for a sample that it drops.
 
-        The receiver then counts and logs the loss.
+        The receiver then counts and logs the dropped sample.
         """
 
         def taking(sample: StampedVector, now_ns: int) -> None:
@@ -212,7 +212,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self.get_logger().warning(f"the law engages again: {reason}", throttle_duration_sec=2.0)
 
     def _tell_effects(self, output: ControlOutput) -> None:
-        """Publish the effects of the inputs after a test, and log which inputs are stuck."""
+        """Publish the effects of the inputs after a test of the probe, and log which are stuck."""
         if output.effects is None or self._publish_effects is None:
             return
         self._publish_effects(self._effects_encoder.encode(output.stamp_ns, output.effects))
@@ -238,7 +238,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return nanoseconds(self.parameters.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Return the ages above which a publisher has timed out, ns.
+        """Return the ages after which another publisher may take over from a silent one, ns.
 
         The first age holds for the same node in a new process. The second age holds for a different
         node, which may take over only after the failsafe has brought u to trim.
@@ -341,9 +341,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             )
 
     def _has_proposal(self, now_ns: int) -> bool:
-        """Return whether a step in lockstep has the proposal that is due before it.
+        """Return whether a step in lockstep can begin, because the proposal due before it has come.
 
-        Returns True if no proposal is due.
+        It can also begin if no proposal is due.
         """
         if self._learning is None:
             return True
@@ -377,7 +377,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         )
 
     def _say(self, event: Event) -> None:
-        """Log and publish the result of a proposal, or a fallback."""
+        """Log and publish what became of a proposed model, or that the controller fell back."""
         sentence = bounded(event.sentence)
         if event.kind is EventKind.REFUSED:
             self.get_logger().warning(sentence)

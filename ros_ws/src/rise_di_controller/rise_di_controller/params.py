@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Validate the parameters of the controller under any control law.
 
-`controller_section` has the fields, and builds the arrays from them.
-
-The parameters of a law are a subclass, which `AnyLaw.validate_mapping` finds by the name of the
-law.
+`controller_section` has the fields, and builds the arrays from them. The parameters of a particular
+law are a subclass, which `AnyLaw.validate_mapping` finds by the name of the law.
 """
 
 from collections.abc import Iterator, Sequence
@@ -90,9 +88,10 @@ class ControllerConfig(ControllerSection):
             pass
 
     def checks(self) -> Iterator[None]:
-        """Check the relations between the values, in parts of at most about 1 ms.
+        """Check the relations between the values, in steps of at most about 1 ms.
 
-        The parts are so short because a controller flies meanwhile. Raises ParameterError.
+        The generator yields after each step, so that a controller can fly meanwhile. Raises
+        ParameterError.
         """
         period = period_ns(self.rate, "rate")
         if self.lockstep:
@@ -213,7 +212,7 @@ class ControllerConfig(ControllerSection):
     def _check_observer(self, observer: ObserverConfig, nominal: Nominal) -> Iterator[None]:
         """Check sizes, stability of filter and feedback, and the delay margin of the nominal loop.
 
-        For each of MARGIN_PARTS, the nominal loop must be stable if u is late by this part of
+        The nominal loop must be stable if u is late by each of the fractions MARGIN_PARTS of
         `observer.margin`, or of `delay` if that is longer.
         """
         expected = (

@@ -197,7 +197,7 @@ class RiseDiConfig(ControllerConfig):
     def read(
         cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True
     ) -> Self | None:
-        """Read the set, and give omega the value 1 for each output if it is left out.
+        """Read the parameters. An omega that is left out is 1 for each output.
 
         Args:
             values: The nested mapping.
@@ -223,14 +223,14 @@ class RiseDiConfig(ControllerConfig):
 
     @classmethod
     def changed_by_node(cls) -> frozenset[str]:
-        """Return the models, which only proposals of a learner may change.
+        """Return the parameters with a model, which only proposals of a learner may change.
 
         A change by an operator would bypass the certification.
         """
         return frozenset({"feedforward", "observer"})
 
     def check_law(self) -> None:
-        """Check that each key has a value for each channel, except k_d, which lacks the last one.
+        """Check that each key has a value for each channel, but k_d one for all except the last.
 
         A schedule needs the output V, and a learner needs an observer without vanes.
         """
@@ -346,7 +346,7 @@ class RiseDiConfig(ControllerConfig):
                 ) from None
 
     def at_speed(self, ratio: float) -> Self:
-        """Return the parameters that fly at a fraction of the trim speed in steady flight.
+        """Return parameters for steady flight at a fraction of the trim speed.
 
         They have the models of that speed and no schedule.
 
@@ -405,9 +405,9 @@ class RiseDiConfig(ControllerConfig):
         return over_speed((slow.ratio, fast.ratio), (at_trim, at_slow, at_fast), airspeed, model)
 
     def _nominal_over_speed(self, at_trim: Nominal) -> OverSpeed:
-        """Return the model of the feedforward over the airspeed.
+        """Return the nominal model of the feedforward as a function of the airspeed.
 
-        The leads, and the choice of inputs, come from the model at the trim speed.
+        The leads, and the inputs in which it acts, are those of the model at the trim speed.
         """
 
         def matrices(config: RiseDiConfig, scale: FloatArray) -> FloatArray:
@@ -420,7 +420,7 @@ class RiseDiConfig(ControllerConfig):
         return (*super().models(), () if self.schedule is None else self.schedule.models)
 
     def guard(self) -> GuardParams:
-        """Return the parameters of the guard, as in the base class.
+        """Return the parameters of the guard.
 
         With a schedule, they also have the model of the feedforward as a function of the airspeed.
         """
@@ -430,7 +430,7 @@ class RiseDiConfig(ControllerConfig):
         return guard._replace(over_speed=self._nominal_over_speed(guard.nominal))
 
     def known_nominal(self) -> Nominal:
-        """Return the arrays of the feedforward, which must exist."""
+        """Return the nominal model of the feedforward of a controller that surely has one."""
         nominal = self.nominal()
         assert nominal is not None  # noqa: S101 - an observer needs a feedforward
         return nominal

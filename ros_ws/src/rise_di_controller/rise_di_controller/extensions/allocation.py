@@ -62,16 +62,14 @@ def allocation(
 def allocate(
     v: FloatArray, u_before: FloatArray, dt: Array, params: Allocation
 ) -> tuple[FloatArray, FloatArray]:
-    """Find a u inside the limits for a demanded v, and return u and the v that it gives.
+    """Find a u inside the limits for a demanded v, and return u and the v that this u gives.
 
-    v has the shape (m,), and u has (p,).
+    v has the shape (m,), and u has (p,). If no limit acts, the results are exactly T v and v.
 
-    If no limit acts, the results are exactly T v and v.
-
-    If T v moves an effector beyond its end stop, the other effectors take over the part that this
-    effector cannot give. For this a motion `exchange w` is added to u, which does not change v. It
-    is chosen for one effector after the other (`_exchanged`). If no such u is inside the stops, the
-    inputs of the law are added one by one in the order of priority:
+    If T v moves an effector beyond its end stop, the other effectors take over what this effector
+    cannot give. For this a motion `exchange w` is added to u, which does not change v. It is chosen
+    for one effector after the other (`_exchanged`). If no such u is inside the stops, the inputs of
+    the law are added one by one in the order of priority:
 
         u += s (T_i v_i + exchange w)
 
@@ -108,9 +106,10 @@ def allocate(
 
 
 def limits_of_effectors(v_free: Array, v: Array) -> Limits:
-    """Return limits of v that saturate the demanded `v_free` to the `v` that effectors give.
+    """Return limits of the law's inputs with which `v_free` saturates to exactly `v`.
 
-    The anti-windup of a law works with these limits.
+    `v_free` is what the law demands, and `v` is what the effectors can give of it. The anti-windup
+    of the law works with these limits.
     """
     xp = array_namespace(v)
     infinite = xp.full_like(v, xp.inf)
@@ -164,11 +163,11 @@ def _towards(
 def _exchanged(
     u: FloatArray, low: FloatArray, high: FloatArray, exchange: FloatArray
 ) -> FloatArray:
-    """Return a u with the same effect on v, as far inside the limits as the sweeps bring it.
+    """Move u as far inside the limits as the sweeps can, without changing its effect v.
 
     A sweep visits each effector. If an effector is beyond a limit, it moves back by RELAXATION
-    times its excess, and the others move so that v stays. After SWEEPS sweeps, u may still be
-    outside.
+    times its excess, and the others move so that v stays the same. After SWEEPS sweeps, u may still
+    be outside.
     """
     columns = exchange.T.tolist()
     ends = list(enumerate(zip(low.tolist(), high.tolist(), strict=True)))

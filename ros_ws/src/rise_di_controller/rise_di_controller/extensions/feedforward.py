@@ -30,7 +30,7 @@ samples takes several steps."""
 class Nominal(NamedTuple):
     """Nominal model of the aircraft: x_dot = A x + f(x) + B u, y = C x.
 
-    It holds for deviations from trim, in SI units and radians.
+    All variables are deviations from trim, in SI units and radians.
     """
 
     A: Array  # (n, n)
@@ -52,7 +52,10 @@ class Nominal(NamedTuple):
 def nominal_model(
     A: Array, B: Array, C: Array, gravity: Array, lead: Array, acts: Array | None = None
 ) -> Nominal:
-    """Build the nominal model, and the products that a tick needs. C B must be invertible."""
+    """Build the nominal model, with the matrix products that each tick needs.
+
+    C B must be invertible.
+    """
     inverse = arithmetic.inverse(product(C, B))
     path = np.eye(len(A)) - product(product(B, inverse), C)
     angles = tuple(np.flatnonzero(gravity.any(axis=0)).tolist())
@@ -92,11 +95,11 @@ def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
 def with_new_model(
     state: FeedforwardState | None, y_m: Array, y_m_dot: Array, dt: Array, nominal: Nominal
 ) -> FeedforwardState:
-    """Return the state with which the feedforward continues its motion by a new model.
+    """Return a state from which the feedforward continues its motion with a new model.
 
     If x has the same length in both models, x and u_0 stay. Otherwise they begin anew, with the
     outputs at y_m and u_0 = 0. u is computed with the new model, and u - u_0 is then the
-    feedforward until the next tick. y_m_dot and dt belong to the last tick.
+    feedforward until the next tick. `y_m_dot` and `dt` are those of the last tick.
     """
     start = initial_state(y_m, nominal)
     if state is not None and state.x.shape == start.x.shape:
@@ -105,7 +108,7 @@ def with_new_model(
 
 
 def ideal_input(x: Array, y_m_dot: Array, nominal: Nominal) -> Array:
-    """Compute the input that moves the outputs of the nominal model by y_m_dot, shape (m,).
+    """Compute the input with which the outputs of the nominal model move by y_m_dot, shape (m,).
 
     u = Omega^-1 (y_m_dot - C (A x + f(x)))
     """
@@ -136,7 +139,7 @@ def sines(x: Array, nominal: Nominal) -> Array:
 
 
 def step_count(span_ns: int, period_ns: int) -> int:
-    """Return the number of Runge-Kutta steps between two ticks.
+    """Return into how many Runge-Kutta steps the time between two ticks is divided.
 
     A step is at most LONGEST_PART periods long.
     """
@@ -181,7 +184,7 @@ def step(
 
 
 def of_active_inputs(u: Array, nominal: Nominal) -> Array:
-    """Keep the entries of u for the inputs with a feedforward, and set the others to 0, (m,)."""
+    """Keep u in the inputs that have a feedforward, and set it to 0 in the others, (m,)."""
     return u if nominal.acts is None else u * nominal.acts
 
 

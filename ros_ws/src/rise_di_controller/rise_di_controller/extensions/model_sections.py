@@ -46,7 +46,10 @@ def _require_sizes(section: Config, key: str, sizes: Mapping[str, tuple[int, int
 
 
 def require_same_signs(Omega: FloatArray, D: Sequence[int], where: str) -> None:
-    """Raise ParameterError if C B of a model has no D, or another D than the controller."""
+    """Check that C B of a model has a D, and that it is the D of the controller.
+
+    Raises ParameterError if not. `where` names the model in the sentence.
+    """
     try:
         signs_of_model = [int(sign) for sign in signs(Omega)]
     except DecompositionError as error:
@@ -84,9 +87,10 @@ class FeedforwardConfig(Config):
     )
 
     def nominal(self, outputs: Sequence[str], inputs: Sequence[str], D: Sequence[int]) -> Nominal:
-        """Return the arrays of the feedforward.
+        """Return the nominal model as arrays.
 
-        Raises ParameterError if sizes do not match or C B has another D.
+        Raises ParameterError if sizes do not match, or if C B of the model has another D than the
+        controller.
         """
         n = len(self.states)
         m = len(outputs)
@@ -135,7 +139,7 @@ class VanesConfig(Config):
     time: Positive = Field(default=1.0, description="time over which the motion is averaged, s")
 
     def params(self, outputs: Sequence[str], states: Sequence[str], estimates: int) -> VaneParams:
-        """Return the arrays of the vanes.
+        """Return the parameters of the vanes as arrays.
 
         Raises ParameterError if a vane has no state of the same name, or if a size is wrong.
         """
@@ -162,7 +166,7 @@ class VanesConfig(Config):
 class ObserverConfig(Config):
     """An observer of the nominal model, an extension of the paper.
 
-    The matrices are taken as designed, in SI units, row by row.
+    The matrices are those of a finished design, in SI units, row by row.
     """
 
     rate: Positive = Field(description="rate of the law for which the matrices hold, Hz")
@@ -225,7 +229,7 @@ class ObserverConfig(Config):
 
 
 class AllocationConfig(Config):
-    """An allocation of the inputs of the law to at least as many effectors.
+    """An allocation, which distributes the inputs of the law over at least as many effectors.
 
     It is an extension of the paper. Values are in SI units, row by row.
     """
@@ -254,7 +258,7 @@ class AllocationConfig(Config):
         )
 
     def arrays(self, inputs: Sequence[str]) -> Allocation:
-        """Return the arrays of the allocation.
+        """Return the parameters of the allocation as arrays.
 
         Raises ParameterError if sizes do not match, or if effect T is not I.
         """

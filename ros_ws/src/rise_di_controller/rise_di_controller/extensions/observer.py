@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Extend a control law by an observer, an extension of the paper, off by default.
 
-The observer estimates states, wind and disturbances, and corrects the trim of the law. It extends
-any control law without changing the law's own equations. Its matrices are parameters, so nothing is
-solved here. See docs/theory.md.
+The observer estimates states, wind and disturbances, and corrects the trim of the law. It works
+with any control law, and leaves the equations of the law as they are. Its matrices are parameters
+that come from a finished design, so nothing is solved here. See docs/theory.md.
 """
 
 from collections.abc import Sequence
@@ -22,8 +22,8 @@ from rise_di_controller.law.saturation import Limits, saturate
 class VaneParams(NamedTuple):
     """Parameters of k vanes, which are sensors beside y that only the observer uses.
 
-    H z predicts how much a reading differs from the reading in the reference motion, where z has
-    the s estimates.
+    A vane reads something else than it would read in the reference motion. H z predicts this
+    difference from the s estimates z.
     """
 
     H: Array  # (k, s)
@@ -55,7 +55,7 @@ class ObserverParams(NamedTuple):
 
 
 class PastTick(NamedTuple):
-    """A tick of the recent record, over which a new observer runs to get its first estimates."""
+    """A past tick. A new observer runs over the past ticks to get its first estimates."""
 
     e: Array | None  # error, (m,), or None for a tick without a y
     u: Array  # u less the trim and the feedforward of the tick, (m,)
@@ -86,12 +86,12 @@ class VaneObserverState(NamedTuple):
 
 
 def predict(z: Array, u: Array, params: ObserverParams) -> Array:
-    """Predict the estimates a period later: Phi z + Gamma u, with u the deviation from u_trim."""
+    """Predict the estimates one period ahead: Phi z + Gamma u, with u the deviation from u_trim."""
     return product(params.Phi, z) + product(params.Gamma, u)
 
 
 def initial_estimates(e: Array, params: ObserverParams) -> Array:
-    """Return the estimates at engagement, H'e, with outputs at the errors and the rest at 0."""
+    """Return the estimates at engagement, H'e: outputs at the errors, and all others at 0."""
     return product(params.H.swapaxes(0, 1), e)
 
 
@@ -107,10 +107,12 @@ def estimates_after(
 
     The start at the steady state includes the disturbances that the law has compensated so far.
     From z = 0 the observer would need longer than the record to estimate them. A tick without a y
-    has no correction. The products with e and u are computed for all ticks with the same parameters
-    at once, which takes a third of the time. `history` has these ticks, at least one of them with a
-    y. `change` is the change of the feedforward since the record, (m,). `filters` has the
-    parameters of the observer at each tick.
+    has no correction. The products with e and u are computed at once for all ticks that have the
+    same parameters, which takes a third of the time.
+
+    `history` has the past ticks, and at least one of them has a y. `change` says by how much the
+    feedforward has changed since they were recorded, (m,). `filters` has the parameters of the
+    observer at each tick.
     """
     known = np.array([tick.e is not None for tick in history])
     e = np.array([np.zeros_like(change) if tick.e is None else tick.e for tick in history]).T
@@ -138,7 +140,7 @@ def estimates_after(
 def with_motion(
     state: VaneObserverState, reading: Array, dt: Array, params: VaneParams
 ) -> VaneObserverState:
-    """Update the measured motion of the readings, and which vanes are in use.
+    """Update how much the readings of the vanes move, and which vanes are in use.
 
         part    = min(dt / time, 1)
         mean   += part (reading - mean)
@@ -175,14 +177,14 @@ def by_vanes(
 
 
 def without_frozen(params: ObserverParams, frozen: Sequence[bool]) -> ObserverParams:
-    """Return parameters with which the frozen vanes are never used, and all other vanes always."""
+    """Return parameters in which the frozen vanes are never used, and all other vanes always."""
     if params.vanes is None:
         return params
     return params._replace(vanes=params.vanes._replace(least=np.where(frozen, np.inf, 0.0)))
 
 
 def filter_matrix(params: ObserverParams) -> FloatArray:
-    """Compute the matrix that advances z by a tick, (s, s).
+    """Compute the matrix that advances the estimates z from tick to tick, (s, s).
 
     It is Phi (I - L H - sum of L_v [H, H_v]). Vanes without a finite `least` are left out.
     """
@@ -196,13 +198,14 @@ def filter_matrix(params: ObserverParams) -> FloatArray:
 
 
 def correct(state: Any, measurements: Measurements, dt: Array, params: ObserverParams) -> Any:
-    """Correct the estimates by the measured error, and set the contribution to the trim.
+    """Correct the estimates by the measured error, and compute what the observer adds to the trim.
 
         z     = z + L (e - H z) + by_vanes
         sigma = min(1, sigma + dt fade_rate)
         u_o   = -sigma F z, inside limits of magnitude and rate
 
-    The limits bound u_o and u_o_dot for any measurement. The fade-in makes the engagement bumpless.
+    Whatever is measured, u_o and u_o_dot stay inside these limits. sigma rises from 0 after the
+    engagement, so that u does not jump there.
     """
     e = measurements.y - measurements.y_m
     innovation = e - product(params.H, state.z)

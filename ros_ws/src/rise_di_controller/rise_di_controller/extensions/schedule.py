@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Schedule input_scale over dynamic pressure, an extension of the paper, off by default.
 
-The response to a control surface grows with the dynamic pressure. Omega therefore grows with V^2,
-and the delay margin of fixed gains falls accordingly. The schedule keeps Omega input_scale near its
-value at trim. It extends a law that has the parameter input_scale, without changing the law's
-equations. A feedforward and an observer also use models for the present airspeed.
+The response to a control surface grows with the dynamic pressure. So Omega grows with V^2, and with
+fixed gains the delay margin shrinks as V grows. The schedule keeps Omega input_scale near its value
+at trim. It works with any law that has the parameter input_scale, and leaves the equations of the
+law as they are. A feedforward and an observer also use models for the present airspeed.
 """
 
 import math
@@ -32,7 +32,7 @@ STEPS = 128
 
 
 class OverSpeed(NamedTuple):
-    """A model as a function of the airspeed V, by d = V / V0 - 1 from `least` to `most`."""
+    """A model that depends on the airspeed V, by d = V / V0 - 1 between `least` and `most`."""
 
     model: Callable[[float], Any]  # the model at d, a multiple of 1 / STEPS
     least: float
@@ -40,15 +40,15 @@ class OverSpeed(NamedTuple):
     airspeed: FloatArray  # 1 for the output V, else 0, (m,)
 
     def at_scale(self, scale: FloatArray) -> Any:
-        """Return the model at the airspeed at which the factors of input_scale are `scale`, (m,).
+        """Return the model at the airspeed that belongs to given factors of input_scale, (m,).
 
-        The factors are (V0 / V)^2 in every channel except V.
+        The factors `scale` are (V0 / V)^2 in every channel except V.
         """
         d = 1.0 / math.sqrt(((1.0 - self.airspeed) * scale).max()) - 1.0
         return self.model(round(min(max(d, self.least), self.most) * STEPS) / STEPS)
 
     def at_scales(self, scales: FloatArray) -> list[Any]:
-        """Return the models of T ticks with the factors `scales` of input_scale, (T, m)."""
+        """Return the models of T ticks, given the factors of input_scale at each tick, (T, m)."""
         d = 1.0 / np.sqrt(((1.0 - self.airspeed) * scales).max(axis=1)) - 1.0
         return [
             self.model(place)
@@ -64,11 +64,11 @@ def over_speed(
 ) -> OverSpeed:
     """Interpolate a model over the airspeed, as trim + d (slope + d curvature), d = V / V0 - 1.
 
-    `values` are the matrices of the model, stacked, at the trim speed, at a lower and at a higher
-    airspeed. `ratios` are these two airspeeds divided by the trim speed. In `values`, matrices that
-    turn y_dot into u, such as F of an observer or the inverse of Omega, are divided by the factor
-    of input_scale at their airspeed. `model` builds the model from stacked matrices and the factors
-    of input_scale, (m,).
+    `values` has three stacks of the matrices of the model: at the trim speed, at a lower and at a
+    higher airspeed. `ratios` are these two airspeeds divided by the trim speed. Matrices that turn
+    y_dot into u, such as F of an observer or the inverse of Omega, are divided by the factor of
+    input_scale at their airspeed before they are stacked. `model` builds the model from a stack and
+    the factors of input_scale, (m,).
     """
     trim, slow, fast = values
     least, most = (ratio - 1.0 for ratio in ratios)
@@ -103,9 +103,10 @@ class ScheduleState(NamedTuple):
 
 
 def airspeed_range(params: ScheduleParams) -> tuple[Array, Array]:
-    """Return the airspeeds, m/s, at which the factor of input_scale is largest and least.
+    """Return the airspeeds, m/s, between which the factor of input_scale follows the airspeed.
 
-    These factors are the ends of SCALE_RANGE. The largest factor comes first.
+    The factor is limited to SCALE_RANGE. The first airspeed has the largest factor, the second one
+    the least.
     """
     return params.speed / math.sqrt(SCALE_RANGE[1]), params.speed / math.sqrt(SCALE_RANGE[0])
 
@@ -170,10 +171,10 @@ def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nom
 
 
 def law_at(params: ScheduleParams, scale: Array) -> Any:
-    """Return the parameters of the extended law at an airspeed.
+    """Return the parameters of the extended law at the airspeed that belongs to `scale`.
 
-    input_scale is multiplied by `scale`. With an observer, the models are those of the airspeed
-    that belongs to `scale`.
+    input_scale is multiplied by `scale`, the factors of input_scale, (m,). An observer gets the
+    model of that airspeed.
     """
     return _scaled(
         params.law if params.observer is None else params.observer.at_scale(scale), scale
@@ -188,9 +189,9 @@ def _scaled(params: Any, scale: Array) -> Any:
 
 
 def observers_of(params: Any, scales: Sequence[Array | None]) -> list[ObserverParams]:
-    """Return the parameters of the observer at each tick.
+    """Return the parameters of the observer at each of several ticks.
 
-    `scales` has the factor of input_scale at each tick, or None without a schedule.
+    `scales` has the factors of input_scale at each tick, or None without a schedule.
     """
     if not isinstance(params, ScheduleParams):
         return [params] * len(scales)
@@ -207,8 +208,8 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
         the law is retuned to `scale` times input_scale (bumpless transfer), then takes the step
 
     The retuning keeps u, so the schedule acts only on u_dot. At engagement scale = target_scale(y).
-    An observer keeps its estimates, which have the same meaning at every speed, and u_o moves to
-    the new -F z at the rate limit of u_o.
+    An observer keeps its estimates, because they mean the same at every speed, and its output u_o
+    moves to the new -F z at the rate limit of u_o.
     """
 
     def followed(

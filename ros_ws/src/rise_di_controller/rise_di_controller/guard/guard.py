@@ -70,11 +70,12 @@ class GuardParams(NamedTuple):
 
     @property
     def longest_ns(self) -> int:
-        """Longest time between two y for one step of the law. Beyond it, the law engages again.
+        """Longest time between two samples of y over which the law may step, ns.
 
-        It is longer than the age limit, because the last tick with a fresh y can be a period before
-        the tick of the next y. A step integrates the whole time. If half of the ticks are lost, a
-        limit of only 3 periods would raise the error by 15 % in q and 22 % in r.
+        After a longer time the law engages again. This time is longer than the age limit, because
+        the last tick with a fresh y can be a period before the tick of the next y. A step
+        integrates the whole time. If half of the ticks are lost, a limit of only 3 periods would
+        raise the error by 15 % in q and 22 % in r.
         """
         return self.max_age_ns + self.period_ns
 
@@ -88,7 +89,7 @@ BEFORE_ALL_NS = -(2**63)
 
 
 class VaneReadings(NamedTuple):
-    """Readings of the k vanes at the last step."""
+    """Readings of the k vanes at the last step of the law."""
 
     reading: FloatArray  # (k,)
     reference: FloatArray  # readings in the motion of the nominal model, (k,)
@@ -123,12 +124,12 @@ class ControllerState(NamedTuple):
 
     @property
     def command(self) -> FloatArray:
-        """The command that is published: u or, with an allocation, that of the effectors."""
+        """The published command: u or, with an allocation, the commands of the effectors."""
         return self.u if self.effectors is None else self.effectors
 
 
 class TickInputs(NamedTuple):
-    """Inputs of a tick, for the log.
+    """What a tick computed u from, for the log.
 
     Computing the tick again from these inputs gives the same u to the last bit.
     """
@@ -231,15 +232,14 @@ def tick(
     u_ff_recorded: FloatArray | None = None,
     vane_m_recorded: FloatArray | None = None,
 ) -> tuple[ControllerState, TickInputs | None]:
-    """Advance the controller by a tick, and return the new state and the inputs of the tick.
-
-    The new state has u.
+    """Advance the controller by a tick, and return the new state, which has u, and the inputs.
 
     Fresh inputs engage or re-engage the law with u_trim = u (bumpless transfer). With each new y,
     the law then takes a step with the measured dt, which is at least LEAST_DT periods. If more than
-    `longest_ns` have passed, the law engages again instead. Before the step, `ControlLaw.missed`
-    predicts the state over every whole period that had no y. The law adds its output to u_trim, or
-    to u_trim + u_ff if there is a feedforward. Without a new y nothing changes.
+    `longest_ns` have passed, the law does not step but engages again. Before the step,
+    `ControlLaw.missed` predicts the state over every whole period that had no y. The law adds its
+    output to u_trim, or to u_trim + u_ff if there is a feedforward. Without a new y nothing
+    changes.
 
     Stale inputs start the failsafe. Its modes are HOLD, in which nothing is integrated, then RAMP
     to trim, then TRIM. The stamp of u is normally that of the y from which it is computed. In a
@@ -251,8 +251,9 @@ def tick(
     if there is nothing to publish.
 
     `y` is the newest sample, and `y_m` holds the last samples with increasing stamps. Their
-    channels are in the law's order, and the readings of vanes follow the outputs in y. In a replay,
-    `u_ff_recorded` and `vane_m_recorded` stand for a feedforward whose state is unknown.
+    channels are in the law's order, and the readings of vanes follow the outputs in y. A replay
+    from a log does not know the state of the feedforward, so it gives the recorded `u_ff_recorded`
+    and `vane_m_recorded`.
     """
     vane = None
     if guard.vanes and y is not None:
@@ -293,7 +294,7 @@ def tick(
 
 
 def _going_on(state: ControllerState, now_ns: int) -> int:
-    """Return the stamp of a u without a y, ns: that of the last u, plus the time since then."""
+    """Return the stamp of a u that has no y, ns: the last stamp of u plus the time since then."""
     return state.stamp_ns + max(now_ns - state.tick_ns, 0)
 
 
@@ -307,10 +308,7 @@ def _with_sample(
     u_ff_recorded: FloatArray | None,
     vane_m_recorded: FloatArray | None,
 ) -> tuple[ControllerState, TickInputs | None]:
-    """Advance by a tick with fresh inputs, in which the law engages or steps.
-
-    Without a new y nothing happens.
-    """
+    """Advance by a tick with fresh inputs: the law engages or steps if there is a new y."""
     last = state.y
     if state.law is None or last is None or state.y_m is None or state.mode is not Mode.ENGAGED:
         return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
@@ -351,7 +349,7 @@ def _stepped(
     u_ff_recorded: FloatArray | None,
     vane_m_recorded: FloatArray | None,
 ) -> ControllerState:
-    """Step the law, and the feedforward if any, from a state predicted over missed ticks."""
+    """Step the law and the feedforward, after predicting the state over the missed ticks."""
     assert state.y is not None  # noqa: S101 - for the type checker
     assert state.y_m is not None  # noqa: S101 - for the type checker
     span_ns = y.stamp_ns - state.y.stamp_ns
@@ -398,14 +396,14 @@ def _stepped(
 
 
 def _predicted(law_state: Any, held: Measurements, missed: int, law: TunedLaw) -> Any:
-    """Predict the state of the law over `missed` periods without a y, while u is held."""
+    """Predict the state of the law over `missed` periods without a y, in which u is held."""
     for _ in range(missed):
         law_state = law.control_law.missed(law_state, held, law.params)
     return law_state
 
 
 def _probed_trim(state: ControllerState, stamp_ns: int, guard: GuardParams) -> FloatArray:
-    """Return the trim of an engagement plus the probe at the stamp of y, (m,)."""
+    """Return u_trim plus the sines of the probe at the stamp of y, (m,)."""
     return state.u_trim if guard.probe is None else state.u_trim + guard.probe.at(stamp_ns)
 
 
@@ -512,10 +510,10 @@ def law_within_limits(
     guard: GuardParams,
     effectors: FloatArray | None,
 ) -> tuple[Any, FloatArray, FloatArray, FloatArray | None]:
-    """Step the law inside the limits of the law and of the effectors.
+    """Step the law inside its own limits and those of the effectors.
 
     Returns the state, u before saturation, u, and the commands of the effectors. The argument
-    `effectors`, (p,), has these commands at the last tick, or is None without an allocation.
+    `effectors`, (p,), has the commands of the last tick, or is None without an allocation.
     """
     after, u_free = law.control_law.step(state, measurements, dt, law.params)
     u, effector_values = _within_effectors(
@@ -532,9 +530,9 @@ def law_within_limits(
 def _within_effectors(
     u: FloatArray, before: FloatArray | None, dt: Array, guard: GuardParams
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Return the u that the effectors give for a demanded u, and their commands, (p,).
+    """Return what the effectors can give of a demanded u, and the commands of the effectors, (p,).
 
-    Without an allocation the result is u itself and None.
+    Without an allocation the results are u itself and None.
     """
     if guard.allocation is None or before is None:
         return u, None
@@ -545,7 +543,7 @@ def _within_effectors(
 def _failsafe(
     state: ControllerState, stamp_ns: int, now_ns: int, guard: GuardParams, active: bool
 ) -> tuple[ControllerState, TickInputs | None]:
-    """Advance by a tick without fresh inputs, or in which the controller is deactivated.
+    """Advance by a tick in which inputs are stale, or the controller is inactive.
 
     u gets the stamp `stamp_ns`.
     """

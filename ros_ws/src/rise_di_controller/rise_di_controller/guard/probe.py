@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Probe the inputs while the law is engaged, and test whether they have an effect.
+"""Probe the inputs while the law is engaged, to find an input that has no effect.
 
-Without a probe nothing shows a surface that is stuck at trim in calm air, because it causes no
-error there.
+In calm air a surface that is stuck at trim causes no error, so only a probe can find it.
 
 A sine is added to the command of each probed input. The frequencies of the sines differ. Over a
 window all sines are orthogonal to each other, and to the frequencies between them, at which the
@@ -33,7 +32,7 @@ LARGEST = 4.0  # highest frequency of a sine, Hz, with five bins a period
 
 
 class ProbeConfig(Config):
-    """Probe of the inputs, an extension that finds a stuck surface while no command moves it."""
+    """Probe of the inputs, an extension that finds a stuck surface even if no command moves it."""
 
     effect: NonNegatives | None = Field(
         default=None,
@@ -52,7 +51,7 @@ class ProbeConfig(Config):
     )
 
     def amplitudes(self, outputs: tuple[str, ...]) -> FloatArray:
-        """Return the amplitude of the motion of each output, (m,), units of y."""
+        """Return by how much the probe may move each output, (m,), units of y."""
         rates = tuple(EFFECT if name in RATES else 0.0 for name in outputs)
         return np.array(self.effect or rates)
 
@@ -114,13 +113,13 @@ class EffectTest:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all ticks, as is necessary at an engagement."""
+        """Forget all recorded ticks. This is necessary at an engagement."""
         self._means.clear()
         self._bin = -1
         self._samples: list[FloatArray] = []
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> FloatArray | None:
-        """Record a tick, and return `most()` if a test is due, else None."""
+        """Record a tick. If a test is due, return its result `most()`, else None."""
         place = stamp_ns // BIN_NS
         result = None
         if place != self._bin:
@@ -153,9 +152,11 @@ class EffectTest:
         Y and U are the complex amplitudes, fitted by least squares together with a cubic. q is the
         quantile of Student's t with two degrees of freedom per frequency. If the noise is Gaussian
         and flat over the frequencies, the result falls below the true effect of an input with a
-        probability of at most `false_alarm`. The command contains the law's response to the
-        disturbances too, so y is not fitted to the command. H is instead the ratio of two
-        correlations with the sine, that of y to that of the command.
+        probability of at most `false_alarm`.
+
+        y is not fitted to the command, because the command also contains the response of the law to
+        the disturbances. Instead H is the ratio of two correlations with the sine, that of y to
+        that of the command.
         """
         window = np.array(self._means)
         t = (window[:, 0] - window[-1, 0]) / (self._probe.window_ns / NANOSECONDS)

@@ -30,9 +30,10 @@ def retune_state(
     | new observer | z from the new filter, u_o continues | starts from the present e |
     | new feedforward | goes on from the same motion | u_ff becomes part of u_trim |
 
-    An observer that starts from the present error also hands its u_o over to u_trim. With a
-    schedule, the models are those of the present speed. Over the history, each tick has the models
-    of its speed. `guards` are the old and the new guard, which hold the models of the feedforward.
+    When an observer starts from the present error, its former output u_o becomes a part of u_trim.
+    With a schedule, the state continues with the models of the present speed, while the run over
+    the history uses at each tick the models of the speed at that tick. `guards` are the old and the
+    new parameters of the guard, which hold the models of the feedforward.
     """
     y = state.y
     y_m = state.y_m
@@ -90,10 +91,11 @@ def _with_estimates(
 ) -> ObserverState:
     """Return the state with which a new observer continues the motion of the old one.
 
-    z has the estimates of the new observer, and `change` is the change of u_ff, (m,). `observers`
-    has the old and the new parameters. From here on, u_o moves to -F z at its rate limit. In a
-    channel that had no observer before, u_o takes over what the law has integrated. Otherwise the
-    integral would stay in the law, and the observer would need a long time to build it up.
+    `z` has the estimates of the new observer, and `change` says by how much u_ff changes, (m,).
+    `observers` has the old and the new parameters. From here on, u_o moves to -F z at its rate
+    limit. In a channel that had no observer before, u_o takes over what the law has integrated.
+    Otherwise the integral would stay in the law, and the observer would need a long time to build
+    it up.
     """
     law_part = state.u - state.u_trim - state.u_ff
     limits = observers[1].limits
@@ -113,10 +115,10 @@ def _with_estimates(
 def _with_nominal(
     state: ControllerState, y_m: FloatArray, nominal: Nominal | None
 ) -> tuple[ControllerState, Array]:
-    """Return the state with a feedforward that continues its motion by another model.
+    """Return a state in which the feedforward continues its motion with another model.
 
-    If `nominal` is None, there is no feedforward any more. The second result is the change of u_ff,
-    (m,).
+    If `nominal` is None, there is no feedforward any more. The second result says by how much u_ff
+    changes, (m,).
     """
     u_ff = np.zeros_like(state.u)
     continued = None

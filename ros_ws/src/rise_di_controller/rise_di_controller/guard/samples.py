@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Decide which samples the controller takes.
+"""Decide which samples of y and y_m the controller takes.
 
-An impossible sample is lost, which means that it counts as a sample that did not arrive.
+A sample that is impossible for an aircraft is dropped, and counts as one that did not arrive.
 
 - `bound_violation` finds a value beyond the bound of its output. No sensor gives such a value.
 - `step` finds a y that changes faster than an aircraft can. The test compares y with the y before
   it, and uses no model, so a wrong model does not lock any sample out. If y really jumps, two
-  samples are lost. The controller takes the third sample in a row that agrees with the sample
+  samples are dropped. The controller takes the third sample in a row that agrees with the sample
   before it.
 - `step` also finds a y that stands still. Such a y repeats every bit of every value, although each
   sample before brought a change.
@@ -68,7 +68,7 @@ class SampleLimits(NamedTuple):
 
 
 class SampleChange(IntEnum):
-    """The judgement on a sample of y, compared with the samples before it."""
+    """How a sample of y compares with the samples before it: near, a jump, or frozen."""
 
     NEAR = 0  # taken
     FAR = 1  # lost
@@ -86,7 +86,7 @@ class Stillness(NamedTuple):
 
 
 class SampleState(NamedTuple):
-    """What the controller knows of the earlier samples of y."""
+    """What the controller remembers of the earlier samples of y, to judge the next one."""
 
     begin_ns: int  # stamp of the first sample
     last: StampedVector  # the last sample taken
@@ -118,7 +118,7 @@ def sample_limits(
 def bound_violation(
     value: FloatArray, names: Sequence[str], limits: SampleLimits
 ) -> Refusal | None:
-    """Return a refusal of the first of m values that is NaN or beyond its bound, else None."""
+    """Return a refusal for the first of m values that is NaN or beyond its bound, or None."""
     is_inside = np.abs(value) <= limits.largest
     if is_inside.all():
         return None
@@ -137,7 +137,7 @@ def jump(before: StampedVector, sample: StampedVector, names: Sequence[str]) -> 
 
 
 def standstill(state: SampleState, sample: StampedVector) -> Refusal:
-    """Return the refusal of a sample because y stands still."""
+    """Return a refusal which says that a sample is dropped because y stands still."""
     span = seconds(sample.stamp_ns - state.stillness.since_ns)
     return Refusal(
         f"y: found every value as before for {span:g} s, expected an aircraft that moves"
@@ -207,7 +207,7 @@ def step(
 def _next_stillness(
     before: Stillness, sample: StampedVector, last: StampedVector, limits: SampleLimits
 ) -> Stillness:
-    """Update the record of whether y changes, given a sample and the last sample taken."""
+    """Update the record of whether y changes, from a new sample and the last sample taken."""
     if not np.array_equal(sample.value, last.value):
         is_moving = before.is_frozen or before.equal == 0
         changes = min(before.changes + 1, MOVING) if is_moving else 1

@@ -120,9 +120,9 @@ def leading_minors(Omega: FloatArray) -> FloatArray:
 
 
 def unit_diagonal(Omega: FloatArray) -> FloatArray:
-    """Scale the inputs of Omega to unit response, v_i = abs(Omega_ii) u_i, shape (m, m).
+    """Scale each input of Omega so that its own output responds by 1, shape (m, m).
 
-    Each entry becomes Omega_ij / abs(Omega_jj).
+    The scaled inputs are v_i = abs(Omega_ii) u_i, so each entry becomes Omega_ij / abs(Omega_jj).
 
     Raises DecompositionError if Omega is not square or not finite, or if an output does not respond
     to the input that it is paired with.
@@ -139,9 +139,7 @@ def unit_diagonal(Omega: FloatArray) -> FloatArray:
 
 
 def coupling(Omega: FloatArray) -> float:
-    """Compute the coupling max abs(U - I) of `unit_diagonal(Omega)`, in inputs of unit response.
-
-    A large value means a bad pairing.
+    """Compute max abs(U - I) of `unit_diagonal(Omega)`, which is large for a bad pairing.
 
     The coupling is infinite if an output does not respond to the input that it is paired with. It
     depends on the units of y, but not on the units or signs of u. Raises DecompositionError as
@@ -252,11 +250,10 @@ def _square(Omega: ArrayLike) -> FloatArray:
 
 
 def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return scales of the rows and of the columns of a matrix, (m,) each.
+    """Compute scales of the rows and of the columns of a matrix, (m,) each, which balance it.
 
-    With them, the largest abs(Omega_ij) / (rows_i columns_j) is 1 in every row and column.
-
-    The scales follow the units of the channels, so a comparison with the scales does not depend on
+    With them, the largest abs(Omega_ij) / (rows_i columns_j) is 1 in every row and column. The
+    scales follow the units of the channels, so a comparison with the scales does not depend on
     units. A row or column of zeros keeps the scale 1. Source: D. Ruiz, "A Scaling Algorithm to
     Equilibrate Both Rows and Columns Norms in Matrices", RAL-TR-2001-034.
     """

@@ -300,5 +300,5 @@ CONTROL_LAWS = {sign: _control_law(sign) for sign in Sign}
 
 
 def tuned(params: LawParams) -> TunedLaw:
-    """Return the law RISE-DI with these parameters."""
+    """Return the law RISE-DI together with these parameters, as the controller flies it."""
     return TunedLaw(CONTROL_LAWS[Sign.SOFT if params.sign is None else params.sign], params)

@@ -66,14 +66,15 @@ class LinearLaw(NamedTuple):
 
 
 def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = None) -> LinearLaw:
-    """Linearise a law's step near e = 0 over m channels.
+    """Linearise the step of a law near e = 0 over m channels.
 
-    Each column is the response to a step of SMALL in one value of the state or of y.
+    Each column of the matrices is the response to a step of SMALL in one value of the state or of
+    y.
 
-    An observer counts as faded in, and its vanes as moving. Each vane adds a column after those of
-    y. If `candidates` is N, the parameters hold N sets of gains in the last axis, and the matrices
-    hold them in the first axis. Raises ParameterError for the literal sign, which is not linear
-    anywhere.
+    The observer counts as fully faded in, and its vanes as moving. Each vane adds a column after
+    the columns of y. If `candidates` is N, the parameters hold N sets of gains in their last axis,
+    and the matrices hold them in the first axis. Raises ParameterError for the literal sign, which
+    is not linear anywhere.
     """
     control_law, params = law
     core = params
@@ -135,9 +136,9 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
 
 
 def _takes_columns(params: Any) -> bool:
-    """Return whether the law is known to step many states at once, one in each column.
+    """Return whether the law can step many states at once, with one state in each column.
 
-    RISE-DI does, alone or with an observer without vanes.
+    RISE-DI can, alone or with an observer without vanes.
     """
     if isinstance(params, ObserverParams) and params.vanes is None:
         params = params.law
@@ -145,7 +146,7 @@ def _takes_columns(params: Any) -> bool:
 
 
 def _for_columns(params: Any) -> Any:
-    """Reshape the parameters of a law for columns side by side: a vector (k,) becomes (k, 1)."""
+    """Reshape the parameters of a law so that it steps states in columns: (k,) becomes (k, 1)."""
     values = []
     for value in params:
         if hasattr(value, "_asdict"):
@@ -170,10 +171,10 @@ def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatA
 
 @lru_cache(maxsize=64)
 def _exponential(matrices: bytes, shape: tuple[int, ...]) -> FloatArray:
-    """Compute exp of matrices, which are given as bytes with their shape.
+    """Compute exp of matrices that are given as bytes with their shape.
 
-    The results are cached, because the matrices of the plant stay the same if gains change in
-    flight.
+    The results are cached by these bytes, because the matrices of the plant stay the same if gains
+    change in flight.
     """
     from scipy.linalg import expm  # noqa: PLC0415 - a controller without an observer starts without it
 
@@ -253,10 +254,10 @@ def sampled_plant(
 def _driven(
     motion: FloatArray, drive: FloatArray, time: float, begin: float, period: float | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the transition over a time, s, and the motion that a held input causes in this time.
+    """Return the transition matrix over a time, s, and the response to an input held in this time.
 
-    If `period` is given, the input is ROOT (2 s - 1) instead, where s rises from `begin` by time /
-    period.
+    If `period` is given, the input is not constant but ROOT (2 s - 1), where s rises from `begin`
+    by time / period.
     """
     transition, step = zero_order_hold(motion, drive, time)
     if period is None:
@@ -273,7 +274,7 @@ def _driven(
 def closed_loop(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming, extra: FloatArray
 ) -> FloatArray:
-    """Return the exact matrix that advances the sampled loop by one period.
+    """Return the matrix that advances the sampled loop by exactly one period.
 
     The loop is stable if no eigenvalue lies outside the unit circle.
 
@@ -297,5 +298,5 @@ def spectral_radius(matrix: FloatArray) -> float:
 
 
 def is_stable(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, extra: FloatArray) -> bool:
-    """Return whether every eigenvalue of `closed_loop` is in the unit circle, up to rounding."""
+    """Return whether no eigenvalue of `closed_loop` is outside the unit circle, up to rounding."""
     return spectral_radius(closed_loop(plant, law, loop, extra)) <= 1.0 + SPECTRAL_RADIUS_TOLERANCE

@@ -67,16 +67,16 @@ def bounds(u_before: Array, dt: Array, limits: Limits) -> tuple[Array, Array]:
 def limited_integral(before: Array, after: Array, change: Array, beyond: Array) -> Array:
     """Advance an integral by a tick with anti-windup, shape (m,).
 
-    If the increment pushes u further beyond a limit, it is reduced:
+    If the increment pushes u further beyond a limit, only a part of the increment is taken:
 
         before + max(1 - beyond / change, 0) (after - before)
 
-    This holds if `change` and `beyond` have the same sign. Otherwise the result is `after`, to the
+    u then ends at the limit, or moves at the rate if a rate limit acts. The increment pushes u
+    further out if `change` and `beyond` have the same sign. Otherwise the result is `after`, to the
     last bit.
 
-    u then ends at the limit, or moves at the rate if a rate limit acts.
-    Source: conditional integration, K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5. The
-    reduced increment is of this project.
+    Source: conditional integration, K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5. That
+    only a part of the increment is taken is of this project.
 
     Args:
         before: Integral before the tick, shape (m,).

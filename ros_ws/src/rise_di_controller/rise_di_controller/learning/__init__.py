@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Take, refuse or give up models that are learned in flight, on the controller's side."""
+"""Decide in the controller which models learned in flight are used, and which are dropped again."""

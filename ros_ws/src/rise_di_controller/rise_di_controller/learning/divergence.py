@@ -80,14 +80,16 @@ def diverging(
 class Oscillations:
     """The error e over the last WINDOW, and the outputs in which it oscillates.
 
-    An output counts only if it oscillates more than under the law of the start.
-
-    In a limit cycle, e resembles e a period earlier over the whole window. Under wind and single
-    commands it does not.
+    In a limit cycle, e repeats itself after a period over the whole window. Under wind and single
+    commands it does not. An output counts only if it oscillates more than it did under the law of
+    the start.
     """
 
     def __init__(self, least: FloatArray) -> None:
-        """Take the mean square below which the error of each output is no divergence, (m,)."""
+        """Begin without a record.
+
+        `least` is the mean square below which the error of each output is no divergence, (m,).
+        """
         # Period of each output's oscillation at the last test, s, (m,), or 0 for none.
         self.periods = np.zeros_like(least)
         self._least = HARMLESS**2 * least
@@ -139,8 +141,8 @@ class Oscillations:
 def oscillating(y: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
     """Return which outputs, (m,), oscillate over a record y, (N, m).
 
-    An output counts only if its variance over the record is above HARMLESS^2 `least`. Repeated
-    commands count as an oscillation, too.
+    An output counts only if its variance over the record is above HARMLESS^2 `least`. Commands that
+    repeat themselves count as an oscillation, too.
     """
     is_moving = np.var(y, axis=0) > HARMLESS**2 * least
     return np.array(

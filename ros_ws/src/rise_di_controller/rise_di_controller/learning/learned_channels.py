@@ -21,14 +21,14 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 def with_channels_of(
     start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence[bool], dead: Sequence[bool]
 ) -> RiseDiConfig:
-    """Give a designed controller the gains of `start` in the channels `bare`, without checks.
+    """Give a designed controller the gains of `start` in the channels that `bare` marks.
 
-    The channels `bare` get no feedforward and no observer.
+    These channels get no feedforward and no observer. The result is not checked.
 
     By equation (22), the K of a channel cannot be below that of the last channel. If the K in
     `start` is below it, the channel gets the K of the last channel and a smaller input scale, which
-    gives the same loop. The inputs `dead` have no effect, and get the least input scale, so that
-    the law does not move them.
+    gives the same loop. The inputs that `dead` marks have no effect. They get the least input
+    scale, so that the law does not move them.
     """
     law = start.law_params()
     design = designed.law_params()
@@ -92,14 +92,14 @@ def acting_inputs(parameters: RiseDiConfig) -> tuple[str, ...]:
 
 
 def authority_names(outputs: Sequence[str]) -> tuple[str, ...]:
-    """Name the channels of the topic `authority`."""
+    """Return the names of the channels of the topic `authority`."""
     return tuple(f"{side}.{name}" for side in SIDES for name in outputs)
 
 
 def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
-    """Compute the y_dot that each input can give to its output for sure, (2m,), units of y / s.
+    """Compute the y_dot that each input can surely give to its output, (2m,), units of y / s.
 
-    The first m values hold for a falling output, the others for a rising output:
+    The first m values are those of a falling output, the others those of a rising output:
 
         y_dot_i = abs(Omega_ii) exp(-2 s_i) abs(limit of u_i),
             Omega = C B of the model learned in flight
@@ -161,9 +161,9 @@ def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
 def without_models(
     start: RiseDiConfig, parameters: RiseDiConfig, outputs: Collection[str]
 ) -> RiseDiConfig:
-    """Return the parameters with which some outputs give up their model.
+    """Return parameters in which some outputs no longer use their learned model.
 
-    These outputs fly the law of the start until the engagement ends, and are added to
+    These outputs fly the law of the start until the engagement ends. They are added to
     `learn.without`.
     """
     fallen = with_fallback(start, parameters, [name in outputs for name in start.outputs])
@@ -177,9 +177,9 @@ def without_models(
 
 
 def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
-    """Return a mask, (m,), of the outputs that the model couples with the outputs `names`.
+    """Return a mask, (m,), of the outputs that the nominal model couples with the given `names`.
 
-    The model is that of the feedforward.
+    The nominal model is that of the feedforward.
     """
     model = parameters.feedforward
     assert model is not None  # noqa: S101 - a learned model flies

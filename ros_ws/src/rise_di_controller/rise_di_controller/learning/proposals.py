@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Handle the models that are learned in flight, on the side of the controller.
+"""Decide in the controller what becomes of models that are learned in flight.
 
-This module decides when identifications begin, which proposals fly, and when to fall back. It has
-no side effects, so the node and the loop in one process both use it.
+This module decides when identifications begin, which proposed models fly, and when to fall back to
+the law of the start. It has no side effects, so the node and the loop in one process both use it.
 """
 
 from collections import Counter, deque
@@ -51,7 +51,7 @@ feedforward, and a design in which all inputs have one lacks it."""
 
 
 class EventKind(StrEnum):
-    """What happened in the learning, as in the messages of the topic `learning`."""
+    """Kind of an event in learning, as the messages of the topic `learning` name it."""
 
     FLIES = "flies"  # the controller has taken a proposal
     REFUSED = "refused"  # a proposal fails a check of the controller
@@ -74,9 +74,9 @@ class Proposal(NamedTuple):
 
 
 class Event(NamedTuple):
-    """The result of a proposal, or a fallback.
+    """What became of a proposed model, or that the controller fell back.
 
-    It has the change of the parameters by dotted name, which may be empty, and the reason.
+    It has the reason and the changed parameters by dotted name. No parameter need have changed.
     """
 
     stamp_ns: int
@@ -98,16 +98,16 @@ AUTHORITY_TICKS = 10
 
 
 class Fallback(NamedTuple):
-    """A fallback of all parts of the model to the law with which the flight started."""
+    """A fallback: all outputs returned to the law with which the flight started."""
 
     flown: int  # digest of the parameters before
     input_scale: tuple[float, ...]  # input_scale of the parameters before
     fallen: int  # digest of the parameters after
 
     def outlived_by(self, proposal: Proposal, digest: int) -> bool:
-        """Return whether a proposal that was made before the fallback still holds after it.
+        """Return whether a proposal may still act although it was made before this fallback.
 
-        It holds if it stops the use of a further input that has no effect.
+        It may if it stops the use of one more input that has no effect.
         """
         scale = proposal.change.get("input_scale")
         if (proposal.flown, digest) != (self.flown, self.fallen) or not isinstance(scale, Sequence):
@@ -116,11 +116,11 @@ class Fallback(NamedTuple):
 
 
 class Updates:
-    """Decides when proposals are due, at the first tick and at given times after it.
+    """The times at which models are proposed: at the first tick, and at given times after it.
 
     At the first tick the rough model is proposed unchanged. From the first given time on, the
-    aircraft is also tested at intervals of `learn.check`. A test is left out if a given time
-    follows in less than `learn.check`.
+    aircraft is also tested for damage at intervals of `learn.check`. A test is left out if a given
+    time follows in less than `learn.check`.
     """
 
     def __init__(self, settings: LearnConfig) -> None:
@@ -152,11 +152,11 @@ class Updates:
 
 
 class Learning:
-    """The proposals of a flight and the fallback, stepped between two ticks of the controller.
+    """The proposed models of a flight and the fallback, advanced between two ticks.
 
     In simulated time a proposal acts `learn.latency` after the end of its window, and the flight
-    waits for it. In real time a proposal acts as soon as it is certified. Each step does a part of
-    the certification, so that no tick has to wait.
+    waits for it. In real time a proposal acts as soon as it is certified. Each call of `step` does
+    a small part of the certification, so that no tick has to wait.
     """
 
     def __init__(
@@ -183,7 +183,7 @@ class Learning:
         self._diverged = set[int]()  # digests of the parameters that diverged in this engagement
 
     def authority(self, controller: Controller) -> FloatArray:
-        """Return the `authority` of the parameters in force."""
+        """Return the values of the topic `authority` under the parameters in force."""
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - proposals keep the law of the start
         return authority(parameters, self.start)
@@ -191,7 +191,7 @@ class Learning:
     def ticked(self, controller: Controller, now_ns: int) -> bool:
         """Note a tick, and return whether an identification or a test begins at it.
 
-        Neither begins while the law is deactivated.
+        None begins while the law is deactivated.
         """
         due = controller.mode is not Mode.INACTIVE and self._updates.due(now_ns)
         if due and self._simulated:
@@ -199,13 +199,13 @@ class Learning:
         return due
 
     def waits(self, now_ns: int) -> bool:
-        """In simulated time, return whether the tick at `now_ns` waits for a proposal."""
+        """Return whether the tick at `now_ns` waits for a proposal; in real time none does."""
         return any(
             self._acts_ns(end_ns) <= now_ns and end_ns not in self._received for end_ns in self._due
         )
 
     def receive(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
-        """Take a proposal, or refuse it with an event."""
+        """Take a proposal, or refuse it and add an event that says why."""
         if not (self._simulated or proposal.change) and proposal.sentence is None:
             return  # a test without a change has nothing to certify or report
         if refusal := self._reason_against(proposal, now_ns, controller):
@@ -219,9 +219,9 @@ class Learning:
     def step(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
         """Certify a part of a proposal, let due proposals act, and fall back if the law diverges.
 
-        A deactivated law begins again with the parameters of the start, because its model may have
-        been the reason to deactivate it. Returns the parameters that the controller has taken, or
-        None if it keeps the present ones.
+        Returns the parameters that the controller has taken, or None if it keeps the present ones.
+        After a deactivation the law begins again with the parameters of the start, because a
+        learned model may have been the reason to deactivate it.
         """
         if controller.mode is Mode.INACTIVE:
             return self._begin_again(controller, now_ns)
@@ -242,10 +242,11 @@ class Learning:
     def _end_divergence(
         self, diverging: Collection[str], controller: Controller, now_ns: int
     ) -> RiseDiConfig:
-        """Fall back to the parameters of the start in all parts, because some of them diverge.
+        """Fall back to the parameters of the start in all outputs, because some of them diverge.
 
-        A fallback counts only for the parts that diverge. A part with FALLBACKS fallbacks keeps
-        the law of the start until the engagement ends.
+        The fallback is counted only for the parts of the model (outputs that it couples with each
+        other) that diverge. A part with FALLBACKS fallbacks keeps the law of the start until the
+        engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -270,9 +271,9 @@ class Learning:
     def _end_oscillations(
         self, periods: Mapping[str, float], controller: Controller, now_ns: int
     ) -> RiseDiConfig:
-        """Fall back to the law of the start in the parts of the model whose outputs oscillate.
+        """Fall back in the outputs that oscillate, and in those that the model couples with them.
 
-        These parts keep the law of the start until the engagement ends.
+        They keep the law of the start until the engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -437,7 +438,7 @@ class Learning:
 def _certificate(
     parameters: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig
 ) -> Generator[None, None, Prepared]:
-    """Apply a change to the parameters in force, and check the result like loaded parameters.
+    """Apply a change to the parameters in force, and check the result as if it came from a file.
 
     The generator yields after at most about 1 ms. Raises ParameterError if a check fails.
     """
@@ -493,7 +494,7 @@ def _certificate(
 
 
 def _speeds(parameters: RiseDiConfig) -> str:
-    """Describe the speeds of the models and the schedule as text, or return ""."""
+    """Describe the speeds of models and schedule as text; return "" without a schedule."""
     schedule = parameters.schedule
     if schedule is None:
         return ""
@@ -502,11 +503,11 @@ def _speeds(parameters: RiseDiConfig) -> str:
 
 
 def design_changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
-    """Return the values of all DESIGNED parameters of a new set, by dotted name.
+    """Return what a new design sets: the parameters in DESIGNED of the new set, by dotted name.
 
-    A value of None removes a parameter. If the new set lacks a parameter, the value is None if the
-    old set has it. It is also None if the parameter is in OPTIONAL, because the parameters in force
-    may have it.
+    The value None means that the parameter is to be removed. A parameter that the new set lacks has
+    the value None if the old set has it, or if it is in OPTIONAL, because the parameters in force
+    may have it by then.
     """
     before = _designed_values(old)
     after = _designed_values(new)
