@@ -54,7 +54,7 @@ class ZeroDynamics(StrEnum):
 
 
 class AirframeFacts(NamedTuple):
-    """The facts that decide whether the theorem applies to an airframe, in SI."""
+    """The properties of an airframe that decide whether the theorem applies to it, in SI."""
 
     name: str
     n: int
@@ -92,9 +92,10 @@ class AirframeFacts(NamedTuple):
 
     @property
     def remedy(self) -> str:
-        """Change of pairs and signs that makes D = I, as text.
+        """The change of pairs and signs that makes D = I, in words.
 
-        Examples are "none needed", "flip rudder", "pair p-rudder, r-aileron, flip rudder", "none".
+        Examples are "none needed", "flip rudder", "pair p-rudder, r-aileron, flip rudder", and
+        "none" if no change does.
         """
         if self.pairing is None:
             return "none" if self.m <= MANY else "none of three orders tried"
@@ -223,9 +224,9 @@ def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
 
 
 def marginal_sentence(facts: Sequence[AirframeFacts]) -> str | None:
-    """Say which airframes have zeros on the imaginary axis, which Assumption 3 does not cover.
+    """Write a sentence that names the airframes with zeros on the imaginary axis.
 
-    Returns None if there are no such airframes.
+    Assumption 3 does not cover such zeros. Returns None if there are no such airframes.
     """
     states = list(dict.fromkeys(chain.from_iterable(airframe.integrated for airframe in facts)))
     names = [airframe.name for airframe in facts if airframe.zero_dynamics is ZeroDynamics.MARGINAL]
@@ -243,7 +244,7 @@ def marginal_sentence(facts: Sequence[AirframeFacts]) -> str | None:
 
 
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
-    """Say in which half plane the invariant zeros lie, the poles of the zero dynamics (5)-(9).
+    """Return in which half plane the invariant zeros lie, the poles of the zero dynamics (5)-(9).
 
     `zeros` has shape (n - m,), in 1/s. A zero counts as on the imaginary axis if its real part is
     at most ZERO_REAL_PART in magnitude.

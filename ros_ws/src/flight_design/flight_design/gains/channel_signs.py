@@ -28,11 +28,10 @@ def signs_of_pairing(
     Omega = C B, (m, m), is in the order of the channels, and its inputs have the signs of the
     airframe. `input_signs` has -1 for an input whose sign is flipped between law and airframe. If
     the input of channel k is flipped, D_k changes its sign, and no other entry of D does. If `D` is
-    given, it is only checked. The checks are made in this order:
+    given, it is checked and not computed. The checks are made in this order:
 
-    1. Omega has a decomposition S D U, and max abs(U - I) is at most 10.
-    2. The input signs fit the D that is given.
-    3. D fits Omega.
+    1. Omega has a decomposition S D U, and max abs(U - I) is at most 10. 2. The input signs fit the
+    D that is given. 3. D fits Omega.
 
     If a check fails, raises ParameterError. The error names the value that contradicts Omega, and
     one that fits Omega.

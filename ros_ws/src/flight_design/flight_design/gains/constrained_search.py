@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Search for factors on gains, so that a loop meets a requirement at the least cost.
+"""Search for factors on gains with which a loop meets a requirement at the least cost.
 
-Each of the m channels has k factors. A place of the search is a tuple of the k m exponents of these
-factors: a factor is STEP to the power of its exponent. Exponents are whole numbers, so that the
-search is deterministic. Source of the pattern search: R. Hooke, T. A. Jeeves, Journal of the ACM
-8(2), 1961.
+Each of the m channels has k factors. A factor is STEP to the power of a whole number, its exponent,
+so that the search is deterministic. A place in the search is a tuple of all k m exponents. Source
+of the pattern search: R. Hooke, T. A. Jeeves, Journal of the ACM 8(2), 1961.
 """
 
 import math
@@ -25,7 +24,7 @@ REACH = 16  # largest change of an exponent by one move while there is a shortag
 
 
 class Moves(NamedTuple):
-    """The moves that a search tries: each is k whole numbers, added to a channel's exponents."""
+    """The moves that a search tries: k whole numbers each, added to a channel's exponents."""
 
     mending: Sequence[tuple[int, ...]]  # moves that may reduce a shortage
     cheaper: Sequence[tuple[int, ...]]  # moves that may lower the cost
@@ -34,7 +33,7 @@ class Moves(NamedTuple):
 
 
 class Trial(NamedTuple, Generic[Content]):
-    """A tuple of exponents that the search has tried, with the shortage and cost of its loop."""
+    """A place that the search has tried, with its loop, what the loop lacks, and what it costs."""
 
     place: Place
     shortage: float  # sum of 1 - found / needed over the goals that the loop misses
@@ -46,7 +45,7 @@ class Trial(NamedTuple, Generic[Content]):
     def is_better(self, trial: "Trial[Content]") -> bool:
         """Return whether this trial is better than another one by at least GAIN.
 
-        The shortages are compared, or the costs if neither trial has a shortage.
+        A smaller shortage is better. If neither trial has a shortage, a lower cost is better.
         """
         if self.shortage == 0.0 or trial.shortage == 0.0:
             return self.shortage < trial.shortage or self.cost < trial.cost - GAIN
@@ -68,13 +67,13 @@ def descend(
     lowest: IntArray,
     highest: IntArray,
 ) -> Trial[Content]:
-    """Move from a start until no move of a single channel helps, and return the last trial.
+    """Search from a start until no move of a single channel helps, and return the last trial.
 
     `lowest` and `highest`, (k, m), bound the exponents. Each move is multiplied by a whole number,
     the reach. As long as there is a shortage, the search takes the best move of all channels. If no
     move helps, it doubles the reach. If no move helps up to the reach REACH, the last trial still
-    has a shortage. Without a shortage, the channels move in turn. The reach begins with its last
-    value, and is halved whenever no channel finds a move that helps.
+    has a shortage. Without a shortage, the channels move in turn. The reach then begins with the
+    value that it had last, and is halved whenever no channel finds a move that helps.
     """
     best = start
     reach = moves.begin

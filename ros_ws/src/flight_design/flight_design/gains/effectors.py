@@ -42,7 +42,7 @@ class Effectors(NamedTuple):
 
 
 class LawInputs(NamedTuple):
-    """The inputs v of the law that an allocation takes, one per output, (m,), units of y / s."""
+    """The inputs v of the law before an allocation, one per output, (m,), units of y / s."""
 
     names: tuple[str, ...]
     # limit of each input at which the first effector reaches its stop, if all other inputs are 0
@@ -64,10 +64,10 @@ def design_allocation(
     The input v is the part of y_dot that the effectors cause, so D = S = U = I on this airframe.
     For a given v, T finds the u with the least sum of squares of (lag_j + SERVO) u_j / range_j.
     Here range_j is half the distance between the stops, and SERVO is the lag of a fast servo. So a
-    slow effector helps a fast one only a little. The lag of v_i is lag_i = sum_j Omega_ij T_ji
-    lag_j, exact to first order. `priority` lists outputs. If an effector saturates, the input of
-    the first output in the list is kept the longest. The outputs that are not listed follow in the
-    airframe's order.
+    slow effector does little of what a fast one can do. The lag of v_i is lag_i = sum_j Omega_ij
+    T_ji lag_j, exact to first order. `priority` lists outputs. If an effector saturates, the input
+    of the first output in the list is kept the longest. The outputs that are not listed follow in
+    the airframe's order.
 
     Raises ParameterError for fewer effectors than outputs, for infinite stops, and for dependent
     rows of Omega. Source of the pseudo-inverse: M. W. Oppenheimer, D. B. Doman, M. A. Bolender,
@@ -106,7 +106,10 @@ def design_allocation(
 
 
 def _require_effectors(airframe: Airframe, effectors: Effectors) -> None:
-    """Raise ParameterError for fewer effectors than outputs, and for infinite stops."""
+    """Check that there is an effector for each output, and that all end stops are finite.
+
+    Raises ParameterError if not.
+    """
     names = tuple(airframe.inputs)
     m = len(airframe.outputs)
     require(
@@ -146,11 +149,11 @@ def _pseudo_inverse(airframe: Airframe, Omega: FloatArray, effectors: Effectors)
 
 
 def _alone(T: FloatArray, sides: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """Return the largest v_i >= 0 of each input that keeps all effectors within their stops, (m,).
+    """Return how large each v_i >= 0 may be while all effectors stay within their stops, (m,).
 
     All other inputs are 0. `sides` are two arrays of stops, one per effector. An effector with a
     negative T_ji moves towards its stop in the first array, and one with a positive T_ji towards
-    that in the second. Only the magnitudes of the stops count.
+    its stop in the second. Only the magnitudes of the stops count.
     """
     against, along = (np.abs(side)[:, None] for side in sides)
     counts = np.abs(T) > SMALL * np.abs(T).max(axis=0)

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Select gains of the law for a loop with an extended-state observer.
 
-This observer models each output of the aircraft as an integrator of its input. Of the aircraft it
-knows only the sign and the size of the integrator's gain.
+This observer models each output of the aircraft as the integral of its input times a gain. It knows
+nothing of the aircraft but the sign and the size of these gains.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ from rise_di_controller.params import ControllerConfig
 
 @dataclass(frozen=True, kw_only=True)
 class WeightProducts:
-    """The `ExtendedStateWeights` of an output, multiplied or divided by the loop's total lag T."""
+    """Each weight in `ExtendedStateWeights` of an output, times or over the loop's total lag T."""
 
     effort: float  # effort / T
     drift: float  # drift T
@@ -54,7 +54,7 @@ def extended_state_weights(outputs: tuple[str, ...], T: FloatArray) -> ExtendedS
 
 
 def integrator_model(controller: ControllerConfig, Omega: FloatArray) -> FeedforwardConfig:
-    """Build the model y_dot = Omega u of a feedforward, Omega (m, m) in the law's order.
+    """Build the model y_dot = Omega u for a feedforward, with Omega (m, m) in the law's order.
 
     The lead of the feedforward is the sum of the lag, the delay and half a period.
     """

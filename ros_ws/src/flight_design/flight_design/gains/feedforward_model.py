@@ -16,7 +16,7 @@ Controller = TypeVar("Controller", bound=ControllerConfig)
 
 
 def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
-    """Return the same controller with the airframe as the nominal model of its feedforward.
+    """Return the controller with a feedforward, whose nominal model is that of the airframe.
 
     The lead is lag + delay + half a period of the controller. Raises ParameterError if the airframe
     cannot be the model, for example because it has a zero in the right half plane.
@@ -43,11 +43,11 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
 
 
 def with_states_of(airframe: Airframe, model: FeedforwardConfig) -> Airframe:
-    """Add the states that a feedforward has and the airframe lacks, and return the airframe.
+    """Return the airframe with the states that the model of a feedforward has in addition.
 
-    They are angles, for example the bank angle, which an airframe of body rates does without. Their
-    rows and columns of A are those of the feedforward, and no input acts on them. Raises
-    ParameterError if the feedforward has sine terms of gravity, which would be lost.
+    They are angles such as the bank angle, which an airframe of body rates lacks. Their rows and
+    columns of A are those of the feedforward, and no input acts on them. Raises ParameterError if
+    the feedforward has sine terms of gravity, which would be lost.
     """
     further = [name for name in model.states if name not in airframe.states]
     if not further:

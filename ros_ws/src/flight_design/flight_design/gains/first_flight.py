@@ -62,8 +62,8 @@ def first_flight(
 
     `controller` is the text of the section controller. The commands are those of `first_commands`,
     and `part` multiplies the heights of their pulses. `shortfall` says which required margins the
-    loop misses, and becomes the first line of the file. The gusts blow across the flight path, at
-    3 % of the trim speed.
+    loop misses, and becomes the first line of the scenario. The gusts blow across the flight path,
+    at 3 % of the trim speed.
     """
     V0 = airframe.speed
     stops = _stops(airframe)
@@ -182,12 +182,12 @@ def _distributed(airframe: Airframe, lag: Sequence[float]) -> tuple[AllocationCo
 
 
 def default_lags(airframe: Airframe) -> tuple[float, ...]:
-    """Return the lag of each input, s: a servo's lag for an angle, otherwise an engine's lag."""
+    """Choose the lag of each input, s: that of a servo for an angle, else that of an engine."""
     return tuple(SURFACE_LAG if surface else ENGINE_LAG for surface in _surfaces(airframe))
 
 
 def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
-    """Write a section controller with all gains at 1, from which gains can be selected."""
+    """Write a section controller with all gains at 1, as a start for the selection of gains."""
     allocation = None
     m = len(airframe.outputs)
     if len(airframe.inputs) > m:

@@ -72,7 +72,7 @@ class Channel(NamedTuple):
 
     @property
     def is_speed(self) -> bool:
-        """Whether thrust moves the output."""
+        """Whether the output is a speed, which thrust changes."""
         return self.motion in SPEEDS
 
     @property
@@ -98,7 +98,7 @@ class Channel(NamedTuple):
 
 
 def _largest(motion: str, speed: float | None) -> float:
-    """Return the size of a command that suits the motion, before the authority limits it."""
+    """Return the size of a command that suits the motion, if the input has enough authority."""
     if motion in SIZE and (speed is None) and motion != "climb":
         return HOVER
     if motion == "q" and speed is not None:
@@ -116,7 +116,7 @@ class FirstCommands(NamedTuple):
 
     @property
     def gust(self) -> float:
-        """Instant of a gust after the last command, s."""
+        """When a gust comes after the last command, s."""
         return self.duration - LAST / 2.0
 
 
@@ -174,7 +174,7 @@ def first_commands(
 def unit_gains(lag: Sequence[float], delay: float) -> dict[str, Any]:
     """Return the parameters of a controller for channels with given lags and a delay, s.
 
-    All gains are 1, because they still have to be selected.
+    All gains are 1, because they are selected later.
     """
     ones = [1.0] * len(lag)
     return dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones) | {
@@ -208,10 +208,10 @@ def scenario_to_design(scenario: FilePath | Scenario) -> Scenario:
 
 
 def scenario_to_check(scenario: FilePath | Scenario) -> Scenario:
-    """Load a scenario, or a file with only the section controller.
+    """Load a scenario to check its gains; a file with only the section controller is enough.
 
-    Such a controller gets the commands, gusts and rate limits of the scenario COMMANDED. The
-    aircraft in COMMANDED may differ from the aircraft that the controller is for. Raises
+    A controller that is alone gets the commands, gusts and rate limits of the scenario COMMANDED.
+    The aircraft in COMMANDED may differ from the aircraft that the controller is for. Raises
     ParameterError.
     """
     controller = controller_alone(scenario)
@@ -221,9 +221,10 @@ def scenario_to_check(scenario: FilePath | Scenario) -> Scenario:
 
 
 def airframe_to_check(airframe: FilePath | Airframe, flight: Scenario) -> Airframe:
-    """Return an airframe, or the linear model of the JSBSim aircraft that a scenario flies.
+    """Return the airframe for a check of gains.
 
-    Raises ParameterError if the airframe has other channels than the law of the scenario.
+    If a JSBSim aircraft is named, this is the linear model of the JSBSim aircraft that the scenario
+    flies. Raises ParameterError if the airframe has other channels than the law of the scenario.
     """
     flown = flight.aircraft
     law = flight.controller

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: N802 - K, U, Phi and N_d are the paper's names
-"""Gains of the law: two procedures, and the conditions on the gains.
+"""Compute gains of the law by two procedures, and the conditions on gains.
 
 The two procedures are Theorem 1 and the engineering procedure.
 
 The theorem's conditions are sufficient, not necessary, and they contain no actuator.
-`theorem_gains` meets them all, but behind servos its result is unstable. `engineering_gains` starts
-from the lag of the loop. On a gain set, `check_theorem` evaluates the theorem's conditions, and
-`check_rules` the rules of the engineering procedure. `check_loop` evaluates what the linear margins
-of the loop do not cover. `rise_di_controller.law.linear_loop` has the linear loop and its delay
-margin.
+`theorem_gains` meets them all, but behind servos the loop with its gains is unstable.
+`engineering_gains` starts from the lag of the loop. For given gains, `check_theorem` evaluates the
+theorem's conditions, and `check_rules` the rules of the engineering procedure. `check_loop`
+evaluates what the linear margins of the loop do not cover. `rise_di_controller.law.linear_loop` has
+the linear loop and its delay margin.
 
 The crossover lag product of a channel is its bandwidth times the lag of its loop, in rad. This is
 the phase in rad that the lag costs at the crossover. A loop that integrates then has a phase margin
@@ -75,7 +75,7 @@ class GainSet(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """Bounds on the aircraft that Theorem 1 requires."""
+    """Bounds on the unknown aircraft that Theorem 1 takes as given."""
 
     # (m, m) upper bounds of abs(U_ij) for j > i; the other entries are zero. In the paper they are
     # zeta_U of (27), and zeta_Psi of (30) if it is given two indices.
@@ -159,12 +159,14 @@ def bound_U(Omegas: FloatArray) -> FloatArray:
 
 
 def rho(Omega: FloatArray, CAC: FloatArray, Lambda: FloatArray) -> float:
-    """Bound norm(N~) / norm(z), (19), 1/s, by the largest singular value of [I - G Lambda, G].
+    """Bound norm(N~) / norm(z) of (19), 1/s.
 
-    G = M (C A C^+ + Lambda) with M = S^-1. N~ = G (r - Lambda e) + e. The reference term of (18) is
-    not in this N~, because it counts as a part of N_d. Omega and CAC = C A C^+ have shape (m, m),
-    Lambda has (m,). Raises DecompositionError if Omega has no decomposition S D U. Source:
-    (16)-(19) of Tanyer, Tatlicioglu, Zergeroglu, with the correction of docs/theory.md.
+        rho = largest singular value of [I - G Lambda, G],  G = M (C A C^+ + Lambda),  M = S^-1
+
+    Here N~ = G (r - Lambda e) + e. The reference term of (18) is not in this N~, because it counts
+    as a part of N_d. Omega and CAC = C A C^+ have shape (m, m), Lambda has (m,). Raises
+    DecompositionError if Omega has no decomposition S D U. Source: (16)-(19) of Tanyer,
+    Tatlicioglu, Zergeroglu, with the correction of docs/theory.md.
     """
     G = np.linalg.solve(decompose(Omega).S, CAC + np.diag(Lambda))
     return float(np.linalg.norm(np.hstack([np.eye(len(G)) - G * Lambda, G]), 2))
@@ -195,8 +197,8 @@ def zeta_Phi(i: int, K: FloatArray, U: FloatArray) -> float:
 def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
     """Compute gains that meet (22), (29), (30) and steps 2 and 3 of Theorem 1 for given bounds.
 
-    The shapes are those in `Bounds` and `GainSet`. `least` is the decay rate of e and r. N~ takes a
-    part of this decay in step 2, and Phi takes a part in step 3:
+    The shapes are those in `Bounds` and `GainSet`. `least` is the decay rate of e and r. N~ uses up
+    a part of this decay in step 2, and Phi uses up another part in step 3:
 
         least = min(Lambda, 1)
         k_g   = 1.5 rho^2 / (4 least)                                     step 2
@@ -304,8 +306,8 @@ def engineering_gains(
 ) -> tuple[GainSet, FloatArray]:
     """Compute gains from the bandwidths (rad/s) of a loop with lag; all arguments have shape (m,).
 
-    The second result is response_i, which is abs(Omega_ii) in scaled inputs. It is less than 1 in a
-    channel that is too slow for (22), and 1 in all others.
+    Returns the gains, and response_i, which is abs(Omega_ii) in scaled inputs. response_i is less
+    than 1 in a channel that is too slow for (22), and 1 in all others.
 
         K_m = max(bandwidth_m, 1.5),  K_i = max(bandwidth_i, K_m),  response_i = bandwidth_i / K_i
         Lambda_i = bandwidth_i / (4 slower_i)

@@ -191,7 +191,7 @@ def select_gains(
 
 
 def _beside_observer(required: Requirement, *, as_read: bool) -> Requirement:
-    """Lower a required phase margin to at most that of a loop with an observer.
+    """Lower a required phase margin to at most the one that suffices with an observer.
 
     If the gains are taken `as_read` from a file, the loop only needs to be stable.
     """
@@ -312,10 +312,11 @@ def _loop(
     lag: ArrayLike | None,
     delay: float | None,
 ) -> LoopSetting:
-    """Return the loop of a scenario with another rate of the law or of y, Hz, lag or delay, s.
+    """Return the loop of a scenario, with what the arguments change.
 
-    The law runs once per sample of y, so sampling lags by 1.5 periods of y. The loop counts only
-    1.5 periods of the law, so the difference is added to the delay. Raises ParameterError.
+    `rate` and `y_rate` are rates of the law and of y, Hz; `lag` and `delay` are in s. The law runs
+    once per sample of y, so sampling lags by 1.5 periods of y. The loop counts only 1.5 periods of
+    the law, so the difference is added to the delay. Raises ParameterError.
     """
     loop = gain_selection.loop_setting(scenario)
     if rate is not None:
@@ -370,9 +371,9 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
 def _pairing(
     inputs: str | Sequence[str], controller: ControllerConfig, airframe: Airframe
 ) -> tuple[str, ...]:
-    """Return the input of each output: from `inputs`, or if that is empty, from the controller.
+    """Return the input of each output: from `inputs`, or if that is empty, as in the controller.
 
-    The controller gives (), if it has an allocation, or other inputs than the airframe.
+    It is () if the controller, then, has an allocation or other inputs than the airframe.
     """
     names = as_names(inputs, "inputs", f"the inputs {', '.join(airframe.inputs)} in any order")
     if names:
@@ -384,7 +385,7 @@ def _pairing(
 
 
 def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
-    """Return a loop without its allocation, with the inputs and lags of the actuators."""
+    """Return a loop without its allocation, with the inputs and lags of the actuators instead."""
     if loop.base.allocation is None:
         return loop
     names = tuple(scenario.aircraft.channels().inputs)
@@ -465,15 +466,16 @@ def selected_observer(
     activity: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
-    """Add the feedforward and observer of a model to a controller, with a text on their gains.
+    """Add the feedforward and observer of a model to a controller.
 
-    The search for the least error begins at these gain sets:
+    Returns them with a text that says where the gains come from. The search for the least error
+    begins at these gain sets:
 
     - If there is a file `weights`: the gains in it.
-    - If `sketched`: gains for a model from a sketch.
+    - If `sketched`: gains for a model that is only a rough sketch of the aircraft.
     - Otherwise: the gains that `rise-di compare --tune` found in the scenario, or in a shipped one
       with the same airframe and lags. If the model has other states, or at least SLOWER times the
-      total lag of that search, a rule derives gains from the lags instead.
+      total lag of that search, a rule derives gains from the lags.
 
     The gains of a file or for a sketch only change if the margins need lower gains. Channels that
     are not free keep their gains. The other arguments are as for `with_aircraft_observer`.
@@ -521,7 +523,7 @@ def selected_observer(
 def _noise(
     controller: RiseDiConfig, scenario: Scenario, model: Airframe
 ) -> tuple[FloatArray, dict[str, float]]:
-    """Return the noise of the outputs, (m,), and that of the vanes by channel, rms per sample.
+    """Return the noise of the outputs, (m,), and the noise of the vanes by channel, rms per sample.
 
     Only vanes whose angle is a state of the model count. A perfect sensor gets a small value.
     """

@@ -89,7 +89,7 @@ Controller = TypeVar("Controller", bound=ControllerConfig)
 
 
 class LoopSetting(NamedTuple):
-    """The loop for which the gains are selected, and the settings of the selection."""
+    """The loop for which gains are selected, and the settings of the selection."""
 
     base: ControllerConfig  # source of all parameters that are not selected: max_age, limits
     rate: float  # Hz
@@ -160,7 +160,10 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
     @property
     def is_stable(self) -> bool:
-        """Whether the loop is stable for every aircraft; False for the literal sign."""
+        """Whether the loop is stable for the nominal and every uncertain aircraft.
+
+        It is False for the literal sign, which has no linear loop.
+        """
         named = (condition for condition in self.loop if condition.name == STABILITY)
         return self.margins is not None and all(condition.holds for condition in named)
 
@@ -178,9 +181,10 @@ def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
 
 @dataclass(frozen=True)
 class Selection:
-    """The two gain sets for an airframe.
+    """The two gain sets that are selected for an airframe.
 
-    A set is assessed when it is first used: the margins of all samples take most of the time.
+    A gain set is assessed when it is first used, because the margins of all samples take most of
+    the time.
     """
 
     study: Study
@@ -191,12 +195,12 @@ class Selection:
 
     @cached_property
     def theorem(self) -> GainAssessment[RiseDiConfig]:
-        """Gain set of Theorem 1, with conditions and margins."""
+        """The gain set of Theorem 1, with conditions and margins of its loop."""
         return assess_gains(self.study, self.literal, self.setting)
 
     @cached_property
     def engineering(self) -> GainAssessment[RiseDiConfig]:
-        """Engineering gains, with conditions and margins."""
+        """The gain set of the engineering procedure, with conditions and margins of its loop."""
         return assess_gains(self.study, self.chosen, self.setting)
 
 
@@ -226,10 +230,10 @@ def gain_sets(study: Study, setting: LoopSetting) -> Selection:
 def gain_candidates(
     study: Study, setting: LoopSetting
 ) -> Callable[[FloatArray, FloatArray], Candidate[RiseDiConfig]]:
-    """Return a function of `slower` and `lower` that builds engineering gains and their loop.
+    """Return a function that builds engineering gains and their loop from `slower` and `lower`.
 
-    Both factors have shape (m,). `lower` divides the bandwidth, and both divide the integral gain.
-    Raises ParameterError as `gain_sets` does.
+    Both arguments of this function are factors of shape (m,). `lower` divides the bandwidth, and
+    both divide the integral gain. Raises ParameterError as `gain_sets` does.
     """
     pairs = _paired(study, setting)
     limits = (
@@ -369,8 +373,8 @@ def assess_scenario(
 ) -> GainAssessment[ControllerConfig]:
     """Evaluate every condition on the gains in a scenario's controller.
 
-    The study flies the scenario's manoeuvre, so the airframe must have its outputs. Raises
-    ParameterError if D or the pairing contradicts the airframe.
+    The study must have flown the manoeuvre of the scenario, so the airframe must have its outputs.
+    Raises ParameterError if D or the pairing contradicts the airframe.
     """
     return assess_gains(study, scenario.controller, loop_setting(scenario, gamma_2))
 

@@ -190,7 +190,7 @@ def _comments(selection: Selection, controller: RiseDiConfig) -> dict[str, str]:
 
 
 def _within(uncertainty: float) -> str:
-    """Say that a value is the largest for deviations up to `uncertainty`; "" if that is 0."""
+    """Write the words that a value holds for deviations up to `uncertainty`; "" if that is 0."""
     return f", the largest within +-{100 * uncertainty:g} %" if uncertainty else ""
 
 
@@ -226,7 +226,7 @@ def section_yaml(
 
 
 def below_requirement(unmet: Sequence[GainCondition], outputs: Sequence[str]) -> str:
-    """Say which margins are too small, in the first line of a file; "" if none is."""
+    """Write the first line of a file, which says which margins are too small; "" if none is."""
     lacking = "; ".join(condition.sentence(outputs) for condition in unmet)
     return f"Margins below the requirement: {lacking}." if lacking else ""
 
@@ -256,7 +256,7 @@ def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) 
 
 
 def chatter_sentence(controller: ControllerConfig, margins: LoopMargins | None) -> str:
-    """Say how late u may act before an implicit sign may chatter.
+    """Write a sentence on how late u may act before the implicit sign may chatter.
 
     Returns "" for any other sign, or without margins.
     """

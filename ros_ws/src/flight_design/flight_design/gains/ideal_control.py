@@ -60,7 +60,7 @@ class ChannelPairing(NamedTuple):
 
 
 class Effected(NamedTuple):
-    """An airframe with uncertain entries, and the allocation u = T v that moves its effectors."""
+    """An airframe with uncertain entries, and the allocation u = T v to its effectors."""
 
     airframe: Airframe
     T: FloatArray  # (p, m) matrix of the allocation
@@ -74,10 +74,9 @@ class Flown(NamedTuple):
 
 
 class Study(NamedTuple):
-    """The rates of the ideal control along a manoeuvre, and the airframes to which they belong.
+    """Rates of the ideal control along a manoeuvre, for a nominal and N - 1 uncertain airframes.
 
-    These are the nominal airframe and N - 1 uncertain airframes. The channels are in the airframe's
-    order, in SI.
+    The channels are in the order of the nominal airframe, in SI.
     """
 
     airframe: Airframe
@@ -97,15 +96,16 @@ class Study(NamedTuple):
     flown: Flown | None = None  # None if the loop does not fly an aircraft yet
 
     def timing_of(self, controller: ControllerConfig) -> LoopTiming:
-        """Return lags, delay and period of the aircraft that flies.
+        """Return lags, delay and period of the loop.
 
-        If no aircraft flies yet, they are those in the controller.
+        They are those of the aircraft that flies. If no aircraft flies yet, they are those that the
+        controller was told.
         """
         return loop_of(controller) if self.flown is None else self.flown.comparison.timing
 
     @property
     def differences(self) -> list[str]:
-        """Sentences on how the aircraft that flies differs from what the controller was told."""
+        """Sentences on how the flying aircraft differs from what the controller was told of it."""
         flown = self.flown
         return [] if flown is None else [each.sentence for each in flown.comparison.differences]
 
@@ -116,7 +116,7 @@ class Study(NamedTuple):
 
 
 def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
-    """Return the commands and gusts of a scenario for the channels and gust axes of an airframe.
+    """Return the commands and gusts of a scenario, for the channels and gust axes of an airframe.
 
     A coordinated turn is kept if the airframe has both of its channels. The turn is then flown at
     the airframe's speed. Raises ParameterError if the scenario has no command for an output.
@@ -251,7 +251,10 @@ class _IdealPlant(NamedTuple):
 
 
 def _times(matrices: FloatArray, columns: FloatArray) -> FloatArray:
-    """Multiply each of N matrices with its own columns, which have shape (n, ..., N)."""
+    """Multiply each of N matrices with one column: matrix k with `columns`[..., k].
+
+    `columns` has the shape (n, ..., N).
+    """
     return np.asarray(np.einsum("Nij,j...N->i...N", matrices, columns))
 
 
@@ -307,8 +310,8 @@ def _zero_dynamics(
 ) -> FloatArray:
     """Integrate eta by Runge-Kutta and return it at every step, shape (n - m, steps, N).
 
-    `eta` is the value at the first step. `halves` has the numbers of the instants of y_m and
-    y_m_dot, in half steps. Every second instant is that of a step.
+    `eta` is the value at the first step. `y_m` and `y_m_dot` are given every half step, and
+    `halves` has the numbers of these half steps. Every second one is the beginning of a step.
     """
     t = (STEP / 2.0 * halves)[:, None, None]
     held = y_m @ plant.P.T
@@ -338,8 +341,8 @@ def _rates(
 ) -> FloatArray:
     """Compute u*_dot at T instants, shape (T, N, m).
 
-    `halves` counts the instants in half steps. Each of the references has shape (m, T), and eta has
-    shape (n - m, T, N).
+    `halves` has the instants, counted in half steps. Each of the references has shape (m, T), and
+    eta has shape (n - m, T, N).
     """
     y_m, y_m_dot, y_m_ddot = references
     instants = np.repeat(STEP / 2.0 * halves, eta.shape[-1])

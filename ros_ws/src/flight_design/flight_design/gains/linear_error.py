@@ -126,9 +126,9 @@ def _gust_energy(
 def _turbulent(
     matrix: FloatArray, blown: FloatArray, noise: FloatArray, period: float, air: Air
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance of a loop's state in turbulence and noise, and the transition matrix.
+    """Return the covariance of a loop's state in turbulence and noise, and its transition matrix.
 
-    The rows of the wind come below those of the loop.
+    In the extended state, the wind comes after the state of the loop.
     """
     size, G = blown.shape
     decay = np.exp(-period / air.time)
@@ -148,7 +148,7 @@ def _turbulent(
 
 
 def linear_error(loop: LinearLoop, u_dot: FloatArray) -> FloatArray:
-    """Compute the rms of e of the nominal linear loop under the ideal control u*, (..., m), SI.
+    """Compute the rms of e of the nominal linear loop along a manoeuvre, (..., m), SI.
 
     The ideal control u* keeps y on y_m, but the loop must produce u* by feedback. So e is the
     response of the loop to the disturbance -u* at the input of the aircraft, starting from trim.

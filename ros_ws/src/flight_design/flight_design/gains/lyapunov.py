@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's Lyapunov functions along a flight of a known plant.
+"""Compute the paper's Lyapunov functions along a flight of a known plant.
 
 They are evidence for the theorem, not part of the law.
 
@@ -37,10 +37,9 @@ class KnownPlant(NamedTuple):
 
 
 class FlightSamples(NamedTuple):
-    """Signals of a flight at N >= 3 ticks of the law.
+    """Signals of a flight at N >= 3 ticks of the law, from which `evidence` is computed.
 
-    From them `evidence` computes the signals of the stability proof. The law engages at the first
-    tick.
+    The law engages at the first tick.
     """
 
     t: FloatArray  # (N,) s
@@ -65,7 +64,7 @@ class Evidence(NamedTuple):
 
 
 def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples]:
-    """Read plant and samples from a scenario's tape at the ticks of the law.
+    """Read plant and samples at the ticks of the law from the recorded topics of a scenario.
 
     The channels are in the law's order, in scaled inputs. The tape must be that of a simulation in
     one process, or of a bag with an exact clock. Raises ValueError if a tick has no sample of

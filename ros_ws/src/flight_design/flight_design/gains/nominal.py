@@ -26,10 +26,10 @@ THRUST_ACTIVITY = 12.0
 
 
 def activity_units(airframe: Airframe) -> FloatArray:
-    """Return, for each input, the mean abs(u_dot) that costs as much as a unit of error, (p,).
+    """Return which mean abs(u_dot) of each input costs as much as a unit of error, (p,).
 
-    The unit of each value is that of the input, in SI, per s. If the file has no `no_thrust`, a
-    thrust in newtons has an infinite unit, so that its activity costs nothing.
+    Each value has the unit of its input, in SI, per s. If the file has no `no_thrust`, a thrust in
+    newtons has an infinite unit, so that its activity costs nothing.
     """
     units = []
     channels = zip(airframe.inputs.values(), airframe.no_thrust(), strict=True)

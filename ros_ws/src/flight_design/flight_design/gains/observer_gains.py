@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the gains of a law with an observer, and the weights of the observer.
 
-The gains and weights follow from a rule, from a sketch of the aircraft, or from a search.
+They follow from a rule, from a rough sketch of the aircraft, or from a search.
 """
 
 from collections.abc import Mapping
@@ -37,7 +37,7 @@ class ObserverGains(NamedTuple):
 
 
 def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> ObserverGains:
-    """Derive gains from the lags of the loop, at which a search can start.
+    """Derive gains from the lags of the loop, as a start for a search.
 
     The numbers were found on the `osprey`. Gains and weights follow from the total lag T of each
     channel:
@@ -80,7 +80,7 @@ BESIDE_SKETCH = {"effort": (0.25, 4.0), "K": (16.0, 1.0)}
 def gains_beside_sketch(
     model: NominalModel, outputs: tuple[str, ...], axes: tuple[str, ...], speed: float
 ) -> ObserverGains:
-    """Derive gains for a model that is only a sketch of the aircraft.
+    """Derive gains for a model that is only a rough sketch of the aircraft.
 
     They are those of `gains_by_rule`, multiplied by BESIDE_SKETCH.
     """
@@ -117,12 +117,12 @@ def read_gains(path: Path, T: FloatArray, axes: int, states: int) -> ObserverGai
 
 
 def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> ObserverGains:
-    """Convert gains that `rise-di compare --tune` finds for rise_observer or pi_observer, by name.
+    """Convert the gains that `rise-di compare --tune` finds for a law with an observer.
 
-    T is the total lag, (m,), s. Gains of rise_observer stay as they are. Gains K and Lambda of
+    `gains` has them by name. Gains of rise_observer stay as they are. Gains K and Lambda of
     pi_observer become gains of RISE-DI that act as the same PI law inside the width of the softened
     sign. RISE-DI gets the same K, and SHARE times the same Lambda. The slope 1 / (softening T) of
-    the softened sign gives the rest of Lambda.
+    the softened sign gives the rest of Lambda. T is the total lag, (m,), s.
     """
     values = {name: np.array(row, dtype=np.float64) for name, row in gains.items()}
     weights = Weights(**{name: values[name] for name in Weights._fields})

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Search for factors on the gains of a law with an observer that give the least error.
+"""Search for the factors on the gains of a law with an observer that give the least error.
 
 The loop must have the required margins. The factor of a channel is its relaxation. It divides K and
 the integral gain, and multiplies the observer's weight `effort`. A relaxation above 1 makes the
 loop slower, and one below 1 makes it faster. Both may be needed, because the inputs of an aircraft
-may act less or more than those for which the gains were found.
+may act less or more than those of the aircraft for which the gains were found.
 """
 
 import math
@@ -93,9 +93,9 @@ class SelectedObserver(NamedTuple):
     left_out: int = 0  # number of uncertain aircraft that no gains can hold
 
     def not_counted(self) -> str:
-        """Say how many uncertain aircraft do not count, or return "" if all count.
+        """Say how many uncertain aircraft were left out of the margins; return "" if none was.
 
-        Those that do not count diverge under any gains while their outputs are held.
+        Those that are left out diverge under any gains while their outputs are held.
         """
         if not self.left_out:
             return ""
@@ -106,7 +106,7 @@ class SelectedObserver(NamedTuple):
 
 
 class AtSpeed(NamedTuple):
-    """The design of an observer for `ratio` times the trim speed."""
+    """An observer that is designed for another airspeed, `ratio` times the trim speed."""
 
     ratio: float
     plant: LinearPlant
@@ -120,7 +120,7 @@ class AtSpeed(NamedTuple):
         return SpeedConfig(ratio=self.ratio, **nominal, **_matrices(self.design(slower)))
 
     def flown(self, controller: RiseDiConfig, slower: FloatArray) -> RiseDiConfig:
-        """Return the controller for this speed, without checking its parameters."""
+        """Return the controller with the models of this speed, without checking its parameters."""
         assert controller.observer is not None  # noqa: S101 - it was designed
         values = {
             "observer": controller.observer.model_copy(update=_matrices(self.design(slower))),
@@ -131,7 +131,7 @@ class AtSpeed(NamedTuple):
 
 
 class _Loops(NamedTuple):
-    """A controller in the search, and its loops around the nominal aircraft at each speed."""
+    """A controller that the search tries, with its loop around the aircraft at each speed."""
 
     controller: RiseDiConfig
     relaxation: FloatArray
@@ -141,7 +141,7 @@ class _Loops(NamedTuple):
 
 
 class ObserverSearch(NamedTuple):
-    """The search for the factors on a gain set that give the least error within the margins.
+    """The search for factors on gains that give the least error within the required margins.
 
     The factor of a channel is its relaxation.
     """
@@ -172,16 +172,16 @@ class ObserverSearch(NamedTuple):
 
     @property
     def loop(self) -> LoopTiming:
-        """Timing of the loop with zero delay: the delay margin contains the declared delay."""
+        """Timing of the loop without its delay, because the required margin contains the delay."""
         return LoopTiming(self.model.lag, 0.0, self.model.period)
 
     def best(self, progress: Callable[[str], None] = lambda _: None) -> Trial[_Loops]:
-        """Find the trial that meets the margins with the least error.
+        """Find the trial with the least error among those that have the required margins.
 
-        If no trial meets them, the result is the trial with the least shortage. The required
-        damping is lowered to about that of the aircraft's zeros if necessary, because no feedback
-        moves a zero. Without `air`, the least relaxed trial is best. `progress` gets a sentence for
-        each loop.
+        If no trial has them, the result is the trial with the least shortage. The required damping
+        is lowered to about that of the aircraft's zeros if necessary, because no feedback moves a
+        zero. Without `air`, the least relaxed trial is best. `progress` gets a sentence for each
+        loop.
         """
         m = len(self.model.lag)
         free = np.ones((1, m)) if self.is_free is None else np.array([self.is_free])
@@ -206,7 +206,7 @@ class ObserverSearch(NamedTuple):
         return descend(assess, start, moves, lowest_of, highest_of)
 
     def _trial(self, place: Place, requirement: Requirement, least: float) -> Trial[_Loops]:
-        """Evaluate the trial at a place.
+        """Evaluate the loops at a place in the search.
 
         `least` is the least cost so far of a trial that meets the margins, infinite if there is
         none. If `least` is finite, a trial is rejected before its margins are computed if it costs
@@ -246,7 +246,7 @@ class ObserverSearch(NamedTuple):
         )
 
     def _loops(self, place: Place) -> _Loops:
-        """Build the loops for a place, the exponents of the relaxation.
+        """Build the loops for given exponents of the relaxation.
 
         At the start of the search they have the controller of the earlier design, if there is one,
         with the new feedforward.
@@ -268,12 +268,12 @@ class ObserverSearch(NamedTuple):
         return _Loops(controller, relaxation, around)
 
     def _is_tolerant(self, loops: _Loops) -> bool:
-        """Return whether each loop is stable if each input is late by the margin that it needs."""
+        """Return whether each loop stays stable when every u is late by its required margin."""
         late = self.margin + RESOLUTION
         return all(is_stable(plant, law, self.loop, late) for plant, law in loops.around)
 
     def _delay_fraction(self, plant: LinearPlant, law: LinearLaw) -> float:
-        """Return the delay margin divided by the needed delay margin, at most 1.
+        """Return the delay margin as a fraction of the required delay margin, at most 1.
 
         The delays of the inputs are in proportion to the delay margins that they need.
         """
@@ -284,7 +284,7 @@ class ObserverSearch(NamedTuple):
         return min(margin / (longest + RESOLUTION), 1.0)
 
     def _shortage(self, loops: _Loops, requirement: Requirement) -> float:
-        """Sum 1 - found / needed over the goals that the loops miss."""
+        """Sum 1 - found / required over the margins that the loops miss."""
         loop = loop_of(loops.controller)
         goals = [np.array([self._delay_fraction(plant, law) for plant, law in loops.around])]
         for plant, law in loops.around:
@@ -384,7 +384,7 @@ def _parameters(
     relaxation: FloatArray,
     vanes: VanesConfig | None,
 ) -> RiseDiConfig:
-    """Return the parameters of a controller with the gains and matrices of a design.
+    """Return a controller's parameters with given gains and the matrices of a designed observer.
 
     A K below MIN_K becomes MIN_K with a smaller input scale, which gives the same loop.
     """

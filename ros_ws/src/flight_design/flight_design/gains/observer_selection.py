@@ -87,7 +87,7 @@ def model_for(airframe: Airframe, controller: ControllerConfig, noise: FloatArra
 
 
 def _limited(model: NominalModel, controller: ControllerConfig) -> NominalModel:
-    """Return a model with the limits and the D of a controller."""
+    """Return a model with the limits of u and the D of a controller."""
     limits = controller.guard().limits
     return model._replace(
         D=np.array(controller.D, dtype=np.float64), lower=limits.lower, upper=limits.upper
@@ -114,17 +114,17 @@ def with_aircraft_observer(
     """Add the feedforward and the observer of an airframe to a controller, and select its gains.
 
     A search lowers or raises the gains of each channel by a factor, the relaxation. Among the
-    linear loops with the required margins, it takes that with the least error in moderate
+    linear loops with the required margins, it takes the one with the least error in moderate
     turbulence with the noise of the sensors. The search is made with each of the gain `sets`, and
     the result with the least error is taken. With `keeps_gains` the gains stay as they are, and are
     only lowered if the margins need it.
 
     `margin` is the least delay margin, s, either one value for all inputs, or one for each, (m,).
-    If the airframe is `uncertain`, WORST_OF uncertain aircraft must have the phase margin too.
-    Aircraft with a zero in the right half plane do not count, because no gains can hold all of
-    their outputs. `speeds` are two airspeeds, divided by the trim speed. With them the controller
-    gets a schedule, and the loop must have the margins at these speeds too. `vanes` has the noise
-    of each vane, rms per sample in rad, by its channel, alpha or beta.
+    If the airframe is `uncertain`, the worst of WORST_OF uncertain aircraft must have the phase
+    margin too. Aircraft with a zero in the right half plane are left out, because no gains can hold
+    all of their outputs. `speeds` are two airspeeds, divided by the trim speed. With them the
+    controller gets a schedule, and the loop must have the margins at these speeds too. `vanes` has
+    the noise of each vane, rms per sample in rad, by its channel, alpha or beta.
 
     If there is an `earlier_design`, the search begins at its loop with the new feedforward. It
     changes the relaxation of free channels only, so this loop stays if no change lowers the error.
@@ -171,7 +171,7 @@ def with_aircraft_observer(
 
 
 def law_activity_unit(airframe: Airframe, controller: ControllerConfig) -> FloatArray:
-    """Return, for each input v, the mean abs(v_dot) that costs as much as a unit of error, (m,).
+    """Return which mean abs(v_dot) of each input v costs as much as a unit of error, (m,).
 
         unit_i = min_j unit_j / abs(T_ji),  u = T v
 
@@ -192,7 +192,7 @@ def _with_schedule(
     controller: RiseDiConfig,
     airframe: Airframe,
 ) -> SelectedObserver:
-    """Add a schedule to the selected observer: the models of the search for two other speeds."""
+    """Add a schedule to a selected observer, with the models of the search at two other speeds."""
     slow, fast = (speed.model(selected.relaxation).model_dump() for speed in search.others)
     schedule = {"speed": airframe.speed, "slow": slow, "fast": fast}
     if controller.schedule is not None:
@@ -243,7 +243,7 @@ def _air(airframe: Airframe, model: NominalModel, vanes: Mapping[str, float]) ->
 
 
 class _AircraftDesigns(NamedTuple):
-    """The observer designs of an airframe for a controller."""
+    """Designs observers for a controller from the model of an airframe."""
 
     base: RiseDiConfig  # with the feedforward, without an observer
     airframe: Airframe
@@ -255,7 +255,10 @@ class _AircraftDesigns(NamedTuple):
     def around(
         cls, controller: RiseDiConfig, airframe: Airframe, noise: FloatArray
     ) -> "_AircraftDesigns":
-        """Prepare the designs, or refuse an airframe that fits no observer of the controller."""
+        """Prepare the designs.
+
+        Raises ParameterError if the airframe fits no observer of the controller.
+        """
         require(
             bool(airframe.gusts),
             f"airframe {airframe.name}",
@@ -272,7 +275,7 @@ class _AircraftDesigns(NamedTuple):
         return cls(with_feedforward(bare, airframe), airframe, noise, model, names)
 
     def plant(self, count: int, vanes: Iterable[str]) -> LinearPlant:
-        """Return the nominal aircraft, and those of `count` uncertain ones that gains can hold.
+        """Return the nominal aircraft and uncertain ones: `count`, less those that no gains hold.
 
         In C, the rows of the vanes come below those of the outputs.
         """
@@ -320,7 +323,10 @@ class _AircraftDesigns(NamedTuple):
 
 
 def _require_no_vanes(vanes: Mapping[str, float], outputs: Sequence[str]) -> None:
-    """Refuse vanes, and outputs without V, because a design at several speeds cannot use them."""
+    """Check that a design at several speeds has the output V and no vanes, which it cannot use.
+
+    Raises ParameterError if not.
+    """
     require(
         not vanes,
         "speeds",
@@ -365,7 +371,7 @@ def with_extended_state_observer(
     margin: float,
     requirement: Requirement = OBSERVER_REQUIREMENT,
 ) -> SelectedObserver:
-    """Add to a controller an observer that knows Omega and the lags, but no A, f or wind.
+    """Add an observer to a controller that knows Omega and the lags, but no A, f or wind.
 
     The gains of the law stay, unless the margin needs slower gains. The model of the feedforward is
     y_dot = Omega u, and the model of the observer is y_dot = diag(Omega) u. If the observer had all

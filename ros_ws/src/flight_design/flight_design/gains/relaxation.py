@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Say which required margins a loop lacks, and which change of the loop would give them."""
+"""Say which required margins a loop lacks, and which change of the loop would help."""
 
 import math
 from collections.abc import Sequence
@@ -14,19 +14,21 @@ from flight_design.gains.requirement import ACCEPTED_PHASE_MARGIN, PHASE_MARGINS
 
 
 def binding(selection: Selection) -> GainCondition:
-    """Return the unmet condition that the engineering gains miss by the largest factor."""
+    """Return the condition that limits the engineering gains most.
+
+    Of the conditions that they do not meet, it is the one that they miss by the largest factor.
+    """
     return min(selection.engineering.unmet, key=lambda condition: condition.margin)
 
 
 def reason_against_gains(selection: Selection, *, options: Sequence[str] = ()) -> Refusal | None:
-    """Say which bound limits the best gains of the search; None if every condition is met.
+    """Say why the best gains of the search do not meet the requirement; None if they do.
 
-    The sentences name the binding bound, every unmet condition, and every change of the loop that
-    reaches the margins.
-
-    A change is a smaller goal, half of the lags, no delay, or twice the rate. For each change,
-    gains are searched again. `options` are those of phase_margin, lag, delay and rate that the
-    calling command has. A sentence names a change by its option if the command has this option.
+    The sentences name the condition that limits the gains most, every other unmet condition, and
+    every change of the loop that reaches the margins. Such a change is a smaller goal, half of the
+    lags, no delay, or twice the rate. For each change, gains are searched again. `options` are
+    those of phase_margin, lag, delay and rate that the calling command has. A sentence names a
+    change by its option if the command has this option.
     """
     assessed = selection.engineering
     if not assessed.unmet:

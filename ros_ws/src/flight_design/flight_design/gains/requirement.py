@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Define the required margins of a loop, and search for gains with these margins.
+"""Define the margins that a loop must have, and search for gains with these margins.
 
-Every margin gives a `GainCondition`. The search computes the margins of every loop that it tries.
+Every required margin gives a `GainCondition`. The search computes the margins of every loop that it
+tries.
 
 The margins are those of the sampled loop with actuators, delay and hold
 (`flight_analysis.linear_loop.input_margins`). The values of 45 degrees and 6 dB come from
@@ -73,7 +74,7 @@ NO_MOTION = 1e-3
 
 
 class Requirement(NamedTuple):
-    """The margins that a loop must have if it is opened at one input; the worst input counts."""
+    """The margins that a loop must have when it is opened at any one of its inputs."""
 
     phase: float = math.radians(PHASE_MARGIN)  # rad, nominal aircraft
     gain: float = 10.0 ** (6.0 / 20.0)  # factor, up or down: 6 dB
@@ -111,9 +112,9 @@ loop, and costs phase."""
 
 
 def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
-    """Return the requirement with a phase margin in deg.
+    """Build the requirement for a phase margin in deg.
 
-    Raises ParameterError if the phase margin is below 40 deg, unless `accept` is set.
+    A phase margin below 40 deg raises ParameterError, unless `accept` says that it is intended.
     """
     phase_margin = as_number(phase_margin, "phase_margin", *PHASE_MARGINS, "deg")
     expected = f"at least {ACCEPTED_PHASE_MARGIN:g} deg, or accept beside it"
@@ -136,11 +137,11 @@ def above_zeros(requirement: Requirement, plant: LinearPlant) -> Requirement:
 def fractions(
     margins: Margins, requirement: Requirement
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compute found / needed for the margins of m inputs, with shapes (..., m), (..., m), (...).
+    """Compare the margins of m inputs with the required ones: found / required.
 
-    A fraction is at least 1 if the margin meets the requirement. The first result is the smaller
-    fraction of phase and sensitivity, the second is the fraction of the gain, in dB, and the third
-    is the fraction of the damping.
+    A fraction is at least 1 if the margin meets the requirement. The first result, (..., m), is the
+    smaller fraction of phase and sensitivity, the second, (..., m), is the fraction of the gain, in
+    dB, and the third, (...), is the fraction of the damping.
     """
     with np.errstate(divide="ignore"):
         phase = np.minimum(
@@ -201,7 +202,10 @@ def nominal_conditions(nominal: Margins, requirement: Requirement) -> tuple[Gain
 def reason_against_margins(
     margins: LoopMargins, requirement: Requirement, outputs: Sequence[str]
 ) -> Refusal | None:
-    """Say which required margins a loop lacks. `outputs` are those of the law."""
+    """Say which required margins a loop lacks; None if it has them all.
+
+    `outputs` are the names of the law's outputs.
+    """
     return joined(
         Refusal(condition.sentence(outputs))
         for condition in failing(margin_conditions(margins, requirement))
@@ -209,7 +213,7 @@ def reason_against_margins(
 
 
 class Candidate(NamedTuple, Generic[Controller]):
-    """A controller of the search, and its loop around the nominal and the uncertain aircraft."""
+    """A controller that the search tries, with its loop around nominal and uncertain aircraft."""
 
     controller: Controller
     loop: LinearLoop
@@ -225,9 +229,11 @@ def within_requirement(
     If no candidate meets it, the candidate with the least shortage is returned.
 
     `build(slower, lower)` makes a controller. It divides the integral gain by both factors, and the
-    bandwidth by `lower`. Each factor has a value of 1 or more for each channel, (m,), and 1 gives
-    the gains of the rule. The error is the product of the `linear_error` of all outputs along
-    `u_dot`, (T, m), with inputs in the law's order. The required damping is that of `above_zeros`.
+    bandwidth by `lower`. Each factor has a value of 1 or more for each channel, (m,). At 1 the
+    gains are those of the engineering procedure, the rule. The error is the product of the
+    `linear_error` of all outputs along `u_dot`, (T, m), with inputs in the law's order. The
+    required damping is that of `above_zeros`.
+
     The search begins with the bandwidths of the rule, and with the largest integral gains with
     which each channel has its margins. If a margin is missing at the end, the search tries other
     starts. While the phase margin of the worst uncertain aircraft is below `uncertain_phase`, the
@@ -332,7 +338,7 @@ class _Loops(Generic[Controller]):
     def _fastest_integrals(
         self, assess: Assess[_Measured[Controller]]
     ) -> Trial[_Measured[Controller]]:
-        """Find the trial with the rule's bandwidths and the largest possible integral gains.
+        """Find the trial with the bandwidths of the rule and the largest possible integral gains.
 
         Here every channel alone must have its margins. A channel for which no integral gain
         suffices gets that of the rule.
@@ -369,7 +375,7 @@ class _Loops(Generic[Controller]):
 
 
 def _stacked(candidates: Sequence[Candidate[Controller]]) -> LinearLoop:
-    """Join the loops of candidates around the same aircraft to one loop with several laws."""
+    """Join the loops of several candidates around the same aircraft into one with several laws."""
     laws = zip(*(candidate.loop.law for candidate in candidates), strict=True)
     return candidates[0].loop._replace(law=LinearLaw(*(np.stack(matrices) for matrices in laws)))
 

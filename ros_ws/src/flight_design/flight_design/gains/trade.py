@@ -53,7 +53,7 @@ def trade(
 
 
 def _nominal(study: Study) -> Study:
-    """Return a study of the nominal airframe alone."""
+    """Return the study with the nominal airframe only."""
     return study._replace(
         A=study.A[:1], B=study.B[:1], u_dot=study.u_dot[:, :1], stable=study.stable[:1]
     )

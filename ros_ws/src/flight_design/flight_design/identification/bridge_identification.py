@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find gains for an aircraft behind a bridge, from a channel map and an experiment in flight.
+"""Find gains for an aircraft behind a bridge from a channel map and an experiment in flight.
 
-There is no model of the aircraft. The first result is the scenario of the experiment. The second
-result is a scenario that flies the aircraft.
+A channel map says which field of an autopilot's topics is which channel. There is no model of the
+aircraft. The first result is the scenario of the experiment. The second result is a scenario that
+flies the aircraft with the gains that were found.
 
 The experiment excites the inputs in turn, open loop. `identify_response` estimates Omega, lags and
 delays from its log. The airframe in both scenarios is y_dot = Omega u, because nothing else is
@@ -103,19 +104,19 @@ def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
 
 
 def motions(channel_map: ChannelMap) -> dict[str, str]:
-    """Return the motion of each output of a map: a key of UNITS, such as q, p, r or V."""
+    """Return the motion of each output of a channel map: a key of UNITS, such as q, p, r or V."""
     return {name: row.motion[0] for name, row in channel_map.outputs.items()}
 
 
 def has_airspeed(channel_map: ChannelMap) -> bool:
-    """Return whether a map has an airspeed. An aircraft without one hovers."""
+    """Return whether a channel map has an airspeed. An aircraft without one hovers."""
     return "V" in motions(channel_map).values()
 
 
 def require_envelope(channel_map: ChannelMap) -> None:
-    """Raise ParameterError unless the map limits the speeds and the attitude that it measures.
+    """Check that a channel map limits the speeds and the attitude that it measures.
 
-    Nothing else guards an experiment.
+    Nothing else guards an experiment. Raises ParameterError if a limit is missing.
     """
     needed: list[str] = [name for name in ("phi", "theta") if name in channel_map.pose]
     needed += [name for name, motion in motions(channel_map).items() if UNITS[motion] == "m/s"]
@@ -145,12 +146,11 @@ def experiment(
     airframe_file: str,
     wait: float = WAIT,
 ) -> Experiment:
-    """Plan the experiment of a channel map.
+    """Plan an experiment that excites the inputs of a channel map.
 
-    `amplitude` is the amplitude of each input as a fraction of the smaller of its two limits.
-    `speed` is the airspeed in trim, m/s, or None in hover. `airframe_file` is the path that the
-    scenario has for the airframe. The experiment lasts for `wait`, s, and for the time of the
-    excitation.
+    Each input is excited by `amplitude`, a fraction of the smaller of its two limits. `speed` is
+    the airspeed in trim, m/s, or None in hover. The scenario refers to its airframe by the path
+    `airframe_file`. The experiment lasts for `wait`, s, and for the time of the excitation.
     """
     pairing, sign = channel_pairs(channel_map)
     rows = [channel_map.inputs[name] for name in pairing.inputs]
@@ -199,7 +199,7 @@ WHOLE = 0.95
 
 
 def reason_against_experiment(engagements: Sequence[Engagement], duration: float) -> Refusal | None:
-    """Say when and why the bridge released before the end of an experiment.
+    """Say when and why the bridge released the aircraft before an experiment ended, or None.
 
     `engagements` are those of the log, and `duration` is the planned one, s.
     """
@@ -279,10 +279,10 @@ class IdentifiedChannels(NamedTuple):
 def join(
     channel_map: ChannelMap, response: Response, models: Sequence[ChannelModel | None]
 ) -> IdentifiedChannels:
-    """Join the models of the channels; a channel without a model gets its step response.
+    """Join the models of all channels; for a channel without a model, use its step response.
 
     Raises ParameterError if a channel has neither a usable model nor a certain step response. It is
-    also raised if the sign of an effect contradicts the map.
+    also raised if the sign of an effect contradicts the channel map.
     """
     pairing, sign = channel_pairs(channel_map)
     Omega = np.where(np.isfinite(response.Omega), response.Omega, 0.0)
@@ -348,7 +348,7 @@ def over_link(channels: IdentifiedChannels, link_delay: float) -> IdentifiedChan
 def measured_trims(
     channel_map: ChannelMap, would_send: Signal, engaged_ns: int
 ) -> dict[str, float]:
-    """Return the command of each input in trim, SI, by the input's name.
+    """Return the command in trim of each input, SI, by the input's name.
 
     These are the commands that the bridge sent in the pause after an engagement, while u was 0.
     """
@@ -372,10 +372,10 @@ def measured_trims(
 def within_range(
     channel_map: ChannelMap, trims: Mapping[str, float]
 ) -> tuple[ChannelMap, list[str]]:
-    """Narrow the limits of a map, so that trim plus u stays within the range of each field.
+    """Narrow the limits of u in a channel map so that each field stays within its range.
 
-    Returns the map, and a sentence for each limit that was narrowed. Raises ParameterError if a
-    trim is at a stop.
+    The value of a field is trim plus u. Returns the map, and a sentence for each limit that was
+    narrowed. Raises ParameterError if a trim is at a stop.
     """
     values = channel_map.model_dump(exclude_unset=True)
     sentences = []
@@ -426,7 +426,7 @@ class _WholeRows(yaml.SafeDumper):
 
 
 def controller_values(channel_map: ChannelMap, pairing: ChannelPairing) -> dict[str, Any]:
-    """Return the parameters of the controller that follow from the map."""
+    """Return the parameters of the controller that the channel map determines."""
     rows = [channel_map.inputs[name] for name in pairing.inputs]
     limits = {"lower": [row.lower for row in rows], "upper": [row.upper for row in rows]}
     common = {"rate": RATE, "outputs": list(pairing.outputs), "inputs": list(pairing.inputs)}
@@ -435,7 +435,7 @@ def controller_values(channel_map: ChannelMap, pairing: ChannelPairing) -> dict[
 
 
 def _rounded(row: FloatArray) -> list[float]:
-    """Round a row to four digits."""
+    """Round the numbers in a row to four digits."""
     return [float(f"{value:.4g}") for value in row]
 
 
@@ -487,7 +487,7 @@ def airframe_yaml(
 
 
 def signs_alone(sign: FloatArray) -> IdentifiedChannels:
-    """Return channels of which only the signs of the effects are known."""
+    """Return channels of which nothing is known but the signs of the effects."""
     none = 0.0 * sign
     return IdentifiedChannels(
         Omega=np.diag(sign),
@@ -515,7 +515,7 @@ def bridge_sections(
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace tuples by lists, and round numbers to six digits."""
+    """Replace tuples by lists and round numbers to six digits, as a YAML file shows them."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, (list, tuple)):

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Choose units and bounds of the relative errors of A and B; an entry with the unit 0 is known."""
+"""Choose units and bounds for the relative errors of the entries of A and B.
+
+An entry with the unit 0 is taken as known.
+"""
 
 import numpy as np
 
@@ -21,10 +24,10 @@ MAX_FACTOR = 2.5
 def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:
     """Return the units in which the errors of the entries of A and B are counted, SI.
 
-    An entry with the unit 0 is known. The units are the nominal values, except in the rows of
-    angles, where they are 0. If `coupled`, an entry that is 0 gets a unit that follows from its
-    row: COUPLING times the largest effect there. Effects of states are compared for motions of one
-    `size` each. The columns of angles stay 0.
+    The units are the nominal values, except in the rows of angles, where they are 0, because these
+    entries are known. If `coupled`, an entry that is 0 gets a unit that follows from its row:
+    COUPLING times the largest effect there. To compare the effects of states, each state moves by
+    its `size`. The columns of angles stay 0.
     """
     free = model.kinematic[:, None] == 0.0
     is_dynamic = model.kinematic == 0.0

@@ -52,7 +52,7 @@ class OwnShare(NamedTuple):
 
     @property
     def is_still(self) -> bool:
-        """Whether the log fails to show the effect of the input on the output."""
+        """Whether the share is too small for the log to show what the input does to the output."""
         return not (self.share >= LEAST_SHARE and self.peak >= LEAST_PEAK)  # NaN shows nothing
 
     @property
@@ -125,10 +125,10 @@ def peaks(recorded: FlightData) -> FloatArray:
 
 
 def to_set(outputs: Iterable[str], parameters: Mapping[str, float]) -> str:
-    """Say which parameter of PX4 to set so that its controller flies the doublets, or return "".
+    """Say which parameter of PX4 must be set so that its controller flies the doublets.
 
     Without this parameter, PX4 does not control the yaw rate to its setpoint. `parameters` are
-    those of the log. Source: PX4 1.16, fw_rate_control.
+    those of the log. Returns "" if no parameter need be set. Source: PX4 1.16, fw_rate_control.
     """
     if "r" not in outputs or parameters.get(YAW_RATES) != 0.0:
         return ""
@@ -138,12 +138,12 @@ def to_set(outputs: Iterable[str], parameters: Mapping[str, float]) -> str:
 def to_fly(
     outputs: Mapping[str, float], scenario: Scenario, airframe: Airframe, y: FloatArray
 ) -> str:
-    """Say which doublets would show the effects on some outputs.
+    """Say which doublets must be flown to show the effects on some outputs.
 
     `outputs` has, for each of these outputs, the factor by which its motion in the log is too
     small. A doublet has the size and length of the scenario's pulses, and at least the size of the
-    motion in the log, y, (T, m). The factor gives the number of doublets. Returns "" if there are
-    no outputs.
+    motion in the log, y, (T, m). The number of doublets follows from the factor. Returns "" if
+    there are no outputs.
     """
     pulses = scenario.reference_model.pulses
     texts = []

@@ -128,7 +128,7 @@ def flying_scenario(
 
 
 class _Identified(NamedTuple):
-    """The identified channels of a map, and the trim speed, m/s, or None in hover."""
+    """The identified channels of a channel map, and the trim speed, m/s, or None in hover."""
 
     channel_map: ChannelMap
     channels: IdentifiedChannels
@@ -143,7 +143,7 @@ class _Identified(NamedTuple):
     def loop(self) -> LoopTiming:
         """Timing of the loop.
 
-        Its delay is the least of all channels. Further delay of a channel counts as lag.
+        Its delay is the least delay of all channels. What a channel has beyond it counts as lag.
         """
         channels = self.channels
         delay = float(np.min(channels.delay))
@@ -164,7 +164,7 @@ class _Identified(NamedTuple):
         return np.array([min(-row.lower, row.upper) for row in rows])
 
     def commands(self) -> FirstCommands:
-        """Return commands that the loop can follow, by `first_commands`; they begin after WAIT."""
+        """Return commands by `first_commands` that the loop can follow, beginning after WAIT."""
         crossover = bandwidths(self.loop, np.array(list(self.products.values())))
         authority = np.abs(np.diag(self.channels.Omega)) * self.reach
         channels = {
@@ -199,7 +199,7 @@ class _Identified(NamedTuple):
         return ideal_control.study_airframe(integrators, short, samples=1)
 
     def setting(self, requirement: Requirement) -> LoopSetting:
-        """Return the loop for which gains are selected, with gains of 1 before the selection."""
+        """Return the loop for which gains are selected. Until then all its gains are 1."""
         loop = self.loop
         lag = loop.lag.tolist()
         channels = controller_values(self.channel_map, self.pairing)

@@ -79,10 +79,10 @@ class FlightData(NamedTuple):
 
 
 def coarser(recorded: FlightData, factor: int) -> FlightData:
-    """Average a flight over `factor` periods.
+    """Average a flight over groups of `factor` periods.
 
-    Each y is the mean over `factor` periods, and stands for the middle of these periods. A u acts
-    from one sample of y to the next, so each u is the mean from this middle to the next middle.
+    Each y is the mean over a group, and stands for the middle of the group. A u acts from one
+    sample of y to the next, so each u is the mean from this middle to the next middle.
     """
     count = len(recorded.t) // factor
     leads = [
@@ -158,7 +158,7 @@ def recording(tape: Tape, airframe: Airframe) -> FlightData:
 
 
 def filter_model(airframe: Airframe, actuation: Actuation, recorded: FlightData) -> NominalModel:
-    """Return the model for the filter of an airframe, with channels in the airframe's order."""
+    """Return the model with which the filter of an airframe predicts, in the airframe's order."""
     noise = measured_noise(recorded.y, airframe.matrix_c() @ unit_sizes(airframe.states.values()))
     loop = LoopTiming(actuation.lag, actuation.delay, recorded.period)
     return airframe_model(airframe, airframe.outputs, tuple(airframe.inputs), noise, loop)
@@ -202,7 +202,7 @@ class FilterBank(NamedTuple):
     period: float  # s
 
     def by_level(self) -> "FilterBank":
-        """Return a bank of filters of the first model, one for each level of the wind.
+        """Return a bank that has one filter of the first model for each level of the wind.
 
         In this bank the levels of the wind are along the axis of the models.
         """
@@ -219,7 +219,7 @@ class FilterBank(NamedTuple):
         )
 
     def lifted(self, level: int, seen: Sequence[bool]) -> FloatArray:
-        """Return HOLD periods of the filters as one linear map, (N, HOLD m + s, ..).
+        """Return the linear map of HOLD periods of each filter, (N, HOLD m + s, ..).
 
         The map takes z, the y and u of the periods, and sin(x) - x, stacked in this order. It gives
         the innovations r of the periods and then the z after them. `seen` says in which periods y
@@ -244,11 +244,11 @@ class FilterBank(NamedTuple):
 
 
 class Passage:
-    """The filters of a bank over a flight, with y, (T, m), and u, (T, m) or (N, T, m) by model.
+    """A run of the filters of a bank over a flight, y (T, m) and u (T, m), or (N, T, m) by model.
 
         r = y - H z,  z+ = Phi (z + L r) + Gamma u + period gravity (sin(x) - x)
 
-    If y is lost, there is no update by r. The flight is a sequence of blocks of HOLD periods, and
+    If y is lost, r does not correct z. The flight is a sequence of blocks of HOLD periods, and
     `level` has the level of the wind in each block. sin(x) - x is held over a block, so that a
     block is linear. Blocks with the same level and the same lost samples share a matrix.
     """

@@ -177,7 +177,7 @@ def identify_jsbsim(
     commands and gusts: `gain_selection.gain_sets`. The beta of V follows from `airspeed_slew`. If
     `observer_margin` is given, the controller gets an extended-state observer for y_dot = Omega u.
     The loop around this model then has the delay margin `observer_margin`, s, and its margins meet
-    `requirement`, where 35 degrees of phase suffice.
+    `requirement`, except that 35 degrees of phase suffice.
 
     4. Simulate the result in calm air, with a gust, and in turbulence.
 
@@ -186,10 +186,10 @@ def identify_jsbsim(
     aircraft whose `sideslip_zero` is positive.
 
     If `learns`, which needs an `observer_margin`, the controller of step 3 gets no observer. The
-    scenario in the result then learns in moderate turbulence, and begins with the gains alone. The
-    designs of the learner have the `observer_margin`, and its rough model is the `sketch` of Omega
-    and speed. The flights of step 4 are without learning. `named` has properties that the user
-    names for an input, in place of JSBSim's.
+    scenario in the result then begins with the gains alone, and a model is learned in moderate
+    turbulence. The designs of the learner have the `observer_margin`, and its rough model is the
+    `sketch` of Omega and speed. The flights of step 4 are without learning. `named` has properties
+    that the user names for an input, in place of JSBSim's.
 
     Raises FlightEnded if the aircraft does not trim or does not respond, and ParameterError if its
     outputs and inputs cannot be paired, or if the speed is below guidance's speed floor.
@@ -291,7 +291,7 @@ def with_sideslip_held(airframe: Airframe, zero: float) -> Airframe:
 
 
 def airspeed_slew(bandwidth: float, effect: float) -> float:
-    """Return the throttle slew from which beta of V follows, 1/s.
+    """Return the slew of the throttle, 1/s, from which beta of V is chosen.
 
     `bandwidth` is that of V, rad/s, and `effect` is that of the throttle, m/s^2. The airspeed V
     contains the wind itself, so the slew is chosen for light turbulence: beta becomes K sigma
@@ -302,10 +302,10 @@ def airspeed_slew(bandwidth: float, effect: float) -> float:
 
 
 def _too_weak(linear: Linearization) -> str:
-    """Return a sentence, after a "; ", for each output that its paired input moves too weakly.
+    """Write a sentence, after a "; ", for each output that its own input hardly moves.
 
-    At full travel, the paired input of such an output moves it less than a tenth as much as another
-    input does.
+    At full travel, the input that is paired with such an output moves it less than a tenth as much
+    as another input does.
     """
     inputs = linear.condition.inputs()
     reach = linear.Omega * linear.travel()
@@ -366,10 +366,10 @@ def _in_law_order(Omega: FloatArray, controller: RiseDiConfig) -> FloatArray:
 def learning_selection(
     selection: Selection, condition: FlightCondition, Omega: FloatArray, margin: float
 ) -> Selection:
-    """Add the section `learn`, and the feedforward and observer of a sketch, to a selection.
+    """Add the section `learn` to a selection, with the feedforward and observer of a rough model.
 
-    `observer.part` is 0, so feedforward and observer do not act yet. Omega has its channels in the
-    aircraft's order.
+    The rough model is a `sketch`. `observer.part` is 0, so feedforward and observer do not act yet.
+    Omega has its channels in the aircraft's order.
     """
     start = selection.chosen
     name = Path(condition.name).stem
@@ -424,7 +424,7 @@ def airspeed_bandwidth(authority: float, lag: float) -> float:
 
 
 def _setting(linear: Linearization, V_bandwidth: float) -> LoopSetting:
-    """Return the loop for which the gains are selected, with gains of 1 before the selection."""
+    """Return the loop for which gains are selected. Until then all its gains are 1."""
     inputs = list(linear.condition.inputs())
     trim = linear.trim
     base = RiseDiConfig.validate_mapping(

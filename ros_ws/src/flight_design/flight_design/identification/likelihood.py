@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute the likelihood of A and B for one block, from a recorded flight.
 
-A block is a part of the aircraft that does not couple with the rest. The Kalman filter of the
-observer gives the innovations at each level of the wind.
+A block is a group of states and inputs of the aircraft that does not couple with the rest. The
+Kalman filter of the observer gives the innovations at each level of the wind.
 """
 
 from collections.abc import Iterable, Sequence
@@ -74,7 +74,7 @@ class Models(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """Standard deviations, before the flight, of what is identified; 0 for a value that is known.
+    """Standard deviations, before the flight, of all that is identified; 0 for a known value.
 
     `drift` is not such a deviation, but the noise of the disturbances in the filter. Hidden states,
     such as alpha, are states that y does not contain. If y has only the rates, the rows of the
@@ -94,7 +94,7 @@ class Unknown(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """Largest factor by which an entry may exceed its nominal value, or fall short of it.
+        """Largest factor by which an entry may be larger or smaller than its nominal value.
 
         It is MAX_FACTOR if `error` and `effect` are at most PRIOR, and grows with the larger of the
         two.
@@ -194,10 +194,10 @@ class Likelihood:
         self.believe(np.repeat([unknown.error, unknown.effect], [count_A, count_B]))
 
     def believe(self, deviation: FloatArray, centre: FloatArray | None = None) -> None:
-        """Set the prior of the relative errors: standard deviation and mean, (entries,) each.
+        """Set the prior of the relative errors: their standard deviations and means, (entries,).
 
-        The mean is `centre`, by default 0. The standard deviations and the bounds of the search are
-        relative to the values of the entries at the centre.
+        The means are `centre`, by default 0. The standard deviations and the bounds of the search
+        are relative to the values of the entries at the means.
         """
         delay_prior = np.ones(len(self._block.inputs) if self._delay_deviation else 0)
         wind_prior = np.full(len(self._block.winds), WIND_PRIOR)
@@ -346,9 +346,9 @@ class Likelihood:
         return np.asarray(np.sqrt(np.einsum("ip,pq,iq->i", size, covariance, size)))
 
     def by_lag(self, covariance: FloatArray) -> FloatArray:
-        """Return the part of each standard deviation of theta that the lags cause, (p,).
+        """Return which part of each standard deviation of theta is caused by unknown lags, (p,).
 
-        They are the lag of y and those of the actuators, with their inertias. `covariance` is that
+        The lags are that of y and those of the actuators, with their inertias. `covariance` is that
         of theta. If the lags were known, the variances would be smaller by the squares of these
         parts.
         """
@@ -358,10 +358,10 @@ class Likelihood:
         return np.asarray(np.sqrt(np.sum(shared.T * by_lags, axis=0)))
 
     def levels(self, theta: FloatArray) -> NDArray[np.int64]:
-        """Return the best level of the wind in each span, (spans,), for the parameters theta, (p,).
+        """Choose the level of the wind in each span, (spans,), for the parameters theta, (p,).
 
-        Each level predicts a span from the estimates at the beginning of this span. Of the levels
-        whose log-likelihood is within CHANGE of the best, the calmest is taken.
+        At each level, the filter predicts a span from the estimates at its beginning. Of the levels
+        whose log-likelihood is within CHANGE of the best one, the calmest is chosen.
         """
         models = self.models(theta[None], self._usable)
         bank = models.bank.by_level()
@@ -392,7 +392,7 @@ class Likelihood:
         return levels
 
     def _of_span(self, values: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Repeat the value of each span for all samples of the span, (T,)."""
+        """Repeat the value of each span for every sample of the span, (T,)."""
         return np.repeat(np.asarray(values), self._spans[0].stop)[: len(self._y)]
 
     def innovations(self, models: Models, levels: NDArray[np.int64]) -> Normalised:
@@ -421,9 +421,9 @@ class Likelihood:
 
             log p = -1/2 sum_i (e_i^2 / s_i + log s_i) - 1/2 log det S,   s_i = mean e_i^2
 
-        The means s_i are over the samples to which the model is fitted. They take out the scale of
-        e, as the means in the cost do: the noise of the filter is a guess, and a model must not
-        gain by a better guess.
+        The means s_i are over the samples to which the model is fitted. As in the cost, the
+        division by them takes out the scale of e. The noise of the filter is only a guess, and a
+        model must not gain by a better guess.
         """
         (r,), (e,), (half_log_det,) = self.passed(theta, levels)
         scale = np.mean(e[self.fitted()] ** 2, axis=0)
@@ -436,7 +436,7 @@ class Likelihood:
         used: NDArray[np.bool_],
         levels: NDArray[np.int64] | None = None,
     ) -> float:
-        """Return the cost of `Search.fit` for theta, (p,).
+        """Return the cost that `Search.fit` minimises, for theta, (p,).
 
         The levels of the wind are `levels`, or if it is None the best ones.
         """
@@ -516,12 +516,12 @@ class Likelihood:
         ]
 
     def in_errors(self, fit: Fit, deviation: FloatArray) -> FloatArray:
-        """Convert deviations of theta, (p,), to those of the entries' relative errors."""
+        """Convert standard deviations of theta, (p,), to those of the entries' relative errors."""
         slope = np.where(self._by_factor, np.exp(fit.theta[: self.count]), 1.0)
         return slope * deviation[: self.count]
 
     def about_centre(self, entries: Iterable[Entry]) -> list[Entry]:
-        """Return entries whose errors and standard deviations are relative to the prior mean."""
+        """Return entries with errors and deviations that are relative to the mean of the prior."""
         centred = []
         centres = self.relative_errors(self.centre[: self.count]).tolist()
         for entry, centre in zip(entries, centres, strict=True):
@@ -531,9 +531,10 @@ class Likelihood:
         return centred
 
     def reason_against_air(self, fit: Fit) -> Refusal | None:
-        """Refuse a fit if the effect of the vertical wind's slope on a state is at a bound.
+        """Refuse a fit in which the slope of the vertical wind has too strong an effect on a state.
 
-        So large an effect stands for errors of the aircraft's model, not for the wind.
+        If this effect is at its bound, it stands for errors of the aircraft's model, not for the
+        wind.
         """
         effects = np.abs(fit.theta[self._shear])
         bounds = self._upper[self._shear]

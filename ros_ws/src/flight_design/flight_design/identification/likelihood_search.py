@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Search for the most probable A and B of one block.
 
-A block is a part of the aircraft that does not couple with the rest. The method is Gauss-Newton
-with damping, from several starts.
+A block is a group of states and inputs of the aircraft that does not couple with the rest. The
+method is Gauss-Newton with damping, from several starts.
 """
 
 from collections.abc import Callable, Iterable
@@ -52,7 +52,7 @@ class SearchEnd(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """The innovations for a theta, divided by their rms, and their derivatives by theta."""
+    """The innovations at a theta, divided by their rms, with their derivatives by theta."""
 
     cost: float
     e: FloatArray  # (samples, m) innovations divided by their rms
@@ -114,16 +114,13 @@ class Search(Likelihood):
         return self._fit_at(min(best, steady, key=lambda end: end.cost), same, used, flown)
 
     def fit_about(self, fit: Fit, used: NDArray[np.bool_], flown: FloatArray | None = None) -> Fit:
-        """Find the minimum of `fit` again, starting at an earlier fit.
-
-        The errors of the earlier fit become the prior mean.
-        """
+        """Search again from an earlier fit, with its errors as the means of the prior."""
         deviation = self.prior[self._errors]
         self.believe(deviation, fit.theta[self._errors])
         return self.fit(used, fit.theta, flown)
 
     def fit_alike(self, used: NDArray[np.bool_], flown: FloatArray | None = None) -> Fit | None:
-        """Find the minimum of `fit` from one start, with the same level of the wind in every span.
+        """Search from one start only, with the same level of the wind in every span.
 
         The start is in moderate turbulence, at the model in flight, whose theta is `flown`. If
         there is none, it is at the nominal model. Returns None if less than the share ALIKE of the
@@ -399,13 +396,13 @@ class Search(Likelihood):
     def flying(self, flown: FloatArray, parts: Iterable[tuple[Likelihood, Fit]]) -> Innovations:
         """Return the innovations of the model that flies, whose theta is `flown`, (p,).
 
-        The winds, angles and delays are those of the `parts`, the blocks that were fitted.
+        Winds, angles and delays are those that were fitted for each of the `parts`.
         """
         theta = np.where(self._errors, flown, self.joined(parts))
         return self.predicted(theta, self.levels(theta))
 
     def joined(self, parts: Iterable[tuple[Likelihood, Fit]]) -> FloatArray:
-        """Return theta, (p,), with the mean winds, angles and delays of the parts.
+        """Return one theta, (p,), with the mean winds, angles and delays of all parts.
 
         The errors of A and B in it are 0, and so are the lags and inertias of the actuators. Those
         that were found for a part are wrong if the part couples with another one.

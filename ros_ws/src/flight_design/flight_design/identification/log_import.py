@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Import y, u and pose by a channel map from the log of a flight that the stack did not fly."""
+"""Import y, u and pose from the log of a flight that another program flew.
+
+A channel map says which quantity of the log is which channel.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -208,7 +211,7 @@ def _tape(
     readers: Mapping[str, "_Reader"],
     ends: tuple[int, int],
 ) -> Tape:
-    """Return the signals of a log between two instants."""
+    """Return the signals that a channel map finds in a log between two instants."""
     first, last = ends
     rows = channel_map.outputs
     stamps = log.tables[sources[channel_map.instant].message].stamp_ns
@@ -256,7 +259,7 @@ def _measured(log: VehicleLog, quantity: str, key: str) -> LogField:
 
 
 def _messages(log: VehicleLog, quantity: str) -> str:
-    """Name the messages in which a log of this format can have a quantity."""
+    """Name the messages of this log format that can have a quantity, for an error sentence."""
     from flight_log.vehicle_tables import ULOG_SOURCES  # noqa: PLC0415 - only this sentence needs it
 
     sources = ULOG_SOURCES if log.format is None else log.format.sources
@@ -510,7 +513,7 @@ def _expected(stamp_ns: Stamps) -> int:
 
 
 def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Signal | None:
-    """Return the channels of the map's pose that the log has, NaN until the first value of each."""
+    """Return the channels of the pose that a log has, NaN until the first value of each."""
     sources = {
         name: source for name in channel_map.pose if (source := log.source(name)) is not None
     }
@@ -523,7 +526,10 @@ def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Si
 
 
 def require_map_of_import(channel_map: ChannelMap, recorded: RecordedRun) -> None:
-    """Raise ParameterError if u of an imported log was read by rows of another map."""
+    """Check that the rows by which the u of a log was imported are also in this channel map.
+
+    Raises ParameterError if the log was imported by other rows.
+    """
     source = recorded.metadata.get(IMPORTED)
     if source is None:
         return
@@ -543,7 +549,7 @@ def require_map_of_import(channel_map: ChannelMap, recorded: RecordedRun) -> Non
 
 
 def _rows_of_import(channel_map: ChannelMap) -> dict[str, object]:
-    """Return the rows of a map that an import uses, by key."""
+    """Return the rows of a channel map that an import uses, by key."""
     keys = {
         "outputs": {"positive", "sign"},
         "inputs": {"field", "positive", "sign", "scale", "offset", "range"},

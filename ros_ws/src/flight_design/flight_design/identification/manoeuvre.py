@@ -58,7 +58,7 @@ class ManoeuvreResult(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The outcome, and the inputs that were at their limits."""
+        """How the flight ended, and which inputs were at their limits, in words."""
         return ", ".join(
             [
                 self.outcome,

@@ -84,7 +84,7 @@ AGAIN = 2
 
 
 class Part(NamedTuple):
-    """The model of a part of the aircraft that does not couple with the rest."""
+    """The model of a group of states and inputs that does not couple with the rest."""
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -132,7 +132,7 @@ class Identification(NamedTuple):
 
 
 class _Study(NamedTuple):
-    """The data and settings that the searches of all parts share."""
+    """The data and settings that the searches for all parts of the aircraft share."""
 
     recorded: FlightData
     airframe: Airframe
@@ -235,9 +235,9 @@ class _Study(NamedTuple):
     ) -> Fit:
         """Search again around a fit in which too many entries are at a bound.
 
-        The cause may be that the airframe file is rough. There is no further search if the effect
-        of an input is at a bound, for two reasons. No law designed from the file can fly an
-        aircraft beyond these bounds. Besides, the cause may be that the part couples with another
+        They may be there because the airframe file is rough. There is no further search if the
+        effect of an input is at a bound, for two reasons. No law designed from the file can fly an
+        aircraft beyond these bounds. Besides, the part of the aircraft may couple with another
         part.
         """
         for _ in range(AGAIN * self.searches_again):
@@ -412,7 +412,7 @@ def identify_model(
 def _counter(
     progress: Callable[..., None], parts: int, *, starts_at_flown: bool
 ) -> Callable[[], None]:
-    """Return a function that counts the search steps of the parts and tells `progress`.
+    """Return a function that counts the steps of all searches and tells `progress`.
 
     `starts_at_flown` says whether the model in flight is one more start.
     """
@@ -433,7 +433,10 @@ def _follows(
     u: FloatArray,
     known: NDArray[np.bool_],
 ) -> float:
-    """Return the largest `correlation` of a part's innovations with another part's u, (T, m)."""
+    """Return how strongly the innovations of a part follow the u of another part, u (T, m).
+
+    The result is the largest `correlation` of all pairs of parts.
+    """
     largest = 0.0
     for (_, fit), block in zip(fits, every, strict=True):
         of_others = np.delete(u, block.inputs, axis=1)
@@ -442,7 +445,10 @@ def _follows(
 
 
 def _couples(flown: Airframe, nominal: Airframe) -> bool:
-    """Return whether a model has nonzero entries where the nominal model has zeros."""
+    """Return whether a model couples states that do not couple in the nominal model.
+
+    It does if an entry is not zero where the nominal entry is zero.
+    """
     new, old = (np.hstack([model.matrix_a(), model.matrix_b()]) for model in (flown, nominal))
     return bool(np.any((new != 0.0) & (old == 0.0)))
 

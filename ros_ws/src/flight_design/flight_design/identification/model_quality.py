@@ -47,7 +47,7 @@ def whiteness(e: FloatArray, held_out: NDArray[np.bool_]) -> FloatArray:
 
 
 def correlation(e: FloatArray, lagged: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
-    """Return how strongly e follows each column of `lagged`, (m, k); 1 for independent noises.
+    """Return how strongly e follows each column of `lagged`, (m, k); 1 if they are independent.
 
     The value is the mean of n_k rho_k^2 over the lags k = 1 .. LAGS. rho_k is the correlation of e
     with `lagged` k samples earlier. e has shape (T, m), lagged (T, k). `used`, (T,), is the mask of
@@ -88,7 +88,7 @@ def advantage(
 
 @dataclass(frozen=True)
 class NoBetter(Refusal):
-    """Refusal of a model only because it predicts no better than the nominal model."""
+    """The refusal of a model only because it predicts no better than the nominal model."""
 
 
 def reason_against_prediction(

@@ -63,7 +63,7 @@ def excitation_factor(effect: Entry) -> float:
 
 
 def at_bound(entries: Iterable[Entry], factor: float = MAX_FACTOR) -> list[Entry]:
-    """Return the entries at a bound of a search that allows factors up to `factor`."""
+    """Return the entries that ended at a bound of a search, which allows factors up to `factor`."""
     found = []
     for entry in entries:
         lower, upper = -MAX_ERROR, largest_error(entry)
@@ -77,7 +77,7 @@ def at_bound(entries: Iterable[Entry], factor: float = MAX_FACTOR) -> list[Entry
 def reason_against_airframe(
     entries: Iterable[Entry], name: str, allowed: int = 0, factor: float = MAX_FACTOR
 ) -> Refusal | None:
-    """Refuse the airframe `name` if more than `allowed` entries are at a bound of the search.
+    """Refuse the airframe `name` if more than `allowed` entries ended at a bound of the search.
 
     A single entry is too many if the record shows it clearly, with less than half of the prior
     standard deviation. The aircraft then lies beyond the bound.
@@ -117,7 +117,7 @@ def reason_against_signs(
 
 
 def in_time(entries: Iterable[Entry], by_timing: Iterable[float]) -> list[Entry]:
-    """Return the entries with standard deviations that leave out one cause of error.
+    """Return entries with the standard deviations that they would have without one cause of error.
 
     `by_timing` is the part of each standard deviation that this cause makes. If the cause is an
     uncertain delay of u, the result has the standard deviations for a known delay.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Read a flight of the exported controller inside PX4, from the topic rise_di_status of a ULog.
+"""Read a flight of the controller that was exported into PX4, from the ULog topic rise_di_status.
 
 The ticks become the signal `internals`, and a replay computes them again.
 """
@@ -27,14 +27,14 @@ EXPECTED = "a ULog of the module of `rise-di export --px4`, with rise_di_status 
 
 
 class ModuleChange(NamedTuple):
-    """Parameters of the controller that the module changed before a tick."""
+    """Parameters of the controller that changed in flight before a tick."""
 
     stamp_ns: int
     values: Mapping[str, Any]
 
 
 class ModuleFlight(NamedTuple):
-    """y, y_m, u and `internals` at the ticks of a module.
+    """What a controller exported into PX4 logged at its ticks: y, y_m, u and `internals`.
 
     `equal` is the number of ticks whose u has the same bits in Python. `lost` is the number of
     ticks after a gap of the log, which Python cannot compute.
@@ -47,14 +47,14 @@ class ModuleFlight(NamedTuple):
 
 
 def module_flight(log: VehicleLog, controller: ControllerConfig) -> ModuleFlight:
-    """Compute in Python again what an exported module computed at its ticks.
+    """Compute the ticks of a controller that was exported into PX4 again in Python.
 
     A stretch is the ticks from an engagement to the first gap or to the next engagement. Python
     starts each stretch with the u of its first tick in the log. In `internals`, e and u come from
     the log, and the states of the law come from Python. At low airspeed the largest torque, 1, may
     limit u more than the parameters do. Then the limits of u count as changed parameters. Raises
-    ParameterError if the log has no ticks, or if the module had other parameters than `controller`.
-    It is also raised if the module computes in single precision, or if the law refuses a tick.
+    ParameterError if the log has no ticks, or if the flight had other parameters than `controller`.
+    It is also raised if the export computes in single precision, or if the law refuses a tick.
     """
     require(STATUS in log.tables, "the log", f"no {STATUS}", EXPECTED)
     table = log.tables[STATUS]
@@ -65,7 +65,7 @@ def module_flight(log: VehicleLog, controller: ControllerConfig) -> ModuleFlight
 
 
 class _Ticks:
-    """The rows of rise_di_status."""
+    """The rows of the topic rise_di_status."""
 
     def __init__(self, table: MessageTable, controller: ControllerConfig) -> None:
         m = len(controller.outputs)
@@ -174,9 +174,10 @@ class _Ticks:
         return self._flight(stretches, rows, changes, equal)
 
     def _limits(self, k: int) -> dict[str, tuple[float, ...]]:
-        """Return the limits of u in the tick k: those of the scenario, or of a torque of 1.
+        """Return the limits of u in the tick k.
 
-        For each input, the narrower limit counts.
+        For each input, they are the narrower of the limits in the scenario and those of a torque of
+        1.
         """
         end = self._values["u_end"][k]
         exported = self._controller.guard().limits

@@ -182,7 +182,7 @@ def fit_channel(
 
 
 def _settled(t: FloatArray) -> NDArray[np.bool_]:
-    """Return the mask (N,) of the samples that are SETTLED or more after each long gap."""
+    """Return the mask (N,) of the samples that come at least SETTLED after each long gap."""
     if len(t) < 2:
         return np.ones(len(t), dtype=bool)
     gaps = np.diff(t)
@@ -191,7 +191,7 @@ def _settled(t: FloatArray) -> NDArray[np.bool_]:
 
 
 def _decay(t: FloatArray, damping: float) -> FloatArray:
-    """Return the third function of time that is fitted, beside a constant and t.
+    """Return a function of time that is fitted in addition to a constant and t.
 
     It shows the decay of an initial value, exp(-damping t). If the damping is 0, it is t^2 / 2.
     """
@@ -247,7 +247,7 @@ def _search(residuals: Any, values: FloatArray, order: int, amplitude: float) ->
 
 
 def _model(fit: Any, misfit: float, period: float) -> ChannelModel:
-    """Return the model of a fit; its standard errors allow for correlated output errors.
+    """Convert a fit to the model of a channel, whose standard errors allow for coloured errors.
 
     Source: L. Ljung, 9.4 (coloured errors).
     """

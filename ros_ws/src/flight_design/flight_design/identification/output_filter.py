@@ -17,7 +17,7 @@ def kept_share(lag: FloatArray, period: float) -> FloatArray:
 
 
 def behind_filter(sampled: ObserverModel, keep: FloatArray) -> ObserverModel:
-    """Let the outputs of N sampled models reach y through a filter.
+    """Extend N sampled models by a filter between their outputs and y.
 
         f+ = keep f + (1 - keep) H z+,   y = f
 

@@ -49,7 +49,7 @@ class OwnLoop(NamedTuple):
     source: str  # the parameters from which the gains come
 
     def in_place(self, scenario: Scenario) -> Scenario:
-        """Return the scenario with the feedback of this loop as the law `pi`.
+        """Return the scenario with the gains of this loop, as the law `pi`, in place of its law.
 
         The law computes u, which is the torque multiplied by the u at a torque of 1.
         """
@@ -73,7 +73,7 @@ class OwnLoop(NamedTuple):
         noise: FloatArray,
         f: FloatArray,
     ) -> FloatArray:
-        """Return y - y_m, (N, m), of the aircraft in this loop, with y_m (N, m) as the setpoint.
+        """Simulate the aircraft in this loop with the setpoint y_m, (N, m); return y - y_m, (N, m).
 
         Each row is a period of the controller. y has the noise, (m,) rms. y is late by the delay of
         the scenario minus a period, and u acts from the next period on. f, (N, n), is the
@@ -110,7 +110,7 @@ class OwnLoop(NamedTuple):
 
 
 def _ends(scenario: Scenario) -> FloatArray:
-    """Return u at a torque of 1, for each input of the law, with the sign of D."""
+    """Return which u a torque of 1 stands for, for each input of the law, with the sign of D."""
     controller = scenario.rise_di()
     inputs = scenario.aircraft.channels().inputs
     upper = dict(zip(inputs, scenario.aircraft.actuators.upper or (), strict=False))

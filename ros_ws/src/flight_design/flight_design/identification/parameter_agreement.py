@@ -59,9 +59,9 @@ MENDS = {
 
 
 class Stick(NamedTuple):
-    """What a map says about an input and its channel of the transmitter.
+    """What a channel map says about an input and its channel of the transmitter.
 
-    `trim_line`, from the input's row of `trims`, turns the pulse, us, into the raw value.
+    `trim_line`, from the input's row of `trims`, converts the pulse, us, to the raw value.
     """
 
     axis: str  # ROLL, PITCH, THROTTLE or YAW
@@ -72,11 +72,11 @@ class Stick(NamedTuple):
 
     @property
     def is_centred(self) -> bool:
-        """Whether ArduPilot measures the channel from its trim instead of the lower end."""
+        """Whether ArduPilot measures the channel from its trim, and not from its lower end."""
         return self.axis != "THROTTLE"
 
     def parameters(self) -> dict[str, tuple[float, float]]:
-        """Return the parameters of ArduPilot that fit the map: (value, tolerance) by name."""
+        """Return which parameters of ArduPilot the map asks for: (value, tolerance) by name."""
         low, high = sorted(to_raw(raw, self.trim_line) for raw in self.raw_range)
         half = (high - low) / 2.0
         name = f"RC{self.channel}"
@@ -91,7 +91,7 @@ class Stick(NamedTuple):
         }
 
     def raw(self, deflection: FloatArray) -> FloatArray:
-        """Return the raw value at a fraction of full deflection.
+        """Return the raw value of the stick at a fraction of full deflection.
 
         The fraction is -1 to 1 about the middle. For a throttle it is 0 to 1 from the lower end.
         """
@@ -101,7 +101,7 @@ class Stick(NamedTuple):
 
 
 def stick_of(channel_map: ChannelMap, name: str) -> Stick:
-    """Return what a map says about the channel of an input.
+    """Return what a channel map says about the transmitter's channel for an input.
 
     Raises ParameterError if the input has no channel.
     """
@@ -136,7 +136,7 @@ class Servo(NamedTuple):
     is_reversed: bool
 
     def deflection(self, pulse: FloatArray, stick: Stick) -> FloatArray:
-        """Return the fraction of full deflection at a pulse, us.
+        """Return at which fraction of full deflection the servo is, given its pulse, us.
 
         The fraction is -1 to 1, and for a throttle 0 to 1.
         """
@@ -242,7 +242,7 @@ def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> None:
 
 
 def absence_sentence(rows: Iterable[Agreement]) -> str | None:
-    """Return a sentence on the parameters that have no value at the samples, or None."""
+    """Write a sentence on the parameters of which the log has no value at the samples, or None."""
     absent = ", ".join(row.what for row in rows if not row.is_known)
     if not absent:
         return None

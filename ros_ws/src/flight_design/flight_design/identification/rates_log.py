@@ -100,7 +100,7 @@ def rates_of_log(
     window: Window,
     show: Callable[[list[Agreement]], None] = lambda _: None,
 ) -> RatesLog:
-    """Return y and u of a log for the identification of an airframe, with the imported log.
+    """Return y and u of a log for the identification of an airframe, together with the log.
 
         u = sign(D) end torque (V / V0)^2
 
@@ -175,7 +175,7 @@ def scaled_torques(parameters: Mapping[str, float]) -> list[str]:
 
 
 def broadened(recorded: FlightData, cutoff: float) -> tuple[FlightData, float]:
-    """Replace the low-pass of the gyro, with its cut-off at `cutoff`, by one at BROAD, Hz.
+    """Replace the low-pass of the gyro, whose cut-off is `cutoff`, by a faster one at BROAD, Hz.
 
         y' = F_BROAD(z) / F_cutoff(z) y,  F is a Butterworth filter of second order
 

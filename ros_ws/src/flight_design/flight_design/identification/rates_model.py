@@ -6,8 +6,8 @@ A log of rates lacks two things that move the aircraft slowly. The first is the 
 in a climb or at another airspeed. The inputs then hold the new trim without moving the rates, and
 to a linear model they seem to have little effect. The second is the bank. In a bank, gravity causes
 sideslip, and the aircraft turns. A model without the bank angle takes this turn for an effect of
-the rudder. The innovations stay white in both cases, because most of the log is quiet. The entries
-are wrong by up to 50 of their standard deviations.
+the rudder. In both cases the innovations stay white, because most of the log is quiet, but the
+entries are wrong by up to 50 of their standard deviations.
 
 Here a high-pass takes the slow changes out of y and u, and the model has the bank angle. A linear
 aircraft has the same model behind any high-pass. If the models behind two different high-passes
@@ -79,7 +79,10 @@ def identify_rates(
 def _reported(
     progress: Callable[..., None], number: int, count: int, *, completed: int, total: int
 ) -> None:
-    """Report how much of `count` searches is completed, during the search with this number."""
+    """Report how many of `count` searches are completed, with a fraction for the one under way.
+
+    `number` is the number of the search that is under way.
+    """
     progress(completed=number * total + completed, total=count * total)
 
 
@@ -126,14 +129,15 @@ def without_trim(recorded: FlightData, slow: float = SLOW) -> FlightData:
 
 
 def doubted(found: Identification, steady: Identification) -> Identification:
-    """Widen the standard deviations of a model by its differences from a second one, `steady`.
+    """Widen the standard deviations of a model by its differences from a second model, `steady`.
 
         new sigma^2 = sigma^2 + (error of the entry - its error in `steady`)^2
 
     An entry that `steady` lacks has the error 0 there. A part is refused if the best known effect
-    on one of its outputs differs by more than MOST_APART. A part that is already refused for
-    another reason keeps this reason. The exception is a part that is refused as no better than the
-    nominal model, but has the higher likelihood: such a part may be used, so it is tested too.
+    on one of its outputs differs by more than MOST_APART between the models. A part that is already
+    refused for another reason keeps this reason. The exception is a part that is refused as no
+    better than the nominal model, but has the higher likelihood: such a part may be used, so it is
+    tested too.
     """
     errors = {entry.name: entry.error for entry in steady.entries}
     return found._replace(parts=tuple(_doubted(part, errors) for part in found.parts))

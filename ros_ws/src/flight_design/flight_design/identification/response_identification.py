@@ -107,7 +107,7 @@ class Response(NamedTuple):
     sign_ratio: FloatArray
 
     def reason_against_sign(self, i: int) -> Refusal | None:
-        """Refuse the sign of Omega_ii if it is uncertain."""
+        """Return a refusal if the sign of Omega_ii is uncertain, else None."""
         output = self.outputs[i]
         name = self.inputs[i]
         ratio = float(self.sign_ratio[i])
@@ -233,7 +233,7 @@ class _Rows(NamedTuple):
 def _within(
     signal: Signal, names: Sequence[str], span: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the times after the start of a span, s, and the values of the named channels."""
+    """Return the samples of the named channels in a span: times after its start, s, and values."""
     inside = (signal.stamp_ns >= span[0]) & (signal.stamp_ns <= span[1])
     return (signal.stamp_ns[inside] - span[0]) / NANOSECONDS, np.stack(
         [signal[name][inside] for name in names], axis=1
@@ -243,7 +243,11 @@ def _within(
 def bridged(
     t: FloatArray, values: FloatArray, period: float
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Fill gaps of at most BRIDGED by straight lines; tell which samples, (N, m), were recorded."""
+    """Fill gaps of at most BRIDGED by straight lines, and return which samples were recorded.
+
+    Returns the times, (N,), the values, (N, m), and the mask, (N,), of the samples that were
+    recorded.
+    """
     missing = np.rint(np.diff(t) / period).astype(np.int64) - 1
     counts = 1 + np.where(missing * period <= BRIDGED, np.maximum(missing, 0), 0)
     before = np.repeat(np.arange(len(counts)), counts)
@@ -256,7 +260,10 @@ def bridged(
 
 
 def _integral(t: FloatArray, steps: FloatArray, instants: FloatArray) -> FloatArray:
-    """Integrate a signal from t[0] to `instants`; `steps` are its means between the times t."""
+    """Integrate a signal from t[0] to `instants`.
+
+    `steps` has the mean of the signal between each of the times t and the next one.
+    """
     sums = np.concatenate(
         [np.zeros((1, steps.shape[1])), np.cumsum(steps * np.diff(t)[:, None], axis=0)]
     )
@@ -271,7 +278,7 @@ def _rows(
     layout: Layout,
     span: tuple[int, int],
 ) -> _Rows:
-    """Return the regressors of a span, the samples of y that they predict, and u."""
+    """Return the regressors for a span, the samples of y that they predict, and u."""
     (t, values), (t_u, u_values), m = (
         _within(y, outputs, span),
         _within(u, inputs, span),
@@ -423,7 +430,7 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
 
 
 def _moves(parts: Iterable[FloatArray]) -> bool:
-    """Return whether a channel moves in any part of the log."""
+    """Return whether the values of a channel change in any of the given parts of a log."""
     return any(len(part) and np.ptp(part) > 0.0 for part in parts)
 
 
@@ -435,7 +442,7 @@ def _fitted_response(
     rows: Sequence[_Rows],
     share: FloatArray,
 ) -> Response:
-    """Return the response of each channel, fitted to step responses of the predictor.
+    """Fit the response of each channel to the step responses of the predictor.
 
     `responses` are those of `_Predictor.step_responses`. `share` is the share of each channel's
     motion that the excitation explains, (m,). A channel that does not move in `rows`, or whose step
@@ -504,7 +511,7 @@ def _reason_against_channel(
 
 
 def _too_little_share(output: str, name: str, share: float) -> str:
-    """Say that the excitation explains too little of a channel, and how to get more.
+    """Say that the excitation explains too little of a channel's motion, and how to get more.
 
     The share is P / (P + Q), with the power P of the excitation and Q of the disturbances.
     """

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Let actuators whose model has a lag of first order move as late servos of the second order do.
+"""Convert u so that actuators with a lag of first order move as other servos would.
 
-The servos may have rate limits. An actuator has no noise, so its position follows from u alone. The
-filters can therefore keep the model of first order. They get the u with which this model has the
-position of the servo at each tick.
+The servos may be late, of second order, and limited in rate. An actuator has no noise, so its
+position follows from u alone. The filters can therefore keep the actuators of first order. They get
+the u with which these actuators have the position of the servo at each tick.
 """
 
 import numpy as np
@@ -57,7 +57,7 @@ def behind_servo(
     inertia: float,
     rate_limit: float = np.inf,
 ) -> FloatArray:
-    """Return the u, (T,), with which a first-order actuator moves as a servo does at each tick.
+    """Return the u, (T,), with which a first-order actuator moves as a given servo, at each tick.
 
         inertia lag^2 p_ddot + servo_lag p_dot + p = u,   abs(p_dot) <= rate_limit
 
@@ -85,7 +85,7 @@ def behind_servo(
 def _within_rate(
     u: FloatArray, Phi: FloatArray, Gamma: FloatArray, rate_limit: float, period: float
 ) -> FloatArray:
-    """Return the positions of a servo after each tick, (T,), whose rate is limited.
+    """Return the positions of a servo with limited rate after each tick, (T,).
 
     The servo is at rest at 0. Without the limit its position and rate would be Phi times those
     before, plus Gamma u.

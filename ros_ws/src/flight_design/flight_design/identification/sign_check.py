@@ -32,7 +32,7 @@ OPEN_LOOP = "excitation"  # the law that makes no use of y
 
 
 class ChannelSign(NamedTuple):
-    """The signs of a channel of the law, from the map, the airframe and a recorded flight."""
+    """The signs of a channel of the law in the channel map, the airframe and a recorded flight."""
 
     output: str
     input: str
@@ -56,9 +56,10 @@ class SignCheck(NamedTuple):
 
 
 def require_signs(channel_map: ChannelMap, scenario: Scenario) -> None:
-    """Raise ParameterError if a map contradicts the D of a scenario's controller.
+    """Check that a channel map agrees with the D of a scenario's controller.
 
-    The effects of the inputs on the outputs are those of the scenario's airframe.
+    The effects of the inputs on the outputs are those of the scenario's airframe. Raises
+    ParameterError if the map contradicts D.
     """
     contradictions = check_scenario(
         channel_map, scenario, load_airframe(scenario.aircraft.airframe), None
@@ -285,12 +286,12 @@ def _places(names: Iterable[str], among: Iterable[str]) -> list[int]:
 
 
 def output_signs(channel_map: ChannelMap) -> FloatArray:
-    """Return +1 for each output with the sign of the stack and -1 for any other, (m,).
+    """Return +1 for each output that has the sign convention of this project, else -1, (m,).
 
-    The signs of the stack are q nose up, p roll right, r nose right, V faster, climb up. The result
-    is in the map's order. For a channel with another name, the motion of its row says which
-    quantity it is. Raises ParameterError if q, p, r or V has the motion of another channel, or if
-    two channels have the same motion.
+    By this convention q is positive nose up, p roll right, r nose right, V faster, and climb up.
+    The result is in the map's order. For a channel with another name, the motion of its row says
+    which quantity it is. Raises ParameterError if q, p, r or V has the motion of another channel,
+    or if two channels have the same motion.
     """
     sign_by_motion: dict[str, int] = {}
     for name, row in channel_map.outputs.items():
@@ -341,6 +342,9 @@ def through(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
 
 
 def motion_as_channel_grows(row: OutputRow | InputRow) -> str:
-    """Return how the aircraft moves as the channel grows, not as its raw value grows."""
+    """Return how the aircraft moves as the channel grows.
+
+    The channel grows with the raw value or against it, as its row in the channel map says.
+    """
     motions = list(MOTIONS)  # each motion stands next to its opposite
     return row.positive if row.sign > 0 else motions[motions.index(row.positive) ^ 1]

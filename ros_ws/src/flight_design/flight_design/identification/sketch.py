@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Build a sketch of an aircraft that has no airframe file.
+"""Build a rough model of an aircraft that has no airframe file: a sketch.
 
-A sketch is a rough model from Omega and the trim speed, with which a learner begins.
+A sketch follows from Omega and the trim speed alone. A learner begins with it.
 """
 
 from collections.abc import Sequence
@@ -94,10 +94,11 @@ def sketch(
 
 
 def sketched(name: str, controller: ControllerConfig, speed: float) -> Airframe:
-    """Return the airframe of a controller's feedforward; `speed` is the trim speed V0, m/s.
+    """Return the airframe of a controller's feedforward, which came from a sketch.
 
-    The wind acts on the states through the columns V, alpha and beta of A. Raises ParameterError if
-    the controller has no feedforward, or if its states are not those of a sketch.
+    `speed` is the trim speed V0, m/s. The wind acts on the states through the columns V, alpha and
+    beta of A. Raises ParameterError if the controller has no feedforward, or if its states are not
+    those of a sketch.
     """
     model = controller.feedforward
     require(
@@ -139,11 +140,11 @@ def with_sketch(
     noise: FloatArray,
     margin: float,
 ) -> RiseDiConfig:
-    """Return a controller with the feedforward and observer of a sketch, which do not act yet.
+    """Add the feedforward and the observer of a sketch to a controller, without letting them act.
 
-    `observer.part` is 0 for this. Omega (m, m) and `noise`, (m,), the rms per sample, are in the
-    law's order. `margin` is the least delay margin, s. Raises ParameterError as `sketch` and
-    `with_aircraft_observer` do.
+    They do not act yet because `observer.part` is 0. Omega (m, m) and `noise`, (m,), the rms per
+    sample, are in the law's order. `margin` is the least delay margin, s. Raises ParameterError as
+    `sketch` and `with_aircraft_observer` do.
     """
     rough = sketch(name, Omega, start.outputs, start.inputs, speed)
     model = model_for(rough, start, noise)

@@ -134,11 +134,11 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
 
 
 def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
-    """Return whether a fitted response begins with the sign of Omega.
+    """Return whether a fitted response begins in the direction of Omega.
 
-    The sign is that of the sum of the response until EARLY after delay and lag. If this is not the
-    sign of Omega, the slow term makes up the whole response. The two fitted poles then stand for a
-    pole and a lag, and Omega is about 0.
+    The direction is the sign of the sum of the response until EARLY after delay and lag. If this is
+    not the sign of Omega, the slow term makes up the whole response. The two fitted poles then
+    stand for a pole and a lag, and Omega is about 0.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     first, second = second_order_response(
@@ -148,10 +148,10 @@ def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 -
 
 
 def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size: float) -> float:
-    """Return how much a fitted response lowers chi squared, minus its number of parameters.
+    """Return by how much a fitted response lowers chi squared, minus its number of parameters.
 
-    Only the time up to EARLY after delay and lag counts. The result is 0 if this is negative, or if
-    the response does not begin with the sign of Omega.
+    Only the time up to EARLY after delay and lag counts. A negative result becomes 0, and so does
+    the result of a response that does not begin with the sign of Omega.
     """
     early = t <= theta[0] + theta[1] + EARLY
     first, second = second_order_response(t[early], *theta[[0, 1, 3, 4]])

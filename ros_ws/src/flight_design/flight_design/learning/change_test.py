@@ -65,7 +65,7 @@ DEAD_WITHIN = 4.0
 
 
 class Change(NamedTuple):
-    """The result of the test of one part of the aircraft, which does not couple with the rest."""
+    """The result of testing one part of the aircraft, which does not couple with the rest."""
 
     outputs: tuple[str, ...]
     gain: float  # log-likelihood that is gained if effects may fall by more than LOSS
@@ -75,7 +75,7 @@ class Change(NamedTuple):
 
     @property
     def is_found(self) -> bool:
-        """Whether the part has changed."""
+        """Whether the test finds that the part has changed."""
         return self.gain > MAX_GAIN
 
 
@@ -136,7 +136,7 @@ def change_test(
 
 
 class Least(NamedTuple):
-    """The least J under a hypothesis, with the parameters at which it lies."""
+    """The least J under a hypothesis, and the parameters for which J is least."""
 
     J: float
     # (p,) kappa of each input, logarithm of the strength of each wind, angles at the beginning
@@ -192,11 +192,11 @@ class Effects(Search):
         )
 
     def most_probable(self, lower: float = REVERSED) -> Least:
-        """Find the least J under the condition kappa >= `lower`.
+        """Find the least J if every kappa is at least `lower`.
 
         With the winds that fit the flown model, a loss of effect may pass for gusts. Therefore the
-        search has several starts: these winds, the same wind in every span, and each input dead.
-        A start with a dead input counts only if its J exceeds the least J by less than CLOSE.
+        search has several starts: these winds, the same wind in every span, and each input dead. A
+        start with a dead input counts only if its J exceeds the least J by less than CLOSE.
         """
         same = self.least(lower=lower, levels=np.full(len(self._spans), TURBULENT))
         best = least_of(self.least(lower=lower), self.least(same.theta, lower))

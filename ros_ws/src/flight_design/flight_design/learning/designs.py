@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Derive what a design needs from learned models: required margins, and how uncertain B is."""
+"""Derive what a design must meet from learned models: margins, and the uncertainty of B."""
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -39,7 +39,7 @@ ROUNDED = 1.001  # factor on the required margins of a loop, so that it has them
 
 
 class Goal(NamedTuple):
-    """The requirements on the design for a learned model."""
+    """What the design for a learned model must meet."""
 
     margin: FloatArray  # (m,) delay margin of each input, s
     needed: Requirement
@@ -56,7 +56,7 @@ ParameterError."""
 
 
 class Known(NamedTuple):
-    """What is known about a part of the aircraft that flies by a learned model."""
+    """What a learned model says of a part of the aircraft: delays of its inputs, and deviations."""
 
     deviation: Mapping[str, float]  # relative deviation of each entry, by name
     latest: Mapping[str, float]  # delay of each input plus two standard deviations, s
@@ -113,7 +113,10 @@ def margin_of(controller: RiseDiConfig) -> float:
 
 
 def asked_margin(start: RiseDiConfig) -> float:
-    """Return `learn.margin`, or else the delay margin of the controller at the start, s."""
+    """Return the delay margin that a learned design should keep, s.
+
+    It is `learn.margin`, or if that is not set, the delay margin of the controller at the start.
+    """
     asked = None if start.learn is None else start.learn.margin
     return margin_of(start) if asked is None else asked
 
@@ -128,9 +131,10 @@ def is_late(start: RiseDiConfig, latest: Mapping[str, float]) -> bool:
 
 
 def price(selected: SelectedObserver, margin: float, beside: SelectedObserver, kept: float) -> str:
-    """Say what the delay margin of a design costs in error, compared with the design `beside`.
+    """Write a sentence on what a larger delay margin costs in tracking error.
 
-    `margin` is the delay margin of the first design, and `kept` that of the second, in s.
+    `selected` is the design with the delay margin `margin`, s, and `beside` is a design that keeps
+    only the margin `kept`, s.
     """
     ratio = math.exp((selected.cost - beside.cost) / len(selected.relaxation))
     return (
@@ -205,15 +209,15 @@ def goal(
 def by_law_of_start(
     start: RiseDiConfig, left: Mapping[tuple[str, ...], str | None], *, has_file: bool
 ) -> set[str]:
-    """Return the outputs that fly by the law of the start.
+    """Return the outputs that fly by the law with which the flight started.
 
-    `left` has the parts that are left to this law, each with its dead input. The dead input is None
-    if the controller gave up the model of the part. Then all outputs of the part fly by the law. If
-    a part has a dead input, all of its outputs fly by the law, too, unless the design for the file
-    flies (`has_file`). In that case only the output of the dead input flies by the law, and V if it
-    is in the part. In flights without an elevator, the observer of V erred four times as much as
-    the law. The other outputs keep the design, because their inputs work. In flights without a
-    rudder, the error of p was half of that under the law.
+    `left` has the parts of the aircraft that are left to this law, each with its dead input. The
+    dead input is None if the controller gave up the model of the part. Then all outputs of the part
+    fly by the law. If a part has a dead input, all of its outputs fly by the law, too, unless the
+    design for the file flies (`has_file`). In that case only the output of the dead input flies by
+    the law, and V if it is in the part. In flights without an elevator, the observer of V erred
+    four times as much as the law. The other outputs keep the design, because their inputs work. In
+    flights without a rudder, the error of p was half of that under the law.
     """
     driven = dict(zip(start.inputs, start.outputs, strict=True))
     return {
@@ -231,11 +235,11 @@ def with_flown_channels(
     flying: Collection[str],
     left: Mapping[tuple[str, ...], str | None],
 ) -> RiseDiConfig:
-    """Let the outputs `flying` fly a design, and all other outputs the law of the start.
+    """Combine a design for the outputs `flying` with the law of the start for all others.
 
-    `left` has the parts that are left to this law, as in `by_law_of_start`. The law does not move
-    their dead inputs. If any part is left and there is an observer, the margin in the controller is
-    set by `with_own_margin`.
+    `left` has the parts of the aircraft that are left to this law, as in `by_law_of_start`. The law
+    does not move their dead inputs. If any part is left and there is an observer, the margin in the
+    controller is set by `with_own_margin`.
     """
     bare = [output not in flying for output in start.outputs]
     mixed = with_channels_of(
@@ -246,7 +250,7 @@ def with_flown_channels(
 
 
 def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> RiseDiConfig:
-    """Set the margin in a controller to the margin of its loop around a model, at most `most`."""
+    """Set the delay margin in a controller to what its loop around a model has, at most `most`."""
     linear = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
     undelayed = linear.loop._replace(delay=0.0)
     kept = delay_margin(linear.nominal, linear.law, undelayed) - RESOLUTION

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Test the deviations that an airframe file states, and identify with wider ones if they are wrong.
+"""Test the deviations that an airframe file states, and widen them if the record contradicts them.
 
 A deviation is information: an entry that the record hardly shows stays at the value of the file,
 with the deviation of the file. So if this deviation is too small, the stated deviations of the
@@ -38,11 +38,11 @@ ROUGHEST = 1.0
 def identified_within(
     identify: Callable[..., Identification], believed: Unknown, *, tests: bool
 ) -> tuple[Identification, Unknown]:
-    """Identify a model, and return it with the deviations of the file that the record allows.
+    """Identify a model, and return it with deviations of the file that the record allows.
 
     If `tests`, the deviations `believed` are tested. If the record contradicts them, they are
-    doubled, the model is identified again, and a remark says so. `identify` takes the deviations as
-    `unknown`, and whether it `searches_again`.
+    doubled, the model is identified again, and a remark says so. `identify` is called with the
+    deviations as `unknown`, and with `searches_again`.
     """
 
     def found_with(deviations: Unknown) -> Identification:
@@ -104,5 +104,5 @@ def _counts(part: Part, factor: float) -> bool:
 
 
 def _if_right(part: Part) -> list[Entry]:
-    """Return the entries of a part with the deviations that they have if the model is right."""
+    """Return the entries of a part with the deviations that they have if the model is exact."""
     return in_time(part.entries, part.by_model or [0.0] * len(part.entries))

@@ -54,7 +54,7 @@ class FlightRecord:
 
     @property
     def flown(self) -> int | None:
-        """Digest of the parameters in the last sample; None if there is no sample."""
+        """Digest of the parameters that flew in the last sample; None if there is no sample."""
         return self._samples[-1].flown if self._samples else None
 
     @property
@@ -111,7 +111,7 @@ class FlightRecord:
 
 
 def steady_end(recorded: FlightData, airframe: Airframe) -> tuple[FlightData, float]:
-    """Return the longest end of a record with a steady airspeed, and this airspeed divided by V0.
+    """Return the longest end of a record with a steady airspeed, and this airspeed over V0.
 
     The airspeed is steady if its rms deviation from the mean is at most SPREAD of the mean. The
     effects of the surfaces vary twice as much, and a linear model still holds.
@@ -130,7 +130,10 @@ def steady_end(recorded: FlightData, airframe: Airframe) -> tuple[FlightData, fl
 
 
 def about(recorded: FlightData, airframe: Airframe, x: FloatArray, u: FloatArray) -> FlightData:
-    """Return a record as deviations from a trim, x, (n,), and u, (m,), in the airframe's order."""
+    """Return a record as deviations from a given trim, in the airframe's order.
+
+    In this trim the aircraft has the state x, (n,), and the inputs u, (m,).
+    """
     return recorded._replace(y=recorded.y - airframe.matrix_c() @ x, u=recorded.u - u)
 
 

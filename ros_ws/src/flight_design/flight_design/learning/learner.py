@@ -92,7 +92,7 @@ PartName = tuple[str, ...]
 
 
 class Verdict(NamedTuple):
-    """The model that flies after an identification, and sentences about its parts."""
+    """Which model flies after an identification, and sentences about its parts."""
 
     model: Airframe  # the model in flight if no part has a new model
     known: dict[PartName, Known]
@@ -102,10 +102,10 @@ class Verdict(NamedTuple):
 
 
 class Learner:
-    """The record of y and u over a window, and the proposals made from it.
+    """The record of y and u over a window, and the designs that are proposed from it.
 
-    The parts of the aircraft are learned one by one. A part without a learned model flies by the
-    design for the airframe file, which allows for errors, or by the law of the start.
+    The parts of the aircraft, which do not couple, are learned one by one. Without a learned model
+    a part flies the design for the airframe file, which allows for errors, or the law of the start.
     """
 
     def __init__(
@@ -186,7 +186,7 @@ class Learner:
         self._record.take(Sample(stamp_ns, y, u, flown))
 
     def propose(self, flown: int, given_up: Sequence[str] = ()) -> LearnerResult:
-        """Propose parameters for the identified model, or return the sentence of a refusal.
+        """Propose parameters for the identified model, or return a sentence that says why not.
 
         The first proposal needs no record. It is a design for the rough airframe that allows for
         errors. Parts whose models are refused later also fly by this design. If this proposal does
@@ -293,7 +293,7 @@ class Learner:
         return LearnerResult(self._last, told)
 
     def _verdict(self, identified: Identification, *, lost: bool) -> Verdict:
-        """Decide which parts fly new models; `lost` if the last proposal does not fly."""
+        """Decide which parts fly new models. If `lost`, the last proposal does not fly."""
         known = dict(self._known)
         model = self._model
         told = list[str]()
@@ -350,9 +350,9 @@ class Learner:
     def _adopt(
         self, model: Airframe, known: dict[PartName, Known], dead: dict[PartName, str | None]
     ) -> str | None:
-        """Design a controller, and note it as the last proposal. Raises ParameterError.
+        """Design a controller for a model, and note it as the last proposal. Raises ParameterError.
 
-        Returns a sentence on what `learn.margin` costs, if anything.
+        Returns a sentence on what `learn.margin` costs, or None if it costs nothing.
         """
         proposed, price_text = self._designed(model, known, dead)
         new = [part for part, value in known.items() if value is not self._known.get(part)]
@@ -368,14 +368,14 @@ class Learner:
         return price_text
 
     def _propose(self, proposed: RiseDiConfig) -> None:
-        """Note the parameters that are proposed."""
+        """Note the parameters of the proposal that is about to be sent."""
         self._last = proposed
         self._proposed = proposed.digest()
         self._proposed_ns = self._record.end_ns
         self._proposals.add(self._proposed)
 
     def _distrust(self, *, lost: bool) -> None:
-        """Stop flying the rough model if it was refused or the law fell back from it."""
+        """Use the rough model no longer if its design was refused or the law fell back from it."""
         is_rough_alone = not self._known and not self._dead
         if lost and (is_rough_alone or self._record.fell_back(-1, self._proposals)):
             self._design_of_rough = None
@@ -392,7 +392,7 @@ class Learner:
         return LearnerResult(proposed, f"the airframe {name} as it is, {UNVERIFIED}")
 
     def _note_given_up(self, flown: int, outputs: Sequence[str]) -> None:
-        """Note that the controller gave up outputs.
+        """Note that the controller uses no learned model in some outputs any more.
 
         The last proposal flies if the flown parameters differ from it only in these outputs.
         Otherwise it was refused.
@@ -406,7 +406,7 @@ class Learner:
             self._proposed = flown
 
     def _give_up(self, outputs: Sequence[str]) -> None:
-        """Leave outputs to the law of the start from now on, by `learn.without`."""
+        """Leave some outputs to the law of the start from now on, by adding to `learn.without`."""
         self._start = without_models(self._controller, self._controller, outputs)
         if outputs:
             part = outputs_without(self._start)
@@ -488,7 +488,7 @@ class Learner:
         return about(steady, self._rough, *level_flight(self._model, ratio, self._thrust)), ratio
 
     def _at_speed(self, model: Airframe, ratio: float) -> Airframe:
-        """Return a model at the speed ratio that `_steady` returns."""
+        """Return a model converted to the speed that `_steady` returns as a ratio to V0."""
         return at_speed(model, ratio, self._thrust) if self._has_speeds else model
 
     def _changes(self, end_ns: int) -> list[Change]:
@@ -582,7 +582,7 @@ class Learner:
         latest: Mapping[str, float],
         dead: Collection[str],
     ) -> str | None:
-        """Say what `learn.margin` costs, or return None if there is no design to compare with."""
+        """Write what `learn.margin` costs in error; None if there is no design to compare."""
         start = self._controller
         settings = start.learn
         if settings is None or settings.margin is None or self._design_of_rough is None:

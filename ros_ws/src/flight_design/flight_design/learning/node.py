@@ -86,7 +86,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
         self._begin_record()
 
     def _begin_record(self) -> None:
-        """Begin a new record, which is empty."""
+        """Start over with an empty record."""
         self._learner, self._updates = self._new_learner(), Updates(self._settings)
         self._identifications = Identifications(self._learner, self._start.outputs)
         self._has_record = self._is_due = False

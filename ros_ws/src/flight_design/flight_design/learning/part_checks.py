@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Check the model of a part against the model in flight, and write sentences about the part."""
+"""Check the model of a part of the aircraft, and write sentences about the part.
+
+A part is a group of states and inputs that does not couple with the rest. Its model is checked
+against the model in flight.
+"""
 
 from collections.abc import Collection, Iterable, Mapping
 
@@ -32,7 +36,7 @@ SERVO_DEVIATION = 0.3
 
 
 def is_within(part: Iterable[str], outputs: Iterable[str]) -> bool:
-    """Return whether the outputs of a part are among `outputs`, those of another part."""
+    """Return whether all outputs of a part belong to the given `outputs`."""
     return set(part) <= set(outputs)
 
 
@@ -110,7 +114,7 @@ def reason_against_first_model(part: Part, name: str, *, flies: bool) -> Refusal
 
 
 def return_to_file(part: Part, name: str | None) -> str:
-    """Say by which model or law a part flies after the model in flight has predicted worse.
+    """Say by which model or law a part flies now, because the model in flight predicted worse.
 
     The model of the airframe file has predicted better. The part flies by the airframe `name`, or
     by the law of the start if `name` is None.
@@ -129,7 +133,7 @@ def entries_of_file(part: Part) -> tuple[Entry, ...]:
 
 
 def reason_against_part_alone(part: Part, known: Iterable[tuple[str, ...]]) -> Refusal | None:
-    """Refuse a part's separate model if the model in flight couples this part with another."""
+    """Refuse a separate model of a part that the model in flight couples with another part."""
     if not any(is_within(part.outputs, outputs) for outputs in known if outputs != part.outputs):
         return None
     return Refusal(
@@ -139,7 +143,7 @@ def reason_against_part_alone(part: Part, known: Iterable[tuple[str, ...]]) -> R
 
 
 def forgotten_coupling(part: Part) -> str:
-    """Say why a model that couples two parts is given up."""
+    """Say why the model that couples two parts is not used any more."""
     return f"no coupling any more: {_file_advantage(part)}"
 
 
@@ -182,7 +186,7 @@ def without_effect(
 ) -> list[str]:
     """Say which parts fly without an input, and which of their outputs fly the law of the start.
 
-    `left` is that of `designs.by_law_of_start`, and `by_law` has the outputs that fly this law.
+    `left` is as in `designs.by_law_of_start`, and `by_law` has the outputs that fly this law.
     """
     told = []
     for part, dead in left.items():

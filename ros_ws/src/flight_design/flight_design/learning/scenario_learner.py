@@ -125,7 +125,9 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
 
 
 def that_learns(scenario: Scenario) -> Scenario:
-    """Turn a scenario with only the law into a scenario that learns, without an airframe file.
+    """Turn a scenario that has only the law into one in which a model is learned in flight.
+
+    No airframe file is needed:
 
         Omega = diag(D omega / input_scale),   V0 the trim speed
 
@@ -200,7 +202,7 @@ def _prior(path: str, flown: Airframe) -> Airframe:
 
 
 class LearnStep(NamedTuple):
-    """The finding of the learner at a flight time."""
+    """What the learner found at a time of the flight."""
 
     t: float  # s
     proposed: bool
@@ -208,7 +210,7 @@ class LearnStep(NamedTuple):
 
 
 class LearnResult(NamedTuple):
-    """The learner's steps over a log, and its model at the end.
+    """What the learner found over a log, step by step, and its model at the end.
 
     The model is None if nothing was learned.
     """
@@ -263,11 +265,12 @@ def _ticks(tape: Tape, controller: RiseDiConfig) -> _Ticks:
 
 
 def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
-    """Step the learner of a scenario with y and u of the engaged ticks of a log.
+    """Let the learner of a scenario work on the ticks of a log, with their y and u.
 
-    As in flight, the record ends if the law is deactivated. If the flight in the log was without a
-    learner, or its learner had other settings than the scenario, each proposal counts as flown.
-    Raises ParameterError if nothing can be learned from the log.
+    Only ticks in which the law was engaged count. As in flight, the record ends if the law is
+    deactivated. If the flight in the log was without a learner, or its learner had other settings
+    than the scenario, each proposal counts as flown. Raises ParameterError if nothing can be
+    learned from the log.
     """
     # Simulated time begins at 0.
     make = learner(scenario, real_time=tape.start_ns > 0)
@@ -330,7 +333,7 @@ def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
 
 
 def learned_yaml(result: LearnResult, origin: str) -> str:
-    """Write the learned model as the text of an airframe file, whose header lists the steps.
+    """Write the learned model as an airframe file, whose heading lists the steps of the learner.
 
     Raises ParameterError if there is no model.
     """
