@@ -42,9 +42,9 @@ NAME = "guidance"
 
 
 class GuidanceClient(Client):
-    """Commands the guidance of a running flight.
+    """Sends commands to the guidance of a running flight.
 
-    A method returns the reason if guidance refuses its command, and None if not.
+    Each method returns the reason if guidance refuses its command, and None if not.
     """
 
     def __init__(
@@ -102,9 +102,10 @@ class GuidanceClient(Client):
     def _reason_against(
         self, topic: Topic, is_taken: Callable[[], bool], unknown: Refusal | None
     ) -> Refusal | None:
-        """Wait until guidance has taken a message or refused it, and return the reason.
+        """Wait until guidance has taken a message or refused it; return the reason of a refusal.
 
-        Returns `unknown` if guidance has neither taken nor refused it within TARGET_TIMEOUT.
+        Returns None if it has taken the message, and `unknown` if it has done neither within
+        TARGET_TIMEOUT.
         """
         reasons: list[Refusal] = []
 
@@ -142,7 +143,7 @@ class GuidanceClient(Client):
         ]
 
     def _has_taken(self, values: Mapping[str, float]) -> bool:
-        """Return whether a sample of guidance since the last call shows these commands."""
+        """Return whether guidance has logged these commands since the last call."""
         mask = sum(1 << TARGETS.index(name) for name in values)
 
         def has_taken(sample: Mapping[str, float]) -> bool:
@@ -159,7 +160,7 @@ class GuidanceClient(Client):
 
 
 class TargetClient(GuidanceClient):
-    """Commands the targets of guidance, and keeps the operator's link alive."""
+    """Sends targets to guidance, and keeps the operator's link alive."""
 
     def __init__(self, namespace: str = "", parent: Client | None = None) -> None:
         super().__init__("operator", namespace, parent)
@@ -180,11 +181,11 @@ class TargetClient(GuidanceClient):
         return self._reason_against(TARGET, lambda: self._published(values), unknown)
 
     def keep_link(self) -> None:
-        """Publish a target without channels, by which guidance knows that an operator is there."""
+        """Publish a target without channels, to tell guidance that an operator is there."""
         self._publish({})
 
     def hold_link(self) -> NoReturn:
-        """Keep the link by a message every LINK_PERIOD.
+        """Keep the operator's link alive by a message every LINK_PERIOD.
 
         Raises ParameterError if no guidance flies in the domain.
         """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Refuse a route beyond the performance of the aircraft before the flight.
+"""Refuse a route that is beyond the performance of the aircraft before it is flown.
 
 The refusal names the nearest feasible value.
 """
@@ -27,7 +27,7 @@ sixth of the airspeed."""
 
 
 class Performance(NamedTuple):
-    """Performance of the aircraft, and the largest wind in which it must fly the route."""
+    """What the aircraft can fly, and the largest wind in which it must fly the route."""
 
     speed: float  # m/s, airspeed for waypoints that name none
     stall_speed: float  # m/s
@@ -214,7 +214,7 @@ def _with_circles(
     least: float,
     can: Performance,
 ) -> FlyableRoute:
-    """Return a route with a circle for each change of altitude that its leg does not allow.
+    """Add a circle to a route for each change of altitude that is too large for its leg.
 
     Such a change exceeds the climb or sink along the leg. `by_number` has the waypoints by their
     numbers.
@@ -260,7 +260,10 @@ def _with_circles(
 
 
 def require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
-    """Refuse waypoints, altitudes and airspeeds that are out of bounds."""
+    """Check that all waypoints, altitudes and airspeeds are inside their bounds.
+
+    Raises ParameterError if not.
+    """
     for k, waypoint in enumerate(waypoints):
         north, east, altitude = waypoint[:3]
         is_plausible = all(
@@ -304,9 +307,9 @@ def require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
 
 
 def require_inside(route: Route, fence: Fence, margin: float) -> None:
-    """Refuse a leg that comes nearer to the fence than `margin`, m.
+    """Check that no leg comes nearer to the fence than `margin`, m.
 
-    The sentence names the place where the clearance is least.
+    Raises ParameterError, which names the place where the clearance is least.
     """
     start: Point = (0.0, 0.0)
     for number, leg in enumerate(route.legs):
@@ -338,5 +341,5 @@ POINT_DISTANCE = 0.05
 
 
 def _up(value: float, step: float) -> float:
-    """Round a least value up to a multiple of a step, so that the result is feasible."""
+    """Round a lower bound up to a multiple of a step, so that the result is still feasible."""
     return math.ceil(value / step) * step

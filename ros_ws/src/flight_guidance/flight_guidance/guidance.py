@@ -77,7 +77,7 @@ def digest(route: Route | None) -> int:
 
 
 class Guidance:
-    """Guidance with its state, the last pose and y, the route and the program of commands."""
+    """The guidance of an aircraft: its state, the last pose and y, its route and timed commands."""
 
     def __init__(self, parameters: GuidanceConfig) -> None:
         self._params: GuidanceParams = parameters.params()
@@ -120,7 +120,7 @@ class Guidance:
 
     @property
     def failed(self) -> int:
-        """Number of failed steps."""
+        """Number of steps that failed."""
         return self._failures.count
 
     @property
@@ -151,9 +151,9 @@ class Guidance:
         self._y = self._newest(self._y, sample, now_ns)
 
     def take_authority(self, channels: Mapping[str, float]) -> None:
-        """Limit the steps from now on by the authority of the inputs.
+        """Limit the next steps by the authority of the inputs.
 
-        The channels are those of the topic `authority`.
+        `channels` are those of the topic `authority`.
         """
         self._authority = authority_of(channels)._replace(roll=self._authority.roll)
 
@@ -171,9 +171,10 @@ class Guidance:
         return sample
 
     def take_target(self, values: Mapping[str, float]) -> None:
-        """Take commands by channel of Target; commands of one instant must come in one call.
+        """Take commands by channel of Target, to be flown from the next step on.
 
-        Raises ChannelError for a command that guidance cannot fly.
+        Commands that belong together must come in one call. Raises ChannelError for a command that
+        guidance cannot fly.
         """
         targets.read_target(values, self._params, self.route, degrees=True)
         # A new lateral or vertical command replaces one of another mode that still waits.
@@ -186,10 +187,10 @@ class Guidance:
         self._commands |= values
 
     def take_route(self, route: Route) -> None:
-        """Fly a new route, beginning with its first leg.
+        """Take a new route, to be flown from its first leg on.
 
-        While guidance is off, the route waits for the engagement. Earlier commands that no step has
-        taken yet become void, and so do the legs in the program.
+        While guidance is off, the route waits for the engagement. Commands that no step has taken
+        yet are dropped, and so are the commands over time that name a leg.
         """
         self.route = route
         self._lander = None  # the lander belongs to the route of the parameters
@@ -205,7 +206,7 @@ class Guidance:
         self.take_target({"leg": 0.0})
 
     def keep_link(self) -> None:
-        """Note a message of the operator. The age of the link then counts from the next step."""
+        """Note a sign of life of the operator, from which the age of the link counts."""
         self._operated_ns = None
         self._link_lost = False
 
@@ -272,17 +273,17 @@ class Guidance:
         return True
 
     def engage(self, *, engaged: bool) -> None:
-        """Engage with the present heading, altitude and airspeed, or stop all commands."""
+        """Start guidance with the present heading, altitude and airspeed, or stop its commands."""
         if engaged and not self._is_engaged:
             self._begin = Begin.HOLD
             self._forget_commands()
         self._is_engaged = engaged
 
     def pause(self, *, paused: bool, forget: bool) -> None:
-        """Stop commanding if `paused`, because the controller does not fly, or else fly again.
+        """Pause guidance because the controller does not fly, or let it fly again.
 
-        If `forget` was set since guidance last flew, it then holds the measured heading, altitude
-        and airspeed. Otherwise it continues with its last commands.
+        When it flies again, it continues with its last commands. If `forget` was set since it last
+        flew, it holds the measured heading, altitude and airspeed.
         """
         if forget:
             self._begin = Begin.HOLD
@@ -322,10 +323,9 @@ class Guidance:
         }
 
     def reason_to_wait(self, now_ns: int) -> Refusal | None:
-        """Return why guidance publishes no u_m, or None.
+        """Return why guidance has published no u_m for longer than STALE_TIME, or None.
 
-        The reason is that the pose is too old, or that the steps fail. The result is None until
-        guidance has waited for STALE_TIME.
+        The reason is that the pose is too old, or that the steps fail.
         """
         since = self._waits_from_ns
         pose = self._pose
@@ -338,7 +338,7 @@ class Guidance:
         return Refusal(f"no u_m: pose is {age:.2f} s old, guidance.max_age {limit:g} s")
 
     def _watch_link(self, now_ns: int) -> None:
-        """Begin to fly home if the age of the operator's link is above the limit."""
+        """Begin to fly home if the operator's link has been silent for longer than its limit."""
         if not self._params.link_timeout_ns:
             return
         if self._operated_ns is None:
@@ -352,7 +352,7 @@ class Guidance:
         return 0.0 if self._operated_ns is None else seconds(now_ns - self._operated_ns)
 
     def _test_roll(self, y: Sequence[float]) -> None:
-        """Test whether p follows the last command, and set `roll` of the authority accordingly."""
+        """Test whether p follows its command, and note the result in the authority as `roll`."""
         state = self._state
         params = self._params
         if state is None or params.multicopter is not None:
@@ -363,7 +363,7 @@ class Guidance:
         self._authority = self._authority._replace(roll=0.0 if self._roll.is_ignored else UNKNOWN)
 
     def _land(self) -> None:
-        """Add the commands of the landing, unless the operator or the program gives others."""
+        """Add the commands of the landing, unless there are other commands for this step."""
         state = self._state
         if self._lander is None or self.route is None or state is None:
             return
@@ -391,7 +391,7 @@ class Guidance:
             return self._last_goes_on(now_ns, sentence(error), is_said=is_said)
 
     def _last_goes_on(self, now_ns: int, cause: str, *, is_said: bool) -> GuidanceOutput | None:
-        """Return the output after a failed step: the last u_m, or None beyond the age limit.
+        """Return what is published after a failed step: the last u_m, or None beyond the age limit.
 
         `cause` is a sentence on the error, and becomes a notice if `is_said`.
         """

@@ -52,7 +52,7 @@ class GuidanceSample(NamedTuple):
 
     @property
     def given(self) -> int:
-        """Channels of the new commands, encoded by `bits`."""
+        """Number that encodes which channels have new commands, by `bits`."""
         return guidance_state.bits(self.inputs.commands)
 
 
@@ -61,7 +61,7 @@ def _tuple(*values: float) -> tuple[float, ...]:
 
 
 class LogChannels(NamedTuple):
-    """Channels of the log, and the attribute of a `GuidanceSample` that they store."""
+    """Channels of the log, and the attribute of a `GuidanceSample` that they hold."""
 
     names: Sequence[str]
     attribute: str
@@ -120,7 +120,7 @@ def names(outputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def require_channels(logged: Collection[str]) -> None:
-    """Refuse a log of guidance that lacks a channel of `names`."""
+    """Check that a log of guidance has all channels in `names`. Raises ParameterError if not."""
     missing = [name for name in names(()) if name not in logged]
     require(not missing, "guidance", f"a log without {', '.join(missing)}", "all of its channels")
 

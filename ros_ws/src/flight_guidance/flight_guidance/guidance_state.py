@@ -35,7 +35,7 @@ class GuidanceMode(IntEnum):
 
 
 class Lateral(IntEnum):
-    """The quantity that the bank controls."""
+    """What guidance controls by the bank."""
 
     PHI = 0
     HEADING = 1
@@ -46,7 +46,7 @@ class Lateral(IntEnum):
 
 
 class Vertical(IntEnum):
-    """The quantity that the pitch controls."""
+    """What guidance controls by the pitch."""
 
     THETA = 0
     CLIMB = 1
@@ -267,12 +267,12 @@ def begun_again(
     params: GuidanceParams,
     *further: str,
 ) -> GuidanceState:
-    """Return the state `holding`, with the fields CARRIED and `further` taken from `state`.
+    """Return the state `holding`, with some fields taken over from the last state.
 
-    `holding` is a state that holds the measured values, and `state` is the last state, if any. If
-    `inputs.begin` is HOLD, or if there is no last state, the result is `holding` itself. If the
-    last state is within the age limit of u_m, the result also has its u_m, because the reference
-    model still flies this u_m.
+    `holding` is a state that holds the measured values, and `state` is the last state, if any. The
+    fields in CARRIED and `further` are taken over. If `inputs.begin` is HOLD, or if there is no
+    last state, the result is `holding` itself. If the last state is within the age limit of u_m,
+    the result also has its u_m, because the reference model still flies this u_m.
     """
     if state is None or inputs.begin is Begin.HOLD:
         return holding

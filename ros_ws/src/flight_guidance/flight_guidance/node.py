@@ -98,9 +98,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     """Steps `guidance.Guidance` at every tick, and publishes u_m and the topic guidance.
 
     The inputs of a step are the received y, pose, target and route. In real time guidance flies
-    while the controller is ENGAGED. In lockstep the number of samples of y gives the time. A step
-    then waits for the y and the pose of its instant, and publishes exactly one u_m. This u_m has no
-    channels if guidance has no command.
+    while the controller is ENGAGED. In lockstep, samples of y count the time. A step then waits for
+    the y and the pose of its instant, and publishes exactly one u_m. This u_m has no channels if
+    guidance has no command.
     """
 
     def __init__(self) -> None:
@@ -224,7 +224,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return (self._pose_receiver if self._lockstep_inputs.has_y else self._y_receiver).name
 
     def _has_authority_for(self, now_ns: int) -> bool:
-        """In lockstep, return whether the last `authority` that a step needs has arrived.
+        """Return whether the `authority` that a step in lockstep needs has arrived.
 
         A controller that learns sends `authority` in equal periods.
         """
@@ -287,7 +287,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self.receive(topic, decode, take, max_age_ns=self._max_age_ns, lock=lock)
 
     def _decode_pose(self, raw: bytes) -> StampedVector:
-        """Decode a pose in the order of `channels.POSE`; it may lack the sideslip."""
+        """Decode a pose into the order of `channels.POSE`. The pose may lack the sideslip."""
         sample = self._named_decoder.decode(raw)
         if self.parameters.lockstep and not sample.channels:
             return StampedVector(sample.stamp_ns, np.array(()), sample.sender)
@@ -300,7 +300,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return nanoseconds(self.parameters.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Return the ages of the last sample above which another publisher can take over, ns.
+        """Return the ages after which another publisher may take over from a silent one, ns.
 
         They hold for y, pose and internals. The first age is for the same node in a new process,
         and the second age is for a different node.
@@ -367,9 +367,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return None if lock is None else lock.publisher
 
     def _poll_authority(self, now_ns: int) -> None:
-        """In real time, take the `authority` that has arrived.
+        """Take the `authority` that has arrived, in real time.
 
-        The last sample is void after AUTHORITY_TIMEOUT_PERIODS periods plus the age limit.
+        The last sample holds no longer than AUTHORITY_TIMEOUT_PERIODS periods plus the age limit.
         """
         if self._authority_receiver is None:
             return
@@ -520,7 +520,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
 def _service(
     answer: Callable[[Any], bool | str], before: Callable[[], None]
 ) -> Callable[[Any, Any], Any]:
-    """Make the callback of a service from a function that returns True or a sentence of refusal.
+    """Make the callback of a service from `answer`, which returns True or a sentence of refusal.
 
     Each call of the service calls the function `before` first.
     """

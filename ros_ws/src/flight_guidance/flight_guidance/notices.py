@@ -70,9 +70,9 @@ TURNS = {FenceAction.RIGHT, FenceAction.LEFT}
 
 
 class _Lasting:
-    """Decides when to give a notice: once, after a condition has held for the time `dwell`, s.
+    """Decides when to give a notice: once after a condition has held for the time `dwell`, s.
 
-    The notice can be due again only after the condition has not held for `dwell`.
+    The notice can be given again only after the condition has not held for `dwell`.
     """
 
     def __init__(self, dwell: float = DWELL) -> None:
@@ -96,10 +96,11 @@ class _Lasting:
 class Notices:
     """The notices of a flight, made from the log of guidance row by row.
 
-    `wind` is guidance.wind, m/s, and `max_age` is guidance.max_age, s. `largest_wind` returns the
-    largest wind, m/s, in which the aircraft can fly its route at a commanded airspeed, m/s.
-    `link_timeout` is guidance.home.link_timeout, s. `reach` is `targets.reach_sentence`.
-    `largest_tilt` is that of a multicopter, rad. `landing` is that of the route.
+    `wind` and `max_age` are the parameters guidance.wind, m/s, and guidance.max_age, s, and
+    `link_timeout` is guidance.home.link_timeout, s. `largest_wind` is a function from a commanded
+    airspeed to the largest wind in which the aircraft can fly its route, both in m/s. `reach` is
+    the function `targets.reach_sentence`. `largest_tilt` is the largest tilt of a multicopter, rad,
+    and `landing` the landing on the route.
     """
 
     CHANNELS = (

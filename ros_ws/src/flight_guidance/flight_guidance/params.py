@@ -110,7 +110,10 @@ class GuidanceConfig(SteeringConfig):
             read_target(target, params, route, f"program at {start:g} s")
 
     def _check_multicopter(self) -> None:
-        """Refuse parameters that only an airplane has, and a home outside the fence."""
+        """Check that a multicopter has no parameter for airplanes only, and a home in the fence.
+
+        Raises ParameterError if not.
+        """
         for key in ("stall_speed", "landing", "touchdown", "throttle_authority"):
             require(not getattr(self, key), key, getattr(self, key), "none of a multicopter")
         inside = self.fence_clearance(self.home.north, self.home.east)
@@ -176,7 +179,7 @@ class GuidanceConfig(SteeringConfig):
         )
 
     def fence_zones(self) -> Fence | None:
-        """Return the fence for the equations; None without zones."""
+        """Return the fence as the equations of guidance use it; None without zones."""
         zones = tuple(zone.zone() for zone in self.fence.values())
         if not zones:
             return None
@@ -184,7 +187,7 @@ class GuidanceConfig(SteeringConfig):
         return Fence(zones, (self.home.north, self.home.east), radius)
 
     def fence_clearance(self, north: float, east: float) -> float:
-        """Return a place's distance from the fence, m, negative outside, infinite without one."""
+        """Return how far a place is from the fence, m: negative outside, infinite without one."""
         fence = self.fence_zones()
         if fence is None:
             return math.inf
@@ -329,7 +332,7 @@ class GuidanceConfig(SteeringConfig):
         return landing_at(waypoints[number].point, route, section, box, self.params())
 
     def lander(self, route: Route | None) -> Lander | None:
-        """Return the lander for the route of the parameters; None without a landing."""
+        """Return what flies the landing on the route of the parameters; None without a landing."""
         landing = None if route is None else self.landing_on(route)
         return None if landing is None else Lander(landing, self.params())
 

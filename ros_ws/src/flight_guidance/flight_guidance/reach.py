@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Derive limits of commands from the authority of the inputs.
 
-At the start the authority is given by rule. Later a model that is learned in flight gives it.
+The authority is the y_dot that an input can give to its output. At the start a rule gives it, and
+later a model that is learned in flight.
 """
 
 import math
@@ -66,12 +67,12 @@ class Authority(NamedTuple):
 
 
 class RollTest(NamedTuple):
-    """Test whether p follows its command p_m, without a model and without u.
+    """Tests whether p follows its command p_m, without a model and without u.
 
         a_dot = p_m^2 - a / MEMORY,   f_dot = p_m p - f / MEMORY
 
-    By least squares, f / a is the fraction of the command that the aircraft follows. The value of
-    a measures how much roll was commanded, and the test decides only if a is large enough.
+    By least squares, f / a is the fraction of the command that the aircraft follows. a grows with
+    the roll that was commanded, and the test decides only if a is large enough.
     """
 
     asked: float = 0.0  # a, rad^2/s

@@ -76,7 +76,7 @@ class RouteConfig(Config):
         )
 
     def waypoints(self) -> tuple[Waypoint, ...]:
-        """Return the waypoints for the equations."""
+        """Return the waypoints as the equations of guidance use them."""
         count = len(self.north)
         columns = (
             self.V or (None,) * count,
@@ -129,7 +129,7 @@ class ZoneConfig(Config):
         )
 
     def zone(self) -> Zone:
-        """Return the zone for the equations."""
+        """Return the zone as the equations of guidance use it."""
         return Zone(
             north=self.north,
             east=self.east,

@@ -160,7 +160,10 @@ class SteeringConfig(NodeConfig):
     )
 
     def by_rule(self) -> list[tuple[str, Any]]:
-        """Return the parameters that follow by rule from other sections of a scenario."""
+        """Return the parameters that were left out, with the values that a rule gives them.
+
+        The rule uses other sections of the scenario.
+        """
         return [(name, getattr(self, name)) for name in BY_RULE if getattr(self, name)]
 
     def _floor(self) -> float:
@@ -169,7 +172,7 @@ class SteeringConfig(NodeConfig):
         return protection.speed_floor(self.stall_speed)
 
     def _stall_speed(self) -> float:
-        """Return the stall speed V_s, m/s; if it is unknown, it follows from the speed floor."""
+        """Return the stall speed V_s, m/s. If it is unknown, derive it from the speed floor."""
         return self._floor() / protection.FLOOR
 
     def _largest_speed(self) -> float:

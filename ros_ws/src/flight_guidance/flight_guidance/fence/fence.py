@@ -178,7 +178,7 @@ class Escape(NamedTuple):
 
 
 def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
-    """Choose the action of the fence after a step; `action` is that of the previous step.
+    """Choose the action of the fence after a step; `action` is the one of the previous step.
 
     Let margin be the distance flown in the time MARGIN. A turn begins when even the better of the
     two turns would come nearer to the fence than margin. It ends when the course is only HOMEWARD

@@ -33,9 +33,9 @@ POINTS = 64
 
 
 class Ways(NamedTuple):
-    """The map of a fence: the aim of each cell, and whether its straight way home is free.
+    """The ways home on a grid of cells: the aim of each cell, and whether it leads straight home.
 
-    The straight way leads onto the orbit round home. The arrays have shape (rows, columns).
+    A straight way leads onto the orbit round home. The arrays have shape (rows, columns).
     """
 
     corner: tuple[float, float]  # north, east of the first cell, m
@@ -187,9 +187,9 @@ def _neighbours(values: FloatArray, fill: float) -> list[FloatArray]:
 
 
 def _uphill(values: FloatArray) -> NDArray[np.intp]:
-    """Return for each cell the neighbour in the direction in which the values rise the most.
+    """Return the neighbour of each cell towards which the values rise the most.
 
-    For a cell at which the values are level, such as a peak, it is the cell itself.
+    For a cell without a rising neighbour, such as a peak, it is the cell itself.
     """
     slopes = np.gradient(values)
     steepness = np.maximum(np.hypot(*slopes), 1e-6)

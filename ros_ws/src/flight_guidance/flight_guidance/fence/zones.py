@@ -80,7 +80,7 @@ def _distance(
     north: Array,
     east: Array,
 ) -> Array:
-    """Return the distance of places from the nearest edge, m."""
+    """Return the distance of each place from the nearest edge, m."""
     xp = array_namespace(north)
     x = north[..., None] - start_north
     y = east[..., None] - start_east

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fly a landing on a line of a route: flare, alignment of the nose, and go-around.
+"""Fly a landing at the end of a line of a route: flare, alignment of the nose, and go-around.
 
 The line to a waypoint on the ground is the glide path. Guidance follows it like any leg of a route,
-down to the flare. Below the height of the flare, each step has commands of the landing. They are in
-the log, so a landing can be computed again from the log like any flight.
+down to the flare. Below the height of the flare, the landing adds commands at each step. They are
+in the log, so a landing can be computed again from the log like any flight.
 """
 
 import math
@@ -61,7 +61,7 @@ class Landing(NamedTuple):
 def landing_at(
     place: Point, route: Route, section: LandingConfig, box: Zone | None, params: GuidanceParams
 ) -> Landing:
-    """Return the landing at a place on a route.
+    """Return the landing at a place on the ground to which a route leads.
 
     Raises ParameterError unless a line of the route descends to the place and the next line goes
     straight on.
@@ -98,9 +98,9 @@ def landing_at(
 
 
 def flare_climb(height: float, path_sink: float, landing: Landing) -> float:
-    """Compute the climb rate that is commanded in the flare, m/s.
+    """Compute the climb rate that the flare commands at a height, m/s.
 
-    It changes with the height, m, linearly from the climb rate on the glide path to -sink.
+    It changes linearly with the height, m, from the climb rate on the glide path to -sink.
     `path_sink` is the sink rate on the glide path, m/s. If it is below the `sink` of the landing,
     the climb rate is -sink at every height.
     """
@@ -109,7 +109,10 @@ def flare_climb(height: float, path_sink: float, landing: Landing) -> float:
 
 
 def time_to_touch(height: float, path_sink: float, landing: Landing) -> float:
-    """Compute the time to the ground by `flare_climb`, s: the integral of dh / sink(h)."""
+    """Compute the time until the wheels touch the ground in the flare, s.
+
+    It is the integral of dh / sink(h), where -sink(h) is `flare_climb`.
+    """
     rate = max(path_sink - landing.sink, 1e-3) / landing.flare
     return math.log1p(rate * max(height, 0.0) / landing.sink) / rate
 
@@ -123,7 +126,7 @@ class Lander:
         self._flares = False
 
     def leave(self) -> None:
-        """Stop the flare, because the operator or the program commands something else."""
+        """End the flare, because the operator or the commands over time ask for something else."""
         self._flares = False
 
     def commands(

@@ -68,7 +68,10 @@ def lateral_bank(
 
 
 def _wide_enough(orbit: Arc, params: GuidanceParams) -> Arc:
-    """Widen an orbit to the least radius, which grows if the largest bank falls in flight."""
+    """Widen an orbit to the least radius at which the aircraft can fly it now.
+
+    The least radius grows if the largest bank falls in flight.
+    """
     return orbit._replace(
         radius=math.copysign(max(abs(orbit.radius), params.limits.radius), orbit.radius)
     )
@@ -81,7 +84,7 @@ def _onto_leg(
     route: Route,
     params: GuidanceParams,
 ) -> tuple[float, PathError, float]:
-    """Compute the `lateral_bank` on the joining circle, by which the aircraft reaches a leg."""
+    """Compute the results of `lateral_bank` on the joining circle, which leads onto a leg."""
     position = (pose["north"], pose["east"])
     course_over_ground, _ = course_and_speed(pose)
     start, course = route.start(state.leg, state.target.along)
@@ -103,7 +106,7 @@ def _along_leg(
     route: Route,
     params: GuidanceParams,
 ) -> tuple[float, PathError, float]:
-    """Compute the `lateral_bank` on a leg of the route."""
+    """Compute the results of `lateral_bank` on a leg of the route."""
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
     if isinstance(leg, Arc) and leg.end is None:

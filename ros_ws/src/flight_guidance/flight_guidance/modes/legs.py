@@ -29,9 +29,9 @@ LEVEL = 5.0
 def along_route(
     state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
 ) -> tuple[GuidanceState, float]:
-    """Put the state on a leg once the aircraft has joined it, and on the next leg at its end.
+    """Put the state on a leg when the aircraft has joined it, and on the next leg at its end.
 
-    Also returns the distance by which the aircraft missed the end of the leg, m, or 0.
+    Also returns by how much the aircraft missed the end of the leg, m, or 0.
     """
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
@@ -82,7 +82,7 @@ def has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) 
 
 
 def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
-    """Return whether an aircraft is near enough to the end of a circle, and on course, to leave it.
+    """Return whether an aircraft on a circle may leave it: it is near the end, and on course.
 
     It must be past the end, by at most `reach`, m.
     """

@@ -111,7 +111,7 @@ def true_airspeed(V: Scalar, params: GuidanceParams) -> Scalar:
 
 
 def yaw_rate(y: Mapping[str, Scalar], phi: Scalar, theta: Scalar, speed: Scalar) -> Scalar:
-    """Return the measured r, rad/s, or without a rudder the r of a coordinated turn."""
+    """Return the measured r, rad/s, or without a rudder the yaw rate of a coordinated turn."""
     return y["r"] if "r" in y else turn_rate(phi, theta, 0.0, speed)
 
 
@@ -173,7 +173,7 @@ def _wanted_rates(
 ) -> BodyRates:
     """Compute the body rates that lead to the commanded attitude, rad/s.
 
-    They are 0 after the loss of the pose. The rate of a dead output is 0 too.
+    They are 0 after the loss of the pose. The rate of an output whose input has no effect is 0 too.
     """
     flies = state.mode is GuidanceMode.ENGAGED
     attitude = params.attitude._replace(n_alpha=load_slope(state.alpha_trim))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Check the commands of an operator, and make those to hold and to fly home.
+"""Check the commands of an operator, and make the commands to hold and to fly home.
 
 The limits of the commands follow from the parameters and from a learned model.
 """
@@ -21,7 +21,7 @@ from flight_guidance.steering.path import Route
 
 
 def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams:
-    """Lower the limits in the parameters to those of a model that was learned in flight.
+    """Lower the limits in the parameters to what a model that was learned in flight allows.
 
     The limits of a multicopter stay. For an airplane, the same rules hold as for parameters that a
     file leaves out: climb and sink follow from the authority of the throttle, and the roll rate
@@ -65,7 +65,7 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
 
 
 def reach_sentence(params: GuidanceParams, authority: Authority) -> str | None:
-    """Write in words the limits that follow from the authority learned in flight.
+    """Write a sentence with the limits that follow from a model learned in flight.
 
     Returns None if these limits are not below those of the parameters.
     """
@@ -113,7 +113,7 @@ def read_target(
     *,
     degrees: bool = False,
 ) -> None:
-    """Refuse commands that guidance cannot fly, by ChannelError.
+    """Check that guidance can fly the given commands. Raises ChannelError if not.
 
     A command is refused if it belongs to no mode or to two modes, if it names a leg that the route
     does not have, or if it is beyond the limits. With `degrees`, the message gives angles in
@@ -164,7 +164,10 @@ def read_target(
 def _require_limits(
     values: Mapping[str, float], params: GuidanceParams, what: str, *, degrees: bool
 ) -> None:
-    """Refuse an angle, a climb, an altitude or an airspeed beyond the limits, by ChannelError."""
+    """Check that an angle, a climb, an altitude and an airspeed are inside the limits.
+
+    Raises ChannelError if not.
+    """
     limits = params.limits
     vertical = params.vertical
     for name, least, largest in (
@@ -184,7 +187,7 @@ def _require_limits(
 
 
 def _read_leg(values: Mapping[str, float], route: Route | None, what: str) -> None:
-    """Refuse a leg that the route does not have, by ChannelError."""
+    """Check that the route has the leg in the commands. Raises ChannelError if it does not."""
     if "leg" in values and route is None:
         raise ChannelError("bounds", f"{what}.leg: found no route, expected one")
     if "leg" in values and route is not None and values["leg"] not in range(len(route.legs)):
@@ -214,13 +217,13 @@ def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> d
 
 
 def permitted_speed(speed: Scalar, params: GuidanceParams) -> Scalar:
-    """Return an airspeed within its limits, m/s."""
+    """Limit an airspeed to the range that may be commanded, m/s."""
     xp = array_namespace(speed)
     return xp.minimum(xp.maximum(speed, params.limits.floor), params.limits.largest_speed)
 
 
 def permitted(commands: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
-    """Return commands made from a pose, each limited to values that `read_target` accepts.
+    """Limit commands that were made from a pose to values that `read_target` accepts.
 
     An aircraft that holds or flies home may be above its highest altitude, and then descends to it.
     """

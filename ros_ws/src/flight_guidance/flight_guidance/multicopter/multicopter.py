@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Step the guidance of a multicopter from a place to body rates.
 
-A place gives a velocity, the velocity an acceleration, the acceleration a direction of the thrust,
-and this direction the body rates. The heading is separate, because no lateral mode needs the nose
-to point anywhere. As in `modes.step`, a step has no clock and no hidden state.
+From the place follows a velocity, from the velocity an acceleration, from the acceleration a
+direction of the thrust, and from this direction the body rates. The heading is separate, because no
+lateral mode needs the nose to point anywhere. As in `modes.step`, a step has no clock and no hidden
+state.
 """
 
 import cmath
@@ -343,7 +344,7 @@ def _wanted(
     escape: Escape,
     params: GuidanceParams,
 ) -> MotionCommand:
-    """Return the motion that the lateral mode commands, or that of the way around a fence."""
+    """Return the motion that the lateral mode commands, or the motion that keeps off a fence."""
     gains = _gains(params)
     target = state.target
     place = (target.north, target.east)
@@ -426,9 +427,9 @@ def _on_path(
 def _by_tilt(
     attitude: Mapping[str, float], pose: Mapping[str, float], gains: MulticopterParams
 ) -> complex:
-    """Compute the acceleration that a tilt causes, (g + drag climb) tan(tilt), m/s^2.
+    """Compute the horizontal acceleration that the tilt in a pose causes, m/s^2, north + i east.
 
-    It is a vector, north + i east.
+    Its magnitude is (g + drag climb) tan(tilt).
     """
     angles = (tilt(attitude["phi"]), tilt(attitude["theta"]), attitude["psi"])
     north, east, up = thrust_axis(*angles)

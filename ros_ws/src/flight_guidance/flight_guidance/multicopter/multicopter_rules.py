@@ -27,12 +27,13 @@ SINK = 0.3
 def gains(
     frequency: Mapping[str, float], bank: float, drag: float, roll_authority: float
 ) -> MulticopterParams:
-    """Choose gains from the reference model's frequencies w, rad/s, and the largest tilt, rad.
+    """Choose the gains of a multicopter's guidance.
 
         k_tilt = w / 4,  k_v = k_tilt / 3,  k_p = k_v / 2,  lead = 1 / k_tilt,  k_psi = w_r / 4,
             braking = BRAKING g tan(bank)
 
-    w is the lesser frequency of p and q. With a reference model of damping 0.9, the loop of the
+    w is the lesser natural frequency of p and q in the reference model, and w_r is that of r,
+    rad/s. `bank` is the largest tilt, rad. With a reference model of damping 0.9, the loop of the
     tilt has a phase margin of 65 deg. The loops of velocity and place together have a phase margin
     of 44 deg and a largest sensitivity of 1.5. The lead is the delay of the tilt behind a ramp.
     """

@@ -206,7 +206,7 @@ def _skipped_name(item: Item) -> str:
 
 
 def _mission_place(key: str, item: Item, speed: Any, before: Place | None) -> Place:
-    """Return the place of an item; a loiter without a position is at the place `before`."""
+    """Return where an item of a mission is; a loiter without a position is at `before`."""
     latitude, longitude, altitude = item.params[4:7]
     if not (latitude or longitude) and before is not None:
         latitude = before.latitude

@@ -95,7 +95,7 @@ before version 4."""
 
 
 def _require_one_place(entry: Any, params: Sequence[Any], frame: int, key: str) -> None:
-    """Refuse an item if other members give another place than its params and frame.
+    """Check that all members of an item that give its place agree with its params and frame.
 
     QGroundControl reads only the params. Other programs also write `coordinate`, or change only one
     of the two.
@@ -134,7 +134,7 @@ FIRST_FENCE = (
 
 
 def has_first_fence(tree: Any) -> bool:
-    """Return whether a plan has a fence of version 1: a polygon, but no list of polygons."""
+    """Return whether the fence of a plan has version 1: a polygon, but no list of polygons."""
     fence = member(tree, "geoFence")
     return (
         any(member(place, "polygon") is not None for place in (fence, tree))

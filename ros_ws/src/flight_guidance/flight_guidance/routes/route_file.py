@@ -58,7 +58,7 @@ class Waypoint(NamedTuple):
 
     @property
     def loiters(self) -> bool:
-        """Whether the aircraft flies a circle round the waypoint before it flies on."""
+        """Whether the aircraft flies circles round the waypoint before it flies on."""
         return self.turns > 0.0 or self.wait > 0.0 or self.departure != self.altitude
 
     @property
@@ -353,7 +353,7 @@ class _Heights:
         self._above_sea = above_sea
 
     def altitude(self, place: Place) -> Any:
-        """Return the altitude in m, not validated yet.
+        """Return the altitude of a place in m, before it is validated.
 
         Raises ParameterError if the file does not say what the altitude counts from.
         """
@@ -407,9 +407,10 @@ def _home_of_fence(
 
 
 def _require_order(places: Sequence[Place], origin: Origin | None) -> None:
-    """Refuse latitudes and longitudes that seem to be exchanged.
+    """Check that latitudes and longitudes are in order, and not exchanged.
 
-    They seem so if the places are near the origin only after an exchange.
+    They seem to be exchanged if the places are near the origin only after an exchange. This raises
+    ParameterError.
     """
     if origin is None:
         return

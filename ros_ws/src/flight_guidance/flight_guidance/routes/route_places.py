@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Hold positions of a route file before validation, and choose the route among its lines."""
+"""Hold the positions of a route file before they are validated, and choose the route.
+
+A file may have several lines, of which one is the route.
+"""
 
 from collections import Counter
 from collections.abc import Sequence

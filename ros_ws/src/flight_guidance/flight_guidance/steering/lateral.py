@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compute the acceleration to the right, and the bank that gives it.
+"""Compute the acceleration to the right that holds a heading or course, or follows a path.
 
-The acceleration holds a heading or course, or follows a path.
+The bank follows from this acceleration.
 """
 
 import math
@@ -40,7 +40,7 @@ class PathParams(NamedTuple):
 
 
 def turn_towards(difference: Scalar) -> Scalar:
-    """Return how hard to turn for a difference of courses, rad, from -1 to 1.
+    """Return how hard to turn towards a course, from -1 to 1, given the difference of courses, rad.
 
     Up to 90 deg it is the sine of the difference, and beyond that 1 with the sign of the sine. With
     the sine alone, an aircraft on the opposite course would not turn.
@@ -69,7 +69,10 @@ def heading_estimate(psi: float, measured: float | None, psi_dot: float, dt: flo
 
 
 def course_acceleration(course_c: float, course: float, speed: float, k: float) -> float:
-    """Compute the acceleration a = k V turn_towards(course_c - course), m/s^2."""
+    """Compute the acceleration to the right that turns onto a course, m/s^2.
+
+    It is a = k V turn_towards(course_c - course).
+    """
     return float(k * speed * turn_towards(math.remainder(course_c - course, 2.0 * math.pi)))
 
 
@@ -151,10 +154,11 @@ def least_period(speed: float, bank: float, roll_rate: float) -> float:
 
 
 def largest_wind(speed: float, wind: float, bank: float) -> float:
-    """Compute the wind in which the circle of `least_radius` for `wind` needs the largest bank.
+    """Compute the largest wind in which the aircraft can fly the circle for `wind`, m/s.
 
-    The result is (V + W) sqrt(tan(b) / tan(0.8 b)) - V, m/s, for the `speed` V and `wind` W, m/s,
-    and the largest `bank` b, rad.
+    In this wind, the circle of `least_radius` for `wind` needs the largest bank. The result is (V +
+    W) sqrt(tan(b) / tan(0.8 b)) - V, for the `speed` V and `wind` W, m/s, and the largest `bank` b,
+    rad.
     """
     return (speed + wind) * math.sqrt(math.tan(bank) / math.tan(0.8 * bank)) - speed
 

@@ -48,7 +48,7 @@ class Line(NamedTuple):
 
 
 class Loiter(NamedTuple):
-    """The circles that an aircraft flies before it goes on.
+    """Circles that an aircraft flies round a waypoint before it goes on.
 
     It goes on only at the altitude of the leg.
     """
@@ -247,7 +247,7 @@ def to_go(leg: Leg, position: Point) -> float:
 
 
 class Side(IntEnum):
-    """Side of the joining circle, which is the sign of its radius."""
+    """On which side the joining circle lies, as the sign of its radius."""
 
     NONE = 0  # no circle, because the aircraft is on the leg or near its point
     RIGHT = 1
@@ -295,7 +295,7 @@ def joining(
     position: Point,
     course_flown: Scalar,
 ) -> Scalar:
-    """Choose the side of the joining circle with the shorter way onto a course at a point.
+    """Choose on which side the joining circle gives the shorter way onto a course at a point.
 
     Returns a value of `Side` for each position. No circle is needed if the position is within
     `near`, m, of the point, and the course flown is within OPPOSITE of the course.
@@ -411,7 +411,7 @@ def turns_back(leg: Leg, following: Leg | None) -> bool:
 
 
 def leads(legs: Sequence[Leg]) -> list[int]:
-    """Return the number of the waypoint to which each leg of a route leads.
+    """Return to which waypoint each leg of a route leads, by its number.
 
     A fillet leads to the waypoint after the corner.
     """

@@ -36,7 +36,7 @@ no flow."""
 
 
 def forward(speed: Scalar) -> Scalar:
-    """Return a speed that can be a divisor, m/s: max(V, LEAST_SPEED)."""
+    """Limit a speed from below, so that it can be a divisor, m/s: max(V, LEAST_SPEED)."""
     return array_namespace(speed).maximum(speed, LEAST_SPEED)
 
 

@@ -86,7 +86,7 @@ def climb_speed(error: Scalar, speed: Scalar) -> Scalar:
 
 
 def path_lag(stall_speed: float, speed: float) -> float:
-    """Compute the time constant of the flight path behind the pitch, s.
+    """Compute by which time constant the flight path lags behind the pitch, s.
 
         T_L = V alpha_1 / g,  alpha_1 = 0.3 rad (V_s / V)^2
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compute the wind, which is the velocity over ground minus the velocity through the air.
+"""Compute the wind: the velocity over ground minus the velocity through the air.
 
-The wind has a north and an east part.
+The wind has a north and an east component.
 """
 
 import math
