@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute the u that the aircraft applies from the u that it receives.
 
-If u times out, the failsafe acts, and a later u takes over without a bump.
+If no u comes for too long, the failsafe acts. When u comes again, it takes over without a bump.
 """
 
 import numpy as np
@@ -16,10 +16,10 @@ class AppliedInput:
 
         u_applied(t) = s(t - t_u) u + r(t - t_0) offset,    offset = u_applied(t_0) - u(t_0)
 
-    u is the last received u, and t_u is the instant of its receipt. s is 1 for `hold_ns`, and then
-    falls to 0 within `ramp_ns`. t_0 is the instant of the last bumpless transfer. Such a transfer
-    is made to a new publisher, and to a u that arrives after the ramp has begun. r falls from 1 to
-    0 within `ramp_ns`, so that u_applied does not jump at t_0.
+    u is the last received u, and t_u is the instant at which it was received. s is 1 for `hold_ns`,
+    and then falls to 0 within `ramp_ns`. t_0 is the instant of the last bumpless transfer. There is
+    a transfer when another publisher takes over, and when a u arrives after the ramp has begun. r
+    falls from 1 to 0 within `ramp_ns`, so that u_applied does not jump at t_0.
     """
 
     def __init__(self, m: int, hold_ns: int, ramp_ns: int) -> None:

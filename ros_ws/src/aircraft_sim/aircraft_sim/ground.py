@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""End a flight on the ground as a landing or as a crash."""
+"""Decide whether a flight that ends on the ground is a landing or a crash."""
 
 import math
 
@@ -18,7 +18,7 @@ wing touches the ground, if the wing reaches 2.5 m to the side per metre of its 
 
 
 def touch(title: str, t_ns: int, sink: float, *, is_on_wheels: bool) -> FlightEnded:
-    """Return the end of a flight that touches the ground at t with the sink rate `sink`, m/s.
+    """Return how a flight ends that touches the ground at t with the sink rate `sink`, m/s.
 
     The aircraft has landed if it is on its wheels and the sink rate is at most SOFT. Otherwise it
     has hit the ground. `title` names the aircraft in the sentence.

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Simulate a multicopter by the linear model of an airframe for rates and climb.
+"""Simulate a multicopter: a linear airframe for rates and climb, and the tilt of the thrust.
 
-The tilt of the thrust moves the multicopter over ground.
+The tilt moves the multicopter over ground.
 """
 
 from collections.abc import Sequence

@@ -158,7 +158,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return self._u_receiver.name if not self._u_received else self._recorded_subscription.name
 
     def _take_u(self, now_ns: int) -> bool:
-        """Take the received u, and return whether there was a valid message.
+        """Take the u that has arrived, and return whether there was a valid message.
 
         A message without channels is valid, too. It says that the controller has no output at this
         instant of a lockstep flight.

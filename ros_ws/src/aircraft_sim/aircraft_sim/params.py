@@ -317,7 +317,7 @@ class AircraftConfig(NodeConfig):
     def _no_thrust(self) -> FloatArray:
         """Return the value of each input at which it gives no thrust, as deviation from trim, SI.
 
-        It is nan if unknown, and -1 for JSBSim's throttle until the model knows its trim.
+        It is nan if it is not known. For JSBSim's throttle it is -1 until the model knows its trim.
         """
         if self.is_jsbsim:
             inputs = self.flight_condition().inputs()

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute the pose of the aircraft: attitude, position and velocity over ground.
 
-The values are no deviations from trim. Guidance and the log use the pose. The position is in a
-local tangent plane. Its origin is below the aircraft at t = 0, unless a scenario starts the
+Its values are absolute, not deviations from trim. Guidance and the log use the pose. The position
+is in a local tangent plane. Its origin is below the aircraft at t = 0, unless a scenario starts the
 aircraft elsewhere. A steady wind moves the air mass as a whole. So the flight relative to the air
 is the same as in still air, and only the pose includes the wind (Galilean invariance).
 """
@@ -23,7 +23,7 @@ instant, with the least k for which the rate is not higher."""
 
 
 def every(rate: float) -> int:
-    """Return k: every k-th sample of an aircraft with the rate `rate`, Hz, has a pose."""
+    """Return k if every k-th sample of an aircraft at the rate `rate`, Hz, has a pose."""
     return max(1, math.ceil(rate / RATE))
 
 

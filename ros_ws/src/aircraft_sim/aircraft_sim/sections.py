@@ -146,7 +146,10 @@ class MicroburstConfig(Config):
 def require_one_wind(
     wind: Sequence[float], shear: ShearConfig | None, burst: MicroburstConfig | None
 ) -> None:
-    """Refuse a steady wind beside a table of the wind, and two altitudes of the ground."""
+    """Check that the steady wind is given once, and the altitude of the ground once.
+
+    Raises ParameterError for a steady wind beside a table of the wind, and for two altitudes.
+    """
     if shear is not None and shear.law == "table":
         expected = "0 beside shear.law table, which has the whole wind"
         require(not any(wind), "wind", list(wind), expected)

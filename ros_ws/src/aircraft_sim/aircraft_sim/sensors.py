@@ -30,7 +30,7 @@ class Sensors(NamedTuple):
 
 
 class RandomWalk(NamedTuple):
-    """State of the sensors: the random walk of the drift at a sample."""
+    """The random walk of the sensors' drift, at a sample."""
 
     number: int  # number of the sample
     value: FloatArray  # (m,) value of the walk, SI
@@ -70,7 +70,7 @@ def measure(number: int, y: FloatArray, drift: RandomWalk, params: Sensors) -> M
 
 
 def error(number: int, drift: RandomWalk, params: Sensors) -> tuple[FloatArray, RandomWalk]:
-    """Compute the additive error at sample `number`: bias + walk(number) + noise(number), (m,).
+    """Compute what is added to y at sample `number`: bias + walk(number) + noise(number), (m,).
 
     Also returns the random walk at this sample, for the next call. The error does not depend on y.
     """
@@ -124,9 +124,9 @@ def walk(number: int, drift: RandomWalk, params: Sensors) -> RandomWalk:
 
 
 def arrives(number: int, params: Sensors) -> bool:
-    """Return whether sample `number` >= 0 arrives, which it does if v >= dropout.
+    """Return whether sample `number` >= 0 arrives, or is lost at random.
 
-    v is uniform in [0, 1), and independent of the noise.
+    It arrives if v >= dropout, where v is uniform in [0, 1), and independent of the noise.
     """
     return (
         params.dropout == 0.0

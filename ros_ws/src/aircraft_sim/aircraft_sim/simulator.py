@@ -29,7 +29,7 @@ WRAPPED = [POSE.index(name) for name in ("phi", "psi")]
 
 
 class FlightDynamicsModel(Protocol):
-    """The interface of an aircraft between the command u and the sensors."""
+    """What the simulator needs of an aircraft, from the command u to outputs without sensors."""
 
     @property
     def truth_names(self) -> tuple[str, ...]:
@@ -190,7 +190,8 @@ class Simulator:
     def _advance(self, number: int, u: FloatArray) -> None:
         """Advance the model to a sample.
 
-        If u has a delay, another u can act in each period, so the model advances period by period.
+        If u is delayed, the u that acts can change in each period, so the model advances period by
+        period.
         """
         step = 1 if self._commands else max(number - self._number, 1)
         for k in range(self._number, number, step):
@@ -216,7 +217,7 @@ class Simulator:
             raise self._with_place(end)
 
     def _with_place(self, end: FlightEnded) -> FlightEnded:
-        """Return `end`; if it is a landing, its sentence gets the lateral speed and the place."""
+        """Add lateral speed and place to the sentence of a flight that ends as a landing."""
         if end.end is not End.LANDED:
             return end
         at = dict(zip(POSE, self.pose().tolist(), strict=True))

@@ -219,7 +219,7 @@ def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str,
 
 
 def drawn_places(airframe: Airframe, *, zeros: bool = False) -> dict[str, tuple[str, int, int]]:
-    """Return the matrix, row and column of each entry that `sampled_matrices` draws, by name.
+    """Return where each entry that `sampled_matrices` draws is: matrix, row and column, by name.
 
     With `zeros`, the entries that are 0 follow, if `row_sizes` has a size for them.
     """
@@ -265,7 +265,7 @@ def row_sizes(airframe: Airframe) -> dict[str, FloatArray]:
 
 
 def input_sizes(airframe: Airframe) -> FloatArray:
-    """Return the deviation of each input for `row_sizes`, (p,), SI; 0 if it is not known."""
+    """Return by how much each input deviates in `row_sizes`, (p,), SI; 0 if it is not known."""
     trim = np.abs(np.nan_to_num(airframe.no_thrust()))
     dimensions = [quantity(channel.unit).dimension for channel in airframe.inputs.values()]
     has_range = [dimension in {ANGLE, DIMENSIONLESS} for dimension in dimensions]

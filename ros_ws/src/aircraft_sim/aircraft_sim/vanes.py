@@ -61,7 +61,7 @@ class VaneSensorsConfig(Config):
             require_length("frozen_at", self.frozen_at, self.channels)
 
     def require_fit(self, airframe: Airframe) -> None:
-        """Refuse a vane that does not fit an airframe."""
+        """Check that the vanes fit an airframe. Raises ParameterError if one does not."""
         key = "vanes.channels"
         has_none = f"none: the airframe {airframe.name} has no"
         for name in self.channels:
@@ -93,7 +93,10 @@ def initial_state(params: Vanes) -> VaneState:
 
 
 def turned(t: float, angles: FloatArray, state: VaneState, params: Vanes) -> VaneState:
-    """Turn the vanes to the alpha and beta of the air, (2,); an iced vane keeps its angle."""
+    """Turn the vanes to the alpha and beta of the air, (2,), except for iced ones.
+
+    An iced vane keeps its angle.
+    """
     return state._replace(
         angle=np.where(t >= params.frozen_at, state.angle, angles[list(params.places)])
     )

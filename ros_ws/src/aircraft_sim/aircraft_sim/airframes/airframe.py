@@ -73,7 +73,7 @@ class Input(Config):
 
 
 class Gravity(Config):
-    """A term f_into += gain sin(angle)."""
+    """A term of gravity in the equations of motion: f_into += gain sin(angle)."""
 
     into: str = Field(description="state to whose derivative it adds")
     angle: str = Field(description="angle, a state")
@@ -81,7 +81,10 @@ class Gravity(Config):
 
 
 class Product(Config):
-    """A term f_into += gain * product of two states."""
+    """A term of inertial coupling in the equations of motion: f_into += gain * product.
+
+    The product is that of two states.
+    """
 
     into: str = Field(description="state to whose derivative it adds")
     product: Names = Field(description="two states")
@@ -379,7 +382,7 @@ class Airframe(Config):
         return empty.with_matrices(A, B, np.ones((len(A), len(self.gusts))))
 
     def through(self, T: FloatArray, inputs: Sequence[str]) -> Self:
-        """Copy the airframe with the m inputs v of u = T v, SI, in place of its p inputs u.
+        """Copy the airframe with new inputs v in place of its p inputs u, by u = T v, SI.
 
         u is in the order of the airframe. The copy is not checked against physics.
 
@@ -453,7 +456,7 @@ def _si(units: Iterable[Unit]) -> FloatArray:
 
 
 def check_identities(airframe: Airframe) -> None:
-    """Refuse an airframe that contradicts the identities of physics.
+    """Check that an airframe obeys the identities of physics. Raises ParameterError if not.
 
     An airframe whose file says `identities: false` passes unchecked.
     """
@@ -514,9 +517,9 @@ def load_airframe(name: FilePath | Airframe) -> Airframe:
 
 @lru_cache(maxsize=8)
 def _parsed(name: str, path: Path, content: bytes) -> Airframe:
-    """Read an airframe from the content of a file; cached.
+    """Read an airframe from the content of a file, and keep it in a cache.
 
-    The cache saves 15 ms in a node that checks a change in flight.
+    The cache saves 15 ms in a node that checks a change of its parameters in flight.
     """
     parsed = parse_yaml(content, f"airframe {path}", EXPECTED)
     require(isinstance(parsed, dict), f"airframe {path}", type(parsed).__name__, "a mapping")

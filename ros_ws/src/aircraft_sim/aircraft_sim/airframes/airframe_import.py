@@ -98,7 +98,7 @@ def _of_file(source: str | Path, name: str, options: Mapping[str, Any]) -> Airfr
 
 
 def _named(names: Named, key: str) -> dict[str, Any]:
-    """Return the text of each unit, with the effect if stated, by name of a state or input.
+    """Return the text of the unit of each state or input by its name, with the effect if stated.
 
     `names` may be such a mapping, a text like "u: ft/s, w: ft/s", or names without units, whose
     texts are then "".
@@ -114,7 +114,10 @@ def _named(names: Named, key: str) -> dict[str, Any]:
 
 
 def _check_identities(model: ToolModel, name: str, speed: float) -> None:
-    """Refuse a model that contradicts an identity of physics; the trim speed is in m/s."""
+    """Check that a model obeys the identities of physics at a trim speed in m/s.
+
+    Raises ParameterError if not.
+    """
     effects = {key: channel.get("positive", "") for key, channel in model.inputs.items()}
     units = tuple(channel["unit"] for channel in model.inputs.values())
     none = np.zeros_like(model.A)

@@ -20,7 +20,7 @@ from flight_core.vectors import FloatArray
 
 
 class Kind(Enum):
-    """The kind of a state, on which the exponents of its entries depend."""
+    """The kind of a quantity that a state is, on which the exponents of its entries depend."""
 
     SPEED = auto()
     INCIDENCE = auto()  # alpha or beta
@@ -132,7 +132,7 @@ def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
 
 
 def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatArray, FloatArray]:
-    """Return by how much x, (n,), and u, (p,), in trim change from V0 to `ratio` times V0, SI.
+    """Return how the trim changes from V0 to `ratio` times V0: dx, (n,), and du, (p,), SI.
 
         (A + gravity) dx + B du = 0
 
@@ -164,7 +164,7 @@ def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatAr
 
 
 def over_airspeed(airframe: Airframe, thrust: str) -> OverAirspeed:
-    """Return the exponents and trims by which an airframe follows the airspeed.
+    """Return how A, B and the trim of an airframe follow the airspeed: exponents and trims.
 
     Raises ParameterError as `exponents` does, and for an airframe without V or without a speed.
     """

@@ -22,7 +22,7 @@ from flight_core.vectors import FloatArray
 
 
 class Kind(NamedTuple):
-    """The kind of a state."""
+    """The kind of quantity that a state is, such as a speed or an angle."""
 
     dimension: tuple[int, ...]
     words: str  # the dimension in words, with units as examples
@@ -38,7 +38,7 @@ class Expected(NamedTuple):
 
 
 class Effect(NamedTuple):
-    """A motion to which a phrase refers."""
+    """A motion of the aircraft, as the phrases for the effects of inputs name it."""
 
     states: tuple[str, ...]  # possible names of the state that moves
     sign: float

@@ -62,7 +62,10 @@ class ToolModel(NamedTuple):
 
 
 def _states(units_by_name: Mapping[str, Any], labels: Sequence[str], n: int) -> dict[str, str]:
-    """Return the units of the n states: the given ones, or those for the names in the model."""
+    """Return the units of the n states.
+
+    They are the given units, or those that belong to the names of the states in the model.
+    """
     names = units_by_name or dict.fromkeys(labels, "")
     names_text = ", ".join(names) or "no names"
     require(

@@ -35,7 +35,7 @@ MIN_RISE = 1e-30
 
 
 class Gusts(NamedTuple):
-    """G discrete gusts. A gust with a speed of 0 has exactly no effect."""
+    """G discrete gusts. A gust with a speed of 0 is no gust."""
 
     start: Array  # (G,) instant of entry, s
     speed: Array  # (G,) peak speed U_ds, m/s
@@ -46,7 +46,7 @@ class Gusts(NamedTuple):
 
 
 class Bias(NamedTuple):
-    """A bias on the derivative of each state. A value of 0 has exactly no effect."""
+    """A bias on the derivative of each state. Where the value is 0, there is no bias."""
 
     start: Array  # (n,) start of the rise, s
     value: Array  # (n,) final value, [x]/s
@@ -54,7 +54,7 @@ class Bias(NamedTuple):
 
 
 class Sines(NamedTuple):
-    """A sine on the derivative of each state. An amplitude of 0 has exactly no effect."""
+    """A sine on the derivative of each state. Where the amplitude is 0, there is no sine."""
 
     amplitude: Array  # (n,) [x]/s
     frequency: Array  # (n,) rad/s

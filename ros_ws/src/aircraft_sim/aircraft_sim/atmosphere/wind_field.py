@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute wind that varies with the position: a profile over the height, and a microburst.
 
-An aircraft flies in an air mass that moves with the wind at its start. Where the wind differs from
-the wind at the start, the difference acts on the aircraft.
+An aircraft flies in an air mass that moves with the wind at its start. Where the wind is another
+one, the difference acts on the aircraft.
 """
 
 import math

@@ -191,7 +191,7 @@ class FlightCondition(NamedTuple):
         return f"{PREFIX}{self.name}"
 
     def commands(self) -> dict[str, Command]:
-        """Return INPUTS, changed by the properties that the user names."""
+        """Return the commands in INPUTS, with properties that the user names in their place."""
         properties = dict(self.named)
         return {
             name: command._replace(trim_property=None, named=properties[name])
@@ -220,7 +220,7 @@ class Trim(NamedTuple):
 
 
 class WindModel(NamedTuple):
-    """The sources of the wind, each with its wind along the AXES of `disturbance`."""
+    """The sources of the wind on an aircraft of JSBSim, each along the AXES of `disturbance`."""
 
     gusts: Gusts
     turbulence: Turbulence | None  # filters for one step; None without turbulence

@@ -38,7 +38,7 @@ LEAST = 1e-6  # least change of an acceleration that counts as an effect, m/s^2 
 
 @contextmanager
 def frozen(fdm: jsbsim.FGFDMExec) -> Iterator[None]:
-    """Hold position, velocity, attitude and fuel while engines and systems run."""
+    """Hold position, velocity, attitude and fuel in this context; engines and systems run on."""
     before = {path: fdm[path] for path in FROZEN}
     for path, value in FROZEN.items():
         fdm[path] = value
@@ -50,7 +50,7 @@ def frozen(fdm: jsbsim.FGFDMExec) -> Iterator[None]:
 
 
 def settle(fdm: jsbsim.FGFDMExec, duration: float) -> None:
-    """Run the frozen aircraft for a time `duration`, s."""
+    """Let engines and systems settle for `duration`, s, while the motion is frozen."""
     with frozen(fdm):
         for _ in range(round(duration / fdm.get_delta_t())):
             fdm.run()
@@ -74,7 +74,7 @@ def command_paths(command: Command, engines: int) -> list[tuple[str, float]]:
 
 
 def set_command(fdm: jsbsim.FGFDMExec, command: Command, value: float) -> None:
-    """Set the properties of a command so that the command has the value `value`."""
+    """Give a command a value, by setting all of its properties."""
     for path, at_one in command_paths(command, engine_count(fdm)):
         fdm[path] = at_one * value
 
@@ -87,10 +87,10 @@ def residuals(fdm: jsbsim.FGFDMExec) -> FloatArray:
 def commands_and_limits(
     fdm: jsbsim.FGFDMExec, inputs: Iterable[Command]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the whole commands, and their lower and upper stops as deviations, (4,) each.
+    """Return the commands with their trims, and their lower and upper stops, (4,) each.
 
-    A whole command is the sum of the command and its trim property. A stop is a deviation from the
-    whole command, so the lower stops are at most 0.
+    A command counts together with its trim property. A stop is a deviation from this sum, so the
+    lower stops are at most 0.
     """
     inputs = list(inputs)
     first = [command_paths(command, 1)[0] for command in inputs]
@@ -125,10 +125,11 @@ def _first(command: Command) -> str:
 
 
 def _moves(fdm: jsbsim.FGFDMExec, paths: Iterable[tuple[str, float]], part: float) -> bool:
-    """Return whether a change of properties changes an acceleration.
+    """Return whether a change of a command changes an acceleration.
 
-    `paths` has the properties with their values at the command 1, and `part` is the change of the
-    command. The acceleration also varies between two equal runs, and must change by more than that.
+    `paths` has the properties of the command with their values at the command 1, and `part` is the
+    change of the command. Between two equal runs the accelerations differ a little, and the change
+    must be larger.
     """
     before = {path: fdm[path] for path, _ in paths}
     runs = []

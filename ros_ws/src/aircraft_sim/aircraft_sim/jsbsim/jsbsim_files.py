@@ -63,7 +63,7 @@ MOST_BYTES = 16 << 20
 
 
 class ModelFiles(NamedTuple):
-    """A model and the files that it names, arranged as a root folder of JSBSim."""
+    """A model and all files that it names, laid out as a root folder of JSBSim."""
 
     model: str  # path of the model in the root
     # Content by path. aircraft/NAME/ has the files beside the model, engine/ and systems/ have the
@@ -225,7 +225,7 @@ def _parsed(content: bytes, path: Path) -> ElementTree.Element:
 
 
 def _leave_out(tree: ElementTree.Element, model: Path) -> tuple[str, ...]:
-    """Remove the sections LEFT_OUT from a model, and return their start tags.
+    """Remove the sections in LEFT_OUT from a model, and return the start tags of those removed.
 
     Raises ParameterError for a child model.
     """
@@ -247,7 +247,10 @@ def _start_tag(element: ElementTree.Element) -> str:
 
 
 def _require_no_writer(tree: ElementTree.Element, path: Path) -> None:
-    """Refuse a property to which JSBSim responds by writing a file."""
+    """Check that a file sets no property by which JSBSim writes a file.
+
+    Raises ParameterError if it does.
+    """
     attributes = chain.from_iterable(element.attrib.values() for element in tree.iter())
     text = "".join([*tree.itertext(), *attributes])
     for name in WRITERS:

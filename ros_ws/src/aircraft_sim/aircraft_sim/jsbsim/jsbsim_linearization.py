@@ -45,7 +45,7 @@ LEAST = 1e-6  # an entry below this value is a rounding error, SI
 
 
 class Linearization(NamedTuple):
-    """An aircraft of JSBSim about its trim: an airframe, and the results of steps of its inputs."""
+    """The linear model of an aircraft of JSBSim: an airframe, and what steps of its inputs did."""
 
     condition: FlightCondition  # without the rudder if the rudder has no effect
     trim: Trim
@@ -180,7 +180,10 @@ def _response(condition: FlightCondition, trim: Trim, name: str, size: float) ->
 
 
 def _x_dot(fdm: jsbsim.FGFDMExec, condition: FlightCondition, trim: Trim) -> FloatArray:
-    """Compute x_dot from the accelerations, (n,); the derivatives of the attitude are 0."""
+    """Compute x_dot, (n,), from the accelerations in frozen flight.
+
+    The derivatives of the attitude angles are 0.
+    """
     u_dot, v_dot, w_dot, p_dot, q_dot, r_dot = residuals(fdm)
     alpha = _trim_state(trim, "alpha")
     along = math.cos(alpha) * u_dot + math.sin(alpha) * w_dot

@@ -177,7 +177,10 @@ class JsbsimModel:
         self._require_flight(t_ns + duration_ns, sink)
 
     def _require_flight(self, t_ns: int, sink: float) -> None:
-        """Raise FlightEnded on the ground, or if an engine stops; `sink` is the sink rate, m/s."""
+        """Check that the aircraft has not touched the ground and that its engines run.
+
+        `sink` is the sink rate, m/s. Raises FlightEnded if not.
+        """
         if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:
             is_on_wheels = not any(node.get_double_value() for node in self._structure)
             raise touch(self.condition.title, t_ns, sink, is_on_wheels=is_on_wheels)

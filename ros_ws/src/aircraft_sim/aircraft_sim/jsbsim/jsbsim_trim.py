@@ -102,9 +102,10 @@ from ATTEMPTS. None if the trim function of JSBSim succeeded, which gives the sa
 
 
 class _Log(jsbsim.FGLogger):
-    """A logger that keeps JSBSim's output off the console.
+    """A logger that keeps JSBSim's messages off the console.
 
-    `last` has the last two errors, because the second one often says only where the error was.
+    `last` has the last two errors, because the second one often says only where the first one
+    occurred.
     """
 
     def __init__(self) -> None:
@@ -132,7 +133,7 @@ class _Log(jsbsim.FGLogger):
 
 
 class Unbalanced(NamedTuple):
-    """A trim that the solver did not reach, with a sentence about the remaining accelerations."""
+    """What the solver returns if it reaches no trim: a sentence on the remaining accelerations."""
 
     sentence: str
 
@@ -192,7 +193,7 @@ def solve_and_probe(
 def trimmed_fdm(
     condition: FlightCondition, solution: TrimSolution
 ) -> tuple[jsbsim.FGFDMExec, Trim]:
-    """Load the aircraft in the trim of a solution.
+    """Load the aircraft and put it into a trim that was found before.
 
     Raises FlightEnded if the aircraft cannot be loaded.
     """
@@ -241,10 +242,10 @@ def cut_engines(fdm: jsbsim.FGFDMExec, cut: bool) -> None:
 
 
 def error_text(error: jsbsim.BaseError) -> str:
-    """Return the message of JSBSim on a single line.
+    """Return the message of an error of JSBSim on a single line.
 
-    Most often the message says that a property is missing which a flight simulator around JSBSim
-    would provide.
+    Most often it says that a property is missing which a flight simulator around JSBSim would
+    provide.
     """
     text = " ".join(str(error).split())
     missing = re.search(r"The property (\S+) does not exist", text)
@@ -299,7 +300,10 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution | Unbalanced:
 
 
 def _require_effect(condition: FlightCondition) -> None:
-    """Refuse an elevator or a throttle without effect, because then no trim can be found."""
+    """Check that elevator and throttle have an effect, because else no trim can be found.
+
+    Raises FlightEnded if one has none.
+    """
     fdm = _load(condition)
     commands = condition.commands()
     _start_engines(fdm, condition)
@@ -478,7 +482,7 @@ def _is_trimmed(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
 
 
 def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str | Unbalanced:
-    """Say why a result is no trim: an engine does not start, or accelerations remain."""
+    """Say why there is no trim: an engine does not start, or accelerations remain."""
     engines = range(engine_count(fdm))
     paths = command_paths(condition.commands()["throttle"], len(engines))
     idle = [fdm[path] < IDLE * at_one for path, at_one in paths]
@@ -506,7 +510,10 @@ def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str | Un
 
 
 def _engines_start(condition: FlightCondition) -> bool:
-    """Return whether every engine runs or gives thrust at sea level, at half of the speed."""
+    """Return whether every engine starts at sea level at half of the speed.
+
+    An engine that gives thrust has started, too.
+    """
     fdm = _load(condition._replace(speed=0.5 * condition.speed, altitude=0.0))
     _start_engines(fdm, condition)
     return all(
@@ -515,7 +522,7 @@ def _engines_start(condition: FlightCondition) -> bool:
 
 
 def nearest_trim(condition: FlightCondition) -> str | None:
-    """Say at which nearby speed and altitude an aircraft trims, or return None.
+    """Say at which speed and altitude nearby the aircraft has a trim, or return None.
 
     The conditions of NEIGHBOURS are tried in order.
     """

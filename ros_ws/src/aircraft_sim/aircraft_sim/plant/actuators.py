@@ -114,9 +114,10 @@ def mean_position(position: Array, command: Array, new: Array, dt: Any, params: 
 def move(
     t: Any, position: Array, command: Array, dt: Any, params: Actuators
 ) -> tuple[Array, Array]:
-    """Return the positions at the end of a step that begins at t, and the mean input over it.
+    """Move the actuators over a step that begins at t, with all faults.
 
-    The mean is the input of the aircraft. Both results include faults and have the shape (m,).
+    Returns the positions at the end of the step, and the mean positions, which are the input of the
+    aircraft in this step, (m,) each.
     """
     now = in_force(t, position, params)
     end = step(position, command, dt, now)
@@ -127,7 +128,7 @@ def move(
 
 
 def in_force(t: Any, position: Array, params: Actuators) -> Actuators:
-    """Return the parameters in force for a step that begins at t.
+    """Return the parameters that the actuators have in a step that begins at t.
 
     A slow actuator has at least the lag `slow_lag`, and a loose actuator has the backlash
     `loose_play`. A runaway goes to `hard_over_to` at the rate limit, without a lag.
@@ -182,17 +183,16 @@ def _input(position: Array, command: Array, params: Actuators) -> Array:
 
 
 def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Array:
-    """Apply faults to the actuator positions at the end of a step that begins at t, shape (m,).
-
-    The positions can also be means over the step.
+    """Replace the positions of actuators with a fault at the end of a step, shape (m,).
 
         t >= stuck_at    position    the actuator keeps the position
         t >= lost_at     no_thrust
             an engine or a rotor stops at once, a surface floats at trim; also if stuck before
         else             new
 
-    `position` is the position at t, and `new` the position at the end of the step without faults.
-    If a fault begins within a step, it acts from the next step on.
+    The step begins at t. `position` is the position at t, and `new` the position at the end of the
+    step without faults, or the mean over the step. If a fault begins within a step, it acts from
+    the next step on.
     """
     xp = array_namespace(position)
     if params.stuck_at is not None:

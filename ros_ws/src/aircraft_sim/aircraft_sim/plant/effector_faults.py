@@ -109,7 +109,7 @@ def require_possible(
     no_thrust: FloatArray,
     owner: str,
 ) -> None:
-    """Refuse faults that the inputs of `owner` cannot have.
+    """Check that the inputs of `owner` can have the given faults. Raises ParameterError if not.
 
     `stops` has the end stops by ENDS. `no_thrust` has the position of each input at which it gives
     no thrust, nan if unknown, and 0 for a surface.

@@ -28,8 +28,8 @@ SHORTEST_DRIFT = 1e-9  # s, in place of a duration of 0, so that nothing is divi
 class Drift(NamedTuple):
     """A change of A, B and the effect of wind in flight.
 
-    A, B and `wind` are factors on the entries, which apply after `duration`. Until then the factors
-    change linearly from 1.
+    `A`, `B` and `wind` are factors on the entries. From the start of the drift on, the factors in
+    force change linearly from 1, and reach these values after `duration`.
     """
 
     start: float  # s of flight time
@@ -40,7 +40,7 @@ class Drift(NamedTuple):
 
 
 def share(t: Array, start: Any, duration: Any) -> Array:
-    """Compute the share of a drift that acts at t: 0 before the start, 1 after the duration."""
+    """Compute how far a drift has gone at t: 0 before its start, 1 after its duration."""
     xp = array_namespace(t)
     part = xp.minimum((t - start) / xp.maximum(duration, SHORTEST_DRIFT), 1.0)
     return xp.where(t >= start, xp.where(duration > 0.0, part, 1.0), 0.0)
