@@ -74,7 +74,7 @@ class LogAttachments(NamedTuple):
 
 @dataclass
 class BagChannel:
-    """A topic of a bag that is being written."""
+    """A topic to which a bag writer adds messages."""
 
     topic: str
     type: MessageDefinition
@@ -84,7 +84,7 @@ class BagChannel:
 
 
 class _MessageIndex(MessageIndex):
-    """The offsets of a channel's messages in a chunk; the writer packs all offsets in one step."""
+    """Where the messages of a channel are in a chunk: their offsets, packed in one step."""
 
     def write(self, stream: RecordBuilder) -> None:
         size = 16 * len(self.records)
@@ -121,7 +121,7 @@ class _ChunkBuilder(ChunkBuilder):
 
 
 class _ChunkIndexes:
-    """Chunk indexes as records on disk, in place of mcap's list in memory.
+    """The chunk indexes of a file as records on disk; mcap would keep them as a list in memory.
 
     The list would grow by 1 kB a chunk, which is 36 MB an hour. Each chunk index also enlarges the
     space that is reserved for the end of the file, because the indexes are written there.
@@ -149,9 +149,9 @@ class _ChunkIndexes:
 
 
 def full_names(remaps: Mapping[str, str]) -> dict[str, str]:
-    """Return the full name in the stack for each topic of a log, the inverse of `remaps`.
+    """Return the name that each topic of a log has in the stack, by its name in the log.
 
-    `remaps` has the topic of the log for each name in the stack.
+    It is the inverse of `remaps`, which has the topic of the log for each name in the stack.
     """
     return {topic: f"/{name.lstrip('/')}" for name, topic in remaps.items()}
 
@@ -160,7 +160,7 @@ def stack_topic(channel: Channel, stack_names: Mapping[str, str] = {}) -> str:
     """Return the full name that a topic of a log has in the stack.
 
     `stack_names` has such names by topic of the log. If it lacks the topic, the name is the one
-    that the log states for the topic before a remap, or else the topic itself.
+    before a remap, if the log states it, or else the topic itself.
     """
     return stack_names.get(channel.topic) or channel.metadata.get(BEFORE_REMAP) or channel.topic
 

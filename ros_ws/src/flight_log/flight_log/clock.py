@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Check the stamps of a topic in the order of the recording.
+"""Check the stamps of a topic in the order in which they were recorded.
 
 The check finds steps of the clock that made the stamps, damaged stamps and equal stamps.
 """
@@ -30,7 +30,7 @@ SINCE_EPOCH_NS = 10**15  # larger stamps count from 1970, not from the start of 
 
 
 class StampClock:
-    """Finds the usable samples of a topic, up to a step of the clock that made their stamps.
+    """Finds which samples of a topic are usable, if the clock of their stamps makes a step.
 
     A sample with a damaged stamp is left out. The samples after a forward step stay, because only
     `without_leaps`, which sees all topics, can decide about them.
@@ -57,8 +57,8 @@ class StampClock:
     ) -> tuple[NDArray[np.bool_], int]:
         """Return a mask of the usable messages among the first K messages, shape (K,), and K.
 
-        Give the messages after the first K to the next call again. Their stamps neither confirm nor
-        exclude a step of the clock, so the messages that follow must decide. `more` says whether
+        Give the messages after the first K to the next call again. It is not clear yet whether the
+        clock has made a step there, so the messages that follow must decide. `more` says whether
         there are such messages, and if not, K is the number of all messages. `end` is true for the
         last messages of the topic. `steps` has the increase of the publisher's message number from
         message to message. If this number and both times go back together, the log is out of order
@@ -141,7 +141,7 @@ class StampClock:
         return None if within.all() else False
 
     def _jump_to(self, stamp_ns: int, offset_ns: int, *, has_time: bool) -> tuple[int, bool]:
-        """Return the time from the last usable stamp to a stamp, ns, and whether the stamp leads.
+        """Return how far a stamp is from the last usable stamp, ns, and whether it leads.
 
         A stamp leads if it is too far ahead of the time of the recording, and if the last samples
         are no history that was recorded in a burst. The returned time is 0 if there is no usable
@@ -177,7 +177,10 @@ class StampClock:
         return keep, count
 
     def recording(self, unset: int = 0) -> Recording:
-        """Return the findings. `unset` further messages count as messages without a stamp."""
+        """Return what was found about the stamps.
+
+        `unset` more messages are counted as messages without a stamp.
+        """
         return Recording(
             found=self._count,
             unset=self._unset + unset,
@@ -190,7 +193,7 @@ class StampClock:
 
 
 def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which of the samples before the last one may have the same clock as the last one."""
+    """Return which of the samples before the last one may have the same clock as it has."""
     away_ns = stamp_ns[-1] - stamp_ns[:-1]
     lead_ns = offset_ns[-1] - offset_ns[:-1]
     is_near = (away_ns <= STRAY_NS) | (lead_ns <= LATE_NS)
@@ -198,10 +201,10 @@ def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArra
 
 
 def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool:
-    """Return whether the last samples were recorded in a burst, as a publisher's history is.
+    """Return whether the last samples were recorded all at once, as the history of a publisher is.
 
     The last samples are those of the last LEAP_NS by their stamps. In a burst they were recorded in
-    less than half of this time. The reason is a recorder that starts late, and receives the history
+    less than half of this time. This happens when a recorder starts late, and receives the history
     of the publisher at once. A pause in such a history is no step of the clock.
     """
     recent = stamp_ns >= stamp_ns[-1] - LEAP_NS
@@ -229,7 +232,7 @@ def recording_note(name: str, recording: Recording, start_ns: int) -> str | None
 
 
 class Leap(NamedTuple):
-    """A forward step that the clock of all topics makes at one instant."""
+    """A forward step of the clock that shows in the stamps of all topics at one instant."""
 
     at_ns: int  # the last stamp before the leap
     by_ns: int  # the size of the leap
@@ -245,12 +248,11 @@ LOOP = ("y", "y_m", "u", "internals", "truth")  # topics that must all show a le
 def without_leaps(
     signals: Mapping[str, Signal], recording: Mapping[str, Recording]
 ) -> tuple[dict[str, Signal], dict[str, Recording], list[Leap]]:
-    """Take the leaps of the clock out of the stamps.
+    """Take forward steps of the clock out of the stamps of all topics.
 
-    Returns the signals, the findings in the recording, and the leaps.
-
-    A leap is a forward step that the clock of all topics makes. After a forward step of a single
-    topic, the samples of this topic are left out.
+    Returns the signals, what is now known of each recording, and the leaps. A leap is a forward
+    step that shows in all topics. If only a single topic shows a step, the samples of this topic
+    after it are left out.
     """
     mended = dict(signals)
     clocks = dict(recording)
@@ -283,7 +285,7 @@ def without_leaps(
 def _candidates(
     signals: Mapping[str, Signal], recording: Mapping[str, Recording]
 ) -> Iterator[Leap]:
-    """Yield the leaps of the stamps relative to a second measure of time.
+    """Yield possible leaps: instants at which the stamps jump ahead of a second measure of time.
 
     The second measure is the flight time in `truth`. Without `truth` it is a constant period of the
     messages, provided that no message is lost. A gap in which nothing was received is no leap,
@@ -312,7 +314,7 @@ def _candidates(
 
 
 def _has_gap(signal: Signal, leap: Leap) -> bool:
-    """Return whether no sample of a topic lies within a leap."""
+    """Return whether a topic has no sample within a leap."""
     after = int(np.searchsorted(signal.stamp_ns, leap.at_ns + STEP_NS, side="right"))
     if not 0 < after < len(signal.stamp_ns):
         return False

@@ -132,8 +132,8 @@ def _on_disk() -> Iterator[None]:
 class _StoredSignal(Signal):
     """A signal whose values are in a file.
 
-    The channels are the columns of the file from `first` on. Each access to `values` maps the file,
-    so the memory is freed when you drop the array. In a loop, keep the array.
+    The channels are the columns of the file from `first` on. Each access to `values` maps the file
+    into memory. The memory is freed when you drop the array, so in a loop, keep the array.
     """
 
     def __init__(

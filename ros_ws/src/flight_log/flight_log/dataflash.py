@@ -22,9 +22,9 @@ TAIL = 528
 
 
 class Packets(DFReader.DFReader_binary):
-    """The packets of a log that are followed by another packet or by the end of the log.
+    """The packets of a log, each followed by another packet or by the end of the log.
 
-    The index of pymavlink would end where bytes are lost, because an unknown packet appears there.
+    pymavlink's own index would end where bytes are lost, because an unknown packet appears there.
     """
 
     def init_arrays(self, progress_callback: Callable[[int], None] | None = None) -> None:
@@ -65,7 +65,7 @@ class Packets(DFReader.DFReader_binary):
         return int(form.len)
 
     def _declare(self, content: bytes) -> bool:
-        """Take the format that a packet declares. Returns False if the format is damaged."""
+        """Learn the format that a packet declares. Returns False if the format is damaged."""
         identity, length, *texts = struct.unpack(self.formats[FORMAT].msg_struct, content)
         name, types, columns = map(DFReader.null_term, texts)
         try:

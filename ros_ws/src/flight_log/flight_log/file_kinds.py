@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Name the kind of a file by its first bytes.
+"""Tell from its first bytes what kind of file a file is.
 
-A file is a log, a packed log, or a file of another program.
+It may be a log, a packed log, or a file of another program.
 """
 
 import struct
@@ -17,7 +17,7 @@ from flight_core.files import open_nonblocking
 
 
 class FileKind(Enum):
-    """The kind of a file, whose value names it with an article."""
+    """The kind of a file. Its value names the kind with an article, for a sentence."""
 
     MCAP = "an MCAP file"
     SQLITE = (
@@ -153,7 +153,7 @@ def kind_of_head(head: bytes) -> FileKind:
 
 
 def tlog_start(head: bytes) -> int | None:
-    """Return the place of the time before the first packet; None without a packet.
+    """Return where a tlog begins: at the time before its first packet. None without a packet.
 
     A text that a radio sends at its start may come before this time. In this case a second packet
     must follow.

@@ -35,7 +35,7 @@ class SampleSpan:
     samples: int
 
     def joined(self, later: "SampleSpan") -> "SampleSpan":
-        """Return the span from the first to the last sample of two spans."""
+        """Return a span from the first sample of this span to the last sample of a later one."""
         return SampleSpan(
             first_ns=min(self.first_ns, later.first_ns),
             last_ns=max(self.last_ns, later.last_ns),
@@ -44,7 +44,7 @@ class SampleSpan:
 
 
 def ready_times(lines: Iterable[bytes]) -> list[tuple[str, int]]:
-    """Return the node and the system time, ns, of each line "ready", in the order of time."""
+    """Return which nodes logged "ready", and at which system time, ns, in the order of time."""
     times = []
     for data in lines:
         try:
@@ -116,9 +116,9 @@ SILENT_PERIODS = 3  # least silence of a slow publisher that counts, in periods 
 
 
 def admitted(signal: Signal) -> Signal:
-    """Return the samples that the nodes admit.
+    """Return the samples that the nodes would have taken, if several publishers sent them.
 
-    They are those of the first publisher. After a silence of this publisher, the nodes admit those
+    They are those of the first publisher. After a silence of this publisher, the nodes take those
     of the next.
     """
     if signal.sender is None:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find the instance of each message in an autopilot's log by which the autopilot flew.
+"""Find the sensor by which the autopilot flew, if its log has several of a kind.
+
+Each such sensor is an instance of a message.
 
 Sources: ArduPilot, AP_Logger/LogStructure.h (ARSP: H healthy, U used, Pri primary; IMU: GH),
 AP_InertialSensor.cpp (INS_USE), AP_Airspeed.cpp (ARSPD_USE); ArduPlane/Log.cpp (CTUN.As: the
@@ -35,7 +37,7 @@ CORES = ("XKF1", "NKF1", "EKF1")
 def instances_of_flight(
     instances: Instances, fields: Mapping[str, Set[str]], parameters: Parameters, choice: Choice
 ) -> tuple[dict[str, MessageTable], list[tuple[str, str]]]:
-    """Return a table for each message, and each choice among several instances with its reason.
+    """Return a table for each message, and which instance was chosen with the reason.
 
     `fields` has the fields that are read, by message. For a message that is not in `fields`, the
     first instance is taken. Raises ParameterError if two different instances remain, if `choice`
@@ -86,9 +88,10 @@ def instances_of_flight(
 
 
 def _of_motion(name: str, tables: Mapping[int, MessageTable], fields: Set[str]) -> tuple[int, str]:
-    """Return the number of the moving instance, or of the first of several that agree, and why.
+    """Choose the instance of a message that moves, and return its number and the reason.
 
-    Raises ParameterError if the moving instances differ.
+    If several move and agree, it is the first of them. Raises ParameterError if the moving
+    instances differ.
     """
     motions = {number: _motion(table, fields) for number, table in tables.items()}
     moving = {
@@ -201,10 +204,10 @@ def _airspeed(sensors: Mapping[int, MessageTable]) -> tuple[MessageTable, str]:
 def _reason_against_airspeed(
     sensors: Mapping[int, MessageTable], parameters: Parameters
 ) -> Refusal | None:
-    """Return why the autopilot flew by none of its airspeed sensors.
+    """Return a refusal if the autopilot flew by none of its airspeed sensors, else None.
 
-    The reason follows from the flags U and H. For a log without U, ARSPD_USE counts. Returns None
-    if the autopilot flew by a sensor, or if the log does not say.
+    The flags U and H tell. For a log without U, the parameter ARSPD_USE tells. Returns None, too,
+    if the log does not say.
     """
     reasons = []
     for number, table in sorted(sensors.items()):

@@ -43,7 +43,7 @@ class _Channel:
     skip: int = 0  # number of messages that are skipped before the next one is read
 
     def chosen(self, batch: MessageBatch) -> slice:
-        """Return the slice of a batch's messages that are read."""
+        """Return the slice of the messages in a batch that are to be read."""
         if self.rate == math.inf:
             return slice(None)
         if self.step == 0 and len(batch.data) > 1 and batch.data.shape[1] >= STAMP.stop:
@@ -119,7 +119,7 @@ class Follower:
         return 0 if self.path is None else self.path.stat().st_size - position
 
     def skip(self, topics: Container[str]) -> None:
-        """Read no more messages of these topics, given by full names, from this file."""
+        """Stop reading the messages of some topics, given by full names, from this file."""
         for channel in self._channels.values():
             if channel.topic in topics:
                 channel.rate = 0.0

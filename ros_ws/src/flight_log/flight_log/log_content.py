@@ -124,21 +124,21 @@ class _Publisher:
         self.batched += len(table)
 
     def lead(self, table: Table, log_ns: NDArray[np.int64]) -> None:
-        """Note by how much the stamps of messages are later than their reception."""
+        """Note how far the stamps of messages are ahead of their reception."""
         leads_ns = stamps_of(table)[log_ns != 0] - log_ns[log_ns != 0]
         if len(leads_ns):
             least, largest = self.leads_ns or (2**62, -(2**62))
             self.leads_ns = min(least, int(leads_ns.min())), max(largest, int(leads_ns.max()))
 
     def has_clock_of(self, other: "_Publisher") -> bool:
-        """Return whether every stamp may come from the clock of the publisher `other`."""
+        """Return whether the stamps may come from the same clock as those of another publisher."""
         if self is other or self.leads_ns is None or other.leads_ns is None:
             return True
         (least, largest), (least_of_other, largest_of_other) = self.leads_ns, other.leads_ns
         return least_of_other - LATE_NS <= least and largest <= largest_of_other + LATE_NS
 
     def recording(self) -> Recording:
-        """Return what a check of the stamps, in the order of the recording, has found."""
+        """Return what the check of the stamps has found, in the order of the recording."""
         is_counted = self._numbered and not self._restarted
         return self.clock.recording(self.zeros)._replace(lost=self._lost if is_counted else None)
 
@@ -341,7 +341,7 @@ class TopicSamples:
         return any(before.last_ns >= after.first_ns for before, after in pairwise(spans))
 
     def recording(self, signal: Signal | None = None) -> Recording:
-        """Return the findings on the stamps of the flight's publishers. Call `signal` first."""
+        """Return what was found about the stamps of the flight. Call `signal` first."""
         recordings = [publisher.recording() for publisher in self.of_flight(signal)]
         if len(recordings) == 1:
             return recordings[0]
@@ -459,7 +459,7 @@ class LogContent:
                 self.attachments.append(StoredFile(name, record.data))
 
     def truncated_at(self, end: float | None) -> list[LostPart]:
-        """Return the spans that are lost at the ends of truncated files.
+        """Return which parts of the flight are lost at the ends of truncated files.
 
         `end` is the flight time of the last sample, s; None if there is no sample.
         """
@@ -507,7 +507,7 @@ def read_content(run: Path, stack_names: Mapping[str, str]) -> LogContent:
 
 
 def _add_metadata(folder: Path, log: LogContent) -> None:
-    """Add the information in metadata.yaml about a bag.
+    """Add what metadata.yaml says about a bag.
 
     If the file cannot be read, a note names the repair command.
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Collect the messages of a log in words: warnings, errors, parameters, learning and bridge."""
+"""Collect from a log the messages for the user: warnings, errors, parameters, learning, bridge."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace

@@ -72,7 +72,7 @@ Decoder = Callable[[Table], Decoded]
 
 @cache
 def typestore() -> Typestore:
-    """Return the message types of ROS 2 Jazzy; they are loaded once, which takes 70 ms."""
+    """Return the message types of ROS 2 Jazzy. The first call loads them, which takes 70 ms."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -122,7 +122,7 @@ def stamps_of(table: Table) -> NDArray[np.int64]:
 
 
 def rows_by_sender(table: Table) -> list[tuple[bytes, NDArray[np.int64] | None]]:
-    """List the senders in the headers of messages, as bytes, each with its rows.
+    """List the senders in the headers of messages, as bytes, and the rows of each sender.
 
     If all rows have one sender, its rows are None. A message without a header in plain CDR has the
     sender b"".
@@ -186,7 +186,10 @@ def encoded(samples: Samples) -> NDArray[np.uint8]:
 
 
 def _marks(k: int) -> FloatArray:
-    """Return k values to look for in a serialised message. Their bytes occur in no string."""
+    """Return k values that serve as marks in a serialised message.
+
+    Their bytes occur in no string.
+    """
     return np.asarray(-np.arange(1.0, k + 1.0) * np.pi)
 
 

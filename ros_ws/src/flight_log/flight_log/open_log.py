@@ -205,7 +205,7 @@ def log_topics(run: Path, stack_names: Mapping[str, str] = {}) -> dict[str, str]
 
 
 def plain_message(data: bytes) -> bytes:
-    """Return a message; if `ros2 bag record` compressed it, decompress it.
+    """Return a message in plain form: decompressed if `ros2 bag record` compressed it.
 
     No message in CDR begins like a compressed message. A damaged message is returned as it is,
     because no decoder accepts it.

@@ -155,7 +155,7 @@ def _scheduled(
 def _latched(
     messages: Sequence[ScheduledMessage], last_messages: Mapping[str, StoredMessage], begin_ns: int
 ) -> Iterator[ScheduledMessage]:
-    """Yield the messages of latched topics from before the beginning, for late subscribers.
+    """Yield the latched messages from before the beginning, which late subscribers still get.
 
     /robot_description is such a topic.
     """

@@ -74,7 +74,10 @@ def provenance() -> dict[str, dict[str, str]]:
 
 
 def recorded_arithmetic(metadata: Mapping[str, Mapping[str, str]]) -> str:
-    """Return the version of the arithmetic of u from a log; the present one if it has none."""
+    """Return the version of the arithmetic with which the u of a log was computed.
+
+    If the log does not state it, return the present version.
+    """
     return metadata.get(VERSIONS, {}).get("arithmetic", ARITHMETIC)
 
 

@@ -33,7 +33,7 @@ from flight_log.scan import Scan
 
 
 class FileRepair(NamedTuple):
-    """The result of a repair for one file."""
+    """What the repair of a file has found and done."""
 
     path: Path
     messages: int  # number of messages in the file after the repair
@@ -44,7 +44,7 @@ class FileRepair(NamedTuple):
 
 
 class Repair(NamedTuple):
-    """The result of a repair for a bag."""
+    """What the repair of a bag has found and done."""
 
     files: tuple[FileRepair, ...]
     wrote_metadata: bool

@@ -123,8 +123,9 @@ def bag_metadata_yaml(
 ) -> str:
     """Write the text of metadata.yaml.
 
-    Compression, custom data and distribution come from the `previous` content. Files of the
-    previous content that are `missing` from the folder stay in the lists of files.
+    Compression, custom data and distribution come from `previous`, the content of an earlier
+    metadata.yaml. Files that it lists but that are `missing` from the folder stay in the lists of
+    files.
     """
     counts: dict[str, TopicCount] = {}
     for count in chain.from_iterable(file.counts for file in files):
@@ -180,7 +181,7 @@ def _entries(information: Mapping[str, Any], names: Sequence[str]) -> list[dict[
 
 
 def _profiles(qos: str) -> list[Any]:
-    """Return the offered profiles in a channel's metadata; [] if they are no YAML list."""
+    """Return the quality-of-service profiles of a channel; [] if they are no YAML list."""
     try:
         profiles = parse_yaml(qos, "qos", "a list")
     except ParameterError:

@@ -119,7 +119,7 @@ _OF_THREAD = _Decompressor()
 
 
 class FilePart(NamedTuple):
-    """A record between the two magics of a file."""
+    """A whole record of a file, or a damaged one."""
 
     opcode: int
     content: bytes
@@ -287,7 +287,7 @@ def _known_places(index: Sequence[McapRecord], size: int) -> list[int]:
 
 
 def whole_parts(stream: IO[bytes], position: int, places: Sequence[int]) -> Iterator[FilePart]:
-    """Yield every whole record from a place to the end of the data, with its message indexes.
+    """Yield every whole record from a position to the end of the data, with its message indexes.
 
     A damaged record gets the opcode DAMAGED, and the reading continues at the next record of the
     index. If the last record is not one of ENDS, the file is truncated or still growing.
@@ -363,7 +363,7 @@ def _decoded(
 
 
 def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Map as `map` does, while a thread computes the next results.
+    """Apply a function to items like `map`, while a thread computes the next results in advance.
 
     The caller runs at the same time, because decompression and NumPy release Python's global lock.
     """
@@ -467,7 +467,7 @@ def _split_batches(
 
 
 def _heads(data: bytes) -> NDArray[np.void]:
-    """Return for every place of a chunk the head that a message at this place would have."""
+    """Read, at every byte of a chunk, the head that a message would have if it began there."""
     return np.ndarray((max(len(data) - HEAD.itemsize + 1, 0),), HEAD, data, strides=(1,))
 
 

@@ -22,7 +22,7 @@ PARAMETER_EVENT = "rcl_interfaces/msg/ParameterEvent"
 
 
 class StoredMessage(NamedTuple):
-    """A message as it is stored; its times are in ns by the clock of the recorder."""
+    """A message as it is stored in a log. Its times are in ns by the clock of the recorder."""
 
     topic: str  # full name
     type_name: str

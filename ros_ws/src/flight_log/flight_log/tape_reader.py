@@ -271,7 +271,7 @@ def _publisher_notes(
     """Write notes on topics with several publishers.
 
     There is a note if they sent samples at the same time, and if some have sent messages that are
-    no samples of the flight. A note covers all topics with the same publishers.
+    no samples of the flight. Topics that have the same publishers share a note.
     """
     conflicts = defaultdict[tuple[str, ...], list[str]](list)
     foreign = defaultdict[tuple[str, ...], list[str]](list)
@@ -312,7 +312,7 @@ def _stamped_by_clock(start_ns: int, spans: Mapping[str, SampleSpan]) -> bool:
 
 
 def _spans(topics: Iterable[tuple[str, Mapping[str, SampleSpan]]]) -> dict[str, SampleSpan]:
-    """Return the span of each publisher over all of its topics.
+    """Return the span of each publisher's samples over all of its topics.
 
     `topics` are names of topics with the spans of their publishers. For programs outside of the
     stack, only the topics of aircraft count.

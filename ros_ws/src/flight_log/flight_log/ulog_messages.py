@@ -30,14 +30,14 @@ TAIL = 528
 
 @dataclass(frozen=True, kw_only=True)
 class Messages:
-    """The undamaged messages of a ULog, again as the bytes of a ULog, and what was lost."""
+    """The undamaged messages of a ULog as the bytes of another ULog, and what was lost."""
 
     content: bytes
     loss: Loss | None
 
 
 def whole_messages(content: bytes) -> Messages:
-    """Return the messages that are followed by another message or by the end of the log.
+    """Keep the messages of a ULog that are followed by another message or by its end.
 
     If no bytes are lost, the content does not change. If the log has appended parts, it does not
     change either, because offsets in the log point to these parts.
@@ -70,7 +70,7 @@ def whole_messages(content: bytes) -> Messages:
 
 
 class _Log:
-    """The facts from earlier messages of a log by which the next message is recognised."""
+    """What earlier messages of a log tell, by which the next message is recognised."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content

@@ -211,11 +211,11 @@ def _read_tlog(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
 def _flown_system(
     messages_of: Mapping[int, list[Received]], choice: int | None
 ) -> tuple[int, tuple[tuple[str, str], ...]]:
-    """Choose the system of a tlog that flew, and return its number.
+    """Choose which system of a tlog flew, and return its number.
 
-    `choice` is the user's. The number is 0 if no autopilot sent a heartbeat. Also returns the
-    choice with its reason, if it is the user's or if there were several systems. Raises
-    ParameterError if two systems moved, or if the log lacks the user's choice.
+    `choice` is the user's choice. The number is 0 if no autopilot sent a heartbeat. If the user
+    chose, or if there were several systems, also returns the choice with its reason. Raises
+    ParameterError if two systems moved, or if the log lacks the system that the user chose.
     """
     numbers = " and ".join(map(str, messages_of)) or "none with a heartbeat"
     if choice is not None:
@@ -420,7 +420,7 @@ def _vehicle(instances: Instances) -> tuple[str, bool]:
 
 
 def _by_message(places: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
-    """Return the fields of some places, by message."""
+    """Group the given fields by the message that has them."""
     fields: dict[str, set[str]] = {}
     for message, field in places:
         fields.setdefault(message, set()).add(field)

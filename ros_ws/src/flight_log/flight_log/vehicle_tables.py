@@ -41,7 +41,7 @@ class MessageTable(NamedTuple):
 
 
 class ParameterRecord(NamedTuple):
-    """A value of a parameter of the autopilot, and the instant of the record, ns."""
+    """A value of a parameter of the autopilot, and when it was recorded, ns."""
 
     stamp_ns: int
     value: float
@@ -55,7 +55,7 @@ PARAMETER = "PARM"
 
 
 class LogField(NamedTuple):
-    """The place of a quantity in a log: its value is scale times the field."""
+    """Where a log has a quantity: a field of a message, and the factor that converts it."""
 
     message: str
     field: str
@@ -123,7 +123,10 @@ COPTER = "multicopter"
 
 
 class Choice(NamedTuple):
-    """The user's choice in a log: a system, sensors, and the kind of vehicle of the channel map."""
+    """What the user chooses of a log: a system, sensors, and the kind of vehicle.
+
+    The kind of vehicle is that of the channel map.
+    """
 
     system: int | None = None  # number of the system in a tlog; None for the system that flew
     # Number of the chosen instance, such as a sensor, by message. For any other message, the
