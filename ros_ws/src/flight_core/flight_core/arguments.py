@@ -51,7 +51,7 @@ def _bounded(
 ) -> float:
     """Return the value if it is a `number` from `least` to `most`, or raise ParameterError.
 
-    `expected` says in the refusal what the value should be.
+    The error says what was `expected`.
     """
     problems = Problems()
     number_in_bounds: float = kind_of(number, {"ge": least, "le": most}).read(value, key, problems)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Confine a process by the Linux kernel to one folder for files, without network.
+"""Confine a process to one folder for its files, and cut it off the network, by the kernel.
 
 Sources: unshare(2), landlock(7); include/uapi/linux/landlock.h.
 """
@@ -31,7 +31,7 @@ _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 def confine(folder: Path) -> list[str]:
-    """Take this process off the network, and let it change files only beneath `folder`.
+    """Cut this process off the network, and let it change files only beneath `folder`.
 
     The process must have a single thread. Returns a sentence for each measure that the kernel does
     not support.

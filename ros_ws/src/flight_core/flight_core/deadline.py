@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Set a deadline for a process that holds even if a library call blocks the interpreter.
+"""Set a deadline for a process, which holds even if a library call blocks the interpreter.
 
 During such a call Python runs no other thread and no signal handler. The default action of a signal
 would end the process, but without the exit status. A timer of the kernel therefore starts a thread

@@ -9,7 +9,7 @@ DWELL = 10.0
 
 
 class Failures:
-    """A count of failed steps.
+    """Counts failed steps, and tells when to log a sentence about them.
 
     A sentence is due at the first failed step. It is due again at a failed step if no step has
     failed in the time DWELL before it.

@@ -54,7 +54,7 @@ class Problems:
         return self.unknown + self.missing_sentences() + self.others
 
     def missing_sentences(self) -> list[str]:
-        """Write one sentence for each set that lacks keys. It names all the missing keys."""
+        """Write one sentence for each set that lacks keys, with the names of all missing keys."""
         sentences = []
         for where, keys in self.missing.items():
             (name, meaning), *more = keys.items()
@@ -81,7 +81,7 @@ class Problems:
 
 
 class Kind(NamedTuple):
-    """The values that an annotation permits, and how they are read."""
+    """The values that an annotation permits, and how to convert them."""
 
     expected: str  # words that describe the permitted values in a sentence
     takes: Callable[[Any], bool]  # whether a value has the type

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check that a computation knows every key of a parameter set that is not at its default.
 
-Some functions compute a flight without the code of the nodes. Each of them states the set of keys
-that it knows. `require_known` refuses every other key whose value is not the default. So if a new
-key is declared, such a function refuses it until the key is added to the function's set.
+Some functions compute a flight without the code of the nodes. Each of them states which keys it
+takes into account. `require_known` refuses every other key whose value is not the default. So if a
+new key is declared, such a function refuses it until the key is added to the function's set.
 
 A key is a dotted name, such as `actuators.lag`. If sections are given by name in a mapping, they
 share their keys. For example, the `start` of every gust is `gusts.*.start`.
@@ -102,7 +102,7 @@ def unknown_keys(parameters: Config, known: Set[str]) -> list[SetKey]:
 
 
 def _outermost(parameters: Config, found: SetKey, known: Set[str]) -> SetKey:
-    """Return the outermost optional section that contains a key and has no known key.
+    """Return the largest section around a key that is optional and of which no key is known.
 
     Returns the key itself if there is no such section.
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Give notes to the user of a process, each of them once.
+"""Give notes to the user of a process, each note only once.
 
 They go to the standard error if no logging is configured.
 """

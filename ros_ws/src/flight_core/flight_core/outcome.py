@@ -49,7 +49,7 @@ class End(StrEnum):
 
 
 class Aim(StrEnum):
-    """What a flight must achieve.
+    """A kind of requirement on a flight.
 
     The aims whose shortfalls are the most serious come first, because a shortfall of an aim can
     explain shortfalls of the later aims.
@@ -179,7 +179,7 @@ class Outcome:
         return _shortened(headline)
 
     def _begin(self) -> str:
-        """Return the beginning of the headline, which says how the flight ended, and why."""
+        """Return the first words of the headline: how the flight ended, and why."""
         if self.end in {End.NEVER_FLEW, End.UNKNOWN} and self.reason:
             return f"{self.end}: {self.reason}"
         return self.reason or self.end.value
@@ -215,7 +215,7 @@ class Outcome:
         }
 
     def record(self) -> dict[str, str]:
-        """Return the end and the reason for the log.
+        """Return what the log stores of the outcome: how the flight ended, and why.
 
         The shortfalls are left out, because they follow from the log itself.
         """
@@ -272,7 +272,7 @@ def read_outcome(record: object) -> Outcome:
 
 
 def _of_fleet(record: Mapping[str, Any]) -> tuple[Shortfall, ...]:
-    """Read those shortfalls of a record that do not follow from the log of a single aircraft.
+    """Read the shortfalls of a record that the log of a single aircraft cannot show.
 
     They are those of the separation in a fleet.
     """

@@ -25,12 +25,12 @@ def require_sender(sender: str, expected: str) -> None:
 
 
 class PublisherLock:
-    """Locks to the first publisher of a topic, until its samples time out.
+    """Takes a topic from its first publisher only, until the samples of this publisher time out.
 
-    After the timeout, it locks to the next publisher. A restarted node, which has the same name,
-    can take over earlier than a different node. The time in which the receiving node overruns does
-    not count as silence of the publisher. Otherwise another publisher could take over if the node
-    happens to take its sample first after the overrun.
+    After the timeout, it takes the topic from the next publisher. A restarted node, which has the
+    same name, can take over earlier than a different node. The time in which the receiving node
+    overruns does not count as silence of the publisher. Otherwise another publisher could take over
+    if the node happens to take its sample first after the overrun.
 
     The middleware numbers the messages of a publisher. If the numbers go back, two publishers use
     the same name. In this case neither is admitted, because either can be forged.
@@ -64,7 +64,7 @@ class PublisherLock:
         return sender == self.publisher and not self.timed_out(now_ns, self._timeouts_ns()[0])
 
     def overran(self, duration_ns: int) -> None:
-        """Note a time in which this node did not run, so that it does not count as silence."""
+        """Note that this node did not run for a time, so that it does not count as silence."""
         self._overrun_ns += duration_ns
 
     def check(self, sender: str, now_ns: int) -> None:
@@ -122,7 +122,7 @@ class PublisherLock:
 
 
 class LockstepLock(PublisherLock):
-    """Locks a topic of a lockstep flight to the publisher of its first message, for good.
+    """Takes a topic of a lockstep flight from the publisher of its first message only.
 
     In lockstep each message is an instant of the flight, so a message of another publisher must not
     count. No message is lost, so the numbers of one publisher rise by one each time. Any other

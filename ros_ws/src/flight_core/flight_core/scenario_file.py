@@ -113,7 +113,7 @@ def names_node(content: bytes, path: Path, name: str, key: str, namespace: str) 
 
 
 def gives_all(content: bytes, path: Path, key: str) -> bool:
-    """Return whether a section for all nodes has the parameter `key`.
+    """Return whether a file gives the parameter `key` to all nodes.
 
     Raises as `names_node` does.
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Make requests to Linux's scheduler, so that fewer ticks of a node are late.
+"""Ask Linux's scheduler for settings with which fewer ticks of a node are late.
 
 No request needs a privilege. If Linux refuses a request, ticks are as late as without it.
 """
@@ -28,8 +28,8 @@ def compute_in_one_thread() -> None:
     Call this before NumPy is imported, because OpenBLAS reads the number of threads only once. The
     matrices here have at most some hundred rows. For such matrices two threads take longer than
     one, because each waits for the other, and on a busy host they take several times as long. With
-    one thread, the last bits of a result also do not depend on the number of processors. A number
-    of threads that the user has set is kept.
+    one thread, the last bits of a result also do not depend on the number of processors. If the
+    user has set a number of threads, it stays.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

@@ -159,7 +159,10 @@ class Process:
 
 @dataclass(frozen=True, kw_only=True)
 class LostPart:
-    """A span of a flight that its log lost: a file, the end of a file, or a leap of the clock."""
+    """A part of a flight that is missing in its log, and why.
+
+    A file, the end of a file, or the time of a forward step of the clock may be missing.
+    """
 
     sentence: str
     # True if the end of a file is lost. If the flight has a planned end, this also shows by the
