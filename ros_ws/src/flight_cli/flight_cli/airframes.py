@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di airframes`: check the assumptions of the theorem on any airframe.
+"""Implement `rise-di airframes`, which checks the assumptions of the theorem on any airframe.
 
 The airframe comes from the library or from the user. The command can also write a new airframe.
 """
@@ -115,7 +115,7 @@ class Airframes:
             _show(Console(), facts)
 
     def _make(self, folder: Path) -> None:
-        """Write the airframe and the scenario, and show the first flight."""
+        """Write the airframe and the scenario, fly the scenario once, and show the result."""
         sources = self.names or []
         sources_text = f"{len(sources)} sources"
         require(len(sources) == 1, "airframes", sources_text, "one beside --write")
@@ -192,7 +192,7 @@ def _roots(facts: AirframeFacts) -> tuple[str, str, str]:
 
 
 def _format_roots(roots: ComplexArray) -> str:
-    """Return roots as text, with one text for a conjugate pair; tiny parts are written as 0."""
+    """Write roots as text. A conjugate pair is one text, and tiny parts are 0."""
     texts = []
     for root in roots:
         real, imaginary = (

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Excite the aircraft behind a channel map, as `rise-di identify bridge` does.
+"""Find gains for the aircraft behind a channel map, as `rise-di identify bridge` does.
 
-The result is a scenario that flies this aircraft. A channel map assigns the channels to messages of
-an autopilot.
+A channel map says which field of an autopilot's messages is which channel. The aircraft is excited
+in flight, and the result is a scenario that flies it.
 """
 
 import shlex
@@ -67,11 +67,11 @@ GUIDED = 600.0  # duration of a flight under guidance, s
 
 @dataclass(frozen=True, kw_only=True)
 class BridgeExperiment:
-    """An experiment on the aircraft behind a channel map: it is flown, or its log is read.
+    """An experiment on the aircraft behind a channel map, which is flown or read from its log.
 
-    The files that fly the aircraft are written to `folder`. If the log was imported, the gains
-    allow for `link_delay`, s, in addition to the delay in the log. If `link_delay` is None, it is
-    that of the map.
+    The results, an airframe and a scenario, are written to `folder`. If the log was imported, the
+    gains allow for `link_delay`, s, in addition to the delay in the log. If `link_delay` is None,
+    it is that of the map.
     """
 
     map_name: str
@@ -84,7 +84,7 @@ class BridgeExperiment:
     link_delay: float | None
 
     def identify(self, *, as_json: bool) -> None:
-        """Excite the aircraft, or read the log, and write the files that fly it."""
+        """Fly the experiment or read its log; write the airframe, and the scenario with gains."""
         channel_map = load_map(self.map_name)
         self._require_fit(channel_map)
         console = Console(quiet=as_json)
@@ -121,7 +121,10 @@ class BridgeExperiment:
             say(console, f"under guidance: {path} in its place")
 
     def _require_fit(self, channel_map: ChannelMap) -> None:
-        """Raise ParameterError if an option does not fit the map, before anything flies."""
+        """Check that the options fit the channel map, before anything flies.
+
+        Raises ParameterError if not.
+        """
         expected = "above 0 and at most 1, a fraction of the limits of the map"
         require(0.0 < self.amplitude <= 1.0, "amplitude", self.amplitude, expected)
         has_speed = self.speed is not None or not has_airspeed(channel_map)
@@ -164,7 +167,10 @@ class BridgeExperiment:
         *,
         imported: bool,
     ) -> IdentifiedChannels:
-        """Add the delay of the link to the channels, if the log was imported."""
+        """Add the delay of the link to the identified channels if the log was imported.
+
+        An imported log was written on board, so it lacks this delay.
+        """
         expected = "a log of rise-di import: an experiment over the link contains its delay"
         require(imported or self.link_delay is None, "link_delay", self.link_delay, expected)
         if not imported:
@@ -186,9 +192,9 @@ class BridgeExperiment:
 
 
 def guided_scenario(scenario: str, channel_map: ChannelMap, speed: float | None) -> str | None:
-    """Return the text of the scenario with guidance in place of its commands.
+    """Return the text of the scenario, with guidance instead of commands over time.
 
-    Returns None if guidance cannot fly it, because the map lacks the pose, the rates or the
+    Returns None if guidance cannot fly it, because the channel map lacks the pose, the rates or the
     airspeed.
     """
     if speed is None or not channel_map.pose or not {*RATES_AND_SPEED} <= {*channel_map.outputs}:
@@ -270,10 +276,11 @@ def _announce(console: Console, plan: Experiment, duration: float, *, hovers: bo
 def _engaged(
     run: Path, channel_map: ChannelMap
 ) -> tuple[Tape, list[tuple[int, int]], Refusal | None]:
-    """Return the tape of an experiment, the engaged spans, ns, and why it ended early, if so.
+    """Return the tape of an experiment and its engaged spans, ns.
 
-    A log of `rise-di import` is a single span. Raises ParameterError if the log has no engagement,
-    or if the flight had feedback, because u then follows y.
+    The third result says why it ended early; it is None if it did not. A log of `rise-di import` is
+    a single span. Raises ParameterError if the log has no engagement, or if the flight had
+    feedback, because u then follows y.
     """
     recorded_run = read_run(run)
     warn_of_lacks(recorded_run)
@@ -310,7 +317,7 @@ def _engaged(
 
 
 def _digits(value: float, digits: int) -> str:
-    """Write a value with so many leading digits, without an exponent if it is below 1e6.
+    """Write a value with a number of significant digits, without an exponent if it is below 1e6.
 
     A narrow column would cut off the exponent.
     """
@@ -392,7 +399,10 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
 
 
 def _show_link(console: Console, channel_map: ChannelMap, link_delay: float | None) -> None:
-    """Print for which delay of the link the gains hold, because the log was written on board."""
+    """Print for which delay of the link the gains hold.
+
+    The log was written on board, so this delay is not in it.
+    """
     if link_delay is None:
         sentence = (
             f"The map {channel_map.name} states no link_delay. Gains and margins are without the "

@@ -181,7 +181,7 @@ def _repeat_interrupt(ignored: "sys.UnraisableHookArgs") -> None:
 
 
 def _looks_on(words: Sequence[str]) -> bool:
-    """Return whether a command only shows a flight. Such a command yields its CPU time.
+    """Return whether a command only shows a flight and so should yield its CPU time to it.
 
     A page with buttons that deactivate the law, or that command a hold, does not yield, because it
     has to answer when the host is busy.
@@ -190,7 +190,10 @@ def _looks_on(words: Sequence[str]) -> bool:
 
 
 def main() -> None:
-    """Run a command. Bad input ends with a sentence and exit status 2. Ctrl-C is quiet."""
+    """Run a command of the command line.
+
+    Bad input ends with a sentence and exit status 2. Ctrl-C ends without a traceback.
+    """
     gc.set_threshold(GARBAGE_THRESHOLD)
     compute_in_one_thread()
     if _looks_on(sys.argv[1:]):

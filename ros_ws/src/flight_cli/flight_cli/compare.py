@@ -80,7 +80,7 @@ Gains = dict[str, dict[str, TuningResult]]
 
 
 class Contest(NamedTuple):
-    """The laws of a comparison, and the file with their tuned gains."""
+    """The laws to compare, and the file with their tuned gains."""
 
     scenario: Scenario
     names: Sequence[str]

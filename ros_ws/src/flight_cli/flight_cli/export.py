@@ -31,7 +31,7 @@ DIFFERS = 1
 
 
 class Target(Enum):
-    """What the code is written as. The value is the argument `autopilot` of the library."""
+    """What the code is written for. The value is the argument `autopilot` of the library."""
 
     C = None
     PX4 = "px4"

@@ -98,7 +98,7 @@ def _separated(
 
 
 def _unreported(flight: MemberFlight) -> _AircraftResult:
-    """Return the result of an aircraft as known before its report is written."""
+    """Return what is known of an aircraft before its report is written."""
     outcome = flight.outcome.as_json()
     outcome["sentence"] = f"{flight.outcome}, no report: rise-di report writes it"
     return _AircraftResult(

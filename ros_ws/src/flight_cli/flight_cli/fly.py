@@ -230,12 +230,15 @@ class Fly(RouteWords):
         return begins and not (self.real_time or self.in_process or has_own_time)
 
     def _require_one_length(self) -> None:
-        """Raise ParameterError if --quiet is given together with --verbose or --json."""
+        """Check that --quiet is not given together with --verbose or --json.
+
+        Raises ParameterError if it is.
+        """
         if self.quiet:
             require_unused(self, ["verbose", "as_json"], "one of the two", "--quiet beside it")
 
     def _require_one_way(self, *, stepping: bool) -> None:
-        """Raise ParameterError if options ask for two ways to fly at once."""
+        """Check that the options ask for only one way to fly. Raises ParameterError if not."""
         other = self.in_process or self.use_sim_time or stepping
         contradiction = "a flight in lockstep, in one process or by /clock"
         require(not (self.real_time and other), "--real-time", contradiction, "one of the two")
@@ -308,7 +311,7 @@ class Fly(RouteWords):
         raise typer.Exit(fly_fleet_file(fleet, runs, as_json=self.as_json))
 
     def _watch(self, *runs: Path, fleet: bool = False) -> None:
-        """With --watch, serve the page of the runs while the command lasts."""
+        """If --watch is given, serve the page of the runs while the command lasts."""
         if not self.watch:
             return
         from flight_cli.watch import watched  # noqa: PLC0415 - loads the server, which few flights need
@@ -318,7 +321,7 @@ class Fly(RouteWords):
 
 
 def _falls_back(lack: Refusal | None, *, can_step: bool = True) -> bool:
-    """Return whether to fly in lockstep because the host lacks something, and tell the user.
+    """Return whether to fly in lockstep because the host cannot fly in real time; tell the user.
 
     `lack` is what the host lacks for real time, or None. If `can_step` is False, the flight stays
     in real time, and the user gets a warning.
@@ -333,9 +336,10 @@ def _falls_back(lack: Refusal | None, *, can_step: bool = True) -> bool:
 
 
 def _as_host_allows(fleet: Fleet) -> Fleet:
-    """Return the fleet, which flies in lockstep and composed if the host lacks something.
+    """Return the fleet as this host can fly it.
 
-    Composed means that the nodes of an aircraft share a process.
+    If the host lacks something for real time, the fleet flies in lockstep and composed, which means
+    that the nodes of an aircraft share a process.
     """
     scenarios = [member.scenario for member in fleet.members]
     lack = shortage(scenarios, cores_given, composed=fleet.composed)
@@ -402,7 +406,7 @@ def _report(
 
 
 def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_process: bool) -> None:
-    """Raise ParameterError if the flight would fail. This comes before anything is written."""
+    """Check that a flight can begin, before anything is written. Raises ParameterError if not."""
     if not in_process:
         require_package("rclpy", "; without ROS fly with --in-process")
         require_ros_environment()
@@ -415,7 +419,10 @@ def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_proc
 
 
 def _that_learns(scenario: Scenario) -> Scenario:
-    """Return the scenario with a learner. Raises ParameterError if it already has a model."""
+    """Return the scenario with a learner, which learns a model in flight.
+
+    Raises ParameterError if it already has a model.
+    """
     from flight_design.learning.scenario_learner import that_learns  # noqa: PLC0415 - loads SciPy, which few flights need
 
     return that_learns(scenario)

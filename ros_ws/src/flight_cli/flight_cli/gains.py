@@ -109,7 +109,10 @@ class _Gains:
     as_json: bool = json_option()
 
     def _require_airframe(self) -> None:
-        """Raise ParameterError if the name of a scenario is given in place of an airframe's."""
+        """Check that the name is that of an airframe, and not of a scenario.
+
+        Raises ParameterError if not.
+        """
         is_scenario = self.airframe in set(scenarios()) - set(airframes())
         require(
             not is_scenario,
@@ -337,7 +340,7 @@ class Guarantee(Check):
         self._exit_if_loop_fails(sets)
 
     def _bound_limited(self, answer: GainAssessment[Any], loop: LinearLoop) -> None:
-        """Prove the guarantee for a loop in which one input saturates, write and print it."""
+        """Prove the guarantee for a loop in which one input saturates; write and print it."""
         name = self.saturation or ""
         require_linear(loop)
         guarantee = guarantee_with_limit(loop, name)
@@ -355,7 +358,7 @@ class Guarantee(Check):
 def _loop_of_px4(
     px4: Path | None, rate: float | None, delay: float | None
 ) -> tuple[float | None, float | None, str]:
-    """Return the rate and the delay of the loop, and a text on their source.
+    """Return the rate and the delay of the loop, and a text on where they come from.
 
     They come from the arguments, or from a parameter file of PX4 if there is one.
     """

@@ -56,7 +56,10 @@ def require_guarantee(
     worst: Path | None,
     certificate: Path | None,
 ) -> None:
-    """Raise ParameterError for options that contradict each other, or that cannot be met."""
+    """Check that the options do not contradict each other, and that a guarantee can be computed.
+
+    Raises ParameterError if not.
+    """
     as_number(late, "late", 0.0, MAX_DELAY_MARGIN, "s")
     if controller_alone(scenario) is not None:
         require(worst is None, "worst", f"no aircraft in {scenario}", "a scenario that flies one")
@@ -89,7 +92,7 @@ def proved(
 
 
 def require_linear(loop: LinearLoop) -> None:
-    """Raise ParameterError if the aircraft that flies has no linear loop."""
+    """Check that the aircraft that flies has a linear loop. Raises ParameterError if not."""
     for each in loop.differences:
         expected = "the aircraft of a linear loop for a guarantee"
         require(each.standing is Standing.TAKEN, "guarantee", each.fact, expected)
@@ -114,7 +117,10 @@ def write_certificate(
 
 
 def _require_worst(folder: Path | None, airframe: str, scenario: str) -> None:
-    """Raise ParameterError if the scenario does not fly the airframe whose variants are written."""
+    """Check that the scenario flies the airframe of which unstable variants are to be written.
+
+    Raises ParameterError if not.
+    """
     if folder is None:
         return
     base = find_scenario(scenario)

@@ -24,7 +24,10 @@ def require_saturation(
     entries: Sequence[str],
     worst: Path | None,
 ) -> None:
-    """Raise ParameterError if the input is unknown, or if options do not fit --saturation."""
+    """Check that the input of --saturation exists, and that the other options fit it.
+
+    Raises ParameterError if not.
+    """
     if saturation is None:
         return
     inputs = scenario_to_check(scenario).controller.inputs

@@ -19,7 +19,7 @@ def milliseconds(margin: float) -> str:
 
 
 class Verdict(NamedTuple):
-    """The verdict on a part of the conditions. The sentence is empty if the part has none."""
+    """The verdict on a group of conditions. Its sentence is empty if there are no conditions."""
 
     holds: bool
     sentence: str
@@ -96,7 +96,7 @@ function that judges this part, in the order in which the parts are shown."""
 
 
 def condition_name(row: tuple[GainCondition, ...], outputs: tuple[str, ...]) -> str:
-    """Return the name of a table row, which shows one condition for each gain set.
+    """Return the name of a table row, which has the same condition of each gain set.
 
     If the condition names the same channel in all gain sets, the name of the row has this channel.
     """

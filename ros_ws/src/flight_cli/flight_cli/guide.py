@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Implement `rise-di guide`, which changes what a guided flight holds from now on.
+"""Implement `rise-di guide`, which commands a guided flight while it flies.
 
 The command also calls the services of guidance, keeps the operator's link alive and sends a route.
 """

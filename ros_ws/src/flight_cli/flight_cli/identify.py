@@ -64,12 +64,12 @@ REFLY_MARGIN = 0.03  # delay margin, s, of a flight that is flown again
 
 
 def _phase_margin_option() -> Any:
-    """Declare the option --phase-margin of gains for an identified aircraft."""
+    """Declare the option --phase-margin of gains that are selected for an identified aircraft."""
     return rare_option("Least phase margin of the loop, deg.", default=PHASE_MARGIN)
 
 
 def _accept_option() -> Any:
-    """Declare the option --accept of gains for an identified aircraft."""
+    """Declare the option --accept of gains that are selected for an identified aircraft."""
     text = "Accept a phase margin below 40 deg, and gains whose margins fall short."
     return rare_option(text, default=False)
 
@@ -148,7 +148,7 @@ class Jsbsim:
             raise ParameterError(f"identify: {lack}; the gains are in {where}")
 
     def _scenario_path(self, name: str) -> Path:
-        """Return the path for the scenario. Only a path that --write names may already exist."""
+        """Return where to write the scenario. It may only exist already if --write names it."""
         path = self.write or Path(f"jsbsim_{Path(name).stem}.yaml")
         expected = "a file to write over, or another"
         is_new = self.write is not None or not path.exists()
@@ -305,7 +305,7 @@ class Bridge:
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Fly the experiment, or read its log, and write the files that fly the aircraft."""
+        """Fly the experiment or read its log; write the airframe, and the scenario with gains."""
         speed = self.speed
         require(speed is None or 0.0 < speed < math.inf, "speed", speed, "above 0 m/s")
         later = self.link_delay

@@ -92,7 +92,7 @@ class Import:
             self._import_by_map(self.map_name, folder)
 
     def _import_by_map(self, map_name: str, folder: Path) -> None:
-        """Write y, u and pose according to the rows of a channel map."""
+        """Write y, u and pose of a log, which the rows of a channel map find in it."""
         channel_map = load_map(map_name)
         console = Console()
         choice = Choice(self.system, _numbers(self.instances or []), kind_of_map(channel_map))
@@ -134,7 +134,7 @@ def _show_agreement(console: Console, rows: list[Agreement]) -> None:
 
 
 def _import_module(log: Path, scenario: Scenario, folder: Path) -> None:
-    """Write the ticks of the module in a PX4 log as a run of the module's scenario."""
+    """Write the ticks of a controller that was exported into PX4 as a run of its scenario."""
     module_log = read_foreign_log(log)
     flight = module_flight(module_log, scenario.controller)
     with writing("--output", folder, "a folder that can"):

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Implement `rise-di learn`, which runs the learner again on the log of a flight.
 
-The learner may have other settings than in the flight. The command can also write the model, and a
-certificate of its loop.
+The settings of the learner may differ from those in the flight. The command can also write the
+model, and a certificate of its loop.
 """
 
 from dataclasses import dataclass
@@ -69,7 +69,7 @@ class Learn:
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Learn again, print the steps, and write the model."""
+        """Run the learner on the log, print its steps, and write the model."""
         if self.write is not None:
             require_yaml("--write", self.write)
         if self.certificate is not None:

@@ -68,7 +68,7 @@ def scenario_file(name: str | None) -> Path | None:
 def warn_of_lacks(recorded_run: RecordedRun) -> None:
     """Print a warning on standard error for everything that a log lacks.
 
-    This keeps users from believing that a result covers more than was recorded.
+    Without it, users might believe that a result covers more than was recorded.
     """
     account = log_account(recorded_run)
     import_note = recorded_run.metadata.get(IMPORTED, {}).get(COMPARED, "")

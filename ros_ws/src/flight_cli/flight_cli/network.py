@@ -61,7 +61,7 @@ class Network:
             self._exchange(own_host, hosts)
 
     def _exchange(self, own_host: str, hosts: Sequence[str]) -> None:
-        """Wait for the other hosts, and print for each host whether both sides receive."""
+        """Exchange messages with the other hosts, and print for each whether both sides receive."""
         from flight_bringup.client import NetworkClient, domain_ports  # noqa: PLC0415 - loads rclpy
 
         others = [address for address in hosts if address != own_host]

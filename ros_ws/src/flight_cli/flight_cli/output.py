@@ -47,7 +47,7 @@ LATEST = Path("runs/latest")  # the run that a command takes if the user names n
 
 
 def has_desktop() -> bool:
-    """Return whether the user at the terminal can see a browser of this machine."""
+    """Return whether the user at the terminal can see a browser that opens on this machine."""
     has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
     return sys.stdout.isatty() and (has_display or sys.platform in {"darwin", "win32"})
 
@@ -160,7 +160,7 @@ def new_table(
 def print_table(console: Console, table: Table) -> None:
     """Print a table as wide as its content.
 
-    A narrow terminal folds the lines, but no cell is cut.
+    If the terminal is narrower, the lines fold, but no cell is cut.
     """
     for column in table.columns:
         if column.no_wrap:
@@ -196,7 +196,7 @@ def progress_bar(*columns: ProgressColumn, quiet: bool = False) -> Progress:
 
 
 def clock(t: float, duration: float) -> str:
-    """Return the text of a progress bar that shows the flight time, s."""
+    """Write the flight time, s, of `duration`, s, for a progress bar."""
     return f"t = {t:5.1f} of {duration:g} s"
 
 
@@ -302,12 +302,18 @@ def write_text(option: str, path: Path, text: str) -> None:
 
 
 def require_writable(option: str, path: Path) -> None:
-    """Raise ParameterError if a file that an option names cannot be written, before long work."""
+    """Check that a file that an option names can be written, before long work begins.
+
+    Raises ParameterError if not.
+    """
     fits = os.access(path.parent, os.W_OK) and not is_folder(path)
     require(fits, option, path, "a file in a folder that can be written")
 
 
 def require_yaml(option: str, path: Path) -> None:
-    """Raise ParameterError if a path is not that of a .yaml file in an existing folder."""
+    """Check that a path is that of a .yaml file in an existing folder.
+
+    Raises ParameterError if not.
+    """
     require(path.suffix == ".yaml", option, path, "a name that ends in .yaml")
     require(path.parent.is_dir(), option, path, "a file in a folder that exists")

@@ -21,7 +21,7 @@ from flight_log.tape_reader import topics_text
 
 
 class Stamps(StrEnum):
-    """How the stamps of the messages are set."""
+    """Which stamps the played messages get."""
 
     NOW = "now"
     RECORDED = "recorded"

@@ -130,7 +130,7 @@ class Report:
 
 
 def _show(flights: Sequence[RecordedFlight]) -> None:
-    """Print the tables of a flight, or a comparison of several."""
+    """Print the tables of one flight, or a comparison of several flights."""
     if len(flights) > 1:
         show_comparison(Console(), flights)
         return

@@ -55,7 +55,7 @@ class Runs:
 
 
 def _row(run: Path) -> dict[str, Any]:
-    """Return the row of a run from its report; without a report, it says how to write one."""
+    """Return the row of a run from its report. Without a report, the row says how to write one."""
     name = display_path(run)
     row = {"run": name, "scenario": "", "duration": None, "outcome": NO_REPORT.format(run=name)}
     # A killed flight has no summary, and a summary of another version may lack a key.

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Implement `rise-di tune`, which makes a better module from the log of an autopilot.
+"""Implement `rise-di tune`, which makes a better controller from the log of an autopilot.
 
-It imports, identifies, selects gains, compares, bounds and exports, as the commands with these
-names do.
+The controller is exported as a module for the autopilot. The command imports, identifies, selects
+gains, compares, bounds and exports, as the commands with these names do.
 """
 
 import math
@@ -222,7 +222,7 @@ class Tune:
     def _in_time(
         self, console: Console, scenario: Scenario, of_log: RatesLog, autopilot: str
     ) -> tuple[Scenario, float]:
-        """Return the scenario with the delay of the log, and the delay of the gyro's filter.
+        """Return the scenario with the delay of the log, and the delay of the gyro's filter, s.
 
         For PX4 both delays follow from the rate and the filters of the gyro. For ArduPlane the
         scenario stays as it is, and the second delay follows from the cut-off of the filter. If the
@@ -357,8 +357,8 @@ def _what_to_fly(identification: Identification, scenario: Scenario, log: Path) 
 def _kept(nominal: Airframe, identification: Identification) -> Airframe | None:
     """Return the airframe with the identified parts, or None if a part must not be used.
 
-    A part is a group of entries that are identified together. If its nominal model explains the log
-    better, the part stays nominal.
+    A part is a group of entries that are identified together. If the nominal model of a part
+    explains the log better, the part stays nominal.
     """
     used = []
     for part in identification.parts:
@@ -374,7 +374,7 @@ def _is_better(part: Part) -> bool:
 
 
 def _kept_model(part: Part) -> str:
-    """Return a text on which model of a refused part is used."""
+    """Say which model is used for a part whose identified model is refused."""
     kept = "is taken, as the likelier one" if _is_better(part) else "stays nominal"
     return f"the model {kept}"
 
@@ -396,9 +396,9 @@ def _uncertainty(identification: Identification) -> float:
 
 
 def _box(identification: Identification, airframe: Airframe) -> dict[str, float]:
-    """Return the uncertainty of each entry by name, as a fraction of its value in the airframe.
+    """Return by how much each entry may deviate in the guarantee, as a fraction of its value.
 
-    The uncertainty is twice the standard deviation. In a part that stays nominal, it is at least
+    It is twice the standard deviation of the entry. In a part that stays nominal, it is at least
     the difference between the identified and the nominal value.
     """
     A, B = airframe.matrix_a(), airframe.matrix_b()

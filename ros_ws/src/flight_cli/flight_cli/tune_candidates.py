@@ -60,7 +60,7 @@ class Candidate(NamedTuple):
 
 
 class Selectors(NamedTuple):
-    """The data and options with which candidates are selected and judged."""
+    """The data and options by which candidates are selected and judged."""
 
     airframe: Airframe  # the identified airframe
     flight: Scenario  # scenario of the log, with the identified airframe
@@ -76,7 +76,7 @@ class Selectors(NamedTuple):
 
     @property
     def airs(self) -> dict[str, dict[str, Any]]:
-        """The airs in which the candidates fly, each as parameters of the section aircraft."""
+        """The kinds of air in which candidates fly, as parameters of the section aircraft."""
         airs: dict[str, dict[str, Any]] = {CALM: {}}
         if self.airframe.gusts and not self.calm:
             airs[GUSTS] = {"turbulence": dict(TURBULENCE)}
@@ -205,7 +205,7 @@ def _judged(selectors: Selectors, name: str, controller: RiseDiConfig, origin: s
 
 
 def _flown(selectors: Selectors, scenario: Scenario, air: Mapping[str, Any]) -> Tape:
-    """Simulate a scenario with the airframe file `aircraft` in an air, such as calm air."""
+    """Simulate a scenario with the airframe file `aircraft` in one kind of air."""
     return simulate(scenario.vary(aircraft={"airframe": str(selectors.aircraft), **air}))
 
 

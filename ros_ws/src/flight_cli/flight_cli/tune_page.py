@@ -89,7 +89,7 @@ class Tuned(NamedTuple):
 
 
 def error_rows(tuned: Tuned) -> list[list[str]]:
-    """Return a row for each controller in each air, with its name and the rms errors, mrad/s."""
+    """Return a table row for each controller in each kind of air: name and rms errors, mrad/s."""
     loops = [(each.name, each.rms, each is tuned.best) for each in tuned.candidates]
     if tuned.own is not None:
         loops.append((OWN, tuned.own.rms, False))

@@ -113,7 +113,10 @@ class Watch:
             serve(flights, ports, _announce, fleet=self.fleet)
 
     def _require_one_view(self) -> None:
-        """Raise ParameterError if options contradict each other or the number of runs."""
+        """Check that the options ask for one view, and fit the number of runs.
+
+        Raises ParameterError if not.
+        """
         runs = len(self.run or ())
         controlled = self.control or self.real
         require(
@@ -147,7 +150,7 @@ def _in_progress(runs: Path) -> list[Path]:
 
 
 def _newest(runs: Path, namespace: str | None) -> Path:
-    """Return the newest run, and print which other aircraft fly."""
+    """Return the newest run, and print which other aircraft fly at the same time."""
     run = newest_run(runs, namespace)
     others = [display_path(folder) for folder in runs_in_recording(runs) if folder != run]
     if others and namespace is None:
@@ -198,7 +201,7 @@ def _serve_with_control(
 
 @contextmanager
 def watched(*runs: Path, fleet: bool = False) -> Iterator[list[str]]:
-    """Serve the page of runs that another process will record during the block.
+    """Serve the page of runs that another process records during the block.
 
     Yields the lines to print for the user.
     """

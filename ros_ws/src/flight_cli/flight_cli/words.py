@@ -86,7 +86,7 @@ def namespace_option() -> Any:
 
 
 def _field(declare: Callable[[str], object], default: Any) -> Any:
-    """Return a data-class field that carries its declaration for Typer."""
+    """Return a data-class field that holds the declaration of an option or argument for Typer."""
     metadata = {DECLARE: declare}
     if default is REQUIRED:
         return field(metadata=metadata)
@@ -109,7 +109,7 @@ def as_function(command: Callable[..., Executable]) -> Callable[..., None]:
 
 
 def _parameter(declared: Field[Any], hint: Any) -> Parameter:
-    """Turn a field into a parameter of the function.
+    """Turn a field of a command into a parameter of the function for Typer.
 
     A field that is declared neither as an option nor as an argument, such as `context`, only has
     its type.
@@ -128,7 +128,10 @@ def values_of(command: Executable, *names: str) -> dict[str, Any]:
 def require_unused(
     command: Executable, names: Iterable[str], expected: str, found: str = ""
 ) -> None:
-    """Raise ParameterError if one of these fields has been set. The error names the first one."""
+    """Check that none of these fields of a command was set.
+
+    Raises ParameterError, which names the first one that was.
+    """
     for name, value in values_of(command, *names).items():
         require(value in (None, False, "", []), name, found or f"{value}", expected)
 
@@ -251,7 +254,7 @@ class RiseDiCommand(TyperCommand):
             raise refused_words(error, _path(ctx), names) from None
 
     def _mend(self, name: str, names: Sequence[str], command: str) -> str:
-        """Say what to write in place of an unknown option."""
+        """Say what to write instead of an unknown option."""
         if name[2:] in names:
             return f"give it without a name, {command} {name[2:].upper()}"
         near = [
@@ -277,7 +280,7 @@ class RiseDiCommand(TyperCommand):
 
 
 def without_help_word(words: Sequence[str]) -> list[str]:
-    """Return the words, with --help in place of `help` if this is the first word."""
+    """Replace a first word `help` of the command line by --help."""
     return [*words[1:], "--help"] if [*words[:1]] == ["help"] else [*words]
 
 
