@@ -230,7 +230,7 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
 
 @dataclass(frozen=True, kw_only=True)
 class _Shared:
-    """The objects that all chunks of a case share."""
+    """What all chunks of a case share."""
 
     scenario: Scenario
     course: Course
@@ -240,7 +240,7 @@ class _Shared:
 
 @lru_cache(maxsize=8)
 def _prepare(text: str, case: int) -> _Shared:
-    """Prepare the objects that all chunks of a case share."""
+    """Prepare what all chunks of a case share."""
     from flight_campaign.batch import batch  # noqa: PLC0415 - as above
 
     scenario = Definition.model_validate_json(text).scenario(case)
@@ -367,7 +367,7 @@ class MonteCarlo:
         return [job for job in self.definition.jobs() if self._path(job).exists()]
 
     def influence(self, case: int, worst: int) -> dict[str, Any]:
-        """Return the rank correlations of the drawn entries with the score of a case.
+        """Return how strongly each drawn entry correlates with the score of a case, by ranks.
 
         `worst` is the number of the worst aircraft in the case.
         """

@@ -141,7 +141,7 @@ def _write_worst(campaign: MonteCarlo, case: int, tally: Tally) -> list[dict[str
 
 
 def _influence(campaign: MonteCarlo, case: int, tally: Tally) -> dict[str, Any]:
-    """Return the rank correlations of a case.
+    """Return how strongly the drawn entries correlate with the score of a case, by ranks.
 
     If the case has a worst corner, its airframe and its scenario are written too.
     """

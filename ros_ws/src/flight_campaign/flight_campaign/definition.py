@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Define a campaign by all inputs of its results."""
+"""Define a campaign: everything on which its results depend."""
 
 from collections.abc import Iterator
 from itertools import product
@@ -88,7 +88,7 @@ class Sweep(Config):
 
 
 class Definition(Config):
-    """All inputs of a campaign's results.
+    """Everything on which the results of a campaign depend.
 
     The version of the stack and the arithmetic of the CPU are no part of the definition.
     """

@@ -30,7 +30,7 @@ class DrawnFleet(NamedTuple):
     equipment: dict[str, FloatArray]  # drawn lags, noise and delays by name, (N,) each
 
     def on_device(self, course: Course, vehicle: Vehicle) -> tuple[FleetMatrices, Vehicle]:
-        """Return the drawn aircraft for the compiled loop, and the vehicle with their equipment."""
+        """Return the drawn aircraft as the compiled loop takes them, and what all of them share."""
         delay = self.equipment.get(equipment.DELAY, np.zeros(1))
         fleet = batch_matrices.assemble(
             self.A,

@@ -25,7 +25,7 @@ KINDS = ("lag", "noise", DELAY)
 
 
 def is_of_equipment(entry: str) -> bool:
-    """Return whether an entry is a lag, a noise or the delay, instead of an entry of A or B."""
+    """Return whether an entry is a lag, a noise or the delay, and not an entry of A or B."""
     return entry.partition("[")[0] in KINDS
 
 
@@ -115,7 +115,7 @@ def drawn(
 
 
 def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, float]:
-    """Return for each entry the value to which its drawn deviation is relative.
+    """Return for each entry the value of which its drawn deviation is a fraction.
 
     These are the `published` values. For the delay it is half of the largest delay, so that the
     delay is drawn within +-100 %.

@@ -24,7 +24,7 @@ CHANCE = 0.05  # share of campaigns in which an entry without effect exceeds the
 
 
 def rank_correlations(table: "pl.DataFrame", published: Mapping[str, float]) -> dict[str, float]:
-    """Return the rank correlation (Spearman) of the size of each entry with the score.
+    """Return how the size of each entry correlates with the score, by ranks (Spearman).
 
     The size is relative to the published value. The strongest correlation comes first. A
     correlation of +1 means that the aircraft flies worse, with a higher score, the larger the entry
@@ -45,11 +45,11 @@ def rank_correlations(table: "pl.DataFrame", published: Mapping[str, float]) -> 
 
 
 def chance_level(aircraft: int, entries: int) -> float:
-    """Return the rank correlation that entries without effect rarely exceed.
+    """Return which rank correlation the entries rarely exceed by chance.
 
-    In 95 % of campaigns none of them exceeds it. The correlation of independent values has mean 0
-    and variance 1 / (N - 1), and is normal for large N. Source: Kendall, Rank Correlation Methods,
-    1948. The level allows for the number of entries (Bonferroni).
+    In 95 % of campaigns no entry without effect exceeds it. The correlation of independent values
+    has mean 0 and variance 1 / (N - 1), and is normal for large N. Source: Kendall, Rank
+    Correlation Methods, 1948. The level allows for the number of entries (Bonferroni).
     """
     return float(ndtri(1.0 - CHANCE / (2 * entries))) / math.sqrt(aircraft - 1)
 

@@ -38,7 +38,7 @@ CHUNK = 4
 
 
 class LearningOutcome(NamedTuple):
-    """The outcome of the identifications of a flight."""
+    """What became of the identifications in a flight."""
 
     first_model: float  # s, instant from which the first learned model flew; NaN if no model flew
     models: int  # number of proposals that flew, without the rough model
@@ -50,7 +50,7 @@ class LearningOutcome(NamedTuple):
 
 
 def learned(tape: Tape, events: Sequence[Event]) -> LearningOutcome:
-    """Return the outcome of the identifications of a flight, from its tape and its events."""
+    """Return what became of the identifications in a flight, from its tape and its events."""
     proposed = tape["learned"]["proposed"] if "learned" in tape else np.ones(0)
     models = [
         event.stamp_ns
@@ -71,7 +71,10 @@ def flies_alone(scenario: Scenario) -> bool:
 
 
 def require_single_flights(scenario: Scenario) -> None:
-    """Raise ParameterError if a campaign of single flights cannot fly a scenario."""
+    """Check that a scenario can be flown in a campaign of single flights.
+
+    Raises ParameterError if not.
+    """
     aircraft = scenario.aircraft
     require(
         not aircraft.is_jsbsim,

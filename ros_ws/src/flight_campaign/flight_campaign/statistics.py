@@ -130,7 +130,7 @@ class Tally(Config):
     def from_flights(
         cls, first: int, diverged: FloatArray, figures: Mapping[str, FloatArray]
     ) -> Self:
-        """Return the statistics of the aircraft first, first + 1, ...
+        """Collect the flights of the aircraft first, first + 1, ... into statistics.
 
         `figures` has the metrics of the aircraft by name, (N,) each. One of them is "score".
         """

@@ -115,11 +115,11 @@ def _rows(values: Sequence[Any]) -> Array:
 
 
 def _reduced(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
-    """Reduce an aircraft to what `remainder_of` needs.
+    """Keep of an aircraft only the states and rows that its nonlinear remainder needs.
 
-    The remainder is the part of f_state that is not linear in the state. Returns the indices of the
-    states on which the remainder depends. Returns also the aircraft with only these states, and
-    with the rows `remainder_rows`.
+    The remainder, `remainder_of`, is the part of f_state that is not linear in the state. Returns
+    the indices of the states on which it depends, and the aircraft with only these states and the
+    rows `remainder_rows`.
     """
     rows = remainder_rows(aircraft)
     coupling = aircraft.coupling

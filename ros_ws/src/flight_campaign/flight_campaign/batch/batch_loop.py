@@ -185,7 +185,7 @@ def fly_run(
 def _chosen(
     constant: int | None, value: Array, branches: Sequence[Callable[..., Any]], *arguments: Any
 ) -> Any:
-    """Run the branch with the number `constant`, or with the number `value` if that is None.
+    """Run the branch with the number `constant`, or if that is None, with the number `value`.
 
     `constant` is known when the loop is compiled, so it needs no branch on the device.
     """
@@ -371,7 +371,7 @@ def _actuated(
 
 @partial(jax.jit, static_argnames=("ticks",))
 def figures(end: LoopState, ticks: int, period: Array) -> FleetResult:
-    """Compute the metrics of flights from the sums at their end."""
+    """Compute the metrics of the flights from the sums that were collected up to their end."""
     return FleetResult(
         jnp.sqrt(end.squares / ticks),
         end.max,

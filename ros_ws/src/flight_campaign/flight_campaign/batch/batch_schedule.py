@@ -27,9 +27,9 @@ LONGEST = 20  # number of ticks of the longest pattern; a pattern is compiled ti
 
 
 class TickKind(NamedTuple):
-    """The properties of a tick that are known when the loop is compiled.
+    """What is known of a tick when the loop is compiled.
 
-    If a property is None, a branch at the tick depends on it.
+    If a property is None, it is not known, and the tick has a branch that depends on it.
     """
 
     phase: int | None

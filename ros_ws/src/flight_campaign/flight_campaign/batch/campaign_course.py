@@ -148,7 +148,7 @@ ONE_AT_A_TIME = "flights of many at once do not have it, those of rise-di fly do
 
 
 def require_flyable(scenario: Scenario) -> None:
-    """Raise ParameterError if a campaign cannot fly an aircraft or a controller.
+    """Check that a campaign can fly an aircraft or a controller. Raises ParameterError if not.
 
     A campaign supports the keys of FLOWN and FLOWN_CONTROLLER. If any other key has a value with an
     effect, the error names this key.
@@ -262,7 +262,10 @@ def _whole_ticks(delay_ns: int, tick_ns: int, key: str) -> int:
 
 
 def _require_lossless(scenario: Scenario, errors: sensors.Sensors) -> None:
-    """Raise ParameterError if y has dropouts and another rate than the ticks."""
+    """Check that no y is lost if y has another rate than the ticks.
+
+    Raises ParameterError if y has dropouts.
+    """
     y_rate = scenario.aircraft.rate
     rate = scenario.controller.rate
     has_same_rate = period_ns(rate, "controller.rate") == period_ns(y_rate, "aircraft.rate")
@@ -295,7 +298,10 @@ def _phases(
 
 
 def _require_plain_vanes(scenario: Scenario, late: int) -> None:
-    """Raise ParameterError if vanes have a delay, icing, lost readings or a quantisation."""
+    """Check that vanes have no delay, icing, lost readings or quantisation.
+
+    Raises ParameterError if they have.
+    """
     vanes = scenario.aircraft.vanes
     sensors_of = scenario.aircraft.sensors
     key = "aircraft.vanes"
@@ -362,7 +368,7 @@ def _sensor_errors(
 
 
 class _Forcing(NamedTuple):
-    """A part of the forcing as a function of time."""
+    """A part of the forcing, given as a function of time."""
 
     over_step: FloatArray  # (T K, ...) mean over each step of the integration
     at_tick: FloatArray  # (T, ...)

@@ -25,7 +25,7 @@ _TURN = Lock()
 
 
 def _as_sentence(record: logging.LogRecord) -> bool:
-    """Log a failing plugin in one sentence, such as the GPU plugin on a host without a GPU.
+    """Shorten the log record of a failing plugin, such as that of a missing GPU, to one sentence.
 
     JAX would log a traceback, and then fly on the other devices.
     """
@@ -60,7 +60,7 @@ def thread_count() -> int:
 
 
 def turn() -> AbstractContextManager[object]:
-    """Return the context in which a thread flies a chunk.
+    """Return the context in which a thread flies a chunk, so that threads take turns on a GPU.
 
     On a GPU only one thread enters it at a time, and meanwhile other threads draw or write their
     chunks. On a CPU every thread may enter it.

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prepare registered laws for a comparison with the laws of the catalogue.
 
-A registered law is the controller of a scenario, with the gains in the scenario.
+A registered law is one that a scenario can fly. It has the gains of a scenario's controller.
 """
 
 from collections.abc import Iterable, Mapping
@@ -84,9 +84,9 @@ def _value(gain: FloatArray, scalar: bool) -> float | list[float]:
 
 
 def _last(*leaves: Any) -> FloatArray:
-    """Stack the values of a parameter of N candidates, with the candidates in the last axis.
+    """Stack the values of a parameter of N candidates, with the candidates along the last axis.
 
-    If all values are equal, there is only one, with the shape (m, 1) for a vector (m,).
+    If all values are equal, one of them stands for all, with the shape (m, 1) for a vector (m,).
     """
     first = np.asarray(leaves[0], dtype=np.float64)
     if all(np.array_equal(first, leaf) for leaf in leaves):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Convert the tuned gains of a comparison to the controller of a scenario.
+"""Convert gains that were tuned in a comparison to the controller of a scenario.
 
 The controller is that of the registered law with the same equations.
 """
@@ -39,7 +39,7 @@ DESIGNS = {
 
 
 def require_registered(name: str) -> None:
-    """Raise ParameterError if no scenario can fly a law."""
+    """Check that a scenario can fly a law. Raises ParameterError if none can."""
     require(name in REGISTERED, "--write", f"the law {name}", f"one of {', '.join(REGISTERED)}")
 
 

@@ -258,7 +258,7 @@ class Evaluation(NamedTuple):
 
 
 def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
-    """Return, for each wind, the flights for one evaluation of the cost.
+    """Return which flights one evaluation of the cost makes in each wind, with their weights.
 
         cost = sum over the winds of weight (mean over the aircraft with u in time
                                             + mean over those with u late)
@@ -438,7 +438,7 @@ def _rounded(gains: Gains) -> dict[str, list[float]]:
 def _after(
     search: Any, point: FloatArray, values: FloatArray, best: tuple[float, FloatArray]
 ) -> tuple[float, FloatArray]:
-    """Tell a search the costs of its candidates, and return the best result so far.
+    """Tell a search what its candidates cost, and return the best result so far.
 
     `point` has the logarithms of each candidate, and `values` the costs. `best` is the least cost
     before, with the logarithms of its candidate.
