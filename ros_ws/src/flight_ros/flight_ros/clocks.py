@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compare the clocks of the nodes of an aircraft on several hosts: offset and delay.
+"""Compare the clocks of the nodes of an aircraft on several hosts.
+
+The result is the offset of each clock, and the mean delay of a message.
 
 The delay is measured in both directions. Once a second, a node i publishes on `clocks` the least
 difference D_ij = (clock of i at the reception) - (clock of j when it was sent) of the messages from
@@ -9,8 +11,8 @@ a node j. With the delay d_ji of a message from j to i, and theta_j = (clock of 
     D_ij = d_ji - theta_j,   D_ji = d_ij + theta_j,   so theta_j = (D_ji - D_ij) / 2
         where d_ij = d_ji.
 
-The error is half of the difference of the two delays. Source: D. L. Mills et al., RFC 5905 (2010),
-section 8.
+If the two delays differ, the error is half of their difference. Source: D. L. Mills et al., RFC
+5905 (2010), section 8.
 
 Nodes of a host share the monotonic clock. So a node also sends the identity of its host, and the
 lead of its clock over the monotonic clock. For nodes of one host, theta_j is then exact, and a busy
@@ -103,7 +105,7 @@ class Peers:
                 self._on_host[sender] = reported.get(AHEAD, self.ahead) - self.ahead
 
     def forget(self, name: str) -> None:
-        """Forget a node."""
+        """Forget a node that has left, by its name."""
         for table in (self._seen, self._reported, self._heard_ns, self._on_host):
             table.pop(name, None)
 

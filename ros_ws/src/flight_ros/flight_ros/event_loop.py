@@ -170,7 +170,10 @@ def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> int | None:
 
 
 def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any], until_ns: int = 0) -> None:
-    """Serve a pending request, and more requests until an instant of the monotonic clock."""
+    """Serve the requests to a node: at least a pending one, and more up to a given instant.
+
+    `until_ns` is by the monotonic clock.
+    """
     while True:
         if (execute := ready_callback(executor)) is None:
             return
@@ -274,7 +277,7 @@ def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, has_begun: 
 
 
 class RealTime:
-    """The ticks and reports of a node in real time.
+    """The ticks of a node in real time, and its reports between them.
 
     With `spin`, the last part of a wait for a deadline is a busy-wait.
     """
@@ -298,7 +301,10 @@ class RealTime:
         self._after_each = 1  # number of reports after each tick
 
     def run_due_tick(self) -> bool:
-        """Run the newest due tick, and return whether there was one."""
+        """Run a tick if one is due, and return whether there was one.
+
+        If several are due, only the newest one runs.
+        """
         if (tick := self.ticker.due()) is None:
             return False
         self.node.run_tick(tick, self._start_ns + tick.number * self.ticker.period_ns)

@@ -252,7 +252,7 @@ class FlightNode(Node, Generic[P]):
         return self.host.monotonic_ns() + self.time_offset_ns
 
     def clock_step_ns(self) -> int:
-        """Return the lead of the system clock over the time of the ticks, ns.
+        """Return by how much the system clock has stepped ahead of the time of the ticks, ns.
 
         A lead of less than CLOCK_STEP_NS is no step of the clock, and the result is 0.
         """
@@ -260,9 +260,9 @@ class FlightNode(Node, Generic[P]):
         return step_ns if abs(step_ns) > CLOCK_STEP_NS else 0
 
     def adopt(self, parameters: P) -> None:
-        """Replace the parameters by a valid set that the node itself has chosen.
+        """Replace the parameters by a set that the node itself has chosen, such as a learned model.
 
-        A parameter event reports the new set. The set is not checked.
+        A parameter event reports the new set. The set must be valid, because it is not checked.
         """
         before, after = (
             dict(flatten(values.model_dump())) for values in (self.parameters, parameters)
@@ -288,7 +288,7 @@ class FlightNode(Node, Generic[P]):
     def warn_no_publisher(
         self, subscription: PolledSubscription, lack: str = "no publisher"
     ) -> None:
-        """Warn of a topic without samples; called at each tick without a sample.
+        """Warn of a topic without samples. Call this at each tick without a sample.
 
         The warning is logged after 3 s, and then every 2 s. If the topic has no publisher, the
         warning gives `lack` as the cause. If it has a publisher, this may be a node that waits for
@@ -352,7 +352,7 @@ class FlightNode(Node, Generic[P]):
         return next((stamp_ns for stamp_ns in instants if stamp_ns > oldest_ns), None)
 
     def match(self) -> None:
-        """Publish the state MATCHED once when every input has a publisher, in real time only."""
+        """Publish once, in real time, that every input of this node has a publisher: MATCHED."""
         awaited = [
             *self.inputs(),
             *([self._start_subscription] if self._start_subscription is not None else []),
@@ -430,7 +430,7 @@ class FlightNode(Node, Generic[P]):
         return self.parameters.lockstep
 
     def require_flight(self) -> None:
-        """Raise FlightEnded after the loss of a peer of a lockstep flight.
+        """Check that the flight can go on. Raises FlightEnded if a peer in lockstep is lost.
 
         The other peers get a report of the loss. In simulated time, raises ClockRestarted after a
         jump of /clock.

@@ -10,7 +10,7 @@ from flight_core.vectors import StampedVector
 
 
 class Instant(NamedTuple):
-    """An instant of y; `others` are the new samples of the second signal up to this instant."""
+    """A sample of y, and the `others`: the new samples of a second signal up to its instant."""
 
     now_ns: int
     due: bool  # whether the node steps at this instant
@@ -33,9 +33,10 @@ class LockstepInputs:
         receive_other: Callable[[], Iterable[StampedVector | None]],
         is_ready: Callable[[int], bool] = lambda now_ns: True,
     ) -> None:
-        """Take the inputs; `is_ready` says whether all other inputs of a step have arrived.
+        """Prepare to match the samples of y and of the second signal.
 
-        `is_ready` is called with the instant of the step, ns.
+        `is_ready` is called with the instant of a step, ns, and says whether all other inputs of
+        the step have arrived.
         """
         self._is_ready = is_ready
         self._y_period_ns = y_period_ns

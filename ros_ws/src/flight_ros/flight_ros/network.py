@@ -59,9 +59,10 @@ def own_address(peers: Sequence[str], local: Collection[str]) -> str:
 
 
 def network_profile(own_host: str, peers: Sequence[str]) -> str:
-    """Return the loopback profile, with the address of this host in place of 127.0.0.1.
+    """Return the profile of the middleware for this host and its peers.
 
-    The hosts are the initial peers in the profile.
+    It is the loopback profile, with the address of this host in place of 127.0.0.1. The hosts are
+    the initial peers in the profile.
     """
     text = LOOPBACK_PROFILE.read_text(encoding="utf-8")
     locators = "".join(

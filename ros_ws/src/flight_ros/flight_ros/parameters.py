@@ -79,7 +79,7 @@ def read_parameters(node: Node, schema: type[P]) -> P:
 def _without_global(
     node: Node, overrides: dict[str, Any], schema: type[NodeConfig]
 ) -> dict[str, Any]:
-    """Leave out parameters that were given to all nodes and that this node does not know.
+    """Leave out parameters that were given to all nodes and that are unknown to this node.
 
     The node also undeclares them, because an ordinary node of ROS does not declare a parameter that
     it does not know. A parameter from a section for this node stays, and is refused later if it is

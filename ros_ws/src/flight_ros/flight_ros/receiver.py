@@ -246,7 +246,7 @@ class Receiver(Generic[S]):
         return sender
 
     def slowness(self, max_age_ns: int) -> Refusal | None:
-        """Say that samples come too slowly, if fewer than FEWEST fit into an age limit."""
+        """Return a refusal if samples come too slowly: fewer than FEWEST fit into the age limit."""
         if (
             len(self._stamps_ns) < RECENT
             or (period_ns := float(np.median(np.diff(self._stamps_ns)))) <= 0.0
@@ -293,9 +293,9 @@ class Receiver(Generic[S]):
         return samples
 
     def _require_next(self, raw: bytes, now_ns: int, sender: str, sequence: int) -> None:
-        """Refuse a lockstep message that is not the next one of the flight's publisher.
+        """Check that a lockstep message is the next one of the flight's publisher.
 
-        The first message must have a stamp of the flight.
+        Raises ChannelError if it is not. The first message must have a stamp of the flight.
         """
         if self.lock is None:
             return
@@ -322,7 +322,10 @@ class Receiver(Generic[S]):
             self.lock.refresh(sample.sender, now_ns)
 
     def _require_stamp(self, stamp_ns: int, now_ns: int, sender: str) -> None:
-        """Refuse a stamp that is farther from the present than the age limit, if there is one."""
+        """Check that a stamp is not farther from the present than the age limit, if there is one.
+
+        Raises ChannelError if it is.
+        """
         if self._max_age_ns is None:
             return
         max_age_ns = self._max_age_ns()

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated time, which the topic /clock gives in place of the clocks of the host.
+"""Take the time from the topic /clock, as a simulator sends it, in place of the host's clocks.
 
 Ticks, stamps and ages are in this time. So a flight takes the same ticks at any speed of the
-simulator, and a pause of /clock is a pause of the flight. The work of the process itself stays in
+simulator, and a pause of /clock is a pause of the flight. What the process does for itself stays in
 the time of the host: diagnostics, services and log lines.
 """
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Throttle repeated log lines.
+"""Limit how often a log line is repeated.
 
 The throttle of rclpy distinguishes lines of code, and not topics and reasons.
 """

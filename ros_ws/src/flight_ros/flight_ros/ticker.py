@@ -17,20 +17,20 @@ MAX_SPIN_FRACTION = 0.2  # largest busy-wait, as a fraction of the period and th
 
 
 class HostTime(Protocol):
-    """The functions of the module `time` that the ticks of a node need."""
+    """The functions of the module `time` with which a node ticks and stamps."""
 
     def monotonic_ns(self) -> int:
-        """Return the time of the ticks."""
+        """Return the present time on the clock that gives the ticks, ns."""
 
     def time_ns(self) -> int:
-        """Return the time of the stamps."""
+        """Return the present time on the clock that stamps the messages, ns."""
 
     def sleep(self, duration: float, /) -> None:
         """Wait for at most `duration` s."""
 
 
 class Tick(NamedTuple):
-    """A deadline that has passed."""
+    """A tick that is due, with the deadline that has passed."""
 
     number: int  # number of periods since the start; after an overrun it skips the missed periods
     previous: int  # number of the previous tick; 0 at the first tick
