@@ -258,8 +258,8 @@ class Control:
     ) -> dict[str, Any]:
         """Carry out a request and write a line to the log.
 
-        `cancellations` is the number of cancellations when the request arrived. If there are more
-        by now, the request is refused.
+        `cancellations` is how many cancellations there had been when the request arrived. If there
+        are more by now, the request is refused.
         """
         self._link.resume()
         self._link.keep_link()
@@ -368,7 +368,7 @@ class Control:
         self._digest = self._with(self._values).digest()
 
     def _with(self, values: Mapping[str, Any]) -> ControllerConfig:
-        """Return the controller's parameters with new values. May raise ParameterError."""
+        """Return the controller's parameters with some values changed. May raise ParameterError."""
         base = self._controller()
         content = {**dict(flatten(base.model_dump(exclude_none=True))), **values}
         return type(base).validate_mapping(nest(content), "controller")
@@ -436,7 +436,7 @@ class Control:
         return Path(str(self._link.parameters("bridge", ["map"]).get("map", ""))).stem
 
     def _sends(self) -> bool:
-        """Return whether the bridge of the flight may send to an autopilot."""
+        """Return whether the bridge of the flight may send commands to an autopilot."""
         return self._link.parameters("bridge", ["dry_run"]).get("dry_run") is not True
 
     def _require_simulated(self) -> None:

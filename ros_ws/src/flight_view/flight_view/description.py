@@ -46,7 +46,7 @@ def rms_by_model(
     scenario: Scenario | None,
     proposed_ns: Sequence[int],
 ) -> dict[str, Any]:
-    """Return the headings and rows of a table of the measured errors, rms, for each model.
+    """Return a table of the measured rms errors for each model: its headings and its rows.
 
     They follow from the ticks of a flight and the stamps at which models were proposed.
     """
@@ -99,7 +99,7 @@ def scenario_description(scenario: Scenario) -> dict[str, Any]:
 
 
 def mission(guidance: GuidanceConfig, waypoints: Sequence[Waypoint]) -> dict[str, Any]:
-    """Return what the map shows of a route, which is `mission_drawing` and the waypoints.
+    """Return what the map shows of a route: the content of `mission_drawing`, and the waypoints.
 
     A waypoint has north, east and altitude in m. Raises ParameterError if the route cannot be
     flown.

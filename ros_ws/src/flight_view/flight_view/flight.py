@@ -301,7 +301,7 @@ class Flight:
         return RATES[name]
 
     def _shows(self, namespace: str) -> bool:
-        """Return whether a namespace is that of the page's aircraft, or this is not known yet."""
+        """Return whether the page shows the aircraft in a namespace, or may come to show it."""
         return self._namespace in {None, namespace}
 
     def _note(self, sentence: str) -> None:
@@ -522,7 +522,7 @@ class Flight:
         self._banded_ns = recorded_ns
 
     def _ticks(self, group: str) -> Signal:
-        """Return a group of channels from the samples of the ticks."""
+        """Return a group of channels from the samples of the topic `internals`."""
         ticks = self.samples["internals"]
         columns = [k for k, name in enumerate(ticks.names) if name.startswith(f"{group}.")]
         names = tuple(ticks.names[k].removeprefix(f"{group}.") for k in columns)

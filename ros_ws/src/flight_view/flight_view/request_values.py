@@ -23,7 +23,7 @@ class RefusedError(Exception):
 
 
 def require_form(holds: bool, sentence: str) -> None:
-    """Raise RefusedError if a request is not well formed."""
+    """Check that a request is well formed: raise RefusedError unless `holds`."""
     if not holds:
         raise RefusedError(HTTPStatus.BAD_REQUEST, sentence)
 
@@ -46,7 +46,10 @@ def permitted_range(value: float) -> list[float]:
 
 
 def require_range(name: str, value: Any, base: Any) -> None:
-    """Raise RefusedError if a gain is outside `permitted_range` of its scenario value `base`."""
+    """Check that a gain is inside the `permitted_range` of its value `base` in the scenario.
+
+    Raises RefusedError if not.
+    """
     for number, middle in zip(as_list(value), as_list(base), strict=True):
         low, high = permitted_range(middle)
         require_form(

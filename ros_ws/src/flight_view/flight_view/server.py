@@ -177,7 +177,7 @@ class Server:
             await asyncio.sleep(pause)
 
     async def news(self, flight: Flight | FleetView, query: Mapping[str, str]) -> bytes:
-        """Return the data that a browser lacks, and wait for it up to MAX_WAIT s.
+        """Wait up to MAX_WAIT s for data that a browser lacks, and return it.
 
         `query` has, by topic, the number of rows that the browser has.
         """
@@ -322,7 +322,7 @@ class _LimitedServer(HTTPServer):
         super().handle_stream(stream, address)
 
     def admit(self, stream: IOStream) -> bool:
-        """Keep a connection that has shown the token, and return whether it is kept.
+        """Try to keep a connection that has shown the token, and return whether it is kept.
 
         If MAX_CONNECTIONS are kept already, a further connection is not.
         """
