@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""List the compared control laws in a catalogue.
+"""List the control laws that are compared.
 
-For each law it has the measurements, the model data, the tuned gains, and the initial gains of a
-search.
+For each law the catalogue has its measurements, its model data, its tuned gains, and the initial
+gains of a search.
 """
 
 from collections.abc import Callable

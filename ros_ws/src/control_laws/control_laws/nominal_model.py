@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Define the nominal model of a model-based law, and functions that several laws share.
 
-The functions saturate u, and prevent the windup of integrals. Channels are in the law's order, and
-states are in the airframe's order.
+These functions saturate u, and prevent the windup of integrals. Channels are in the law's order,
+and states are in the airframe's order.
 """
 
 from collections.abc import Callable

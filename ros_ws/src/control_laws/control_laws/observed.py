@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Extend any law by observers, for many sets of weights at once.
+"""Extend a law by an observer, for many sets of weights at once.
 
 The parameters of the observers come from the gains of a search.
 """
@@ -83,7 +83,7 @@ def extended_state_design(
 
 
 def unnamed(model: NominalModel) -> Names:
-    """Return numbers as names, for designs that are not written to a file."""
+    """Return numbers in place of names, for a design that is not written to a file."""
     (n, m), G = model.B.shape[-2:], model.wind.shape[-1]
     numbers = [tuple(map(str, range(count))) for count in (n, m, m, G)]
     return Names(*numbers)

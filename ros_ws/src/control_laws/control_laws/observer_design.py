@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Design the observer, for many models and weights at once.
 
-A design is a model in discrete time with two linear-quadratic gains, that of the estimates and that
-of the feedback.
+A design is a model in discrete time with two linear-quadratic gains, one for the estimates and one
+for the feedback.
 
 There are two models. `aircraft_observer` knows A, B, f, wind and lags of an airframe, and
 `extended_state_observer` knows only Omega and lags. A, B, wind and the weights may have leading
