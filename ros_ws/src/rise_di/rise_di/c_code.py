@@ -228,7 +228,7 @@ def _sha256(text: str) -> str:
 
 
 def _certified(scenario: Scenario, constants: Path) -> tuple[str, str] | None:
-    """Return the certificate of a loop's guarantee, and what it guarantees as a line of text.
+    """Return the certificate of a loop's guarantee, and a line of text on what it guarantees.
 
     The guarantee is the one that `rise-di gains guarantee` has stored for the loop of the scenario.
     `constants` is the file of the C constants, whose text goes into the certificate. Returns None

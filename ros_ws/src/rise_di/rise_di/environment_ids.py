@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Register the environments with gymnasium, which has no entry point for them since 1.0."""
+"""Register the environments with gymnasium.
+
+Since version 1.0 gymnasium has no entry point for them.
+"""
 
 ID = "rise_di/Flight-v0"
 

@@ -104,10 +104,10 @@ sample at a tick do not depend on whether the samples before this tick were meas
 
 
 def _is_newest_last(scenario: Scenario) -> bool:
-    """Return whether only the last sample of y before each tick has to be measured.
+    """Return whether it suffices to measure the last sample of y before each tick.
 
-    This is so if the section of the aircraft sets only keys in BY_TICK, and if the controller has
-    no vanes. Otherwise each sample must be measured.
+    It does if the section of the aircraft sets only keys in BY_TICK, and if the controller has no
+    vanes. Otherwise each sample must be measured.
     """
     aircraft = scenario.aircraft
     return not unknown_keys(aircraft, BY_TICK) and not scenario.controller.vanes

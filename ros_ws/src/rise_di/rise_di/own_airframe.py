@@ -170,7 +170,7 @@ def new_airframe(
 
 
 def _require_free(files: Sequence[Path], *, replace: bool) -> None:
-    """Raise ParameterError if a file exists and must not be replaced."""
+    """Check that no file exists already, unless it may be replaced. Raises ParameterError."""
     for path in files:
         require(
             replace or not path.exists(),
@@ -181,7 +181,7 @@ def _require_free(files: Sequence[Path], *, replace: bool) -> None:
 
 
 def _pairing_sentence(airframe: Airframe) -> str | None:
-    """Return a sentence on how inputs and outputs are paired, if not in their order."""
+    """Write a sentence on how inputs and outputs are paired; None if they are in the same order."""
     places = first_flight.pairing(airframe)
     if len(airframe.inputs) != len(airframe.outputs) or places == tuple(range(len(places))):
         return None
