@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compute live commands u_m up to their age limit, and the ending if the publisher is lost.
+"""Compute live commands u_m up to their age limit, and what follows if the publisher is lost.
 
-The ending is the sequence of commands that follow the last u_m. Commands of zero rates alone would
-keep the present bank, so the ending first levels the wings. It knows bank and pitch by dead
-reckoning from the attitude that guidance sent with u_m.
+The commands that follow the last u_m are called the ending. Commands of zero rates alone would keep
+the present bank, so the ending first levels the wings. It knows bank and pitch by dead reckoning
+from the attitude that guidance sent with u_m.
 """
 
 from typing import NamedTuple
@@ -53,10 +53,10 @@ def take(t_ns: int, u_m: FloatArray, attitude: FloatArray | None, params: LivePa
 
 
 def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> FloatArray:
-    """Compute u_m at t, shape (m,), which is the last u_m up to the age limit, then the ending.
+    """Compute u_m at t, shape (m,): the last u_m up to its age limit, then the ending.
 
-    If the attitude is known, the ending uses phi and theta by dead reckoning, and V = V0 + V_m.
-    For `levelling_ns` it commands
+    If the attitude is known, the ending uses phi and theta by dead reckoning, and V = V0 + V_m. For
+    `levelling_ns` it commands
 
         phi_dot_c = -k_phi phi, at most `roll_rate`; theta_dot_c = -k_theta theta
 

@@ -82,7 +82,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         return nanoseconds(self.parameters.live.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Return the ages above which the publisher of u_m has timed out, ns.
+        """Return the ages after which another publisher of u_m may take over from a silent one, ns.
 
         The first age holds for the same node in a new process. The second holds for another node,
         which may take over only after the wings are levelled.
@@ -97,7 +97,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         return LiveCommand(sample.stamp_ns, sample.value, self._attitude(raw), sample.sender)
 
     def _attitude(self, raw: bytes) -> FloatArray | None:
-        """Return the attitude, or None if the message has none."""
+        """Return the attitude that a message of u_m carries, or None if it carries none."""
         try:
             sample = self._attitude_decoder.decode(raw)
         except ChannelError as error:
@@ -136,10 +136,10 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             advanced = True
 
     def _commands_known(self) -> bool:
-        """Return whether the next y_m can be computed in lockstep.
+        """Return whether all commands are known that the next y_m in lockstep depends on.
 
-        It can if no u_m is due at the instant one period before this y_m. If a u_m is due then, it
-        must have arrived, and this method takes it.
+        They are if no u_m is due at the instant one period before this y_m. If a u_m is due then,
+        it must have arrived, and this method takes it.
         """
         t_ns = (self._number - 1) * self.period_ns()
         if not self._u_m_ns or t_ns < 0 or t_ns % self._u_m_ns:

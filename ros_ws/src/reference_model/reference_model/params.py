@@ -167,7 +167,10 @@ def _require_one_each(start: Numbers, others: Mapping[str, Numbers], kind: str) 
 
 
 def _require_spans(start: Numbers, stop: Numbers, value: Numbers, kind: str) -> None:
-    """Raise ParameterError if the lists differ in length, or a stop is not after its start."""
+    """Check that the lists have the same length, and that each stop is after its start.
+
+    Raises ParameterError if not.
+    """
     _require_one_each(start, {"stop": stop, "value": value}, kind)
     for k, (begin, end) in enumerate(zip(start, stop, strict=True)):
         require(end > begin, f"stop[{k}]", end, f"later than start[{k}] = {begin:g} s")
@@ -185,7 +188,7 @@ class CoordinatedTurn(Config):
 
 
 class LiveCommands(Config):
-    """Live commands on the topic u_m in place of the profile.
+    """Live commands, which come on the topic u_m in place of the profile.
 
     They end if their publisher is lost.
     """
