@@ -31,7 +31,7 @@ Records = Mapping[str, Mapping[str, str]]
 
 
 class FlightBag:
-    """The bag of a flight. After an error or on a full disk, the node goes on without it.
+    """The bag of a flight. It ends on an error or a full disk, and the node goes on without it.
 
     `clock` is the topic of simulated time, if there is one. `last_records` returns the records that
     are written at the end of the bag. `report` takes the line that says why the bag ended early.
@@ -146,7 +146,7 @@ class FlightBag:
         return None
 
     def _told_outcome(self) -> Outcome:
-        """Return the outcome that the flight left for the log, or UNKNOWN if there is none."""
+        """Return the outcome that the flight has left for its log, or UNKNOWN if there is none."""
         file = self._writer.directory / OUTCOME_FILE
         if not is_file(file):
             return UNKNOWN

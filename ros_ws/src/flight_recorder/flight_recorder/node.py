@@ -285,7 +285,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
             self._publish_recorded(instant(stamps[-1]))
 
     def _hear(self, topic: _Subscribed, arrivals: Sequence[ReceivedMessage]) -> None:
-        """Note when the newest message of a topic was sent and received, and its stamp."""
+        """Note the newest message of a topic: when it was sent and received, and its stamp."""
         now_ns = self._flight_time.monotonic_ns()
         topic.hear(arrivals[-1].sent_ns, now_ns)
         if topic.subscription.topic in LOOP and not self.parameters.lockstep:
@@ -360,7 +360,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return level, f"recording to {self._bag.path}", figures
 
     def _drain(self) -> None:
-        """Write the messages that were sent before the end.
+        """Write the messages that were sent before the end of the flight.
 
         On a busy host, this process can be seconds behind.
         """

@@ -34,9 +34,10 @@ class RecordedTopic:
         self.sent_ns = sent_ns
 
     def continues(self, sequence: int) -> bool:
-        """Return whether a message follows the last one, as far as its sequence number shows.
+        """Return whether a message is the next one after the last, as far as its number shows.
 
-        The number shows nothing if the topic is foreign, or if two publishers have the same name.
+        The sequence number shows nothing if the topic is foreign, or if two publishers have the
+        same name.
         """
         if not self.is_foreign and not self._is_shared and sequence != self._next_sequence:
             return False
