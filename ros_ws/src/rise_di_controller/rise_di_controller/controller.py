@@ -37,9 +37,9 @@ class ControlOutput(NamedTuple):
 
     @property
     def internals(self) -> FloatArray:
-        """Values for the log in the order of `Controller.names`.
+        """Values for the log, in the order of `Controller.names`.
 
-        They are computed on access, so that u can be published first.
+        They are computed only when this property is read, so that u can be published first.
         """
         return self.log()
 
@@ -47,9 +47,8 @@ class ControlOutput(NamedTuple):
 class Prepared(NamedTuple):
     """What a controller computes from new parameters before they take effect.
 
-    It is computed in advance, so that less work is left for the tick at which the parameters
-    change: a third of the work of a change is done before it, and `Controller.retune` does the
-    rest.
+    A third of the work of a change is done in advance in this way. `Controller.retune` does the
+    rest, at the tick at which the parameters change.
     """
 
     parameters: ControllerConfig
@@ -158,14 +157,14 @@ class Controller:
     def has_learned_model(self) -> bool:
         """Whether the feedforward or the observer has changed since the start of the flight.
 
-        Only the proposals of a learner change them.
+        Only a learner changes a feedforward or an observer in flight, by its proposals.
         """
         return self._has_learned_model
 
     def restart(self) -> None:
         """Engage the law again with the next fresh y and y_m, starting from the present u.
 
-        u does not jump (bumpless transfer). If a failsafe is under way, it continues until then.
+        u does not jump (bumpless transfer). A failsafe that is under way continues until then.
         """
         if self._state.mode is Mode.ENGAGED:
             self._state = self._state._replace(mode=Mode.WAITING)
@@ -435,10 +434,10 @@ class Controller:
     def overrun(self, last_ns: int, now_ns: int) -> tuple[int, ...]:
         """Return the instants of ticks that must be added before the tick at `now_ns`.
 
-        Ticks are added if the last tick was longer ago than the age limit. As u was missing in the
-        meantime, the aircraft has started its own failsafe. Two ticks without fresh inputs bring
-        the u of the controller to the value that the aircraft has now, so that the law engages
-        again without a bump.
+        Ticks are added if the last tick was longer ago than the age limit. Since no u arrived in
+        the meantime, the aircraft has started its own failsafe. Two ticks without fresh inputs
+        bring the u of the controller to the value that the aircraft applies now, so that the law
+        engages again without a bump.
 
         Args:
             last_ns: Instant of the last tick, ns.

@@ -48,9 +48,10 @@ OF_NODE = frozenset({"lockstep", "y_rate", "autostart", "start_active"})
 
 
 class ControllerSection(NodeConfig):
-    """The fields of the section `controller`, and the arrays that are built from them.
+    """The fields of the section `controller`, and the arrays that are built from the fields.
 
-    `params.ControllerConfig` checks them, and a subclass of it adds the parameters of a law.
+    `params.ControllerConfig` checks the fields. Each law has a subclass of `ControllerConfig` with
+    its parameters.
     """
 
     needs: ClassVar[str] = ""
@@ -250,11 +251,11 @@ class ControllerSection(NodeConfig):
         return self.feedforward.nominal(self.outputs, self.inputs, self.D)
 
     def _flown_nominal(self) -> Nominal | None:
-        """Return the nominal model for the feedforward, which follows y_m with it.
+        """Return the nominal model with which the feedforward follows y_m, or None.
 
-        If `observer.part` is 0, neither feedforward nor observer acts on u yet. The learner needs
-        the states of the model nevertheless. So with a learner the result is the model without any
-        effect on u, and without a learner it is None.
+        If `observer.part` is 0, neither feedforward nor observer acts on u yet. A learner needs the
+        states of the model nevertheless. So with a learner this method returns the model in a form
+        that has no effect on u, and without a learner it returns None.
         """
         nominal = self.nominal()
         if nominal is None or self.observer is None or self.observer.part > 0.0:
@@ -264,8 +265,8 @@ class ControllerSection(NodeConfig):
     def digest(self) -> int:
         """Compute a hash of the parameters of law and guard, from 0 to 2^48 - 1.
 
-        It is the BLAKE2b hash of names and values, so it changes with any bit of any gain. A
-        float64 represents it exactly. Parameters that concern only the node are left out.
+        The BLAKE2b hash of names and values changes with any bit of any gain. A float64 represents
+        the result exactly. Parameters that concern only the node are left out.
         """
         content = self.model_dump(exclude=OF_NODE)
         # Older versions had only RISE-DI, and the digests in their logs do not include its name.
@@ -278,9 +279,9 @@ class ControllerSection(NodeConfig):
     def probe_gain(self) -> FloatArray:
         """Compute the gain abs(y_i / u_i) at the frequency of the sine on each input, shape (m,).
 
-        An input without a sine has the gain 0. If there is a nominal model, the response is that of
-        C (j omega I - A - gravity)^-1 B, and otherwise 1 / (input_scale omega). The lag of the
-        actuator is included.
+        An input without a sine has the gain 0. The gain is computed from C (j omega I - A -
+        gravity)^-1 B if there is a nominal model, and otherwise from 1 / (input_scale omega). The
+        lag of the actuator is included.
         """
         gain = np.zeros(len(self.outputs))
         if self.probe is None:

@@ -104,8 +104,8 @@ def values(
     """Return the values of the topic `internals`, in the order of `names`.
 
     `given_up` is 1 for each output that no longer uses its learned model, (m,), and is empty
-    without a learner. With an allocation, an input counts as limited by MAGNITUDE if it or any
-    effector is at a stop. Raises ValueError if the law was never engaged.
+    without a learner. With an allocation, an input is shown as limited by MAGNITUDE if the input or
+    any effector is at a stop. Raises ValueError if the law was never engaged.
     """
     if state.law is None:
         raise ValueError(

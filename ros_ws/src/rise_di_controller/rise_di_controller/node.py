@@ -65,8 +65,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
 
     u has the stamp of the y from which it is computed.
 
-    In lockstep, samples of y count the time. A tick waits for the y and the y_m of its instant, and
-    publishes exactly one u. This u has no channels if the controller has no output.
+    In lockstep, the time of the flight is the number of samples of y. A tick waits for the y and
+    the y_m of its instant, and publishes exactly one u. If the controller has no output, this u has
+    no channels.
     """
 
     def __init__(self) -> None:
@@ -203,9 +204,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return taking
 
     def _tell_restart(self) -> None:
-        """Count and log that the law has engaged again by itself, if it has.
+        """Count and log it if the law has engaged again by itself.
 
-        This is logged at most once in 2 s.
+        There is at most one such line in 2 s.
         """
         if (reason := self._controller.pop_restart_reason()) is not None:
             self._restarts += 1
@@ -331,9 +332,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self.adopt(parameters)
 
     def _publish_authority(self, now_ns: int) -> None:
-        """Publish the authority of the inputs for guidance.
+        """Publish the authority of the inputs, which follows from the model in force, for guidance.
 
-        It follows from the model in force. Without a learner nothing is published.
+        Without a learner nothing is published.
         """
         if self._learning is not None:
             self._send_authority(
@@ -341,9 +342,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             )
 
     def _has_proposal(self, now_ns: int) -> bool:
-        """Return whether a step in lockstep can begin, because the proposal due before it has come.
+        """Return whether a step in lockstep can begin.
 
-        It can also begin if no proposal is due.
+        It can if no proposal of the learner is due before it, or if this proposal has come.
         """
         if self._learning is None:
             return True

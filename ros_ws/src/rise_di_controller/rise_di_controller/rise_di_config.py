@@ -133,10 +133,10 @@ class LearnConfig(Config):
     def least_margin(self, margin: float) -> float:
         """Return the delay margin that a learned model must keep, s.
 
-        It is the configured margin. If none is configured, it is the smaller of LEAST_MARGIN and
-        `margin`, the delay margin of the loop at the start. That margin holds around the model in
-        the scenario. Around the real aircraft it can be smaller, so a learned model need not have
-        it.
+        If `learn.margin` is set, it is this margin. Otherwise it is the smaller of LEAST_MARGIN and
+        `margin`, the delay margin of the loop at the start. The loop at the start has this margin
+        around the model in the scenario, but perhaps not around the real aircraft, so no learned
+        model need have more.
         """
         return min(margin, LEAST_MARGIN) if self.margin is None else self.margin
 
@@ -217,7 +217,7 @@ class RiseDiConfig(ControllerConfig):
     def tunable(cls) -> frozenset[str]:
         """Return the names of the parameters that may change in flight.
 
-        They are those of the base class, and input_scale, but not `learn`.
+        They are the tunable parameters of every law, and input_scale, but not `learn`.
         """
         return (super().tunable() | {"input_scale"}) - {"learn"}
 
@@ -270,10 +270,10 @@ class RiseDiConfig(ControllerConfig):
             )
 
     def _check_schedule(self, schedule: ScheduleConfig) -> None:
-        """Check that the outputs suit a schedule, and that it has models at two speeds.
+        """Check that the outputs suit a schedule, and that the schedule has models at two speeds.
 
         The outputs must be V and at least one other. A controller with a feedforward or an observer
-        needs a model below the trim speed and one above it.
+        needs a model below the trim speed and one above the trim speed.
         """
         followed = "V" in self.outputs and len(self.outputs) > 1
         require(
@@ -407,7 +407,7 @@ class RiseDiConfig(ControllerConfig):
     def _nominal_over_speed(self, at_trim: Nominal) -> OverSpeed:
         """Return the nominal model of the feedforward as a function of the airspeed.
 
-        The leads, and the inputs in which it acts, are those of the model at the trim speed.
+        Its leads, and the inputs in which it acts, are taken from the model at the trim speed.
         """
 
         def matrices(config: RiseDiConfig, scale: FloatArray) -> FloatArray:
@@ -481,7 +481,7 @@ class RiseDiConfig(ControllerConfig):
         return 0 if self.learn is None else round(HISTORY * self.rate)
 
     def control_law(self) -> ControlLaw:
-        """Return the law RISE-DI, with the sign sampled as the parameters choose."""
+        """Return the law RISE-DI, which samples the sign in the way that the parameters choose."""
         return CONTROL_LAWS[self.sampled_sign()[0]]
 
     def law_params(self) -> LawParams:

@@ -106,10 +106,10 @@ def allocate(
 
 
 def limits_of_effectors(v_free: Array, v: Array) -> Limits:
-    """Return limits of the law's inputs with which `v_free` saturates to exactly `v`.
+    """Return limits for the law's inputs that turn the demand `v_free` into exactly `v`.
 
-    `v_free` is what the law demands, and `v` is what the effectors can give of it. The anti-windup
-    of the law works with these limits.
+    `v_free` is what the law demands, and `v` is the part of it that the effectors can give. The
+    anti-windup of the law works with these limits.
     """
     xp = array_namespace(v)
     infinite = xp.full_like(v, xp.inf)

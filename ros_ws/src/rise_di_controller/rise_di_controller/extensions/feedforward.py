@@ -99,7 +99,7 @@ def with_new_model(
 
     If x has the same length in both models, x and u_0 stay. Otherwise they begin anew, with the
     outputs at y_m and u_0 = 0. u is computed with the new model, and u - u_0 is then the
-    feedforward until the next tick. `y_m_dot` and `dt` are those of the last tick.
+    feedforward until the next tick. `y_m_dot` and `dt` belong to the last tick.
     """
     start = initial_state(y_m, nominal)
     if state is not None and state.x.shape == start.x.shape:
@@ -191,8 +191,8 @@ def of_active_inputs(u: Array, nominal: Nominal) -> Array:
 def nominal_zeros(nominal: Nominal) -> NDArray[np.complex128]:
     """Compute the zeros of the nominal model, shape (n - m,), 1/s.
 
-    They are the eigenvalues of its zero dynamics, H' (I - B Omega^-1 C) (A + gravity) H. H has the
-    columns of I for the states that are not outputs, and sin(x) is linearised to x. Only NumPy
+    The zeros are the eigenvalues of the zero dynamics, H' (I - B Omega^-1 C) (A + gravity) H. H has
+    the columns of I for the states that are not outputs, and sin(x) is linearised to x. Only NumPy
     arrays are accepted.
     """
     hidden = ~np.asarray(nominal.C).any(axis=0)

@@ -46,9 +46,9 @@ def _require_sizes(section: Config, key: str, sizes: Mapping[str, tuple[int, int
 
 
 def require_same_signs(Omega: FloatArray, D: Sequence[int], where: str) -> None:
-    """Check that C B of a model has a D, and that it is the D of the controller.
+    """Check that C B of a model has a D, and that it equals the D of the controller.
 
-    Raises ParameterError if not. `where` names the model in the sentence.
+    Raises ParameterError if not. `where` names the model in the sentence of the error.
     """
     try:
         signs_of_model = [int(sign) for sign in signs(Omega)]
@@ -166,7 +166,7 @@ class VanesConfig(Config):
 class ObserverConfig(Config):
     """An observer of the nominal model, an extension of the paper.
 
-    The matrices are those of a finished design, in SI units, row by row.
+    The matrices come from a finished design, in SI units, row by row.
     """
 
     rate: Positive = Field(description="rate of the law for which the matrices hold, Hz")

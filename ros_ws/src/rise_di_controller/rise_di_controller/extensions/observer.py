@@ -22,8 +22,8 @@ from rise_di_controller.law.saturation import Limits, saturate
 class VaneParams(NamedTuple):
     """Parameters of k vanes, which are sensors beside y that only the observer uses.
 
-    A vane reads something else than it would read in the reference motion. H z predicts this
-    difference from the s estimates z.
+    A reading differs from what the vane would read in the reference motion. H z predicts this
+    difference, where z has the s estimates.
     """
 
     H: Array  # (k, s)
@@ -110,9 +110,8 @@ def estimates_after(
     has no correction. The products with e and u are computed at once for all ticks that have the
     same parameters, which takes a third of the time.
 
-    `history` has the past ticks, and at least one of them has a y. `change` says by how much the
-    feedforward has changed since they were recorded, (m,). `filters` has the parameters of the
-    observer at each tick.
+    `history` has the past ticks. At least one of them must have a y. `change`, (m,), is the change
+    of the feedforward since these ticks. `filters` has the parameters of the observer at each tick.
     """
     known = np.array([tick.e is not None for tick in history])
     e = np.array([np.zeros_like(change) if tick.e is None else tick.e for tick in history]).T
@@ -147,8 +146,8 @@ def with_motion(
         square += part ((reading - mean)^2 - square)
         measures 1 where square > least, else 0
 
-    A frozen vane shows only electrical noise, with a mean square below `least`. The same holds for
-    a vane in calm air, but then there is no wind to measure.
+    A frozen vane shows only electrical noise, with a mean square below `least`. A vane in calm air
+    shows no more, but then there is no wind to measure.
     """
     xp = array_namespace(reading)
     part = xp.minimum(dt / params.time, 1.0 + 0.0 * dt)
@@ -161,10 +160,10 @@ def with_motion(
 def by_vanes(
     z: Array, innovation: Array, deviation: Array, measures: Array, params: VaneParams
 ) -> Array:
-    """Compute the correction of the estimates by the vanes in use, (s,).
+    """Compute how the vanes in use correct the estimates, (s,).
 
-    It is the sum over v of L_v [e - H z, deviation_v - H_v z]. `innovation` is e - H z, (m,).
-    `deviation` has the readings minus the readings in the reference motion, (k,).
+    The correction is the sum over v of L_v [e - H z, deviation_v - H_v z]. `innovation` is e - H z,
+    (m,). `deviation` has the readings minus the readings in the reference motion, (k,).
     """
     xp = array_namespace(z)
     residual = deviation - product(params.H, z)
@@ -244,14 +243,15 @@ def _at_engagement(
 def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
     """Extend a control law by an observer, which moves the trim of the law from u_trim by u_o.
 
-    With `vanes`, the observer also uses the readings of the vanes. It predicts z with u after
-    saturation, so that its disturbance estimates do not wind up:
+    The observer predicts z with u after saturation, so that its disturbance estimates do not wind
+    up:
 
         u_o by `correct`
         u   = law(y, y_m) from the trim u_trim + u_o
         z   = Phi z + Gamma (u - u_trim) for the next tick, and again for each missed tick
 
-    The law takes the measured e, not the estimate.
+    The law takes the measured e, not the estimate. With `vanes`, the observer also uses the
+    readings of the vanes.
     """
 
     def corrected(

@@ -114,11 +114,11 @@ def airspeed_range(params: ScheduleParams) -> tuple[Array, Array]:
 def target_scale(y: Array, params: ScheduleParams) -> Array:
     """Compute the factor of input_scale, shape (m,), at the airspeed V0 + V with V from y.
 
-    It is (V0 / (V0 + V))^2 within SCALE_RANGE, and 1 in channel V.
+    The factor is (V0 / (V0 + V))^2 within SCALE_RANGE, and 1 in channel V.
 
-    This is a ratio of dynamic pressures at equal density. It holds at any altitude if V in y is
-    equivalent airspeed, and near the altitude of the trim if it is true airspeed. Thrust does not
-    follow the ratio.
+    It is a ratio of dynamic pressures at equal density. If V in y is equivalent airspeed, this
+    ratio holds at any altitude. If V is true airspeed, it holds near the altitude of the trim.
+    Thrust does not follow the ratio.
     """
     xp = array_namespace(y)
     least, largest = airspeed_range(params)

@@ -72,10 +72,10 @@ class GuardParams(NamedTuple):
     def longest_ns(self) -> int:
         """Longest time between two samples of y over which the law may step, ns.
 
-        After a longer time the law engages again. This time is longer than the age limit, because
+        After a longer time the law engages again. This limit is larger than the age limit, because
         the last tick with a fresh y can be a period before the tick of the next y. A step
-        integrates the whole time. If half of the ticks are lost, a limit of only 3 periods would
-        raise the error by 15 % in q and 22 % in r.
+        integrates over the whole time between two samples. If half of the ticks are lost, a limit
+        of only 3 periods would raise the error by 15 % in q and 22 % in r.
         """
         return self.max_age_ns + self.period_ns
 
@@ -242,18 +242,19 @@ def tick(
     changes.
 
     Stale inputs start the failsafe. Its modes are HOLD, in which nothing is integrated, then RAMP
-    to trim, then TRIM. The stamp of u is normally that of the y from which it is computed. In a
-    failsafe it continues from there with the clock, as the stamps of the missing y would. A y that
-    is older than the last u does not engage the law, so the stamp of u never goes back.
+    to trim, then TRIM. The stamp of u is normally the stamp of the y from which u is computed. In a
+    failsafe the stamp of u continues from there with the clock, as the stamps of the missing y
+    would. A y that is older than the last u does not engage the law, so the stamp of u never goes
+    back.
 
     If `active` is false, the mode is INACTIVE, and u is held or ramps to trim. With fresh inputs u
     is published even before the first engagement, and is then at trim. The returned inputs are None
     if there is nothing to publish.
 
-    `y` is the newest sample, and `y_m` holds the last samples with increasing stamps. Their
-    channels are in the law's order, and the readings of vanes follow the outputs in y. A replay
-    from a log does not know the state of the feedforward, so it gives the recorded `u_ff_recorded`
-    and `vane_m_recorded`.
+    `y` is the newest sample, and `y_m` holds the last samples with increasing stamps. The channels
+    of both are in the law's order, and the readings of vanes follow the outputs in y. A replay from
+    a log does not know the state of the feedforward, so it gives the recorded `u_ff_recorded` and
+    `vane_m_recorded`.
     """
     vane = None
     if guard.vanes and y is not None:
@@ -468,8 +469,7 @@ def _is_finite(state: ControllerState) -> bool:
 def _readings(reading: FloatArray, before: VaneReadings | None) -> FloatArray:
     """Return the readings of the vanes, (k,), without gaps.
 
-    If a reading is missing, the reading of the tick before is repeated, so that the vane counts as
-    still.
+    If a reading is missing, the last reading is repeated, so that the vane seems to stand still.
     """
     last = np.zeros_like(reading) if before is None else before.reading
     return np.where(np.abs(reading) <= LARGEST_VANE, reading, last)
@@ -494,8 +494,8 @@ def _vanes(
 ) -> VaneReadings | None:
     """Return the readings of the vanes, and what they would read in the reference motion.
 
-    The reference motion is the motion of the nominal model along y_m. The vanes would read states
-    of this model. Returns None without vanes.
+    In the reference motion, the nominal model follows y_m, and each vane would read a state of this
+    model. Returns None without vanes.
     """
     if reading is None:
         return None

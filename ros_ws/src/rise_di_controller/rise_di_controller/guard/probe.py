@@ -58,9 +58,8 @@ class ProbeConfig(Config):
     def harmonics(self, outputs: tuple[str, ...], input_scale: tuple[float, ...]) -> FloatArray:
         """Choose the frequency of each sine as a multiple of 1 / window, (m,).
 
-        It is 0 for an input that is not probed.
-
-        The weakest input gets the lowest frequency, because it moves the aircraft the least.
+        An input that is not probed has the multiple 0. The weakest input gets the lowest frequency,
+        because it moves the aircraft the least.
         """
         probed = np.flatnonzero(self.amplitudes(outputs))
         first = max(round(self.lowest * self.window), GAP)
@@ -113,13 +112,13 @@ class EffectTest:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all recorded ticks. This is necessary at an engagement."""
+        """Forget all recorded ticks, which is necessary when the law engages."""
         self._means.clear()
         self._bin = -1
         self._samples: list[FloatArray] = []
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> FloatArray | None:
-        """Record a tick. If a test is due, return its result `most()`, else None."""
+        """Record a tick. If a test is due, return the result of `most()`, else None."""
         place = stamp_ns // BIN_NS
         result = None
         if place != self._bin:

@@ -24,11 +24,11 @@ def retune_state(
 ) -> ControllerState:
     """Carry the state over to new parameters of the law, without a jump of u (bumpless transfer).
 
-    | change | with a history of ticks | without one |
+    | change | with a history of ticks | without a history |
     |---|---|---|
-    | same matrices of the observer | it continues | it continues |
+    | same matrices of the observer | the observer continues | the observer continues |
     | new observer | z from the new filter, u_o continues | starts from the present e |
-    | new feedforward | goes on from the same motion | u_ff becomes part of u_trim |
+    | new feedforward | continues the same motion | u_ff becomes part of u_trim |
 
     When an observer starts from the present error, its former output u_o becomes a part of u_trim.
     With a schedule, the state continues with the models of the present speed, while the run over

@@ -107,7 +107,7 @@ def sample_limits(
     """Return the limits within which the samples of the outputs `names` must be.
 
     `authority` is the y_dot that full inputs give, (m,), units of y / s. `largest` holds the bounds
-    from the parameters. If it is None, plausible bounds are used.
+    from the parameters. If `largest` is None, plausible bounds are used.
     """
     least = [LEAST.get(name, LEAST_RATE) for name in names]
     reach = np.maximum(AUTHORITY * authority * seconds(period_ns), least)
@@ -166,18 +166,18 @@ def step(
         NEAR if change <= max(TIMES largest, reach) in all outputs, and then largest = max(change,
         faded largest)
 
-    `largest` is `state.change`, and `reach` and the period come from `limits`. The possible change
-    grows with the time since the last sample that was taken, so no sensor is locked out for ever.
-    After lost samples, `largest` takes the whole change instead of the change per period. The
-    reason is that these samples may have been lost because y is noisy, and the changes of noise do
-    not grow with time.
+    `largest` is `state.change`, and `reach` and the period come from `limits`. The change that is
+    allowed grows with the time since the last sample that was taken, so no sensor is locked out for
+    ever. After dropped samples, `largest` takes the whole change instead of the change per period.
+    The samples may have been dropped because y is noisy, and the changes of noise do not grow with
+    time.
 
-    The samples within the first FIRST_NS are always NEAR. A gyro may start with wrong values.
-    During this time `largest` therefore takes at most `reach` of a near change, and nothing of a
-    larger change.
+    The samples within the first FIRST_NS are always NEAR. A gyro may start with wrong values, so
+    during this time `largest` takes at most `reach` of a near change, and nothing of a larger
+    change.
 
-    A sample is FROZEN if y has moved and now stands still. It has moved if at least MOVING samples
-    in a row differed from the one before. It stands still if no value has changed since then, for
+    A sample is FROZEN if y has moved and now stands still. y has moved if at least MOVING samples
+    in a row differed from the one before. y stands still if no value has changed since then, for
     STILL samples and for as many periods.
     """
     stillness = _next_stillness(state.stillness, sample, state.last, limits)
@@ -220,7 +220,10 @@ def _next_stillness(
 def _comparison(
     before: StampedVector, sample: StampedVector, largest: FloatArray, limits: SampleLimits
 ) -> tuple[bool, FloatArray]:
-    """Return whether a sample is near the sample before it, and its change per period, (m,)."""
+    """Compare a sample with the sample before it.
+
+    Returns whether the sample is near, and its change per period, (m,).
+    """
     periods = max((sample.stamp_ns - before.stamp_ns) / limits.period_ns, 1.0)
     change = np.abs(sample.value - before.value) / periods
     return bool((change <= np.maximum(TIMES * largest, limits.reach)).all()), change

@@ -19,9 +19,9 @@ from rise_di_controller.law.saturation import Limits
 class Measurements(NamedTuple):
     """Inputs of a law at a tick, as deviations from trim in SI, with channels in the law's order.
 
-    Arrays have shape (m,) for a single aircraft. In a campaign the N aircraft are the last axis,
-    with the shape (m, N), or (m, 1) for a value that they share. The fields from `position` to
-    `y_dot` are not on the topics: only campaigns fill them in, for laws that need more sensors.
+    Arrays have shape (m,) for a single aircraft. In a campaign the N aircraft are the last axis:
+    (m, N), or (m, 1) for a value that all aircraft share. The fields from `position` to `y_dot` are
+    not on the topics. Only campaigns fill them in, for laws that need more sensors.
     """
 
     y: Array  # measured outputs
@@ -46,14 +46,15 @@ def _no_prediction(state: Any, measurements: Measurements, params: Any) -> Any:
 class ControlLaw(NamedTuple):
     """A control law as pure functions of state and parameters, with NumPy and JAX arrays.
 
-    The state is a NamedTuple of arrays, (m,) or (m, N). The log records its fields by name, so that
-    a replay can continue from any tick. The parameters can be any NamedTuple of arrays.
+    The state is a NamedTuple of arrays, (m,) or (m, N). The log records the fields of the state by
+    name, so that a replay can continue from any tick. The parameters can be any NamedTuple of
+    arrays.
 
     `engage` makes the state at engagement, and the first u must equal u_trim. `step` advances the
     law by a tick of dt seconds without limits. `limited` advances the law inside limits, with its
-    anti-windup. If no limit acts, it must give the same bits as `step`. `retune` carries the state
-    over to new parameters without a jump of u. `missed` predicts the state over one period without
-    a sample, while u is held.
+    anti-windup. If no limit acts, `limited` must give the same bits as `step`. `retune` carries the
+    state over to new parameters without a jump of u. `missed` predicts the state over one period
+    without a sample, while u is held.
     """
 
     state: type[Any]

@@ -43,7 +43,7 @@ Order = tuple[tuple[int, ...], tuple[int, ...]]
 class DecompositionError(ParameterError):
     """Raised if a matrix has no S D U.
 
-    `minor` is the number of the first leading minor that is zero or nearly so. It is None if the
+    `minor` is the number of the first leading minor that is zero or nearly so, or None if the
     matrix is not square.
     """
 
@@ -155,12 +155,11 @@ def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
     Returns None if none of the orders that are tried gives D = I.
 
     Up to MANY channels, every order of the outputs is combined with every order of the inputs,
-    which is (m!)^2 cases. With more channels only three orders are tried: the given one, the inputs
-    by their largest responses, and the order of complete pivoting. A smaller change may then exist,
-    even if None is returned. The signs of the inputs need no search: an input k is reversed where
-    D_k = -1, because its sign changes only D_k. Orders with a zero on the diagonal, or with max
-    abs(U - I) above `largest_U`, are excluded. The others are compared by these criteria, one after
-    the other:
+    which is (m!)^2 cases. With more channels only the three orders of `_likely_orders` are tried. A
+    smaller change may then exist, even if None is returned. The signs of the inputs need no search:
+    an input k is reversed where D_k = -1, because its sign changes only D_k. Orders with a zero on
+    the diagonal, or with max abs(U - I) above `largest_U`, are excluded. The others are compared by
+    these criteria, one after the other:
 
     - Most outputs keep their input.
     - Most outputs keep their place.
@@ -194,10 +193,11 @@ def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
 
 
 def _likely_orders(matrix: FloatArray) -> Iterable[Order]:
-    """List the orders that are likely to give D = I.
+    """List three orders of the channels that are likely to give D = I.
 
-    They are the given order, the inputs with the largest product of responses, and the order of
-    complete pivoting.
+    They are the order that is given, the order that pairs inputs and outputs so that the product of
+    the responses is largest, and the order in which an elimination with complete pivoting takes the
+    channels.
     """
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - takes 0.17 s, needed only above MANY channels
 
@@ -252,8 +252,8 @@ def _square(Omega: ArrayLike) -> FloatArray:
 def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Compute scales of the rows and of the columns of a matrix, (m,) each, which balance it.
 
-    With them, the largest abs(Omega_ij) / (rows_i columns_j) is 1 in every row and column. The
-    scales follow the units of the channels, so a comparison with the scales does not depend on
+    With these scales, the largest abs(Omega_ij) / (rows_i columns_j) is 1 in every row and column.
+    The scales follow the units of the channels, so a comparison with the scales does not depend on
     units. A row or column of zeros keeps the scale 1. Source: D. Ruiz, "A Scaling Algorithm to
     Equilibrate Both Rows and Columns Norms in Matrices", RAL-TR-2001-034.
     """
@@ -271,8 +271,8 @@ def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _eliminate(Omega: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return L, p, W and L^-1 of Omega = L diag(p) W, without pivoting.
 
-    L is unit lower and W unit upper triangular. The sign of p_k counts as certain if p_k
-    is large enough compared with the terms of the sum p_k = (L^-1)_k Omega (W^-1)_k.
+    L is unit lower and W unit upper triangular. The sign of p_k is taken as certain if p_k is large
+    enough compared with the terms of the sum p_k = (L^-1)_k Omega (W^-1)_k.
     """
     remainder = _square(Omega)
     m = len(remainder)

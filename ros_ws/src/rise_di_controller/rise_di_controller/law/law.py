@@ -188,9 +188,9 @@ def step(
 def control(before: LawState, after: LawState, params: LawParams) -> Array:
     """Compute u of (20), shape (m,): u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi).
 
-    e and integral_e are the values after the tick. With the literal sign, Pi is the value before
-    the tick, because it is used first and updated afterwards. With the soft and implicit signs, Pi
-    is the value after the tick. u has the units of input_scale.
+    e and integral_e are taken after the tick. Pi is taken after the tick with the soft and implicit
+    signs, and before the tick with the literal sign, which uses Pi first and updates it afterwards.
+    u has the units of input_scale.
     """
     Pi = before.Pi if params.sign is Sign.LITERAL else after.Pi
     return params.input_scale * (
@@ -210,13 +210,13 @@ def step_with_anti_windup(
 ) -> tuple[LawState, Array, Array]:
     """Advance the law by a step with anti-windup.
 
-    Returns the state of the law, u before saturation, and the commanded u, each u with the shape
+    Returns the state of the law, u before saturation, and the commanded u. Each u has the shape
     (m,).
 
-    The anti-windup is conditional integration. If u_trim + u exceeds a magnitude or rate limit, any
-    increment of integral_e or of Pi that pushes u further out is reduced. An increment that brings
-    u back stays. The increment of integral_e is dropped. The increment of Pi, the faster integral,
-    is scaled so that u ends at the limit:
+    The anti-windup is conditional integration. If u_trim + u exceeds a magnitude or rate limit,
+    increments of integral_e and of Pi that push u further out are reduced, and increments that
+    bring u back stay. The increment of integral_e is dropped. The increment of Pi, the faster
+    integral, is scaled so that u ends at the limit:
 
         beyond = abs(u_trim + u - saturated)
         excess = max(beyond - abs(change of u by the increment of integral_e), 0)

@@ -68,13 +68,13 @@ class LinearLaw(NamedTuple):
 def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = None) -> LinearLaw:
     """Linearise the step of a law near e = 0 over m channels.
 
-    Each column of the matrices is the response to a step of SMALL in one value of the state or of
-    y.
+    Each column of the matrices is the response to a step of size SMALL in one value of the state or
+    of y.
 
-    The observer counts as fully faded in, and its vanes as moving. Each vane adds a column after
+    The observer is taken as fully faded in, and its vanes as moving. Each vane adds a column after
     the columns of y. If `candidates` is N, the parameters hold N sets of gains in their last axis,
-    and the matrices hold them in the first axis. Raises ParameterError for the literal sign, which
-    is not linear anywhere.
+    and the matrices hold the N results in their first axis. Raises ParameterError for the literal
+    sign, which is not linear anywhere.
     """
     control_law, params = law
     core = params
@@ -202,9 +202,9 @@ def sampled_plant(
     The states are x, (n,), then the positions of the m actuators, and then u, (m,), of each earlier
     tick that still acts, the latest first.
 
-    u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,).
-    If `rising`, u of a tick is not constant but multiplies the second Legendre polynomial ROOT (2 s
-    - 1), where s rises from 0 to 1 over the period.
+    The u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape
+    (m,). If `rising`, the u of a tick is not constant over the period: it is multiplied by the
+    second Legendre polynomial ROOT (2 s - 1), where s rises from 0 to 1 over the period.
 
     Source: K. J. Astrom, B. Wittenmark, "Computer-Controlled Systems", section 2.3, for the
     sampling of a plant with delay.
@@ -276,10 +276,9 @@ def closed_loop(
 ) -> FloatArray:
     """Return the matrix that advances the sampled loop by exactly one period.
 
-    The loop is stable if no eigenvalue lies outside the unit circle.
-
-    Its state is the state of `sampled_plant`, followed by the state of the law. Leading axes of
-    plant and law are batches.
+    The loop is stable if no eigenvalue lies outside the unit circle. The state of the loop is the
+    state of `sampled_plant`, followed by the state of the law. Leading axes of plant and law are
+    batches.
     """
     A, B, C = sampled_plant(plant, loop, extra)
     k = A.shape[-1]

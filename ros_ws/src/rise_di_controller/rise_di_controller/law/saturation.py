@@ -75,8 +75,8 @@ def limited_integral(before: Array, after: Array, change: Array, beyond: Array) 
     further out if `change` and `beyond` have the same sign. Otherwise the result is `after`, to the
     last bit.
 
-    Source: conditional integration, K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5. That
-    only a part of the increment is taken is of this project.
+    Source: conditional integration, K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5. This
+    project takes a part of the increment, where the book takes none.
 
     Args:
         before: Integral before the tick, shape (m,).

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Test whether a law with a learned model diverges or oscillates.
 
-The error is compared with the error under the law of the start, which is the law with which the
-flight started.
+The error is compared with the error before a model was learned, when the flight used the law with
+which it started.
 """
 
 from collections import deque
@@ -40,9 +40,10 @@ HARMLESS = 0.2  # fraction of LEAST or LEAST_RATE below which an oscillation doe
 
 
 class Errors(NamedTuple):
-    """Mean squares of e = y - y_m, each with the shape (m,).
+    """Mean squares of the error e = y - y_m, each with the shape (m,).
 
-    `now` is the running mean, and `largest` is its largest value under the law of the start.
+    `now` is the running mean of e^2. `largest` is the largest value that `now` reached before a
+    model was learned, or while the controller had fallen back to the law of the start.
     """
 
     now: FloatArray
@@ -55,9 +56,9 @@ def least(outputs: tuple[str, ...]) -> FloatArray:
 
 
 def step(errors: Errors, e: FloatArray, dt: float, *, has_learned_model: bool) -> Errors:
-    """Update by a tick: now += (1 - exp(-dt / MEMORY)) (e^2 - now).
+    """Update the mean squares by a tick: now += (1 - exp(-dt / MEMORY)) (e^2 - now).
 
-    `largest` changes only while the law of the start flies.
+    `largest` changes only while no learned model flies.
     """
     now = errors.now - np.expm1(-dt / MEMORY) * (e**2 - errors.now)
     return Errors(now, errors.largest if has_learned_model else np.maximum(errors.largest, now))
@@ -68,11 +69,9 @@ def diverging(
 ) -> NDArray[np.bool_]:
     """Return which outputs, (m,), diverge under a learned model.
 
-    An output diverges if its rms error is above FACTOR times its largest under the law of the
-    start, and above `least`.
-
-    Only outputs with a learned model count, as `is_learned` (m,) says, because the others still fly
-    the law of the start.
+    An output diverges if its rms error is above FACTOR times the largest rms error that it had
+    without a learned model, and above `least`. Outputs that still fly without a learned model are
+    left out. `is_learned` (m,) is False for them.
     """
     return is_learned & (errors.now > np.maximum(FACTOR**2 * errors.largest, least))
 
@@ -81,8 +80,8 @@ class Oscillations:
     """The error e over the last WINDOW, and the outputs in which it oscillates.
 
     In a limit cycle, e repeats itself after a period over the whole window. Under wind and single
-    commands it does not. An output counts only if it oscillates more than it did under the law of
-    the start.
+    commands it does not. An output is included only if it oscillates more than it did without a
+    learned model.
     """
 
     def __init__(self, least: FloatArray) -> None:
@@ -102,10 +101,10 @@ class Oscillations:
         self._has_learned_model = False
 
     def take(self, e: FloatArray, dt: float, is_learned: NDArray[np.bool_] | None) -> None:
-        """Record a tick, and test once a second.
+        """Record a tick, and test for oscillations once a second.
 
-        `is_learned` is the mask of the outputs with a learned model, (m,), or None under the law of
-        the start.
+        `is_learned` is the mask of the outputs with a learned model, (m,), or None if no learned
+        model flies.
         """
         if (is_learned is not None) is not self._has_learned_model:
             self._has_learned_model = is_learned is not None
@@ -141,8 +140,8 @@ class Oscillations:
 def oscillating(y: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
     """Return which outputs, (m,), oscillate over a record y, (N, m).
 
-    An output counts only if its variance over the record is above HARMLESS^2 `least`. Commands that
-    repeat themselves count as an oscillation, too.
+    The variance of an output over the record must be above HARMLESS^2 `least`. Commands that repeat
+    themselves are found as an oscillation, too.
     """
     is_moving = np.var(y, axis=0) > HARMLESS**2 * least
     return np.array(
@@ -153,11 +152,10 @@ def oscillating(y: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
 def period(x: FloatArray) -> int:
     """Return the period of an oscillation that fills a record, (N,), in samples.
 
-    It is at most N / 4, and 0 if there is no oscillation.
-
         r_k = N / (N - k) sum x_i x_(i+k) / sum x_i^2,  x less its mean
 
-    The period is the lag of the first peak above LIKENESS that comes after the first negative r.
+    The period is the lag of the first peak above LIKENESS that comes after the first negative r. It
+    is at most N / 4. Returns 0 if there is no oscillation.
     """
     n = len(x)
     lags = len(x) // 4

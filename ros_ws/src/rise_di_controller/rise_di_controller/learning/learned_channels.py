@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Combine channels with a learned model and channels that fly the law of the start.
+"""Combine channels that use a learned model with channels that fly the law of the start.
 
 The law of the start is the law with which the flight started.
 """
@@ -99,15 +99,15 @@ def authority_names(outputs: Sequence[str]) -> tuple[str, ...]:
 def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
     """Compute the y_dot that each input can surely give to its output, (2m,), units of y / s.
 
-    The first m values are those of a falling output, the others those of a rising output:
+    The first m values hold for a falling output, the other m for a rising output:
 
         y_dot_i = abs(Omega_ii) exp(-2 s_i) abs(limit of u_i),
             Omega = C B of the model learned in flight
 
     s_i is the standard deviation of Omega_ii divided by abs(Omega_ii). For a small s_i the factor
     subtracts two deviations, and for any s_i it stays above 0. If there are models at other speeds,
-    the least value over the speeds counts. The result is 0 for an input without effect. It is
-    UNKNOWN if the input has no limit, or if the output flies the law of the start.
+    the least value over the speeds is returned. The result is 0 for an input without effect. It is
+    UNKNOWN if the input has no limit, or if no learned model flies in the output.
     """
     m = len(parameters.outputs)
     model = parameters.feedforward
@@ -136,9 +136,9 @@ def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
 def with_fallback(
     start: RiseDiConfig, parameters: RiseDiConfig, bare: Sequence[bool]
 ) -> RiseDiConfig:
-    """Return the parameters with which the channels `bare` fall back to the law of the start.
+    """Return parameters in which the channels `bare` fly the law of the start again.
 
-    If no channel keeps a model, the result is `start` itself.
+    If no channel keeps a learned model, the result is `start` itself.
     """
     acting = acting_inputs(parameters)
     is_first = parameters.models() == start.models()
@@ -163,7 +163,7 @@ def without_models(
 ) -> RiseDiConfig:
     """Return parameters in which some outputs no longer use their learned model.
 
-    These outputs fly the law of the start until the engagement ends. They are added to
+    These outputs fly the law of the start until the engagement ends, and their names are added to
     `learn.without`.
     """
     fallen = with_fallback(start, parameters, [name in outputs for name in start.outputs])
@@ -177,9 +177,9 @@ def without_models(
 
 
 def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
-    """Return a mask, (m,), of the outputs that the nominal model couples with the given `names`.
+    """Return a mask, (m,), of the outputs that the model couples with the outputs `names`.
 
-    The nominal model is that of the feedforward.
+    The model is the nominal model of the feedforward.
     """
     model = parameters.feedforward
     assert model is not None  # noqa: S101 - a learned model flies

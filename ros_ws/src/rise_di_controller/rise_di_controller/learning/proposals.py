@@ -76,7 +76,8 @@ class Proposal(NamedTuple):
 class Event(NamedTuple):
     """What became of a proposed model, or that the controller fell back.
 
-    It has the reason and the changed parameters by dotted name. No parameter need have changed.
+    An event has the reason, and the parameters that changed, by dotted name. It is possible that
+    none changed.
     """
 
     stamp_ns: int
@@ -107,7 +108,7 @@ class Fallback(NamedTuple):
     def outlived_by(self, proposal: Proposal, digest: int) -> bool:
         """Return whether a proposal may still act although it was made before this fallback.
 
-        It may if it stops the use of one more input that has no effect.
+        It may act if it stops the use of one more input that has no effect.
         """
         scale = proposal.change.get("input_scale")
         if (proposal.flown, digest) != (self.flown, self.fallen) or not isinstance(scale, Sequence):
@@ -244,9 +245,9 @@ class Learning:
     ) -> RiseDiConfig:
         """Fall back to the parameters of the start in all outputs, because some of them diverge.
 
-        The fallback is counted only for the parts of the model (outputs that it couples with each
-        other) that diverge. A part with FALLBACKS fallbacks keeps the law of the start until the
-        engagement ends.
+        A part of the model is a group of outputs that the model couples. The fallback is counted
+        only for the parts in which an output diverges. A part with FALLBACKS fallbacks flies the
+        law of the start until the engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -271,9 +272,9 @@ class Learning:
     def _end_oscillations(
         self, periods: Mapping[str, float], controller: Controller, now_ns: int
     ) -> RiseDiConfig:
-        """Fall back in the outputs that oscillate, and in those that the model couples with them.
+        """Fall back in the outputs that oscillate, and in outputs that the model couples with them.
 
-        They keep the law of the start until the engagement ends.
+        All of these outputs fly the law of the start until the engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -404,9 +405,9 @@ class Learning:
     def _reason_against_change(self, proposal: Proposal, controller: Controller) -> Refusal | None:
         """Return why the law cannot take a certified proposal, or None.
 
-        It cannot if the law is not engaged, or if another change of the parameters came first. A
-        proposal that stops the use of an input without effect still counts after a fallback,
-        because the loss of this input may have caused the fallback.
+        The law cannot take it if it is not engaged, or if another change of the parameters came
+        first. A proposal that stops the use of an input without effect is taken even after a
+        fallback, because the loss of this input may have caused the fallback.
         """
         if controller.mode is not Mode.ENGAGED:
             return Refusal(
@@ -505,9 +506,9 @@ def _speeds(parameters: RiseDiConfig) -> str:
 def design_changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
     """Return what a new design sets: the parameters in DESIGNED of the new set, by dotted name.
 
-    The value None means that the parameter is to be removed. A parameter that the new set lacks has
-    the value None if the old set has it, or if it is in OPTIONAL, because the parameters in force
-    may have it by then.
+    The value None removes a parameter. Two kinds of parameters that the new set lacks get this
+    value: those that the old set has, and those in OPTIONAL, which the parameters in force may have
+    by then.
     """
     before = _designed_values(old)
     after = _designed_values(new)
