@@ -104,8 +104,8 @@ class GuidanceClient(Client):
     ) -> Refusal | None:
         """Wait until guidance has taken a message or refused it; return the reason of a refusal.
 
-        Returns None if it has taken the message, and `unknown` if it has done neither within
-        TARGET_TIMEOUT.
+        Returns None if guidance has taken the message. Returns `unknown` if guidance has neither
+        taken nor refused the message within TARGET_TIMEOUT.
         """
         reasons: list[Refusal] = []
 
@@ -173,7 +173,7 @@ class TargetClient(GuidanceClient):
     def send(self, values: Mapping[str, float]) -> Refusal | None:
         """Publish commands by channel until guidance has taken them.
 
-        Returns the reason if guidance does not take them, and None if it does.
+        Returns the reason if guidance refuses them, else None.
         """
         self._spin_until(lambda: bool(self._received()), self._silent)
         self._log.take()

@@ -44,8 +44,8 @@ class Performance(NamedTuple):
 def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
     """Return the airspeed on the leg to each waypoint, m/s.
 
-    If a waypoint names no airspeed, the airspeed of the previous leg goes on, and on the first leg
-    it is `first`.
+    If a waypoint names no airspeed, its leg has the airspeed of the leg before. The first leg then
+    has the airspeed `first`.
     """
     leg_speeds = []
     for waypoint in waypoints:
@@ -58,8 +58,8 @@ def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
 class FlyableRoute:
     """The legs of a route, and the waypoints through which they lead.
 
-    Waypoints that were left out because of short legs are missing. Legs that were too steep have
-    loiters.
+    Waypoints that were left out because their legs were too short are not among them. Legs that
+    were too steep have circles on which the aircraft climbs or descends.
     """
 
     legs: tuple[Leg, ...]
@@ -74,9 +74,9 @@ def flyable(
     """Plan the legs of a route with fillets of `radius`, m, and path following with `period`, s.
 
     If a leg is too short for the fillets, one of its waypoints is left out. The route must still
-    pass this waypoint within `radius` or within 1 s of flight. A change of altitude may be larger
-    than the aircraft can fly along the straight part of its leg in a tailwind. It is then flown on
-    a circle: a climb at the start of the leg, and a descent at its end.
+    pass this waypoint within `radius` or within 1 s of flight. A change of altitude may be too
+    large for the straight part of its leg in a tailwind. The aircraft then makes the change on a
+    circle: a climb at the start of the leg, and a descent at the end of the leg.
 
     Raises ParameterError for a waypoint that is not finite or beyond LARGEST, for an altitude or a
     speed out of bounds, and for a speed of at most HEADWIND times the wind. It is also raised for a
@@ -115,9 +115,9 @@ def as_route(
     `speed` is the airspeed, m/s, up to the first waypoint that names one. If `slopes`, the altitude
     changes linearly along each line. Otherwise it changes in a step at the start of a leg.
 
-    A fillet counts as a part of the way to the next waypoint. A leg starts at the altitude and the
-    airspeed of the previous waypoint. An orbit round a waypoint starts at the altitude of this
-    waypoint, and ends at the altitude at which the aircraft flies on.
+    A fillet belongs to the way to the next waypoint. A leg starts at the altitude and the airspeed
+    of the previous waypoint. An orbit round a waypoint starts at the altitude of this waypoint, and
+    ends at the altitude at which the aircraft flies on.
     """
     leg_speeds = speeds(waypoints, speed)
     numbers = path.leads(legs)
@@ -216,8 +216,8 @@ def _with_circles(
 ) -> FlyableRoute:
     """Add a circle to a route for each change of altitude that is too large for its leg.
 
-    Such a change exceeds the climb or sink along the leg. `by_number` has the waypoints by their
-    numbers.
+    A change is too large if it needs a faster climb or sink along the leg than the aircraft can
+    fly. `by_number` has the waypoints by their numbers.
     """
     numbers = list(by_number)
     waypoints = list(by_number.values())

@@ -57,7 +57,7 @@ class GuidanceOutput(NamedTuple):
 def u_m(state: GuidanceState) -> FloatArray:
     """Return the values that are published as u_m.
 
-    They are the commands in the order of the parameters' outputs, followed by the channels of
+    First come the commands, in the order of the parameters' outputs, and then the channels of
     ATTITUDE.
     """
     return np.array([*state.u_m, state.phi, state.theta - state.alpha])
@@ -131,8 +131,8 @@ class Guidance:
     def take_pose(self, sample: StampedVector, now_ns: int) -> None:
         """Take a pose in the order of `channels.POSE`.
 
-        Raises ChannelError if the stamp is not newer than that of the last pose, or is in the
-        future. It is also raised if a value is beyond LARGEST, and if every value is that of the
+        Raises ChannelError if the stamp is not newer than the stamp of the last pose, or is in the
+        future. It is also raised if a value is beyond LARGEST, and if all values equal those of the
         last pose.
         """
         last = self._pose
@@ -153,7 +153,7 @@ class Guidance:
     def take_authority(self, channels: Mapping[str, float]) -> None:
         """Limit the next steps by the authority of the inputs.
 
-        `channels` are those of the topic `authority`.
+        `channels` are the channels of the topic `authority`.
         """
         self._authority = authority_of(channels)._replace(roll=self._authority.roll)
 
@@ -282,8 +282,8 @@ class Guidance:
     def pause(self, *, paused: bool, forget: bool) -> None:
         """Pause guidance because the controller does not fly, or let it fly again.
 
-        When it flies again, it continues with its last commands. If `forget` was set since it last
-        flew, it holds the measured heading, altitude and airspeed.
+        When guidance flies again, it continues with its last commands. If `forget` was set in the
+        meantime, it holds the measured heading, altitude and airspeed.
         """
         if forget:
             self._begin = Begin.HOLD
@@ -348,7 +348,7 @@ class Guidance:
             self._link_lost = self.home()
 
     def _link_age(self, now_ns: int) -> float:
-        """Return the age of the operator's link, s; 0 if it has no limit."""
+        """Return the age of the operator's link, s; 0 if the parameters set no limit for it."""
         return 0.0 if self._operated_ns is None else seconds(now_ns - self._operated_ns)
 
     def _test_roll(self, y: Sequence[float]) -> None:
@@ -378,10 +378,10 @@ class Guidance:
     def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
         """Take a step at the instant `now_ns` and the flight time `t_ns`.
 
-        Returns None if y is not fresh, if no pose has come yet, or while disengaged. After such
-        steps the filters start again at the measured values. If a step raises an exception or gives
-        a value that is not finite, the state stays and commands wait for the next step. The last
-        u_m is then repeated until the age limit.
+        Returns None if y is not fresh, if no pose has come yet, or if guidance is disengaged. When
+        guidance continues after that, its filters start again at the measured values. If a step
+        raises an exception or gives a value that is not finite, the state stays and commands wait
+        for the next step. The last u_m is then repeated until the age limit.
         """
         try:
             return self._step(now_ns, t_ns)

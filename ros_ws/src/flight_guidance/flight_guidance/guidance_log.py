@@ -36,7 +36,7 @@ WIND = ("north", "east")
 
 
 class GuidanceSample(NamedTuple):
-    """A step as the log holds it: its inputs, the state after it, and its commands."""
+    """A step as the log holds it: the inputs of the step, the state after it, and its commands."""
 
     inputs: Inputs
     state: GuidanceState
@@ -61,7 +61,7 @@ def _tuple(*values: float) -> tuple[float, ...]:
 
 
 class LogChannels(NamedTuple):
-    """Channels of the log, and the attribute of a `GuidanceSample` that they hold."""
+    """Channels of the log, with the attribute of a `GuidanceSample` whose numbers they hold."""
 
     names: Sequence[str]
     attribute: str

@@ -231,7 +231,7 @@ class GuidanceState(NamedTuple):
 
 
 class StepCommands(NamedTuple):
-    """Results of a step that are no part of the state, for the log."""
+    """Results of a step that the log needs and that are no part of the state."""
 
     phi_c: float = 0.0
     theta_c: float = 0.0
@@ -267,12 +267,12 @@ def begun_again(
     params: GuidanceParams,
     *further: str,
 ) -> GuidanceState:
-    """Return the state `holding`, with some fields taken over from the last state.
+    """Return the state `holding`, with some fields taken over from the last state, `state`.
 
-    `holding` is a state that holds the measured values, and `state` is the last state, if any. The
-    fields in CARRIED and `further` are taken over. If `inputs.begin` is HOLD, or if there is no
-    last state, the result is `holding` itself. If the last state is within the age limit of u_m,
-    the result also has its u_m, because the reference model still flies this u_m.
+    `holding` is a state that holds the measured values. The fields in CARRIED and `further` are
+    taken over from `state`. If `inputs.begin` is HOLD, or if there is no last state, the result is
+    `holding` itself. If the last state is within the age limit of u_m, its u_m is taken over too,
+    because the reference model still flies this u_m.
     """
     if state is None or inputs.begin is Begin.HOLD:
         return holding

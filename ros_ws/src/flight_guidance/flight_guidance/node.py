@@ -98,9 +98,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     """Steps `guidance.Guidance` at every tick, and publishes u_m and the topic guidance.
 
     The inputs of a step are the received y, pose, target and route. In real time guidance flies
-    while the controller is ENGAGED. In lockstep, samples of y count the time. A step then waits for
-    the y and the pose of its instant, and publishes exactly one u_m. This u_m has no channels if
-    guidance has no command.
+    while the controller is ENGAGED. In lockstep, the time of the flight is the number of samples of
+    y. A step then waits for the y and the pose of its instant, and publishes exactly one u_m. If
+    guidance has no command, this u_m has no channels.
     """
 
     def __init__(self) -> None:
@@ -302,8 +302,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     def _timeouts_ns(self) -> tuple[int, int]:
         """Return the ages after which another publisher may take over from a silent one, ns.
 
-        They hold for y, pose and internals. The first age is for the same node in a new process,
-        and the second age is for a different node.
+        The ages hold for y, pose and internals. The first age is for the same node in a new
+        process, and the second age is for a different node.
         """
         return self._max_age_ns(), self._max_age_ns() + nanoseconds(self.parameters.hold)
 
@@ -367,9 +367,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return None if lock is None else lock.publisher
 
     def _poll_authority(self, now_ns: int) -> None:
-        """Take the `authority` that has arrived, in real time.
+        """Take the `authority` that has arrived, if the flight is in real time.
 
-        The last sample holds no longer than AUTHORITY_TIMEOUT_PERIODS periods plus the age limit.
+        The last sample is valid for AUTHORITY_TIMEOUT_PERIODS periods plus the age limit.
         """
         if self._authority_receiver is None:
             return

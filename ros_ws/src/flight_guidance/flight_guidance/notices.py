@@ -43,17 +43,17 @@ STALE_TIME = 2.0
 
 
 class Notice(NamedTuple):
-    """A sentence and its flight time."""
+    """A sentence for the log, and the flight time to which it belongs."""
 
     t: float  # s
     text: str
 
 
 def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
-    """Return whether the wind carries an aircraft back along its path, although it flies ahead.
+    """Return whether a strong wind carries an aircraft back along its path.
 
-    It flies ahead through the air, but goes back over ground. `log` has the channels of `guidance`,
-    as values or arrays.
+    Such an aircraft flies ahead through the air, but goes back over ground. `log` has the channels
+    of `guidance`, as values or arrays.
     """
     track = log["track"]
     lateral = log["mode.lateral"]

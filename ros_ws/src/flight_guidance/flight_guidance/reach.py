@@ -54,9 +54,9 @@ rolls with up to half of the command."""
 
 
 class Authority(NamedTuple):
-    """Least rate at which each input can change its output from trim, units of y / s.
+    """Least rate at which each input can surely change its output from trim, units of y / s.
 
-    It is 0 if the input has no effect, and UNKNOWN if no model is learned.
+    The rate is 0 if the input has no effect, and UNKNOWN if no model is learned.
     """
 
     q: float = UNKNOWN  # rad/s^2
@@ -101,8 +101,8 @@ AUTHORITY = tuple(f"{side}.{name}" for side, name in product(SIDES, ("q", "p", "
 def authority_of(channels: Mapping[str, float]) -> Authority:
     """Read the authority from the channels of the topic `authority`.
 
-    The topic has a value for each of two directions of an output. For q and p the lesser one
-    counts.
+    The topic has a value for each of two directions of an output. For q and p the smaller value is
+    taken.
     """
     q = min(channels[f"{side}.q"] for side in SIDES)
     p = min(channels[f"{side}.p"] for side in SIDES)
@@ -122,7 +122,8 @@ def roll_rate(authority: float, frequency: float) -> float:
     """Compute the roll rate p_max for an authority of the aileron, rad/s.
 
     With this p_max, a step of the command asks for a third of the authority: the largest p_m_dot of
-    the reference is then 0.4 w p_max, where w is its natural frequency, `frequency`, rad/s.
+    the reference is then 0.4 w p_max. w is the natural frequency of the reference for p,
+    `frequency`, rad/s.
     """
     return authority / (3.0 * 0.4 * frequency)
 

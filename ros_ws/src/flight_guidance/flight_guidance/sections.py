@@ -142,8 +142,8 @@ class ZoneConfig(Config):
 class HomeConfig(Config):
     """The place to which the aircraft flies when the fence acts, or by the service `guidance/home`.
 
-    It also flies there after the loss of the pose (`after_loss`) or of the operator's link
-    (`link_timeout`).
+    The aircraft also flies there after the loss of the pose (`after_loss`) or of the operator's
+    link (`link_timeout`).
     """
 
     north: Number = Field(default=0.0, description="distance to the north of the origin, m")

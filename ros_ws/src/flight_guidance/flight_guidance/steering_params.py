@@ -70,7 +70,7 @@ STEEPEST = 0.1
 
 
 class SteeringConfig(NodeConfig):
-    """Parameters of steering. They give the constants in the equations of guidance."""
+    """Parameters of steering, from which the constants in the equations of guidance follow."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(
         default=50.0, description="rate at which u_m is published, Hz"
@@ -160,7 +160,7 @@ class SteeringConfig(NodeConfig):
     )
 
     def by_rule(self) -> list[tuple[str, Any]]:
-        """Return the parameters that were left out, with the values that a rule gives them.
+        """Return the parameters that the file leaves out, with the values that a rule gives them.
 
         The rule uses other sections of the scenario.
         """
@@ -189,8 +189,8 @@ class SteeringConfig(NodeConfig):
         """Return the largest roll rate p_max, rad/s.
 
         By rule it is FASTEST_ROLL, but less if 0.4 w p_max would exceed a third of the authority.
-        This product is the largest p_m_dot after a step, and w is the natural frequency of the
-        reference of p.
+        0.4 w p_max is the largest p_m_dot after a step, and w is the natural frequency of the
+        reference for p.
         """
         frequency = self._frequency()["p"]
         authority = math.inf if self.roll_authority is None else self.roll_authority

@@ -84,12 +84,12 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
         phi' = p_max after the lag, to the largest bank;  chi' = share g tan(phi) / V;
             [n, e]' = V [cos, sin](chi) + W
 
-    A turn begins with the `lag`. The bank then changes at p_max to the largest bank. `share` is one
-    of SHARES, the fractions of the turn of this bank that the aircraft really flies, and the least
-    clearance over all of them counts. A turn ends when the course is only HOMEWARD away from the
-    bearing of the way home. It also ends after the time of nearly a full turn at the largest bank,
-    where a bank below LEAST_TURN counts as LEAST_TURN. The path is integrated by the trapezoidal
-    rule at POINTS instants.
+    A turn begins with the `lag`. The bank then changes at p_max to the largest bank. The turn is
+    computed for each `share` in SHARES, the fraction of the turn of this bank that the aircraft
+    really flies, and the result is the least clearance of all. A turn ends when the course is only
+    HOMEWARD away from the bearing of the way home. It also ends after the time of nearly a full
+    turn at the largest bank, where a bank below LEAST_TURN is taken as LEAST_TURN. The path is
+    integrated by the trapezoidal rule at POINTS instants.
     """
     xp = array_namespace(motion.phi)
     axes = (1,) * np.ndim(motion.phi)
@@ -129,9 +129,10 @@ def room_at_home(fence: Fence, motion: Motion, wind: float) -> float:
     """Compute how near to the fence the turn from home onto the orbit may come, m.
 
     An aircraft may come over home on any course, and its turn onto the orbit may lead outside of
-    the orbit by up to twice the radius of the turn. It flies the better of the turns to the right
-    and to the left. The result is the least clearance over COURSES courses, and over COURSES
-    directions of the wind. `wind` is its speed, m/s, and `motion` is that of the aircraft at home.
+    the orbit by up to twice the radius of the turn. The aircraft flies the better of the turns to
+    the right and to the left. The result is the least clearance over COURSES courses, and over
+    COURSES directions of the wind. `wind` is the speed of the wind, m/s, and `motion` is the motion
+    of the aircraft over home.
     """
     angles = np.linspace(0.0, 2.0 * math.pi, COURSES, endpoint=False)
     from_sides = angles if wind else angles[:1]
@@ -178,11 +179,11 @@ class Escape(NamedTuple):
 
 
 def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
-    """Choose the action of the fence after a step; `action` is the one of the previous step.
+    """Choose the action of the fence after a step; `action` is the action in the previous step.
 
     Let margin be the distance flown in the time MARGIN. A turn begins when even the better of the
-    two turns would come nearer to the fence than margin. It ends when the course is only HOMEWARD
-    away from the bearing of the way home, or later if the way home is not free yet.
+    two turns would come nearer to the fence than margin. The turn ends when the course is only
+    HOMEWARD away from the bearing of the way home, or later if the way home is not free yet.
 
     On the way home the aircraft turns only if the better turn keeps a larger clearance than the way
     does. Besides, the clearance of this turn must be below margin and below the present clearance.

@@ -33,7 +33,7 @@ POINTS = 64
 
 
 class Ways(NamedTuple):
-    """The ways home on a grid of cells: the aim of each cell, and whether it leads straight home.
+    """The ways home on a grid of cells: the aim of each cell, and whether its way home is straight.
 
     A straight way leads onto the orbit round home. The arrays have shape (rows, columns).
     """
@@ -45,10 +45,9 @@ class Ways(NamedTuple):
     straight: NDArray[np.bool_]
 
     def aim(self, fence: Fence, north: Array, east: Array) -> tuple[Array, Array, Array]:
-        """Return the aims of some places, north and east, m, and whether the way home is straight.
+        """Return towards which aims to fly from some places, and whether the way home is straight.
 
-        An aircraft at the place flies towards its aim. For a place outside of the map, the aim is
-        the nearest cell.
+        The aims are north and east, m. A place outside of the grid has the nearest cell as its aim.
         """
         xp = array_namespace(north)
         rows, columns = self.straight.shape
@@ -100,7 +99,7 @@ def line_clearance(
 
 @lru_cache(maxsize=64)
 def ways(fence: Fence) -> Ways:
-    """Make the map of a fence.
+    """Compute the ways home inside a fence on a grid of cells.
 
     A cell is open if the clearance at its centre exceeds half a cell. A way leads from an open cell
     to a neighbour if the circles round their centres, with their clearances as radii, overlap. The
@@ -189,7 +188,7 @@ def _neighbours(values: FloatArray, fill: float) -> list[FloatArray]:
 def _uphill(values: FloatArray) -> NDArray[np.intp]:
     """Return the neighbour of each cell towards which the values rise the most.
 
-    For a cell without a rising neighbour, such as a peak, it is the cell itself.
+    If no neighbour of a cell has a larger value, as on a peak, the result is the cell itself.
     """
     slopes = np.gradient(values)
     steepness = np.maximum(np.hypot(*slopes), 1e-6)

@@ -117,8 +117,8 @@ def _groups(zones: tuple[Zone, ...]) -> tuple[tuple[Zone, ...], ...]:
 def _deepest(groups: tuple[tuple[Zone, ...], ...], north: Array, east: Array) -> Array:
     """Return how deep a place is inside a group of zones, m; negative outside of all groups.
 
-    The depth in a group is the distance from the nearest border of its zones. Of several groups,
-    the one with the largest depth counts.
+    The depth in a group is the distance from the nearest border of its zones. If a place is in
+    several groups, the largest depth is returned.
     """
     xp = array_namespace(north)
     depths = []

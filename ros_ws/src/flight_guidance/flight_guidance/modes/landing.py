@@ -111,7 +111,7 @@ def flare_climb(height: float, path_sink: float, landing: Landing) -> float:
 def time_to_touch(height: float, path_sink: float, landing: Landing) -> float:
     """Compute the time until the wheels touch the ground in the flare, s.
 
-    It is the integral of dh / sink(h), where -sink(h) is `flare_climb`.
+    The time is the integral of dh / sink(h), where -sink(h) is `flare_climb`.
     """
     rate = max(path_sink - landing.sink, 1e-3) / landing.flare
     return math.log1p(rate * max(height, 0.0) / landing.sink) / rate
@@ -167,7 +167,7 @@ class Lander:
         return float(clearance((self._landing.box,), north, east)[0]) < 0.0
 
     def _go_around(self, pose: Mapping[str, float], route: Route) -> dict[str, float]:
-        """Return the commands to fly the line of the go-around from its nearest point on."""
+        """Return the commands that fly the line of the go-around, from its nearest point on."""
         leg = self._landing.around
         along = path.nearest(route.legs[leg], (pose["north"], pose["east"]))
         return {"leg": float(leg), "along": along}
@@ -175,13 +175,13 @@ class Lander:
     def _along_line(self, pose: Mapping[str, float], drift: float) -> dict[str, float]:
         """Return the commands that turn the nose along the line and lower the upwind wing.
 
-        `drift` is the speed across the line, m/s, and e the distance from it, m, both positive to
-        the right. The law is
+        `drift` is the speed across the line, m/s, and e the distance from the line, m. Both are
+        positive to the right. The law is
 
-        r = k (course - psi),  g tan(phi) = -w^2 e - 2 zeta w drift,  w = 2 pi / P
+            r = k (course - psi),  g tan(phi) = -w^2 e - 2 zeta w drift,  w = 2 pi / P
 
-        k is YAW_GAIN, and course is that of the line. P and zeta are the period and the damping of
-        path following.
+        k is YAW_GAIN, and course is the course of the line. P and zeta are the period and the
+        damping of path following.
         """
         landing = self._landing
         w = 2.0 * math.pi / self._params.path.period

@@ -140,11 +140,11 @@ def follow(
     """Compute the bank that follows a path, rad, before protection.
 
     `entry` is the curvature of the next leg at its start, 1/m. Because the bank lags its command,
-    this curvature must replace that of the present leg before the aircraft reaches the next leg. It
-    does so as soon as `is_entered` is true for the position that the aircraft will have after the
-    mean lag. For a change d of the bank, the mean lag is the sum of three times: abs(d) / (2 p_max)
-    for the ramp of the bank, 1 / (2 k_phi) for the loop of the bank, and `turn_lag` for the turn
-    behind the bank.
+    this curvature must replace the curvature of the present leg before the aircraft reaches the
+    next leg. It does so as soon as `is_entered` is true for the position that the aircraft will
+    have after the mean lag. For a change d of the bank, the mean lag is the sum of three times:
+    abs(d) / (2 p_max) for the ramp of the bank, 1 / (2 k_phi) for the loop of the bank, and
+    `turn_lag` for the turn behind the bank.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)
@@ -166,10 +166,10 @@ def escaping_bank(
     speed: Scalar,
     params: GuidanceParams,
 ) -> Scalar:
-    """Compute the bank for the action of the fence, rad.
+    """Compute the bank that the action of the fence needs, rad.
 
-    It is the bank of a turn, or the bank that holds the course home. If the fence does not act, the
-    result is `bank`, the bank of the lateral mode.
+    In a turn it is the bank of the turn, and on the way home the bank that holds the course. If the
+    fence does not act, the result is `bank`, the bank of the lateral mode.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)

@@ -31,7 +31,7 @@ def along_route(
 ) -> tuple[GuidanceState, float]:
     """Put the state on a leg when the aircraft has joined it, and on the next leg at its end.
 
-    Also returns by how much the aircraft missed the end of the leg, m, or 0.
+    The second result says by how much the aircraft missed the end of the leg, m, or is 0.
     """
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
@@ -82,9 +82,9 @@ def has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) 
 
 
 def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
-    """Return whether an aircraft on a circle may leave it: it is near the end, and on course.
+    """Return whether an aircraft on a circle may leave the circle.
 
-    It must be past the end, by at most `reach`, m.
+    It may if it is on course, and past the end of the circle by at most `reach`, m.
     """
     return leg.end is not None and bool(
         path.is_joined(leg.end, path.end_course(leg), reach, position, course_and_speed(pose)[0])
@@ -103,9 +103,9 @@ def with_commands(
     """Return the state with new modes and commands in force.
 
     If a leg is passed, `follow` first sets the commands of the next leg. Then the given commands
-    replace them. `join` returns the state on the way to a point of a leg. If there is a lateral
+    replace these. `join` returns the state on the way to a point of a leg. If there is a lateral
     command, the present leg is not followed any more, because the command may come with a new
-    route. Also returns the distance by which the end of a leg was missed at this step, m.
+    route. The second result is the distance by which the end of a leg was missed at this step, m.
     """
     lateral_names = channels.lateral.keys() & commands.keys()
     miss = 0.0
@@ -149,7 +149,8 @@ def on_profile(
 ) -> GuidanceState:
     """Return the state with the altitude and the climb rate of the leg as commands.
 
-    They are taken at the nearest point of the leg, or at the point where the aircraft joins it.
+    Both are taken at the nearest point of the leg. If the aircraft has yet to join the leg, they
+    are taken at the point where it joins.
     """
     flies = (
         state.mode is GuidanceMode.ENGAGED

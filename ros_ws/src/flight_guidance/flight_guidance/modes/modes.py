@@ -122,16 +122,15 @@ def step(
 
     1. Euler's kinematics with p, q, r of y carry phi and theta of the pose forward over its age.
     psi follows by `heading_estimate`. While the pose is stale, only Euler's kinematics act
-    (`GuidanceMode.DEAD_RECKONING`). If it stays stale for longer than `hold_ns`, the attitude is
-    unknown (`GuidanceMode.POSE_LOST`) until the pose returns. Then the wings are levelled at the
-    present altitude, or the aircraft flies home if `home.after_loss` is set.
-    2. When a leg ends, the commands of the next leg apply, and then the given commands. The
-    aircraft joins a leg by a circle that touches the leg at its start, unless it is near. If it
-    passes the end of a leg far away, the leg counts as missed.
-    3. The fence replaces the lateral mode by the last safe turn, and then by the way home.
-    4. Protection limits bank, airspeed, climb and pitch, in this order; `attitude.body_rates`
-    limits roll rate and load; the slew of u_m is limited last.
-    5. u_m is p, q, r by `attitude.body_rates`, and V_m = V_c - V0. In POSE_LOST p, q, r are 0.
+    (`GuidanceMode.DEAD_RECKONING`). If the pose stays stale for longer than `hold_ns`, the attitude
+    is unknown (`GuidanceMode.POSE_LOST`) until the pose returns. Then the wings are levelled at the
+    present altitude, or the aircraft flies home if `home.after_loss` is set. 2. When a leg ends,
+    the commands of the next leg apply, and then the given commands. Unless it is near, the aircraft
+    joins a leg by a circle that touches the leg at its start. If the aircraft passes the end of a
+    leg far away, the leg is noted as missed. 3. The fence replaces the lateral mode by the last
+    safe turn, and then by the way home. 4. Protection limits bank, airspeed, climb and pitch, in
+    this order; `attitude.body_rates` limits roll rate and load; the slew of u_m is limited last. 5.
+    u_m is p, q, r by `attitude.body_rates`, and V_m = V_c - V0. In POSE_LOST p, q, r are 0.
     """
     params = within_reach(params, inputs.authority)
     state = begin(state, inputs, params)
@@ -173,7 +172,8 @@ def _wanted_rates(
 ) -> BodyRates:
     """Compute the body rates that lead to the commanded attitude, rad/s.
 
-    They are 0 after the loss of the pose. The rate of an output whose input has no effect is 0 too.
+    All are 0 after the loss of the pose. If the input of an output has no effect, the rate of this
+    output is 0.
     """
     flies = state.mode is GuidanceMode.ENGAGED
     attitude = params.attitude._replace(n_alpha=load_slope(state.alpha_trim))
@@ -423,7 +423,8 @@ def _pitch_within(
 ) -> Scalar:
     """Return the commanded pitch, rad, within the range that the altitude limits allow.
 
-    The range is that of the pitch for the climb rates of `_climb_within`.
+    The range is from the pitch for the least climb rate of `_climb_within` to the pitch for the
+    largest one.
     """
     if not any(map(math.isfinite, (params.limits.lowest, params.limits.highest))):
         return state.target.theta
@@ -437,7 +438,7 @@ def _pitch_within(
 def _climb_within(altitude: Scalar, params: GuidanceParams) -> tuple[Scalar, Scalar]:
     """Return the least and the largest climb rate that the altitude limits allow, m/s.
 
-    They are the rates of `climb_for` towards the two limits.
+    `climb_for` gives them, with each of the two limits as the commanded altitude.
     """
     vertical = params.vertical
     limits = params.limits

@@ -25,11 +25,11 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
 
     The limits of a multicopter stay. For an airplane, the same rules hold as for parameters that a
     file leaves out: climb and sink follow from the authority of the throttle, and the roll rate
-    follows from that of the aileron. The bank is limited so that its reversals fit into the period
-    of path following, and orbits have the radius for this bank. If the aileron has no effect, or p
-    ignores its command, the largest bank is YAWED_BANK. If the throttle has no effect, the aircraft
-    does not climb. The limit of the sink then stays, because the pitch holds the airspeed at its
-    floor.
+    follows from the authority of the aileron. The bank is limited so that its reversals fit into
+    the period of path following, and orbits have the radius for this bank. If the aileron has no
+    effect, or p ignores its command, the largest bank is YAWED_BANK. If the throttle has no effect,
+    the aircraft does not climb. The limit of the sink then stays, because the pitch holds the
+    airspeed at its floor.
     """
     if authority == Authority() or params.multicopter is not None:
         return params
@@ -237,8 +237,8 @@ def permitted(commands: Mapping[str, float], params: GuidanceParams) -> dict[str
 def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
     """Return the commands of an orbit round home, or for a multicopter of a hover at home.
 
-    The orbit is clockwise and has the least radius. The altitude is that of home, or the present
-    altitude if home has none.
+    The orbit is clockwise and has the least radius. Its altitude is the altitude of home, or the
+    present altitude if home has none.
     """
     place = params.home
     altitude = pose["altitude"] if place.altitude is None else place.altitude

@@ -118,13 +118,14 @@ def step(
         a_c = a_ff + k_v (v_c - v) + d (v_ff - W),  within l tan(bank),  l = g + d climb
         [p, q] = k_tilt (angle from the thrust to [a_c, l]),  r = k_psi (heading - psi)
 
-    The attitude is that of the pose; p, q, r of y carry it forward to the present. While the pose
-    is stale, the thrust is vertical. After `hold` the rates are 0 until the pose returns. When a
-    leg ends, the next leg's commands apply, and then the given commands. The fence acts on the
+    The attitude comes from the pose, and p, q, r of y carry it forward to the present. While the
+    pose is stale, the thrust is vertical. After `hold` the rates are 0 until the pose returns. When
+    a leg ends, the next leg's commands apply, and then the given commands. The fence acts on the
     place where the aircraft can stop. If this place is not inside, the aircraft flies home. The
     wind W follows by `_with_wind`, since an unexplained deceleration is drag in a wind. The climb
     rate follows from the altitude, as for an airplane. a_ff and v_ff are the acceleration and the
-    velocity of the path `lead` later, because the tilt follows its command with this delay.
+    velocity of the path at the time `lead` from now, because the tilt follows its command with this
+    delay.
     """
     gains = _gains(params)
     pose = dict(zip(POSE, inputs.pose, strict=True))
@@ -303,8 +304,8 @@ def _within_fence(
     """Return the state under the action of the fence; when the action begins, home is the target.
 
     The action begins when the way to the place where the aircraft can stop comes too near to the
-    fence: nearer than the distance flown in the time MARGIN at the present speed, or at 1 m/s if
-    this is faster.
+    fence. Too near is the distance flown in the time MARGIN at the present speed, or at 1 m/s if
+    the aircraft is slower.
     """
     fence = params.fence
     if fence is None or state.mode is not GuidanceMode.ENGAGED:
@@ -368,7 +369,7 @@ def _wanted(
 def _approach(distance: float, speed: float, gains: MulticopterParams) -> tuple[float, float]:
     """Return the speed towards a place at a distance, m/s, and its slope over distance, 1/s.
 
-    The speed is that of `climb_for` with the gain `k_p` and the deceleration `braking`.
+    `climb_for` gives the speed, with the gain `k_p` and the deceleration `braking`.
     """
     params = VerticalParams(
         k_h=gains.k_p, acceleration=2.0 * gains.braking, climb=speed, sink=speed, alpha_time=0.0
@@ -444,7 +445,7 @@ def _with_wind(
         W' = (v' - (g + d climb) tan(tilt) + d (v - W)) / (d T)
 
     d is the drag, and T the time constant of the estimate. This is a low-pass of the wind that
-    explains the acceleration of the pose. The tilt is that in the pose, so commands that are not
+    explains the acceleration of the pose. The tilt is taken from the pose, so commands that are not
     flown have no effect on the estimate. W stays within the wind in which the largest tilt can
     still hover.
     """
@@ -499,7 +500,10 @@ def _attitude_for(
 def _with_climb(
     state: GuidanceState, pose: Mapping[str, float], dt: float, params: GuidanceParams
 ) -> tuple[GuidanceState, bool]:
-    """Set the commanded climb rate; also return whether the altitude limits reduce it."""
+    """Set the commanded climb rate.
+
+    The second result says whether the altitude limits reduce it.
+    """
     vertical_params = params.vertical
     climb = 0.0
     bounded_climb = 0.0

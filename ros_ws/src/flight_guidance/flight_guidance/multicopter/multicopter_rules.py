@@ -32,10 +32,11 @@ def gains(
         k_tilt = w / 4,  k_v = k_tilt / 3,  k_p = k_v / 2,  lead = 1 / k_tilt,  k_psi = w_r / 4,
             braking = BRAKING g tan(bank)
 
-    w is the lesser natural frequency of p and q in the reference model, and w_r is that of r,
-    rad/s. `bank` is the largest tilt, rad. With a reference model of damping 0.9, the loop of the
-    tilt has a phase margin of 65 deg. The loops of velocity and place together have a phase margin
-    of 44 deg and a largest sensitivity of 1.5. The lead is the delay of the tilt behind a ramp.
+    In the reference model, w is the lower of the natural frequencies of p and q, and w_r is the
+    natural frequency of r, rad/s. `bank` is the largest tilt, rad. With a reference model of
+    damping 0.9, the loop of the tilt has a phase margin of 65 deg. The loops of velocity and place
+    together have a phase margin of 44 deg and a largest sensitivity of 1.5. The lead is the delay
+    of the tilt behind a ramp.
     """
     w = min(frequency["p"], frequency["q"])
     k_tilt = w / BANDWIDTH_RATIO

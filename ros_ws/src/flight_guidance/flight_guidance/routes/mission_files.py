@@ -95,10 +95,10 @@ before version 4."""
 
 
 def _require_one_place(entry: Any, params: Sequence[Any], frame: int, key: str) -> None:
-    """Check that all members of an item that give its place agree with its params and frame.
+    """Check that an item of a mission gives its place only once, or always the same place.
 
     QGroundControl reads only the params. Other programs also write `coordinate`, or change only one
-    of the two.
+    of the two. Raises ParameterError if they differ.
     """
     latitude, longitude, altitude = params[4:7]
     coordinate = member(entry, "coordinate")
@@ -284,8 +284,9 @@ def _grouped(area: Area, group: Any = 0) -> Area:
 def json_fence(tree: Any, key: str) -> FencePlaces:
     """Read a fence of polygons and circles; circles are Points with the property `radius`.
 
-    Holes of a polygon are zones to keep out of, and so are zones with the property `exclude`. Zones
-    with the same property `group` form a group; a zone without it is a group by itself.
+    The aircraft must keep out of holes of a polygon, and of zones with the property `exclude`.
+    Zones with the same property `group` form a group. A zone without this property is a group by
+    itself.
     """
     require_wgs84(tree, key)
     zones: list[Area] = []

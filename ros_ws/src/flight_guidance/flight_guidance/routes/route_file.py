@@ -157,11 +157,11 @@ def read_route_file(
 ) -> RouteFile:
     """Read the waypoints of a route file, whose ending is one of ENDINGS.
 
-    Latitudes and longitudes are turned to north and east of the origin, by default the home in the
-    file. If the file has no altitudes, `altitude` is the altitude to fly at, m. If the file counts
-    altitudes from the ground or from the home, `altitude` is that of the ground or of the home.
-    `above_sea` says whether the altitudes of `pose` count from the sea (True), or from the start,
-    which is the home in the file (False). None means that this is unknown.
+    Latitudes and longitudes are converted to north and east of the origin, by default the home in
+    the file. If the file has no altitudes, `altitude` is the altitude to fly at, m. If the file
+    counts altitudes from the ground or from the home, `altitude` is the altitude of the ground or
+    of the home. `above_sea` says whether the altitudes of `pose` count from the sea (True), or from
+    the start, which is the home in the file (False). None means that this is unknown.
 
     Successive equal positions become one waypoint. A waypoint is left out if the line without it
     passes within `simplify`, m. In a file with several lines, `line` chooses one by its number from
@@ -209,7 +209,7 @@ def read_route_file(
 def _merged(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
     """Merge successive waypoints at one place into a single waypoint with all of their circles.
 
-    The aircraft leaves it at the altitude and with the airspeed of the last of them. Raises
+    The aircraft leaves this waypoint at the altitude and with the airspeed of the last one. Raises
     ParameterError for circles in both directions at one place.
     """
     places: list[Waypoint] = []

@@ -28,7 +28,7 @@ def parsed_json(content: bytes, key: str) -> Any:
 def _whole(digits: str) -> int | float:
     """Read a whole number of JSON: as an int up to 15 digits, and as a float beyond.
 
-    A float of that many digits is rounded. It is infinite if the number is too large for a float.
+    A float with so many digits is rounded. It is infinite if the number is too large for a float.
     """
     return int(digits) if len(digits) < 16 else float(digits)
 
@@ -95,10 +95,10 @@ def read_lines(content: bytes, key: str) -> list[list[Place]]:
 
 
 def _ring(rings: list[Any]) -> list[list[Any]]:
-    """Return the rings of a Polygon, which are the members that are lists.
+    """Return the rings of a GeoJSON Polygon, which are the members that are lists.
 
-    The first ring is the outer border, which is a route if the file has no other line. Further
-    rings are holes.
+    The first ring is the outer border of the polygon, and further rings are holes. If a file has no
+    line, the outer border is taken as the route.
     """
     return [ring for ring in rings if isinstance(ring, list)]
 
@@ -142,9 +142,10 @@ def nodes(tree: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def require_wgs84(tree: Any, key: str) -> None:
-    """Refuse a member `crs` with another coordinate system than WGS84.
+    """Check that a member `crs` names no other coordinate system than WGS84.
 
-    RFC 7946 permits only WGS84, but older versions of GDAL wrote other systems.
+    RFC 7946 permits only WGS84, but older versions of GDAL wrote other systems. Raises
+    ParameterError.
     """
     crs = member(tree, "crs")
     name = str(member(member(crs, "properties"), "name") or "")
@@ -174,7 +175,7 @@ def entries(tree: Any, name: str, key: str) -> list[Any]:
 def flag(tree: Any, name: str, absent: bool | None, key: str) -> bool:
     """Return a member of a JSON object that must be true or false, or 1 or 0.
 
-    If the object lacks it, return `absent`.
+    Returns `absent` if the object has no such member.
     """
     value = absent if member(tree, name) is None else tree[name]
     require(value in (True, False), key, f"{name}: {short_repr(value)}", "true or false")

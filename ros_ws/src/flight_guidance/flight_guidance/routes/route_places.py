@@ -19,7 +19,7 @@ A_ROUTE = "a route file"
 
 
 class Above(Enum):
-    """The reference from which an altitude counts."""
+    """What the altitude of a place counts from."""
 
     AS_POSE = 0  # the number needs no conversion to the reference of `pose`
     SEA = 1
@@ -75,8 +75,9 @@ def one_route(
 ) -> Places:
     """Return the route of a file: its only line, the line that `line` chooses, or its points.
 
-    The points are the route if the file has no line. `others` are the kinds of the geometries that
-    cannot be a route. Raises ParameterError if there are any, or if no single route remains.
+    The points are the route if the file has no line. `others` are the kinds of geometries in the
+    file that cannot be a route. Raises ParameterError if there are any, or if no single route
+    remains.
     """
     joined_lines = _joined([geometry for geometry in geometries if geometry.kind not in POINTS])
     lines = [geometry for geometry in joined_lines if geometry.places]

@@ -105,7 +105,7 @@ def body_rates(
 def yaw_for_bank(phi_c: Scalar, phi: Scalar, speed: Scalar) -> Scalar:
     """Compute the yaw rate for a bank without an aileron, rad/s, within +-g tan(LARGEST_YAW) / V.
 
-    It is the yaw rate of the turn, plus a yaw rate that rolls the aircraft to the bank:
+    It is the sum of the yaw rate of the turn and a yaw rate that rolls the aircraft to the bank:
 
         r_m = g tan(phi_c) / V + k (SKIDDING phi_c - phi),  k = YAW_TO_BANK
 

@@ -86,13 +86,15 @@ def path_acceleration(
         a       = (4 pi zeta / P) v_g turn_towards(bearing - course)
                   + sin(l)^2 v_g^2 cos(course - track) kappa / (1 - kappa e)
 
-    e, track and the curvature kappa are those of `error`, P, zeta and capture those of `params`.
-    v_g is the speed over ground, m/s. Outside a circle of radius R, at the distance d from its
-    centre, 1 - kappa e = d / R. The angle between the tangent to the circle and the track is acos(R
-    / d), so a distant aircraft flies along the tangent. Near a line e'' + 2 zeta w e' + w^2 e = 0
-    with w = 2 pi / P. The equations use the velocity over ground, so they also hold in a wind. On
-    the inner side of an arc, e is limited to half of the radius. Source: PX4-Autopilot,
-    src/lib/npfg/DirectionalGuidance.cpp, without the adaptation to wind.
+    `error` has the distance e, the course `track` and the curvature kappa of the path. `params` has
+    P, zeta and capture. v_g is the speed over ground, m/s.
+
+    Outside a circle of radius R, at the distance d from its centre, 1 - kappa e = d / R. The angle
+    between the tangent to the circle and the track is acos(R / d), so a distant aircraft flies
+    along the tangent. Near a line e'' + 2 zeta w e' + w^2 e = 0 with w = 2 pi / P. The equations
+    use the velocity over ground, so they also hold in a wind. On the inner side of an arc, e is
+    limited to half of the radius. Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp,
+    without the adaptation to wind.
     """
     e, track, kappa = error
     xp = array_namespace(e)

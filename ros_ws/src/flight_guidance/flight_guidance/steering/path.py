@@ -48,9 +48,9 @@ class Line(NamedTuple):
 
 
 class Loiter(NamedTuple):
-    """Circles that an aircraft flies round a waypoint before it goes on.
+    """Circles that an aircraft flies round a waypoint.
 
-    It goes on only at the altitude of the leg.
+    It flies on when the circles are flown and it has the altitude of the leg.
     """
 
     turns: float = 0.0  # number of turns
@@ -91,17 +91,17 @@ class Route(NamedTuple):
         return abs(self.legs[-1].radius) if isinstance(self.legs[-1], Arc) else 0.0
 
     def near(self, leg: int) -> float:
-        """Return the distance from the end of a leg within which the leg counts as flown, m.
+        """Return the distance from the end of a leg within which the leg is taken as flown, m.
 
         The distance is the radius, but at least 1 s of flight.
         """
         return max(self.radius, self.V[leg])
 
     def start(self, leg: int, along: float = 0.0) -> tuple[Point, float]:
-        """Return the start of a leg, and the course at it, rad.
+        """Return the start of a leg, and the course at the start, rad.
 
-        For a line the start is the point at the distance `along`, m. For an orbit it is the centre,
-        and the course is 0.
+        For a line the start is the point at the distance `along`, m. For an orbit the start is the
+        centre, and the course is 0.
         """
         path = self.legs[leg]
         if isinstance(path, Line):
@@ -147,9 +147,9 @@ def along(start: Point, end: Point, share: float) -> Point:
 
 
 def nearest(leg: Leg, position: Point) -> float:
-    """Return the distance along a line from its start to the point nearest to a position, m.
+    """Return how far along a line the point nearest to a position is, m from the start.
 
-    It lies between 0 and the length, and is 0 for an arc.
+    The result lies between 0 and the length. For an arc it is 0.
     """
     if isinstance(leg, Line):
         return min(max(length(leg) - to_go(leg, position), 0.0), length(leg))
@@ -202,9 +202,10 @@ def end_course(leg: Leg) -> float:
 
 
 def is_passed(leg: Leg, position: Point) -> bool:
-    """Return whether a position has passed the end of a leg.
+    """Return whether a position is past the end of a leg.
 
-    It lies beyond the line through the end, perpendicular to the course. An orbit is never passed.
+    It is if it lies beyond the line through the end, perpendicular to the course. An orbit is never
+    passed.
     """
     return (
         leg.end is not None
@@ -268,10 +269,11 @@ def joining_length(
 ) -> Scalar:
     """Compute the length of the way by a joining circle onto a course at a point, m.
 
-    The length is R abs(turn) + sqrt(d^2 - R^2) + R sweep. turn is the angle from the course flown
-    to the tangent, and d is the distance from the centre of the joining circle. sweep is the angle
-    on the circle from the point where the tangent touches it to the point of the leg.
-    `course_flown` and `course` are in rad.
+        R abs(turn) + sqrt(d^2 - R^2) + R sweep
+
+    turn is the angle from the course flown to the tangent, and d is the distance from the centre of
+    the joining circle. sweep is the angle on the circle from the point where the tangent touches it
+    to the point of the leg. `course_flown` and `course` are in rad.
     """
     xp = array_namespace(radius)
     centre = joining_centre(point, course, radius)
@@ -314,9 +316,10 @@ def joining(
 def is_joined(
     point: Point, course: Scalar, near: Scalar, position: Point, course_flown: Scalar
 ) -> Any:
-    """Return whether an aircraft is beyond a point of a leg, and near the leg.
+    """Return whether an aircraft is beyond a point of a leg, and flies near the leg.
 
-    Near means within `near`, m, of the leg, and on a course within JOINED of the leg's course.
+    It flies near the leg if it is within `near`, m, of the leg, and if its course differs from the
+    leg's course by at most JOINED.
     """
     xp = array_namespace(course)
     is_near = xp.hypot(position[0] - point[0], position[1] - point[1]) <= near
@@ -404,7 +407,7 @@ def distance_from(legs: Sequence[Leg], point: Point) -> float:
 
 
 def turns_back(leg: Leg, following: Leg | None) -> bool:
-    """Return whether the corner between two lines is sharper than SHARPEST."""
+    """Return whether the corner between two lines is too sharp for a fillet, beyond SHARPEST."""
     if not isinstance(leg, Line) or not isinstance(following, Line):
         return False
     return abs(math.remainder(end_course(following) - end_course(leg), 2.0 * math.pi)) > SHARPEST
@@ -443,12 +446,12 @@ def route(
     The corners have fillets of `radius`, m. The fillet of a turn tau begins and ends at radius
     tan(tau / 2) from the waypoint. A corner sharper than SHARPEST has no fillet. `loiters` has
     waypoints by number, at which a circle round the waypoint replaces the fillet. Circles and the
-    orbit are clockwise, but counter-clockwise at the waypoints of `left`. Lines are tangents to the
-    circles, but a line that is too short for a tangent leads to the waypoint. Raises ParameterError
-    for fewer than two waypoints, for a radius below `least` (`lateral.least_radius`), for a
-    waypoint inside the circle of a loiter, and for circles of opposite sides that overlap. Raises
-    ShortLegError for a leg that is too short for the fillets. Source: R. W. Beard, T. W. McLain,
-    Small Unmanned Aircraft (2012), algorithm 8.
+    orbit are clockwise, but at the waypoints of `left` they are counter-clockwise. Lines are
+    tangents to the circles, but a line that is too short for a tangent leads to the waypoint.
+    Raises ParameterError for fewer than two waypoints, for a radius below `least`
+    (`lateral.least_radius`), for a waypoint inside the circle of a loiter, and for circles of
+    opposite sides that overlap. Raises ShortLegError for a leg that is too short for the fillets.
+    Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
     """
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
     require(

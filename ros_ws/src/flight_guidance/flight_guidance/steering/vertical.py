@@ -33,7 +33,7 @@ class VerticalParams(NamedTuple):
 def climb_for(error: Scalar, params: VerticalParams) -> Scalar:
     """Compute the climb rate, m/s, for an altitude error (command minus altitude), m.
 
-    It stays between -sink and climb:
+    The rate stays between -sink and climb:
 
         k_h e  near,  sign(e) sqrt(a (abs(e) - e_l / 2))  from e_l = a / (2 k_h^2) on
 
@@ -62,8 +62,8 @@ def alpha_estimate(
 
         alpha+ = alpha + (1 - exp(-dt/T)) (theta - gamma - alpha)
 
-    It is a low-pass of theta - gamma, where gamma = asin(climb / V). The filter replaces an
-    integrator. It is bumpless, has no windup, and is correct at any bank, airspeed or trim.
+    The estimate is a low-pass of theta - gamma, where gamma = asin(climb / V). This filter replaces
+    an integrator. It is bumpless, has no windup, and is correct at any bank, airspeed or trim.
     """
     return alpha + (1.0 - math.exp(-dt / params.alpha_time)) * (
         theta - path_angle(climb, speed) - alpha
@@ -76,10 +76,10 @@ def pitch_for(climb: Scalar, speed: Scalar, alpha: Scalar) -> Scalar:
 
 
 def climb_speed(error: Scalar, speed: Scalar) -> Scalar:
-    """Compute the increase of the airspeed, m/s, that corrects an error of the climb rate, m/s.
+    """Compute by how much to fly faster to correct an error of the climb rate, m/s.
 
-    An aircraft without an elevator uses it. The increase is K V / (2 g) error. At a constant angle
-    of attack the lift grows with V^2, so h_ddot = 2 g dV / V, and the error decays at K =
+    This serves an aircraft without an elevator. The increase is K V / (2 g) error. At a constant
+    angle of attack the lift grows with V^2, so h_ddot = 2 g dV / V, and the error decays at K =
     CLIMB_BANDWIDTH.
     """
     return CLIMB_BANDWIDTH * speed / (2.0 * GRAVITY) * error

@@ -28,7 +28,7 @@ def wind_of(v_north: Scalar, v_east: Scalar, climb: Scalar, heading: Scalar, spe
 
 
 def wind_estimate(wind: Wind, measured: Wind, dt: float) -> Wind:
-    """Advance the estimate of the wind by a step; it is a low-pass.
+    """Advance the estimate of the wind by a step, as a low-pass of the measured wind.
 
     wind+ = wind + (1 - exp(-dt/T)) (measured - wind), T = WIND_TIME
     """
