@@ -29,7 +29,7 @@ class AppliedInput:
         self._u_ns = self._transfer_ns = 0
 
     def take(self, u: FloatArray, now_ns: int, *, transfer: bool) -> None:
-        """Take a received u; `transfer` is true if its publisher is new."""
+        """Take a received u; `transfer` is true if another publisher has sent it than before."""
         if transfer or self._scale(now_ns) < 1.0:
             self._offset = self.u_at(now_ns) - u
             self._transfer_ns = now_ns

@@ -135,7 +135,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return True
 
     def _complete(self) -> None:
-        """Report once that the flight is complete. The u of its last instant has arrived."""
+        """Report once that the flight is complete: the u of its last instant has arrived."""
         if not self._completed:
             self._completed = True
             self.publish_state(NodeState.COMPLETED)
@@ -160,8 +160,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
     def _take_u(self, now_ns: int) -> bool:
         """Take the u that has arrived, and return whether there was a valid message.
 
-        A message without channels is valid, too. It says that the controller has no output at this
-        instant of a lockstep flight.
+        A message without channels is valid, too. In lockstep it says that the controller has no
+        output at this instant.
         """
         publisher = self._publisher_lock.publisher
         u = self._u
@@ -190,10 +190,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
             self._ages_of_u.append(now_ns - sample.stamp_ns)
 
     def _max_u_age_ns(self) -> int:
-        """Return the age limit of u, ns. The age counts from the stamp of the y that led to this u.
+        """Return the age limit of u, ns, from the stamp of the y from which u was computed.
 
-        The limit is needed because the middleware of a controller that was stopped sends the last u
-        when the process continues.
+        The limit is needed because of suspended controllers: when such a process is resumed, its
+        middleware first sends the last u from before.
         """
         return self._max_age_ns + nanoseconds(self.parameters.sensors.delay)
 

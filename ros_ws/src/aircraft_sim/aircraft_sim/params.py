@@ -172,9 +172,9 @@ class AircraftConfig(NodeConfig):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Return the parameters of faults that can begin and end in flight.
+        """Return the parameters that may change in flight, because faults can begin and end.
 
-        These are the faults of effectors and sensors, the gusts, and the start of a drift.
+        They are the faults of effectors and sensors, the gusts, and the start of a drift.
         """
         gusts = {f"gusts.{axis}.{key}" for axis, key in product(AXES, Gust.model_fields)}
         sensors = {f"sensors.{key}" for key in ("bias", "noise", "dropout")} | {
@@ -317,7 +317,8 @@ class AircraftConfig(NodeConfig):
     def _no_thrust(self) -> FloatArray:
         """Return the value of each input at which it gives no thrust, as deviation from trim, SI.
 
-        It is nan if it is not known. For JSBSim's throttle it is -1 until the model knows its trim.
+        An unknown value is nan. For JSBSim's throttle the value is -1 until the model knows its
+        trim.
         """
         if self.is_jsbsim:
             inputs = self.flight_condition().inputs()
@@ -404,7 +405,7 @@ class AircraftConfig(NodeConfig):
         )
 
     def drifted_airframe(self) -> Airframe:
-        """Return the airframe after its drift; without a drift, that at the start."""
+        """Return the airframe after its drift; without a drift, the airframe at the start."""
         airframe = self.sampled_airframe()
         section = self.drift
         if section is None:
@@ -566,7 +567,7 @@ class AircraftConfig(NodeConfig):
         return divide(period_ns(rate, "pose.rate"), period_ns(self.rate, "rate"), "rate", "")
 
     def pose_sensors(self) -> Sensors | None:
-        """Return the errors of pose in the order of `channels.POSE`, independent of those of y."""
+        """Return the errors of pose, in the order of `channels.POSE`, apart from those of y."""
         pose = self.pose
         if not (
             pose.delay

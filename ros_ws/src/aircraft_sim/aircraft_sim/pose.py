@@ -61,7 +61,7 @@ def velocity(
 
 
 class Start(NamedTuple):
-    """The position of the aircraft at t = 0, to the north and to the east, m; its heading, rad."""
+    """Where the aircraft is at t = 0, to the north and to the east, m, and its heading, rad."""
 
     north: float = 0.0
     east: float = 0.0
@@ -71,7 +71,7 @@ class Start(NamedTuple):
 def over_ground(pose: FloatArray, t: float, wind: Sequence[float], start: Start) -> FloatArray:
     """Convert a pose relative to the air mass into a pose over ground, after t s of steady wind.
 
-    The wind is in m/s to the north and to the east. The given pose is that of a flight that starts
+    The wind is in m/s to the north and to the east. The given pose belongs to a flight that starts
     at the origin and heads north. The pose is rotated by the heading at the start, and moved to the
     place of the start.
     """

@@ -177,7 +177,7 @@ def wind_field_of(
 class BiasConfig(Config):
     """A bias on the derivative of a state.
 
-    It rises from 0 to `value` along half a cosine. If `rise` is 0, it rises in a step.
+    The bias rises from 0 to `value` along half a cosine. If `rise` is 0, it is a step.
     """
 
     start: NonNegative = Field(description="instant at which it begins, s")
@@ -319,7 +319,7 @@ class ActuatorConfig(Config):
 
 
 class SensorConfig(Config):
-    """The errors and delays of the sensors. The defaults are those of ideal sensors."""
+    """The errors and delays of the sensors. By default the sensors are ideal."""
 
     bias: NumbersOrNone = Field(default=(), description="constant errors, SI")
     drift: NonNegativesOrNone = Field(

@@ -37,7 +37,7 @@ class RandomWalk(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """A measurement, with its error."""
+    """A measured value, and by how much it is wrong."""
 
     y: FloatArray  # (m,)
     error: FloatArray  # (m,) measured y minus C x

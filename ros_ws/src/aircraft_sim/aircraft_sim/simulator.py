@@ -50,7 +50,7 @@ class FlightDynamicsModel(Protocol):
     def pose(self) -> FloatArray:
         """Return the pose relative to the air mass, SI, in the order of `channels.POSE`.
 
-        The values are no deviations from trim.
+        The values are absolute, not deviations from trim.
         """
 
     def diverged(self) -> bool:

@@ -25,7 +25,7 @@ class StateSpaceModel:
     """Equation (1) with the matrices of an airframe, behind actuators.
 
     The forcing is computed for BLOCK steps at once, in a tenth of the time that single steps take.
-    Heading, position and altitude are no states of an airframe. They begin at 0, and each call of
+    An airframe has no states for heading, position and altitude. They begin at 0, and each call of
     `advance` integrates them by the trapezoidal rule. States that the airframe lacks are 0, as in
     trim.
     """
@@ -120,7 +120,7 @@ class StateSpaceModel:
         return self._into @ (wind_field.body_axes(phi, theta, self._psi) @ self._wind_dot)
 
     def _drifts(self, t_ns: int) -> bool:
-        """Return whether the drift at t differs from that for which the block was computed."""
+        """Return whether the drift at t differs from the one that the block was computed with."""
         drift = self._plant.drift
         if drift is None:
             return False

@@ -20,7 +20,7 @@ def names(airframe: Airframe) -> tuple[str, ...]:
     - "x.state": the states of the airframe.
     - "f.state": f of equation (1), with the disturbances.
     - "gust.axis": the wind along the axes of the airframe's gusts, m/s. It is the sum of 1-cosine
-      gusts, turbulence, and the difference of the wind at the place from that at the start.
+      gusts, turbulence, and the wind at the present place minus the wind at the start.
     - "actuator.input": the present position of the actuator.
     """
     groups = (

@@ -110,8 +110,8 @@ def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatAr
             1 where the published A_ij is 0 or the airframe has no state j
         published       factor_i = 1
 
-    The published effect is that of w / V0 or of w, as the file says. If it is minus the published
-    column j, the effect for each aircraft is minus column j of its A.
+    The published effect is the effect of w / V0 or of w, as the file says. If it is minus the
+    published column j, the effect for each aircraft is minus column j of its A.
     """
     nominal = airframe.matrix_a()
     factors = np.ones((len(A), len(airframe.states), len(airframe.gusts)))
@@ -157,8 +157,8 @@ def sampled_matrices(
     """Draw A and B of the aircraft first, first + 1, ... of a seed, SI.
 
     The shapes are (count, n, n) and (count, n, m). Every entry is multiplied by 1 + d, with an
-    independent d within +-uncertainty and the distribution of `spread`. The rows of angles stay. An
-    entry that is 0 becomes d times its `row_sizes`, with d within +-zeros. An aircraft
+    independent d within +-uncertainty and the distribution of `spread`. The rows of angles do not
+    change. An entry that is 0 becomes d times its `row_sizes`, with d within +-zeros. An aircraft
     depends only on seed and number, and not on `count`. Raises ParameterError for an uncertainty
     outside [0, 1), and for an unknown entry.
     """
@@ -246,9 +246,9 @@ def row_sizes(airframe: Airframe) -> dict[str, FloatArray]:
     this comparison each state and each input deviates by its size. The sizes are 1 m/s, 0.1 rad
     (/s), a tenth of a throttle, and THRUST_SIZE of the thrust in trim.
 
-    The result is 0 for entries that are not 0, and for entries that stay 0 in every aircraft. These
-    are the entries in rows of angles, and in columns of angles, because gravity is the only force
-    that depends on an angle. Entries of inputs without a known size stay 0 too.
+    The result is 0 for entries that are not 0, and for entries that stay 0 in every aircraft. The
+    latter are in rows of angles, and in columns of angles, because gravity is the only force that
+    depends on an angle. Entries of inputs without a known size stay 0 as well.
     """
     is_free = np.array([state not in KINEMATIC for state in airframe.states])
     matrices = {"A": airframe.matrix_a(), "B": airframe.matrix_b()}

@@ -83,7 +83,7 @@ class Gravity(Config):
 class Product(Config):
     """A term of inertial coupling in the equations of motion: f_into += gain * product.
 
-    The product is that of two states.
+    The product is the product of two states.
     """
 
     into: str = Field(description="state to whose derivative it adds")
@@ -285,7 +285,7 @@ class Airframe(Config):
     def no_thrust(self) -> FloatArray:
         """Return the value of each input at which it gives no thrust, shape (p,), SI.
 
-        It is a deviation from trim. It is 0 for a surface, and nan if the file does not state it.
+        The value is a deviation from trim: 0 for a surface, and nan if the file does not state it.
         """
         units = [quantity(channel.unit) for channel in self.inputs.values()]
         unsaid = [0.0 if unit.dimension == ANGLE else math.nan for unit in units]

@@ -302,8 +302,8 @@ def _effect(model: ToolModel, name: str) -> str:
 def _gusts(frame: Airframe) -> dict[str, dict[str, float]]:
     """Return the effect of wind on x_dot by axis and state, for the section `gusts` of a file.
 
-    The effect is that of a wind w with w / V0 = 1. It is minus the column of A that belongs to the
-    state of the motion relative to the air. Wind has no effect on angles and h.
+    Each effect is the x_dot of a wind w with w / V0 = 1. It is minus the column of A that belongs
+    to the state of the motion relative to the air. Wind has no effect on angles and h.
     """
     A = frame.matrix_a()
     names = list(frame.states)

@@ -112,7 +112,7 @@ def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
     effect of a force on an angle of incidence grows with the force over V. Thrust, gravity and
     kinematics stay the same, and so does lift, which equals the weight. Every entry is scaled by a
     power of the ratio: EXPONENTS, OF_SURFACE, and OF_THRUST for the input `thrust`. Wind acts
-    through the new A. The derivatives are those of the trim, without an effect of Mach number and
+    through the new A. The derivatives are taken at the trim, without an effect of Mach number and
     C_L. Source: B. L. Stevens, F. L. Lewis, "Aircraft Control and Simulation", 2.6, dimensional
     derivatives. Raises as `exponents` does.
     """

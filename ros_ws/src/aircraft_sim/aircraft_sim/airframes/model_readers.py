@@ -64,7 +64,7 @@ class ToolModel(NamedTuple):
 def _states(units_by_name: Mapping[str, Any], labels: Sequence[str], n: int) -> dict[str, str]:
     """Return the units of the n states.
 
-    They are the given units, or those that belong to the names of the states in the model.
+    The user gives them, or they follow from the names of the states in the model.
     """
     names = units_by_name or dict.fromkeys(labels, "")
     names_text = ", ".join(names) or "no names"
@@ -92,7 +92,7 @@ def _inputs(
 ) -> dict[str, dict[str, str]]:
     """Return units and effects of the m inputs.
 
-    They are the given ones, such as "rad nose down". Otherwise the unit is rad, or 1 for a thrust.
+    The user gives them, such as "rad nose down". Otherwise the unit is rad, or 1 for a thrust.
     """
     names = units_by_name or dict.fromkeys(labels, "")
     names_text = ", ".join(names) or "no names"
@@ -483,7 +483,7 @@ def _avl_values(text: str) -> dict[str, float]:
 def _avl_controls(text: str, inputs: Mapping[str, Any]) -> dict[str, int]:
     """Return the numbers of controls in AVL's file, by name.
 
-    The names are those of `inputs`, or the usual ones if there are no inputs.
+    The names are taken from `inputs`. If there are no inputs, they are the usual ones.
     """
     numbers = {
         _control(name): int(number) for name, number in re.findall(r"(\S+)\s+d0?(\d+)\b", text)

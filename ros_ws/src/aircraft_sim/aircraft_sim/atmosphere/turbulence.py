@@ -122,7 +122,7 @@ def filters(
         v, w    z1_dot = -a z1 + sqrt(2a) n,  z2_dot = a (z1 - z2),
             v = sigma/sqrt(2) (sqrt(3) z1 + (1 - sqrt(3)) z2)
 
-    They have the published spectra, one-sided in omega, with T = L/V0:
+    The filters have the published spectra, one-sided in omega, with T = L/V0:
 
         Phi_u = sigma^2 2T/pi / (1 + (T omega)^2)
         Phi_v = sigma^2 T/pi (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2,  Phi_w alike
@@ -216,8 +216,8 @@ def initial_state(params: Turbulence) -> FloatArray:
 def normals(first: int, count: int, params: Turbulence) -> FloatArray:
     """Draw the standard normal numbers of `count` steps, beginning at `first`, shape (count, k).
 
-    The numbers of a step depend only on the seed and on the number of the step. Those of the winds
-    are the same with and without rotary gusts.
+    The numbers of a step depend only on the seed and on the number of the step. Rotary gusts add
+    numbers, but the numbers for the three winds stay the same.
     """
     offset = first % BLOCK
     streams = [(random_streams.TURBULENCE, STATES)]

@@ -268,9 +268,9 @@ def root() -> Path:
 def require_aircraft(airframe: str) -> str:
     """Return the name in "jsbsim:NAME", or the absolute path of the model in "jsbsim:PATH".
 
-    PATH is the XML file of a model, or its folder. It contains a "/" or ends with ".xml". Raises
-    ParameterError. For an unknown name, the message has the closest known name. For a path, it says
-    what is there.
+    PATH is the XML file of a model, or its folder. A text with a "/", or that ends with ".xml", is
+    taken as a PATH. Raises ParameterError. For an unknown name, the message has the closest known
+    name. For a path, it says what is there.
     """
     name = airframe.removeprefix(PREFIX)
     if "/" in name or name.endswith(SUFFIX):
@@ -286,7 +286,7 @@ def require_aircraft(airframe: str) -> str:
 def foreign_model(name: str) -> Path | None:
     """Return the file of an aircraft's model if it does not come from the package jsbsim.
 
-    The user names this file, or it comes from $JSBSIM_ROOT. For other models the result is None.
+    Such a file is named by the user, or lies in $JSBSIM_ROOT. For other models the result is None.
     """
     if Path(name).is_absolute():
         return Path(name)

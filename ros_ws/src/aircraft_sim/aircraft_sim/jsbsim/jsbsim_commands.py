@@ -62,7 +62,7 @@ def engine_count(fdm: jsbsim.FGFDMExec) -> int:
 
 
 def command_paths(command: Command, engines: int) -> list[tuple[str, float]]:
-    """Return the properties of a command, each with its value at the command 1.
+    """Return the properties of a command, each with the value that it has at the command 1.
 
     A command of the engines has one property for each engine.
     """
@@ -89,8 +89,8 @@ def commands_and_limits(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the commands with their trims, and their lower and upper stops, (4,) each.
 
-    A command counts together with its trim property. A stop is a deviation from this sum, so the
-    lower stops are at most 0.
+    The trim property of a command is added to it. A stop is a deviation from this sum, so the lower
+    stops are at most 0.
     """
     inputs = list(inputs)
     first = [command_paths(command, 1)[0] for command in inputs]
@@ -150,7 +150,7 @@ def sentence_without_effect(
 ) -> str:
     """Write a sentence about inputs that have no effect.
 
-    It names the properties that have no effect, and those that the model reads.
+    The sentence names the properties that have no effect, and the properties that the model reads.
     """
     parts = [
         f"{name}: {' and '.join(path for path, _ in command_paths(commands[name], 1))}"

@@ -45,7 +45,7 @@ LEAST = 1e-6  # an entry below this value is a rounding error, SI
 
 
 class Linearization(NamedTuple):
-    """The linear model of an aircraft of JSBSim: an airframe, and what steps of its inputs did."""
+    """The linear model of an aircraft of JSBSim: an airframe, and how steps of inputs move it."""
 
     condition: FlightCondition  # without the rudder if the rudder has no effect
     trim: Trim

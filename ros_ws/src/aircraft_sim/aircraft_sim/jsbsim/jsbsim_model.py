@@ -211,8 +211,8 @@ class JsbsimModel:
     def pose(self) -> FloatArray:
         """Return the pose relative to the air mass, in the order of `channels.POSE`.
 
-        The values are no deviations from trim, and are in SI. The position is integrated from the
-        velocity by the trapezoidal rule.
+        The values are absolute, in SI. The position is integrated from the velocity by the
+        trapezoidal rule.
         """
         phi, theta, psi, altitude, *velocity, beta = (
             node.get_double_value() * si for node, si in self._pose_nodes
@@ -234,7 +234,7 @@ class JsbsimModel:
         self._wind_model = self._wind_model._replace(gusts=parameters.gust_arrays(AXES))
 
     def _cut_engines(self, cut: bool) -> None:
-        """Stop the engines if `cut` is true, because they are lost; otherwise start them again.
+        """Stop the engines if `cut`, as a fault demands; otherwise start them again.
 
         An engine that stops here does not end the flight.
         """
@@ -260,7 +260,7 @@ class JsbsimModel:
     def _wind(self, t_ns: int) -> FloatArray:
         """Return the wind along AXES at t, (3,), m/s.
 
-        The present state of the turbulence must be that at t.
+        The turbulence must have been advanced to t.
         """
         gusts = one_minus_cosine(
             np.array(seconds(t_ns)), self._wind_model.gusts, np.array(self.condition.speed)

@@ -221,7 +221,7 @@ def structure_contacts(fdm: jsbsim.FGFDMExec) -> list[str]:
 def running_property(engine: int) -> str:
     """Return the name of the property that is 1 while an engine runs.
 
-    For an electric engine of JSBSim it is never 1.
+    JSBSim never sets this property to 1 for an electric engine.
     """
     return f"propulsion/engine[{engine}]/set-running"
 
@@ -259,9 +259,10 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution | Unbalanced:
 
     The trim function of JSBSim comes first. It assumes settled engines and flight control systems,
     so they get time in frozen flight, where everything runs except position, velocity and attitude.
-    If this trim fails, or does not last, a solver finds the six unknowns (alpha, throttle, pitch
-    trim, aileron, rudder, bank) in frozen flight, where everything has settled. Raises FlightEnded
-    with one sentence if there is no trim. Returns Unbalanced if the solver does not reach a trim.
+    If the function finds no trim, or none that lasts, a solver finds the six unknowns (alpha,
+    throttle, pitch trim, aileron, rudder, bank) in frozen flight, where everything has settled.
+    Raises FlightEnded with one sentence if there is no trim. Returns Unbalanced if the solver does
+    not reach a trim.
     """
     fdm = _load(condition)
     try:
@@ -415,7 +416,7 @@ def _solve_accelerations(
 
     The unknowns are x = START + (scaled - 1) SCALE, and the result is `scaled`. `by_elevator` is
     the share of the pitch trim that the command of the elevator sets instead of the trim property.
-    If it is not 0, the search stays within LOWEST and HIGHEST.
+    If `by_elevator` is not 0, the search stays within LOWEST and HIGHEST.
     """
     from scipy.optimize import fsolve, least_squares  # noqa: PLC0415 - a sixth of a second, which other aircraft do not need
 

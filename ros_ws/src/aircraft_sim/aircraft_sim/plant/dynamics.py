@@ -83,7 +83,7 @@ def x_dot_forced(x: Array, forced: Array, params: Aircraft) -> Array:
 def f_state(x: Array, params: Aircraft) -> Array:
     """Compute the state-dependent part of f, shape (n,).
 
-    It is gravity @ sin(x) + gain @ (x[first] x[second]) + kinematics(x).
+    gravity @ sin(x) + gain @ (x[first] x[second]) + kinematics(x)
     """
     total = params.gravity.dot(array_namespace(x).sin(x))
     if params.coupling is not None:
@@ -118,7 +118,7 @@ def kinematics(x: Array, params: EulerKinematics) -> Array:
 def f_time(t: Any, wind: Array, params: Aircraft) -> Array:
     """Compute the time-dependent part of f, shape (n,).
 
-    It is gust_direction @ wind + bias(t) + sines(t), with the wind in m/s, shape (G,).
+    gust_direction @ wind + bias(t) + sines(t),  wind in m/s, shape (G,)
     """
     total = params.gust_direction @ wind
     if params.bias is not None:

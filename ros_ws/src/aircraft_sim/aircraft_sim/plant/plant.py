@@ -67,8 +67,8 @@ class OverAirspeed(NamedTuple):
 class PlantParams(NamedTuple):
     """Parameters of the plant.
 
-    They are those of aircraft, actuators, integration step, turbulence and drift, and of the change
-    with airspeed.
+    They describe the aircraft, the actuators, the integration step, turbulence and drift, and the
+    change with airspeed.
     """
 
     aircraft: Aircraft
@@ -104,7 +104,7 @@ def aircraft_at(t_ns: int, plant: PlantParams, x: Array | None = None) -> Aircra
 def _at_airspeed(x: Array, aircraft: Aircraft, over: OverAirspeed) -> Aircraft:
     """Return the aircraft at the airspeed of the state x.
 
-    The airspeed counts as at least the lowest and at most the highest one that has a trim.
+    The airspeed is limited to the range from the lowest to the highest airspeed that has a trim.
     """
     least, most = over.ratio[[0, -1]].tolist()
     r = min(max(1.0 + x[over.place].item() / over.speed, least), most)
@@ -147,7 +147,7 @@ def initial_state(plant: PlantParams) -> AircraftState:
 def forcing(t_ns: int, steps: int, plant: PlantParams, x: Array | None = None) -> Forcing:
     """Compute the forcing at the beginnings, middles and ends of steps that begin at t.
 
-    For n steps there are 2 n + 1 instants. The aircraft does not change between them. It is the
+    For n steps there are 2 n + 1 instants. The aircraft is the same at all of them, namely the
     aircraft at t in the state x, or in trim if x is None.
     """
     halves = array_namespace(plant.aircraft.A).arange(2 * steps + 1, dtype=plant.aircraft.A.dtype)
