@@ -24,8 +24,8 @@ IN_MESSAGE = AGE_OF_U["mean"].encode()  # bytes that occur in a message with an 
 def age_of_u(messages: Iterable[bytes], namespace: str) -> Signal | None:
     """Return the mean and the largest age of u, s, in each diagnostics report of an aircraft.
 
-    A report covers the time since the previous one. `namespace` is the namespace of the aircraft.
-    Returns None if the messages have no report of it.
+    A report covers the time since the previous report. `namespace` is the namespace of the
+    aircraft. Returns None if there is no report of this aircraft.
     """
     rows: dict[int, list[float]] = {}
     for data in messages:

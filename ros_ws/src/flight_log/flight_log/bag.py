@@ -97,7 +97,8 @@ class _MessageIndex(MessageIndex):
 class _ChunkBuilder(ChunkBuilder):
     """A chunk builder that writes the same bytes as mcap's builder in half the time.
 
-    The builder of mcap writes a message field by field, and then goes back to write its length.
+    The builder of mcap writes a message field by field, and then goes back to write the message's
+    length.
     """
 
     def add_message(self, message: Message) -> None:
@@ -149,18 +150,18 @@ class _ChunkIndexes:
 
 
 def full_names(remaps: Mapping[str, str]) -> dict[str, str]:
-    """Return the name that each topic of a log has in the stack, by its name in the log.
+    """Return, for each topic of a log, its full name in the flight stack before a remap.
 
-    It is the inverse of `remaps`, which has the topic of the log for each name in the stack.
+    The result is the inverse of `remaps`, which has the topic of the log for each such name.
     """
     return {topic: f"/{name.lstrip('/')}" for name, topic in remaps.items()}
 
 
 def stack_topic(channel: Channel, stack_names: Mapping[str, str] = {}) -> str:
-    """Return the full name that a topic of a log has in the stack.
+    """Return the full name that a topic of a log has in the flight stack, before a remap.
 
-    `stack_names` has such names by topic of the log. If it lacks the topic, the name is the one
-    before a remap, if the log states it, or else the topic itself.
+    `stack_names` has such names by topic of the log. For a topic that is not in `stack_names`, the
+    name is the one that the log states, or else the topic itself.
     """
     return stack_names.get(channel.topic) or channel.metadata.get(BEFORE_REMAP) or channel.topic
 
@@ -224,8 +225,8 @@ class BagWriter:
         """Add a topic by its full name.
 
         `qos` is rosbag2's YAML list of the offered profiles of quality of service. `before_remap`
-        is the full name of the topic in the stack.
-        Raises ParameterError if the definition of the type is not known.
+        is the full name that the topic has in the flight stack. Raises ParameterError if the
+        definition of the type is not known.
         """
         type_definition = definition(type_name)
         schema = self._writer.register_schema(
@@ -290,7 +291,7 @@ def _is_mapping_of_strings(content: object) -> bool:
 
 
 def read_metadata_records(path: Path) -> dict[str, dict[str, str]]:
-    """Read named sets of strings from a YAML file. Raises ParameterError for anything else."""
+    """Read named sets of strings from a YAML file. Raises ParameterError for another content."""
     expected = "a mapping of mappings of strings"
     content = read_yaml(path, str(path), expected)
     valid = isinstance(content, dict) and all(map(_is_mapping_of_strings, content.values()))

@@ -33,7 +33,7 @@ class StampClock:
     """Finds which samples of a topic are usable, if the clock of their stamps makes a step.
 
     A sample with a damaged stamp is left out. The samples after a forward step stay, because only
-    `without_leaps`, which sees all topics, can decide about them.
+    `without_leaps`, which sees all topics, can decide about these samples.
     """
 
     def __init__(self) -> None:
@@ -141,10 +141,10 @@ class StampClock:
         return None if within.all() else False
 
     def _jump_to(self, stamp_ns: int, offset_ns: int, *, has_time: bool) -> tuple[int, bool]:
-        """Return how far a stamp is from the last usable stamp, ns, and whether it leads.
+        """Return how far a stamp is from the last usable stamp, ns, and whether the stamp leads.
 
-        A stamp leads if it is too far ahead of the time of the recording, and if the last samples
-        are no history that was recorded in a burst. The returned time is 0 if there is no usable
+        A stamp leads if it is too far ahead of the time of the recording, unless the last samples
+        are a history that was recorded in a burst. The returned time is 0 if there is no usable
         stamp yet.
         """
         # There is no usable stamp yet, or only a stamp that was not set.
@@ -203,9 +203,9 @@ def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArra
 def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool:
     """Return whether the last samples were recorded all at once, as the history of a publisher is.
 
-    The last samples are those of the last LEAP_NS by their stamps. In a burst they were recorded in
-    less than half of this time. This happens when a recorder starts late, and receives the history
-    of the publisher at once. A pause in such a history is no step of the clock.
+    The last samples are taken over LEAP_NS by their stamps. In a burst they were recorded in less
+    than half of this time. This happens when a recorder starts late, and receives the history of
+    the publisher at once. A pause in such a history is no step of the clock.
     """
     recent = stamp_ns >= stamp_ns[-1] - LEAP_NS
     span_ns = stamp_ns[-1] - stamp_ns[recent][0]

@@ -27,8 +27,8 @@ class Columns:
     """Samples in the order of arrival, with stamps and rows of equal length.
 
     The rows are read as columns, which are contiguous in memory. At first there is space for
-    `expected` samples, and it grows with further samples. Raises ParameterError if no temporary
-    file can hold a long topic.
+    `expected` samples, and the space grows with further samples. Raises ParameterError if no
+    temporary file can hold a long topic.
     """
 
     def __init__(self, width: int, expected: int) -> None:
@@ -90,8 +90,8 @@ class _MemoryColumns:
 class _FileColumns:
     """Columns in a temporary file without a name.
 
-    The columns are written to the file immediately, and mapped into memory only while an array of
-    them is in use.
+    The columns are written to the file immediately. They are mapped into memory only while an array
+    of the columns is in use.
     """
 
     def __init__(self, width: int, capacity: int) -> None:

@@ -47,8 +47,8 @@ class ReservedFile:
     """A new unbuffered file that reserves disk space, so that it can be finished on a full disk.
 
     A second, unnamed file occupies the reserved space, and stores the data of `keep`, which belong
-    to the end of the file. If a write finds no space, the data move into memory, the second file is
-    closed, and the write succeeds. The reserve also ends with the process.
+    to the end of the first file. If a write finds no space, these data move into memory, the second
+    file is closed, and the write succeeds. The reserve also ends with the process.
     """
 
     def __init__(self, path: Path) -> None:

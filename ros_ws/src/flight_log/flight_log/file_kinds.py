@@ -126,7 +126,7 @@ def file_kind(path: Path) -> FileKind:
 def kind_of_head(head: bytes) -> FileKind:
     """Return the kind of a file by its first HEAD_BYTES bytes.
 
-    If the bytes are those of no known format, they are a text or unknown bytes.
+    If no known format begins with these bytes, the file is a text or has unknown bytes.
     """
     # A recorder that is killed at its start leaves a file that has only the first bytes of an MCAP.
     if MCAP0_MAGIC.startswith(head):

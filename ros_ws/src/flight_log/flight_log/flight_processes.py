@@ -68,9 +68,10 @@ def flight_processes(
 
     A node that was restarted has several processes. `ready` has the times at which each node was
     ready. Such a time belongs to the process whose first sample follows, or came at most 1 s
-    earlier. Of several times, the last one counts. A node without samples, such as the recorder,
-    has no process id in its name. In lockstep no node has a process id. If there are nodes of the
-    stack, every other publisher counts as a process too, even `ros2 topic pub`, which has no name.
+    earlier. If several times belong to a process, the last one is taken. A node without samples,
+    such as the recorder, has no process id in its name. In lockstep no node has a process id. If
+    the log has nodes of this flight stack, every other publisher is listed as a process too, even
+    `ros2 topic pub`, which has no name.
     """
     waiting: dict[str, list[int]] = {}
     for node, time_ns in ready:
@@ -118,8 +119,8 @@ SILENT_PERIODS = 3  # least silence of a slow publisher that counts, in periods 
 def admitted(signal: Signal) -> Signal:
     """Return the samples that the nodes would have taken, if several publishers sent them.
 
-    They are those of the first publisher. After a silence of this publisher, the nodes take those
-    of the next.
+    The nodes take samples from the first publisher. When this publisher is silent for too long,
+    they take samples from the next one.
     """
     if signal.sender is None:
         return signal
@@ -144,8 +145,8 @@ def controller_starts(number: FloatArray) -> list[int]:
     """Return the indices at which a new controller begins, from the numbers of ticks, (N,).
 
     A new controller counts its ticks from the beginning, so the number falls. But two ticks of one
-    instant may be stored in either order, and then the number falls a little. This is no new
-    controller if the number has not yet occurred since the last start.
+    instant may be stored in either order, and then the number falls a little. A fall to a number
+    that has not occurred since the last start is therefore no new controller.
     """
     starts = []
     first = 0

@@ -90,8 +90,8 @@ def instances_of_flight(
 def _of_motion(name: str, tables: Mapping[int, MessageTable], fields: Set[str]) -> tuple[int, str]:
     """Choose the instance of a message that moves, and return its number and the reason.
 
-    If several move and agree, it is the first of them. Raises ParameterError if the moving
-    instances differ.
+    If several instances move and agree, the first of them is chosen. Raises ParameterError if the
+    moving instances differ.
     """
     motions = {number: _motion(table, fields) for number, table in tables.items()}
     moving = {
@@ -113,7 +113,7 @@ def moving_numbers(motions: Mapping[int, float], least: float = STILL) -> list[i
 
 
 def _motion(table: MessageTable, fields: Set[str]) -> float:
-    """Return a measure of the motion that an instance shows.
+    """Return a measure of how much an instance moves.
 
     For an airspeed it is the typical value, which is 0 for a dead sensor. For other messages it is
     the sum of the standard deviations of the fields.
@@ -206,8 +206,8 @@ def _reason_against_airspeed(
 ) -> Refusal | None:
     """Return a refusal if the autopilot flew by none of its airspeed sensors, else None.
 
-    The flags U and H tell. For a log without U, the parameter ARSPD_USE tells. Returns None, too,
-    if the log does not say.
+    The log shows this by the flags U and H, or if it has no U, by the parameter ARSPD_USE. Returns
+    None as well if the log does not show it.
     """
     reasons = []
     for number, table in sorted(sensors.items()):

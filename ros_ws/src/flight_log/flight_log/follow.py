@@ -61,9 +61,9 @@ class Follower:
     """Reads the log of a run while it grows.
 
     The run is the folder of a bag, or an MCAP file. The folder need not have a file yet.
-    `rate_of(topic, type_name)` returns the highest rate of messages to read from a topic, Hz. It is
-    infinite for all messages, and 0 for no messages. `stack_names` has names of the stack by
-    topic of the log.
+    `rate_of(topic, type_name)` returns the highest rate at which to read messages of a topic, Hz:
+    infinite to read all messages, and 0 to read none. `stack_names` is a mapping from a topic of
+    the log to the name that the topic has in the flight stack before a remap.
     """
 
     def __init__(

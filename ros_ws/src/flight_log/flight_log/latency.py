@@ -16,7 +16,7 @@ TOPICS = ("y", "u")
 
 
 class Times(NamedTuple):
-    """Stamps of messages of a topic and the times at which they were sent, ns, (N,) each."""
+    """When the messages of a topic were stamped and when they were sent, ns, (N,) each."""
 
     stamp_ns: NDArray[np.int64]
     sent_ns: NDArray[np.int64]
@@ -25,9 +25,9 @@ class Times(NamedTuple):
 def latency(times: Mapping[str, Sequence[Times]]) -> Signal | None:
     """Compute the time from the sending of y to the sending of the u with the same stamp, s.
 
-    The signal has one channel, and its stamps are those of u. `times` has the times by the full
-    names of the topics y and u. Returns None for a log without y or u, and for a log with several
-    aircraft. Returns None also if u was sent at the times of y, as in a flight in one process.
+    The signal has one channel, and the stamps of u. `times` has the times by the full names of the
+    topics y and u. Returns None for a log without y or u, and for a log with several aircraft.
+    Returns None also if u was sent at the times of y, as in a flight in one process.
     """
     topics = {topic.rpartition("/")[2]: topic for topic in times}
     if len(times) != len(TOPICS) or len(topics) != len(TOPICS) or not all(times.values()):

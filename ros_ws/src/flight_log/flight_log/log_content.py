@@ -91,7 +91,10 @@ class StoredFile(NamedTuple):
 
 
 class _Publisher:
-    """The messages of a publisher on a topic: those not decoded yet, and the counts of all."""
+    """The messages of a publisher on a topic.
+
+    It holds the messages that are not decoded yet, and counts all messages.
+    """
 
     def __init__(self) -> None:
         # Tables of messages of equal length, with their log times and the steps of their numbers.
@@ -131,7 +134,7 @@ class _Publisher:
             self.leads_ns = min(least, int(leads_ns.min())), max(largest, int(leads_ns.max()))
 
     def has_clock_of(self, other: "_Publisher") -> bool:
-        """Return whether the stamps may come from the same clock as those of another publisher."""
+        """Return whether two publishers may have stamped their messages by the same clock."""
         if self is other or self.leads_ns is None or other.leads_ns is None:
             return True
         (least, largest), (least_of_other, largest_of_other) = self.leads_ns, other.leads_ns
@@ -240,9 +243,9 @@ class TopicSamples:
     def signal(self, name: str) -> Signal | None:
         """Return the samples of a topic in the order of the stamps, or None if none has a stamp.
 
-        A publisher that sets no stamps leaves them at 0, and its samples are left out. But a single
-        stamp of 0 may be the flight time 0, and so may several stamps of 0 in RESTING topics, whose
-        stamps may repeat. UNSTAMPED topics need no stamp.
+        A publisher that sets no stamps leaves its stamps at 0, and these samples are left out. But
+        a single stamp of 0 may be the flight time 0. So may several stamps of 0 in RESTING topics,
+        whose stamps may repeat. UNSTAMPED topics need no stamp.
         """
         for publisher in self._publishers.values():
             while publisher.batch:

@@ -68,8 +68,8 @@ def log_message(
 ) -> LogMessage | None:
     """Return a decoded message as a LogMessage; None if it is mere information, or empty.
 
-    Set `has_begun` to False before the first sample. New parameters then do not count as changes,
-    because the nodes still declare them at their start.
+    Set `has_begun` to False before the first sample. New parameters are then not taken as changes,
+    because the nodes still declare their parameters at that time.
     """
     if type_name == LOG:
         if message.level >= WARN:
@@ -121,9 +121,9 @@ def log_messages(texts: Iterable[StoredText], namespace: str, first_ns: int) -> 
 
 
 def last_words(messages: Iterable[LogMessage]) -> list[str]:
-    """Return the last warning or error and those up to LAST_NS before it, without repetitions.
+    """Return the last warning or error, and the messages up to LAST_NS before, each only once.
 
-    They are in the order of `messages`.
+    The result has the order of `messages`.
     """
     said = [each for each in messages if each.kind in {"warning", "error"}]
     end_ns = max((each.stamp_ns for each in said), default=0) - LAST_NS

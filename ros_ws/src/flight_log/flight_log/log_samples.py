@@ -33,9 +33,9 @@ def tables_of(
     """Return the tables of the messages, the parameters, and a note if parts were left out.
 
     If the clock goes back by more than STEP_NS, as when an autopilot starts again, a new part
-    begins. Only the longest part is returned, and the third result says so; else it is "". A
-    parameter belongs to the part of the next sample, because an autopilot writes its parameters
-    first when it starts.
+    begins. Only the longest part is returned, and the third result says so. Otherwise the third
+    result is "". A parameter belongs to the part of the next sample, because an autopilot writes
+    its parameters first when it starts.
 
     Damaged samples are left out without a note. A stamp is damaged if fewer than AGREEING samples
     in a row agree with it. A table with fewer than AGREEING samples is damaged if another instance

@@ -124,8 +124,8 @@ def stamps_of(table: Table) -> NDArray[np.int64]:
 def rows_by_sender(table: Table) -> list[tuple[bytes, NDArray[np.int64] | None]]:
     """List the senders in the headers of messages, as bytes, and the rows of each sender.
 
-    If all rows have one sender, its rows are None. A message without a header in plain CDR has the
-    sender b"".
+    If all rows have the same sender, its rows are given as None. A message without a header in
+    plain CDR has the sender b"".
     """
     count = len(table)
     first = _sender(table[0])
@@ -153,9 +153,9 @@ def _sender(row: NDArray[np.uint8]) -> bytes:
 
 
 def flight_start_ns(stamp_ns: int, t: float) -> int | None:
-    """Return the stamp of flight time 0, ns, from the stamp of a `truth` sample at time t.
+    """Return the stamp of flight time 0, ns, from the stamp of a `truth` sample at time t, s.
 
-    t is in s. The result is the stamp minus t, or None if t is too large for a flight.
+    The result is the stamp minus t, or None if t is too large for a flight.
     """
     return stamp_ns - nanoseconds(t) if abs(t) <= MAX_FLIGHT_TIME else None
 

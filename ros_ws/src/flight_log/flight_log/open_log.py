@@ -180,9 +180,9 @@ def _unpack(file: Path, plain: Path, kind: FileKind) -> None:
 def log_topics(run: Path, stack_names: Mapping[str, str] = {}) -> dict[str, str]:
     """Return the types of the topics in a log, by the full name of the topic.
 
-    `stack_names` has names of the stack by topic of the log. The type of messages that are not CDR
-    ends with "in ENCODING". If the file has an index, only the index is read. Raises ParameterError
-    for a path without a log.
+    `stack_names` is a mapping from a topic of the log to its name in the flight stack. The type of
+    messages that are not CDR ends with "in ENCODING". If the file has an index, only the index is
+    read. Raises ParameterError for a path without a log.
     """
     topics: dict[str, str] = {}
     for file in log_files(run):

@@ -64,14 +64,14 @@ def read_playback(
 ) -> Playback:
     """Read the messages of a log from the flight time `start`, s.
 
-    `topics` are full names, or the last parts of names. If it is empty, every topic except SHARED
-    is played. `namespace` selects an aircraft; None selects every aircraft. Topics in an encoding
-    other than CDR, such as JSON, are skipped.
+    `topics` are full names, or the last parts of names. If `topics` is empty, every topic except
+    SHARED is played. `namespace` selects an aircraft; None selects every aircraft. Topics in an
+    encoding other than CDR, such as JSON, are skipped.
 
-    A message is due at its time of sending. In the log of a lockstep flight the host's clock has no
-    meaning. A message is then due at its stamp, but not earlier than messages that were sent before
-    it. Raises ParameterError if the log cannot be read, lacks a topic or the namespace, or ends
-    before the start.
+    A message is due at its time of sending. In the log of a lockstep flight, however, the host's
+    clock has no meaning. A message is then due at its stamp, but not earlier than messages that
+    were sent before it. Raises ParameterError if the log cannot be read, lacks a topic or the
+    namespace, or ends before the start.
     """
     stored = sorted(
         (message for message in stored_messages(run) if message.topic != CLOCK), key=_sent_ns
@@ -232,7 +232,7 @@ def _is_flight_time(message: StoredMessage) -> bool:
 def _start_ns(messages: Iterable[StoredMessage], otherwise: int) -> int:
     """Return the stamp of flight time 0, from the first `truth` or from the first `y_m`.
 
-    Returns `otherwise` if the messages contain neither of them.
+    Returns `otherwise` if the messages contain neither `truth` nor `y_m`.
     """
     first: dict[str, StoredMessage] = {}
     for message in messages:

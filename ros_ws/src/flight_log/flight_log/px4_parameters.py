@@ -48,15 +48,15 @@ class RateLoop(NamedTuple):
 def rate_loop(path: Path, rate: float | None = None, logged: float = 0.0) -> RateLoop:
     """Return the timing of a law at `rate`, Hz, by default the rate of the gyro.
 
-    The rate of the gyro is IMU_GYRO_RATEMAX. Its samples may be `logged` at a lower rate, Hz. If
-    this lower rate suffices for the law, it counts as the rate of the gyro.
+    The rate of the gyro is IMU_GYRO_RATEMAX. Samples of the gyro may be `logged` at a lower rate,
+    Hz. If this lower rate suffices for the law, it is used as the rate of the gyro.
 
         delay = 1 / (sqrt(2) pi f) + sum_k b_k / (2 pi f_k^2) + 1 / rate + wait
 
     f is the cut-off of a second-order Butterworth filter, and the notches have the frequency f_k
     and the width b_k. If the gyro is faster than the law, a tick waits for the next sample, and
-    `wait` is a period of the gyro. Otherwise it is 0. Raises ParameterError if `rate` is above the
-    rate of the gyro, or if the file cannot be read.
+    `wait` is a period of the gyro. Otherwise `wait` is 0. Raises ParameterError if `rate` is above
+    the rate of the gyro, or if the file cannot be read.
     """
     values = {**DEFAULTS, **_read(path)}
     fastest = values["IMU_GYRO_RATEMAX"]

@@ -56,11 +56,11 @@ def repair(run: Path) -> Repair:
     """Rebuild the damaged files in the folder of a bag, and metadata.yaml.
 
     A damaged file is truncated or has damaged parts. A rebuilt file holds every readable record and
-    has an index. It replaces the damaged file atomically, and the damaged file stays as *.damaged.
-    An intact bag does not change. metadata.yaml keeps the names of missing files. If `run` is a
-    single file of a bag, only this file is repaired, and metadata.yaml stays. Raises ParameterError
-    if there is no bag, if a recorder still writes the bag, if no message can be read, if
-    metadata.yaml comes from another program, or if the folder cannot be written.
+    has an index. The rebuilt file replaces the damaged file atomically, and the damaged file stays
+    as *.damaged. An intact bag does not change. metadata.yaml keeps the names of missing files. If
+    `run` is a single file of a bag, only this file is repaired, and metadata.yaml stays. Raises
+    ParameterError if there is no bag, if a recorder still writes the bag, if no message can be
+    read, if metadata.yaml comes from another program, or if the folder cannot be written.
     """
     # `log_files` raises, and says what the path contains.
     files = bag_files(run) or log_files(run)
@@ -241,7 +241,7 @@ class _FileScan:
 
 
 def _keep_damaged(path: Path) -> Path:
-    """Give the damaged file a second name, which it keeps after the replacement.
+    """Give the damaged file a second name, under which it stays after the replacement.
 
     On a file system without hard links, a copy gets this name.
     """

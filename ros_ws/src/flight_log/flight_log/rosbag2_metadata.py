@@ -32,7 +32,7 @@ class TopicCount(NamedTuple):
 class FileContents(NamedTuple):
     """The content of a file of a bag.
 
-    The log times are in ns. They are 0 if the file has no message.
+    The log times are in ns, and 0 if the file has no message.
     """
 
     file: str

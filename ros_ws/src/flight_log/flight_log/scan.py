@@ -178,7 +178,7 @@ class Scan:
         """Yield the schemas, channels, messages, attachments and metadata.
 
         Schemas and channels of the index come first, so that a damaged chunk loses none of them.
-        Raises OSError if the file cannot be read, and nothing for damaged content.
+        Raises OSError if the file cannot be read. Damaged content raises no error.
         """
         return chain.from_iterable(self._read(decode_parts, 0, map))
 
@@ -187,7 +187,7 @@ class Scan:
         return chain.from_iterable(self._read(decode_batches, JOINED_BYTES, map_ahead))
 
     def groups(self) -> Iterator[Sequence[McapRecord | MessageBatch]]:
-        """Yield the same as `batches`, chunk by chunk, so that a caller may stop between them."""
+        """Yield the content of `batches` chunk by chunk, so that a caller may stop in between."""
         return self._read(decode_batches, 0, map)
 
     def _read(
@@ -347,7 +347,7 @@ def _joined(parts: Iterator[FilePart], most: int) -> Iterator[Sequence[FilePart]
 def _decoded(
     decode_record: Callable[[Sequence[FilePart]], Iterator[R]], parts: Sequence[FilePart]
 ) -> tuple[FilePart, list[R], int]:
-    """Return the last of the parts, their records, and the number of damaged parts."""
+    """Decode parts of a file, and return the last part, the records, and how many were damaged."""
     try:
         return parts[-1], list(decode_record(parts)), 0
     except DECODE_ERRORS:

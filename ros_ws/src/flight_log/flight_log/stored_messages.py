@@ -78,8 +78,8 @@ def parameter_changes(
     """Return the changes of a node's parameters on `/parameter_events`, in order of the stamps.
 
     `node` is the full name of a node, as in "/one/controller". A change is a mapping from dotted
-    names to values in SI units. It has only names that are in `parameters`, or that belong to a
-    group in `parameters`. None means that a parameter was deleted.
+    names to values in SI units. Names that are not in `parameters`, nor belong to a group in
+    `parameters`, are left out. The value None means that a parameter was deleted.
     """
     store = typestore()
     events: list[tuple[int, dict[str, Any]]] = []

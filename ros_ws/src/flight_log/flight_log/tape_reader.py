@@ -70,10 +70,10 @@ class RecordedRun(NamedTuple):
 
     `metadata` holds the named sets of strings, and `attachments` the files except the scenario.
     `latency` is the latency of the loop from y to u, and `age_of_u` is the age of u at the
-    aircraft. `engagements` has the engagements of a bridge. Each of these is None if the log has no
-    such samples or no times of sending. `messages` are the warnings, errors and parameter changes
-    in the log, and the messages about learning and a bridge. `path` is the path of the log, and
-    `topics` has the types of all its topics by full name.
+    aircraft. `engagements` has the engagements of a bridge. Each of these three is None if the log
+    does not show it. `messages` are the warnings, errors and parameter changes in the log, and the
+    messages about learning and a bridge. `path` is the path of the log, and `topics` has the types
+    of all topics in the log by full name.
     """
 
     tape: Tape
@@ -90,7 +90,7 @@ class RecordedRun(NamedTuple):
 
     @property
     def account(self) -> Any:
-        """The account of the log: how much of each topic it holds, and what it lacks.
+        """How much of each topic the log holds, and what it lacks.
 
         It is None unless `rise_di.read_run` has read the log.
         """
@@ -270,8 +270,8 @@ def _publisher_notes(
 ) -> list[str]:
     """Write notes on topics with several publishers.
 
-    There is a note if they sent samples at the same time, and if some have sent messages that are
-    no samples of the flight. Topics that have the same publishers share a note.
+    There is a note if the publishers sent samples at the same time, and if some have sent messages
+    that are no samples of the flight. Topics that have the same publishers share a note.
     """
     conflicts = defaultdict[tuple[str, ...], list[str]](list)
     foreign = defaultdict[tuple[str, ...], list[str]](list)
@@ -365,8 +365,8 @@ def aircraft_namespaces(topics: Collection[str]) -> list[str]:
 def chosen_namespace(topics: Collection[str], namespace: str | None, where: str) -> str:
     """Return the namespace of an aircraft; "" for the root and if there is no aircraft.
 
-    `namespace` is the choice of the caller. Raises ParameterError if no aircraft is in it, or if it
-    is None and there are several aircraft.
+    `namespace` is the choice of the caller, or None. Raises ParameterError if no aircraft is in the
+    chosen namespace, or if there are several aircraft and no choice.
     """
     aircraft = aircraft_namespaces(topics)
     aircraft_names = ", ".join(name or "/" for name in aircraft) or "none"
@@ -416,8 +416,8 @@ def _duration(attachments: Sequence[StoredFile]) -> float | None:
 def _start_ns(signals: Mapping[str, Signal]) -> int:
     """Return the stamp of flight time 0.
 
-    It follows from `truth`. Without `truth` it is the stamp of the first y_m, with which the
-    commands begin, and without y_m it is the earliest stamp.
+    It follows from `truth`. A log without `truth` begins at the first y_m, because the commands
+    begin there, and a log without y_m begins at its earliest stamp.
     """
     truth = signals.get("truth")
     if truth is not None and "t" in truth.names:

@@ -88,7 +88,7 @@ class TapeWriter:
     def write_learning(self, stamp_ns: int, kind: str, sentence: str, *, level: int) -> None:
         """Write what became of a learner's proposal, as a controller would publish it.
 
-        `level` is that of the message, OK or WARN of `learning_messages`.
+        `level` is the level of the message, OK or WARN of `learning_messages`.
         """
         message = learning_message(stamp_ns, kind, sentence, level=level)
         self._write_message(f"/{LEARNING}", DIAGNOSTIC_ARRAY, stamp_ns, message)

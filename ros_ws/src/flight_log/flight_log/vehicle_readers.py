@@ -254,8 +254,8 @@ def _dated(messages: list[Received]) -> Iterator[Sample]:
     """Yield the samples with stamps by the clock of the autopilot.
 
     The times of arrival cannot serve: a radio may bunch messages, and a second link repeats
-    messages later. A message without a time gets that of the preceding message on the same link,
-    which is found by the sequence numbers. The stamp of the first message with a time is its
+    messages later. A message without a time gets the time of the preceding message on the same
+    link, which is found by the sequence numbers. The stamp of the first message with a time is its
     arrival. If no message has a time, or if the clock stands still, each stamp is an arrival.
     """
     with_time = [message for message in messages if hasattr(message.content, "time_boot_ms")]
@@ -355,9 +355,9 @@ def _read_ulog(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
 
 
 class UlogContent(BytesIO):
-    """The content of a ULog, which ends after too many reads.
+    """The content of a ULog as a stream, which ends after too many reads.
 
-    Otherwise pyulog may read the same cut message again for ever.
+    Without this limit, pyulog may read the same truncated message again for ever.
     """
 
     def __init__(self, content: bytes) -> None:

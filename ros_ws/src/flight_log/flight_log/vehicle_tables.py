@@ -125,7 +125,7 @@ COPTER = "multicopter"
 class Choice(NamedTuple):
     """What the user chooses of a log: a system, sensors, and the kind of vehicle.
 
-    The kind of vehicle is that of the channel map.
+    The kind of vehicle comes from the channel map.
     """
 
     system: int | None = None  # number of the system in a tlog; None for the system that flew
