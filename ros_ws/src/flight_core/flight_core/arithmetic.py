@@ -69,8 +69,8 @@ def sine(x: Scalar) -> Scalar:
 def _rounded(x: Scalar) -> Scalar:
     """Round to the nearest integer, and a half to the even one.
 
-    A float is rounded by adding and subtracting ROUNDING. An array is rounded by its `round`,
-    because XLA would simplify the two operations to x.
+    A float is rounded by adding and subtracting ROUNDING. An array is rounded by its method
+    `round`, because XLA would simplify the two operations to x.
     """
     return (x + ROUNDING) - ROUNDING if isinstance(x, float) else array_namespace(x).round(x)
 

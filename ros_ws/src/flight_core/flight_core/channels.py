@@ -46,7 +46,7 @@ surface still has 0.44 at two thirds of the trim speed."""
 
 
 def reason_against_inputs(names: Sequence[str], effects: Sequence[float]) -> Refusal | None:
-    """Return a sentence on the inputs whose measured effect is below LEAST_EFFECT.
+    """Return a refusal of the inputs whose measured effect is below LEAST_EFFECT.
 
     `effects` are the values of a sample of the topic `effects`, one for each of the inputs `names`.
     Each is a fraction of the input's effect at trim. Returns None if there is no such input.

@@ -195,7 +195,7 @@ def _check_count(count: int, key: str, problems: Problems, least: float, most: f
 def _values(parts: Sequence[Any], *, min_length: float = 0, max_length: float = math.inf) -> Kind:
     """Permit a tuple of values.
 
-    It has either any number of values of one kind, or one value for each of several kinds.
+    The tuple has either any number of values of one kind, or one value for each of several kinds.
     """
     is_repeated = parts[-1] is Ellipsis
     kinds = [kind_of(part) for part in parts if part is not Ellipsis]

@@ -59,9 +59,9 @@ def _section(annotation: Any) -> tuple[type[Config] | None, bool]:
 def set_keys(parameters: Config) -> Iterator[SetKey]:
     """Yield the keys whose value is not their default.
 
-    If the default is the empty list, a list of zeros counts as the default, too, because both mean
-    that there is no value. Some sections are absent by default. If such a section is given, but all
-    of its keys have their defaults, the section itself is the key.
+    If the default is the empty list, a list of zeros is taken as the default, too, because both
+    mean that there is no value. Some sections are absent by default. If such a section is given,
+    but all of its keys have their defaults, the section itself is the key.
     """
     return _set_keys(parameters, "", "")
 

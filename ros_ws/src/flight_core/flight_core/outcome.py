@@ -75,7 +75,8 @@ class Shortfall:
     """A shortfall of a flight, as a sentence and as numbers in SI.
 
     `brief` replaces the sentence in a headline if the sentence is too long. `times` is the factor
-    by which a value exceeds the allowed one. It serves to find the worst shortfall of an aim.
+    by which a value exceeds the allowed value. By this factor the worst shortfall of an aim is
+    found.
     """
 
     aim: Aim
@@ -107,9 +108,9 @@ def joined(refusals: Iterable[Refusal | None]) -> Refusal | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Allowance:
-    """A large tracking error that is no shortfall, because the linear loop has it too.
+    """A large tracking error that is no shortfall.
 
-    Noise or wind causes it there.
+    The linear loop would have such an error too, because of noise or wind.
     """
 
     sentence: str
@@ -146,8 +147,8 @@ class Outcome:
     def status(self) -> int:
         """Exit status, which is 0 for a flight that reached its end without a shortfall.
 
-        Spans in which the host was too busy are left out of the judgement, so a shortfall counts
-        also if there were such spans.
+        Spans in which the host was too busy are left out of the judgement, so a shortfall is not
+        excused by such spans.
         """
         if self.end is End.INTERRUPTED:
             return STATUS_INTERRUPTED
@@ -274,7 +275,7 @@ def read_outcome(record: object) -> Outcome:
 def _of_fleet(record: Mapping[str, Any]) -> tuple[Shortfall, ...]:
     """Read the shortfalls of a record that the log of a single aircraft cannot show.
 
-    They are those of the separation in a fleet.
+    Such a shortfall is a violated separation in a fleet.
     """
     shortfalls = []
     for each in record.get("shortfalls") or ():

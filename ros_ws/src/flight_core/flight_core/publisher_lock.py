@@ -28,9 +28,9 @@ class PublisherLock:
     """Takes a topic from its first publisher only, until the samples of this publisher time out.
 
     After the timeout, it takes the topic from the next publisher. A restarted node, which has the
-    same name, can take over earlier than a different node. The time in which the receiving node
-    overruns does not count as silence of the publisher. Otherwise another publisher could take over
-    if the node happens to take its sample first after the overrun.
+    same name, can take over earlier than a different node. If the receiving node overruns, this
+    time is not seen as silence of the publisher. Otherwise another publisher could take over if the
+    node happens to take its sample first after the overrun.
 
     The middleware numbers the messages of a publisher. If the numbers go back, two publishers use
     the same name. In this case neither is admitted, because either can be forged.
@@ -64,7 +64,7 @@ class PublisherLock:
         return sender == self.publisher and not self.timed_out(now_ns, self._timeouts_ns()[0])
 
     def overran(self, duration_ns: int) -> None:
-        """Note that this node did not run for a time, so that it does not count as silence."""
+        """Note that this node did not run for a time, which is no silence of the publisher."""
         self._overrun_ns += duration_ns
 
     def check(self, sender: str, now_ns: int) -> None:
@@ -101,7 +101,7 @@ class PublisherLock:
     def require_alone(self, sender: str, sequence: int, now_ns: int) -> None:
         """Raise ChannelError, reason "sender", if two publishers send under the locked name.
 
-        The name counts as shared for SHARED_NS after the numbers went back. `sequence` is the
+        After the numbers went back, the name is taken as shared for SHARED_NS. `sequence` is the
         number that the middleware gave the message, or 0 if it is unknown. After a timeout, a lower
         number comes from a restarted publisher. Call this only for samples with a valid stamp and
         content, so that a replay of old messages does not stop the flight.
@@ -124,8 +124,8 @@ class PublisherLock:
 class LockstepLock(PublisherLock):
     """Takes a topic of a lockstep flight from the publisher of its first message only.
 
-    In lockstep each message is an instant of the flight, so a message of another publisher must not
-    count. No message is lost, so the numbers of one publisher rise by one each time. Any other
+    In lockstep each message is an instant of the flight, so a message of another publisher must be
+    ignored. No message is lost, so the numbers of one publisher rise by one each time. Any other
     number belongs to a second publisher under the same name, and only the message with this number
     is refused. If the messages of a topic name no sender, the sender is "".
     """

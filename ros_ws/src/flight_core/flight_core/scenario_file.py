@@ -103,7 +103,7 @@ def parse_sections(
 def names_node(content: bytes, path: Path, name: str, key: str, namespace: str) -> bool:
     """Return whether a section for the node `name` has the parameter `key`.
 
-    Sections for all nodes do not count. Raises ParameterError if the content is no ROS parameter
+    Sections for all nodes are left out. Raises ParameterError if the content is no ROS parameter
     file.
     """
     return any(

@@ -130,8 +130,8 @@ class Signal:
 class Recording(NamedTuple):
     """What the stamps of a topic's messages show, in the order of the recording.
 
-    If the clock of the stamps steps, the signal ends before the step. It also lacks the samples
-    without a usable stamp.
+    If the clock of the stamps steps, the signal ends before the step. Samples without a usable
+    stamp are left out of the signal, too.
     """
 
     found: int  # number of messages
@@ -177,10 +177,10 @@ class Tape:
     `start_ns` is the stamp of flight time t = 0, and `outcome` comes from flight_core.outcome. A
     flight of `simulate` also has its `scenario`, and the `changes` of the controller's parameters
     in flight. The tape of a log also has the `recording` by topic, the `processes` by name, and how
-    many samples of a topic were `refused`. If it is known, the `duration` of the whole flight is
-    there too, s. `is_by_clock` says whether the flight followed the simulated time of /clock.
+    many samples of a topic were `refused`. The `duration` of the whole flight, s, is there too, if
+    it is known. `is_by_clock` says whether the flight followed the simulated time of /clock.
     `lost_parts` are parts that the log lost, which the `notes` mention as well. `account` is what
-    `rise_di.read_run` found in the log, and what it lacks.
+    `rise_di.read_run` found in the log, and what the log lacks.
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))

@@ -16,7 +16,7 @@ def printable(text: str) -> str:
 def bounded(text: str) -> str:
     """Make a text printable and at most MAX_LENGTH characters long, not counting escapes.
 
-    If it is longer, its middle is left out.
+    The middle of a longer text is left out.
     """
     if len(text) > MAX_LENGTH:
         text = f"{text[: MAX_LENGTH // 2]} ... {text[5 - MAX_LENGTH // 2 :]}"
