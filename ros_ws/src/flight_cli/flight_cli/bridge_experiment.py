@@ -71,7 +71,7 @@ class BridgeExperiment:
 
     The results, an airframe and a scenario, are written to `folder`. If the log was imported, the
     gains allow for `link_delay`, s, in addition to the delay in the log. If `link_delay` is None,
-    it is that of the map.
+    the delay in the channel map is used.
     """
 
     map_name: str
@@ -194,8 +194,8 @@ class BridgeExperiment:
 def guided_scenario(scenario: str, channel_map: ChannelMap, speed: float | None) -> str | None:
     """Return the text of the scenario, with guidance instead of commands over time.
 
-    Returns None if guidance cannot fly it, because the channel map lacks the pose, the rates or the
-    airspeed.
+    Returns None if guidance cannot fly the aircraft, because the channel map lacks the pose, the
+    rates or the airspeed.
     """
     if speed is None or not channel_map.pose or not {*RATES_AND_SPEED} <= {*channel_map.outputs}:
         return None
@@ -276,11 +276,11 @@ def _announce(console: Console, plan: Experiment, duration: float, *, hovers: bo
 def _engaged(
     run: Path, channel_map: ChannelMap
 ) -> tuple[Tape, list[tuple[int, int]], Refusal | None]:
-    """Return the tape of an experiment and its engaged spans, ns.
+    """Return the tape of an experiment and the spans in which the bridge was engaged, ns.
 
-    The third result says why it ended early; it is None if it did not. A log of `rise-di import` is
-    a single span. Raises ParameterError if the log has no engagement, or if the flight had
-    feedback, because u then follows y.
+    The third result says why the experiment ended early, or is None. A log of `rise-di import` is a
+    single span. Raises ParameterError if the log has no engagement, or if the flight had feedback,
+    because u then follows y.
     """
     recorded_run = read_run(run)
     warn_of_lacks(recorded_run)

@@ -213,7 +213,10 @@ def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: b
 
 
 def _row_as_json(row: CheckedRow) -> dict[str, object]:
-    """Return a row for JSON, with a sentence for each release, which is empty if the row holds."""
+    """Return a row of a channel map as a dict that JSON can hold.
+
+    It has a sentence for each release, which is empty if the row fits this release.
+    """
     return row._asdict() | {"faults": [str(fault or "") for fault in row.faults]}
 
 

@@ -117,9 +117,9 @@ class Contest(NamedTuple):
             tuned_gains.save(self.path, tunings, list(gain_tuning.OBJECTIVES), command)
 
     def benchmark(self, *seed: int) -> Benchmark:
-        """Build the winds and the aircraft.
+        """Build the winds and the aircraft of the comparison.
 
-        For the tuning, the turbulence has a fixed seed. `seed` replaces it.
+        For the tuning, the turbulence has a fixed seed. `seed` replaces this seed.
         """
         build = gain_tuning.build_benchmark(self.scenario, *seed)
         return registered_laws.with_courses(build, self.controllers)
@@ -127,8 +127,8 @@ class Contest(NamedTuple):
     def tuned(self) -> Gains:
         """Return the gains by law and objective.
 
-        They come from the file, or if it lacks them, from the controller of the law. Raises
-        ParameterError if no law has gains.
+        They come from the file. For a law without gains in the file, they come from the controller
+        of the law. Raises ParameterError if no law has gains.
         """
         tunings = tuned_gains.load(self.path)
         gains: Gains = {}
@@ -417,9 +417,9 @@ def _notes(
 
 
 def _as_json(result: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
-    """Return the results of a law for JSON, in SI.
+    """Return the results of a law as a dict that JSON can hold, in SI.
 
-    An infinite value is null, and so is the cost of gains that do not come from a search.
+    An infinite value becomes null, and so does the cost of gains that do not come from a search.
     """
     controller = scenario.controller
     levels = []

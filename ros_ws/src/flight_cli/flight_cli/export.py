@@ -134,7 +134,7 @@ class Export:
 
 
 def _as_json(exported: Exported) -> dict[str, Any]:
-    """Return the files and the results of the proof for JSON."""
+    """Return the written files and the results of the proof as a dict that JSON can hold."""
     proof = exported.proof
     files = {"files": [str(path) for path in exported.files]}
     if proof is None:

@@ -71,7 +71,7 @@ def fly_fleet_file(fleet: Fleet, runs: Sequence[Path], *, as_json: bool) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class _AircraftResult:
-    """The summary of an aircraft, and the share of its ticks with the controller ENGAGED.
+    """The summary of an aircraft, and in which share of its ticks the controller was ENGAGED.
 
     The share `engaged` is None if there are no ticks. `track` is where the aircraft was, or None
     without a pose.

@@ -109,7 +109,7 @@ class _Gains:
     as_json: bool = json_option()
 
     def _require_airframe(self) -> None:
-        """Check that the name is that of an airframe, and not of a scenario.
+        """Check that the name belongs to an airframe, and not to a scenario.
 
         Raises ParameterError if not.
         """

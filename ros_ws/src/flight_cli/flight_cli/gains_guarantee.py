@@ -74,10 +74,10 @@ def proved(
 ) -> Guarantee:
     """Return the guarantee of a loop, and store it for the report pages of this loop's flights.
 
-    The box holds the entries of A and B that may deviate. If it leaves out the entries that are 0
-    in the file, the guarantee also says how far these may deviate while all others are exact.
-    `report` gets a sentence for each step. Raises ParameterError before the proof if the aircraft
-    has no linear loop.
+    The guarantee is about a box of entries of A and B that may deviate. If entries that are 0 in
+    the file are not in the box, the guarantee also says how far these may deviate while all others
+    are exact. `report` gets a sentence for each step. Raises ParameterError before the proof if the
+    aircraft has no linear loop.
     """
     loop = answer.loop_with_box()
     require_linear(loop)
@@ -135,9 +135,9 @@ def write_unstable(
 ) -> list[str]:
     """Write the unstable aircraft nearest to the nominal one, if a folder is given.
 
-    A second aircraft has the deviations of the first multiplied by FARTHER. Each is written as an
-    airframe and a scenario that flies it. Returns a sentence for each aircraft, which says how far
-    it deviates, and whether this is within `--uncertainty`.
+    A second aircraft has the deviations of the first one, multiplied by FARTHER. Each is written as
+    an airframe and a scenario that flies it. Returns a sentence for each aircraft, which says how
+    far it deviates, and whether this is within `--uncertainty`.
     """
     if folder is None:
         return []

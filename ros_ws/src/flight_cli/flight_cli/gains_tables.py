@@ -68,7 +68,10 @@ class GainSets(NamedTuple):
 
     @property
     def titles(self) -> dict[str, Assessment]:
-        """Gain sets by the names to print. After a check, the name is that of the scenario."""
+        """Gain sets by the names under which they are printed.
+
+        A gain set that was checked has the name of its scenario.
+        """
         return {self.checked: self.first} if self.checked else self.answers
 
     @property
@@ -78,7 +81,7 @@ class GainSets(NamedTuple):
 
     @property
     def last(self) -> Assessment:
-        """The last gain set. In a selection, it is that of the engineering procedure."""
+        """The last gain set. After a selection, it comes from the engineering procedure."""
         return [*self.answers.values()][-1]
 
     @property
@@ -267,7 +270,7 @@ def _stable_speed_ratio(study: Study, answer: Assessment) -> float | None:
 
 
 def gains_as_json(sets: GainSets, seed: int) -> dict[str, Any]:
-    """Return the study, gain sets with conditions, and the guarantee, if any, for JSON."""
+    """Return study, gain sets with conditions, and guarantee as a dict that JSON can hold."""
     study = sets.study
     guarantee = sets.guarantee
     inputs = list(study.airframe.inputs)

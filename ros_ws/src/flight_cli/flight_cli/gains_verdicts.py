@@ -59,7 +59,7 @@ def loop_verdict(answer: GainAssessment[Any], guarantee: Guarantee | None) -> Ve
 
 
 def rules_verdict(answer: GainAssessment[Any], _: Guarantee | None) -> Verdict:
-    """Return the verdict that counts which rules of the engineering procedure a gain set meets."""
+    """Return a verdict on a gain set: how many rules of the engineering procedure it meets."""
     rules = answer.rules
     if not rules:
         return Verdict(True, "")
@@ -72,7 +72,7 @@ def rules_verdict(answer: GainAssessment[Any], _: Guarantee | None) -> Verdict:
 
 
 def theorem_verdict(answer: GainAssessment[Any], _: Guarantee | None) -> Verdict:
-    """Return the verdict that counts which sufficient conditions of Theorem 1 a gain set meets."""
+    """Return a verdict on a gain set: how many sufficient conditions of Theorem 1 it meets."""
     conditions = answer.theorem
     if not conditions:
         return Verdict(True, "")
@@ -109,7 +109,7 @@ SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 
 
 def condition_cells(condition: GainCondition) -> tuple[str, str]:
-    """Return two cells: the value beside its bound, and the margin, which is red if it fails."""
+    """Return two cells of a table: the value beside its bound, and the margin, red if it fails."""
     margin = "" if math.isnan(condition.margin) else f"{condition.margin:.2g}"
     side = SIDES[condition.side]
     return (
@@ -121,7 +121,7 @@ def condition_cells(condition: GainCondition) -> tuple[str, str]:
 def condition_as_json(
     part: str, condition: GainCondition, outputs: tuple[str, ...]
 ) -> dict[str, Any]:
-    """Return a condition of a part as JSON."""
+    """Return a condition as a dict that JSON can hold; `part` is the group to which it belongs."""
     return {
         "name": condition.name,
         "part": part,

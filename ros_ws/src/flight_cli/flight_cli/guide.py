@@ -86,7 +86,10 @@ class Guide(RouteWords):
         values: dict[str, float],
         points: list[tuple[float, float, float]],
     ) -> Refusal | None:
-        """Send targets, a route or a service call, and return why guidance refuses it, if so."""
+        """Send targets, a route or a service call.
+
+        Returns the reason if guidance refuses the request, else None.
+        """
         from flight_guidance.client import GuidanceClient, TargetClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
         if values or command == LINK:

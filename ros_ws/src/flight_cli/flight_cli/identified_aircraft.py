@@ -138,7 +138,7 @@ def _show_flights(console: Console, aircraft: IdentifiedAircraft) -> None:
 
 
 def identified_as_json(aircraft: IdentifiedAircraft, path: Path) -> dict[str, Any]:
-    """Return the result of the identification for JSON, in SI."""
+    """Return the result of an identification as a dict that JSON can hold, in SI."""
     linear = aircraft.linear
     trim = linear.trim
     outputs = aircraft.condition.paired_outputs()

@@ -118,8 +118,8 @@ def _units(identification: Identification) -> dict[str, DisplayUnit]:
 def _innovation_page(identification: Identification, name: str) -> Page:
     """Return a page with the innovations of the nominal and of the identified model.
 
-    They are drawn over the time of the flight. The seconds that the identification did not use are
-    shaded.
+    The innovations are drawn over the time of the flight. The seconds that the identification did
+    not use are shaded.
     """
     t = identification.recorded.t - identification.recorded.t[0]
     before, after = (
@@ -162,7 +162,7 @@ def _innovation_page(identification: Identification, name: str) -> Page:
 def model_as_json(
     identification: Identification, path: Path | None, again: Reflight | None
 ) -> dict[str, Any]:
-    """Return the model, its file, and the flight with it, if any, for JSON in SI."""
+    """Return the model, its file, and the flight with it, if any, as a dict for JSON, in SI."""
     outputs = identification.airframe.outputs
     return {
         "airframe": identification.airframe.name,

@@ -78,7 +78,7 @@ def _accept_option() -> Any:
 class Jsbsim:
     """Linearise an aircraft of JSBSim, select its gains, fly it, and write a scenario of it.
 
-    Exit status: 0, 2 bad input, 3 the aircraft does not trim or does not fly.
+    Exit status: 0; 2 for bad input; 3 if the aircraft does not trim or does not fly.
     """
 
     aircraft: str = argument(
@@ -188,7 +188,7 @@ class Log:
     The model is accepted if it predicts the held-out part of the flight better than the nominal
     airframe does.
 
-    Exit status: 0, or 2 bad input or a model that is refused.
+    Exit status: 0; 2 for bad input, or if the model is refused.
     """
 
     log: Path = argument("The folder of a run, or an MCAP file.", default=REQUIRED)
@@ -277,7 +277,7 @@ class Bridge:
     From the response it selects gains, and writes a scenario that flies the aircraft. With --run it
     reads the log of such a flight, or one of `rise-di import`, and flies nothing.
 
-    Exit status: 0, or 2 bad input or an experiment that is refused.
+    Exit status: 0; 2 for bad input, or if the experiment is refused.
     """
 
     channel_map: str = argument(

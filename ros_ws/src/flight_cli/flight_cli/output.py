@@ -123,8 +123,8 @@ def entry_table(title: str, entries: Iterable[Entry]) -> Table:
 def entries_as_json(entries: Iterable[Entry]) -> dict[str, dict[str, float]]:
     """Return the nominal and the identified values of entries of A and B by name, in SI.
 
-    The change and its standard deviation are fractions of the nominal entry. If this is zero, they
-    are in SI.
+    The change of an entry and its standard deviation are fractions of the nominal value. If the
+    nominal value is 0, they are in SI.
     """
     return {
         entry.name: {
@@ -206,8 +206,8 @@ def flight_progress(
 ) -> Iterator[tuple[Callable[[float, str], None], Callable[[str], None]]]:
     """Show the progress bar of a flight of `duration` s.
 
-    Yields two functions. The first takes the flight time and the text beside it. The second prints
-    a line above the bar.
+    Yields two functions. The first is called with the flight time and a text to show beside it. The
+    second prints a line above the bar.
     """
     with progress_bar(*CLOCK_COLUMNS, quiet=quiet) as bar:
         task = bar.add_task("flight", total=duration, clock="", shown="")

@@ -153,7 +153,7 @@ class Shown(NamedTuple):
 
 
 def _claims_of(run: RecordedRun) -> tuple[Guarantee | None, tuple[str, ...]]:
-    """Return the guarantee of a flight's loop, and sentences on how its aircraft differs.
+    """Return the guarantee of a flight's loop, and sentences on the aircraft.
 
     The sentences say how the aircraft differs from what the controller was told. The guarantee is
     None if none was computed, if there is no linear model, if the parameters changed in flight, or
@@ -254,8 +254,8 @@ def _count_by_group(result: ReplayResult) -> dict[str, int]:
 def _u_figures(result: ReplayResult, inputs: tuple[str, ...]) -> dict[str, dict[str, float]]:
     """Return by how much the computed u differs from the recorded u, by input.
 
-    The figures are the rms and the largest difference, its time, and the rms of the recorded u, in
-    the input's unit. They are NaN if there is no u.
+    The figures are the rms of the difference, the largest difference with its time, and the rms of
+    the recorded u, in the input's unit. They are NaN if there is no u.
     """
     is_finite = np.isfinite(result.computed).all(axis=1)
     u_recorded = result.group(result.recorded[is_finite], "u")

@@ -226,7 +226,7 @@ class Tune:
 
         For PX4 both delays follow from the rate and the filters of the gyro. For ArduPlane the
         scenario stays as it is, and the second delay follows from the cut-off of the filter. If the
-        log does not have the cut-off, the second delay is that of the controller.
+        log does not have the cut-off, the delay of the controller is returned.
         """
         controller = scenario.rise_di()
         if autopilot != "px4":
@@ -283,9 +283,10 @@ def _guarantee(
     entries: Mapping[str, float],
     report: Callable[[str], None],
 ) -> Guarantee:
-    """Return the guarantee for A and B within their errors, and tell each step to `report`.
+    """Return the guarantee for A and B within the errors of the identification.
 
-    An entry without an error may be off by the fraction LEAST.
+    An entry without an error may be off by the fraction LEAST. `report` gets a sentence for each
+    step.
     """
     answer = check_gains(
         airframe, scenario, uncertainty=LEAST, samples=SAMPLES, entries=entries, as_told=True
@@ -382,10 +383,10 @@ def _kept_model(part: Part) -> str:
 def _uncertainty(identification: Identification) -> float:
     """Return the uncertainty of A and B for which gains are searched, from LEAST to MOST.
 
-    Of the effects on each output, only the one with the smallest relative standard deviation
-    counts. The result is twice the largest standard deviation of these effects, as a fraction of
-    the identified value. The uncertainty of the delay does not count. If the delay is wrong, A and
-    B are wrong in a way that compensates it, so that the loop is still that of the log.
+    For each output, take the effect of an input that has the smallest relative standard deviation.
+    The result is twice the largest of these deviations, as a fraction of the identified value. The
+    uncertainty of the delay is left out. If the delay is wrong, A and B are wrong in a way that
+    compensates it, so that the loop is still the loop of the log.
     """
     relative = [
         effect.deviation * abs(effect.nominal / effect.value)
@@ -424,9 +425,9 @@ def _box(identification: Identification, airframe: Airframe) -> dict[str, float]
 def _on_airframe(scenario: Scenario, airframe: Path, recorded: FlightData) -> Scenario:
     """Return the scenario on the identified airframe, with the noise of the gyro in the log.
 
-    The samples of the sensors may come at another rate than those of `recorded`. White noise has
-    the same density at both rates if its variance is proportional to the rate. The density counts,
-    because the loop passes only slow noise.
+    The sensors of the scenario may have another rate than `recorded`. White noise has the same
+    density at both rates if its variance is proportional to the rate. The density is kept, because
+    the loop passes only slow noise.
     """
     noise = measured_noise(recorded.y, np.ones(recorded.y.shape[1]))
     noise = noise * math.sqrt(scenario.aircraft.rate * recorded.period)

@@ -52,8 +52,9 @@ class Candidate(NamedTuple):
     def score(self) -> float:
         """The geometric mean of the rms errors of the outputs, rad/s.
 
-        The rms error of an output is taken over all airs together, so an air with larger errors
-        counts more. In the geometric mean, an equal relative change counts the same in each output.
+        The rms error of an output is taken over all kinds of air together, so air with larger
+        errors has more weight. In the geometric mean, an equal relative change has the same weight
+        in each output.
         """
         in_all = np.sqrt(np.mean(np.square(list(self.rms.values())), axis=0))
         return float(np.exp(np.mean(np.log(in_all))))
@@ -142,8 +143,8 @@ def candidates(selectors: Selectors) -> list[Candidate]:
 def best_of(found: Sequence[Candidate], *, accept: bool) -> Candidate:
     """Return the candidate with the least score among those whose margins suffice.
 
-    With `accept`, it is the one with the least score among all. Raises ParameterError, with the
-    shortfall of the best candidate, if no margins suffice.
+    With `accept`, candidates whose margins do not suffice are included. Raises ParameterError, with
+    the shortfall of the best candidate, if no margins suffice.
     """
     by_score = sorted(found, key=lambda candidate: candidate.score)
     enough = [candidate for candidate in by_score if accept or not candidate.shortfall]
@@ -180,9 +181,9 @@ def rms_of_own_loop(own: OwnLoop, selectors: Selectors) -> dict[str, FloatArray]
 
 
 def _judged(selectors: Selectors, name: str, controller: RiseDiConfig, origin: str) -> Candidate:
-    """Fly a controller in each air, and compare its margins with the requirement.
+    """Fly a controller in each kind of air, and compare its margins with the requirement.
 
-    The margins are those of aircraft in the box that the guarantee bounds.
+    The margins are the worst ones of aircraft in the box that the guarantee bounds.
     """
     scenario = selectors.flight.vary(controller=controller)
     selectors.report(f"flying in {' and in '.join(selectors.airs)}: {name}")
