@@ -347,8 +347,8 @@ class MonteCarlo:
     def guarantee(self, case: int) -> Guarantee | None:
         """Return the stability guarantee that was computed for the loop of a case.
 
-        Returns None if there is no guarantee. It also returns None if lags or delays are drawn,
-        because a guarantee assumes that they are exact.
+        Returns None if there is no guarantee. If lags or delays are drawn it also returns None,
+        because a guarantee assumes exact lags and delays.
         """
         definition = self.definition
         if any(equipment.is_of_loop(entry) for entry in definition.entries):

@@ -52,8 +52,8 @@ class Sweep(Config):
     def scaled(self, controller: ControllerConfig, factor: float) -> float | tuple[float, ...]:
         """Multiply the swept parameter by a factor, or only its value in a channel that is named.
 
-        A channel of u means the channel of y with which it is paired. Raises ParameterError if the
-        parameter or the channel cannot be swept.
+        If the channel is an input, the value is that of the output with which it is paired. Raises
+        ParameterError if the parameter or the channel cannot be swept.
         """
         swept = swept_parameters(controller)
         require(

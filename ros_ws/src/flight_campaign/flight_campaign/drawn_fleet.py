@@ -20,7 +20,7 @@ from flight_core.vectors import FloatArray
 class DrawnFleet(NamedTuple):
     """Drawn aircraft of a campaign, in the memory of the host.
 
-    They can be drawn while the device flies other aircraft.
+    The host can draw them while the device flies other aircraft.
     """
 
     scenario: Scenario

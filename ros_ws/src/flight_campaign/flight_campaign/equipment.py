@@ -95,7 +95,7 @@ def drawn(
     The aircraft have the numbers first, first + 1, ... under `seed`. A lag and a noise are
     multiplied by 1 + d, in the same way as an entry of A. A delay is (1 + d) / 2 times the largest
     delay, in whole periods. A value depends only on the seed and on the number of the aircraft. The
-    entries of `spread` are those of `expanded`.
+    entries of `spread` must come from `expanded`.
     """
     published_values = published(scenario)
     rate = scenario.controller.rate
@@ -139,7 +139,7 @@ def in_order(
 def scenario_with_equipment(scenario: Scenario, values: Mapping[str, float]) -> Scenario:
     """Return the scenario with other lags, other noise and an additional delay of u.
 
-    `values` has them by the names of `drawn`.
+    `values` has these by the names of `drawn`.
     """
     aircraft = scenario.aircraft
     channels = scenario.aircraft.channels()

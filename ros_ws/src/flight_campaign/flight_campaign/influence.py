@@ -60,13 +60,13 @@ def influence(
     published: Mapping[str, float],
     uncertainty: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Return the rank correlations of a case, ready for a JSON file.
+    """Return the rank correlations of a case as a dict that JSON can hold.
 
     The correlations come from `table`, and the row `worst` has the entries of the worst aircraft.
-    `uncertainty` is the largest deviation of each entry. "worst_aircraft" and "worst_corner" have
-    deviations, as fractions of the published entries. The first has those of the worst aircraft.
-    The second has plus or minus the uncertainty, with the sign for which the score rises, and 0 if
-    the correlation may be chance.
+    `uncertainty` is the largest deviation of each entry. Two entries of the result have deviations,
+    as fractions of the published entries. "worst_aircraft" has the deviations of the worst
+    aircraft. "worst_corner" has plus or minus the uncertainty, with the sign for which the score
+    rises, and 0 if the correlation may be chance.
     """
     correlations = rank_correlations(table, published)
     level = chance_level(table.height, len(correlations)) if correlations else None

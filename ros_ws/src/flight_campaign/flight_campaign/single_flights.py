@@ -133,11 +133,11 @@ def _tracking_figures(tape: Tape, scenario: Scenario) -> dict[str, float]:
 def mission_figures(tape: Tape, guidance: GuidanceConfig) -> dict[str, float]:
     """Return the metrics of a mission, by name, SI.
 
-    They are the score, the cross-track and altitude errors on the route, the largest bank
-    and the missed legs. With a fence there are also the distance flown outside of it and the
+    They are the score, the cross-track and altitude errors on the route, the largest bank and the
+    missed legs. With a fence there are also the distance flown outside of the fence and the
     distance from home at the end. The score is the largest cross-track error divided by the
     distance that the aircraft flies in half a second at V0. Errors on the orbit round the last
-    waypoint, on the way onto a leg and while the fence acts do not count. If no leg was flown, the
+    waypoint, on the way onto a leg and while the fence acts are left out. If no leg was flown, the
     score and these errors are NaN.
     """
     log = tape["guidance"]

@@ -57,7 +57,7 @@ class FigureStatistics(Config):
 
     @classmethod
     def from_values(cls, values: FloatArray) -> Self:
-        """Collect values >= 0, (N,), into statistics; NaN does not count."""
+        """Collect values >= 0, (N,), into statistics, and leave out NaN."""
         values = values[~np.isnan(values)]
         if not len(values):
             return cls()
@@ -204,7 +204,7 @@ class Tally(Config):
     def share(self, count: int) -> tuple[float, float, float]:
         """Return a count of flights as a share, with its 95 % confidence interval, 0 to 1.
 
-        The interval is that of Clopper and Pearson, by quantiles of the beta distribution.
+        The interval is the one of Clopper and Pearson, by quantiles of the beta distribution.
         """
         others = self.flights - count
         low = float(betaincinv(count, others + 1, 0.025)) if count else 0.0

@@ -73,7 +73,7 @@ def vehicle(scenario: Scenario) -> Vehicle:
 
 
 def shared(params: Any) -> Any:
-    """Convert the parameters of a law for one aircraft, (m,), to those for a fleet, (m, 1).
+    """Convert the parameters of a law for one aircraft, (m,), to the shape (m, 1) for a fleet.
 
     Matrices stay as they are, because all aircraft share them.
     """
@@ -88,8 +88,8 @@ def with_equipment(
 ) -> Vehicle:
     """Return the vehicle with the lags and the noise of N aircraft.
 
-    `values` has them by the names of `equipment.drawn`, (N,) each. Lags and noise without a value
-    are those of the scenario.
+    `values` has the lags and noises by the names of `equipment.drawn`, (N,) each. If one is
+    missing, the value of the scenario holds for all aircraft.
     """
     channels = scenario.aircraft.channels()
     aircraft = scenario.aircraft
@@ -118,8 +118,8 @@ def _reduced(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
     """Keep of an aircraft only the states and rows that its nonlinear remainder needs.
 
     The remainder, `remainder_of`, is the part of f_state that is not linear in the state. Returns
-    the indices of the states on which it depends, and the aircraft with only these states and the
-    rows `remainder_rows`.
+    the indices of the states on which the remainder depends, and the aircraft with only these
+    states and the rows `remainder_rows`.
     """
     rows = remainder_rows(aircraft)
     coupling = aircraft.coupling
@@ -158,13 +158,12 @@ def fly(
     Each tick has four parts. The first is the sensors. The second is a step of the law, its
     engagement, or a missed sample, depending on the phase of the course. The third moves the
     actuators in K steps up to the next tick, and the fourth moves the aircraft. The nonlinear
-    remainder s is that of the middle between two ticks, extrapolated from its values at this tick
+    remainder s is taken in the middle between two ticks, extrapolated from its values at this tick
     and at the previous one.
 
-    `params` of the law have shape (m, 1) or (m, N). If all aircraft have the same parameters,
-    `shared` converts those of one aircraft, (m,). `schedule` divides the ticks into compiled loops.
-    None selects the schedule that is fastest on the device. The schedule does not change the
-    result.
+    `params` of the law have shape (m, 1) or (m, N). If all aircraft have the same parameters, (m,),
+    `shared` converts them. `schedule` divides the ticks into compiled loops. None selects the
+    schedule that is fastest on the device. The schedule does not change the result.
     """
     timing = _timing(fleet, course)
     constants = batch_loop.Constants(fleet._replace(blocks=()), vehicle, params)

@@ -84,9 +84,9 @@ def rows_of(array: Array, places: Sequence[int] | NDArray[np.int64]) -> Array:
 
 
 def remainder_of(states: Array, aircraft: Aircraft) -> Array:
-    """Return the remainder, which is the nonlinear part of f_state, (q, N).
+    """Return the nonlinear part of f_state, the remainder, (q, N).
 
-    It is gravity @ (sin(x) - x) + gain @ (x[first] x[second]) + kinematics(x).
+    gravity @ (sin(x) - x) + gain @ (x[first] x[second]) + kinematics(x)
     """
     return dynamics.f_state(states, aircraft) - aircraft.gravity @ states
 
@@ -126,9 +126,9 @@ class LoopState(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """Inputs that stay the same in all ticks.
+    """Inputs of the compiled loop that stay the same in all ticks.
 
-    They are arguments of the compiled loop, because the compiler would compute with constants in
+    They are arguments of the loop, because the compiler would use constants to compute results in
     advance.
     """
 
@@ -166,7 +166,7 @@ def fly_run(
     control_law: ControlLaw,
     timing: Timing,
 ) -> LoopState:
-    """Fly the ticks of a run from the number `first` on, and return the state after them."""
+    """Fly the ticks of a run, beginning with the tick `first`, and return the state after them."""
     size = len(run.pattern)
 
     def patterns(values: Array) -> Array:
@@ -381,7 +381,7 @@ def figures(end: LoopState, ticks: int, period: Array) -> FleetResult:
 
 
 def in_trim(fleet: FleetMatrices, vehicle: Vehicle, timing: Timing) -> LoopState:
-    """Return the state of the closed loop before the first tick, without that of the law."""
+    """Return the state of the closed loop before the first tick, without the state of the law."""
     n = len(fleet.forced)
     count = len(fleet.wind)
     m = len(vehicle.outputs)

@@ -84,14 +84,14 @@ def assemble(
         forced = [Phi^(K-1) Gamma F, ..., Gamma F],
             F = [gust_directions[course.axes], course.basis]
 
-    The steps are those of `plant.advance`, and so are the mean positions of the actuators. The
+    The steps, and the mean positions of the actuators, equal those of `plant.advance`. The
     remainder is held over a tick, and the forcing over a step.
 
     `wind` and `late` have one value for all aircraft or N values. `late` is added to the delay of
     the course. `gust_directions`, (N, n, G), are the effects of wind on x_dot, as in
-    `uncertainty.gust_directions`; None means those of the plant for all aircraft. A drift of the
-    plant multiplies the entries of all aircraft by the same factors, and the matrices are
-    interpolated.
+    `uncertainty.gust_directions`. If it is None, all aircraft have the effects of the plant. A
+    drift of the plant multiplies the entries of all aircraft by the same factors, and the matrices
+    are interpolated.
     """
     aircraft = plant.aircraft
     directions = aircraft.gust_direction if gust_directions is None else gust_directions

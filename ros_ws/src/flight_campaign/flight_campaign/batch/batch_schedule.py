@@ -29,7 +29,7 @@ LONGEST = 20  # number of ticks of the longest pattern; a pattern is compiled ti
 class TickKind(NamedTuple):
     """What is known of a tick when the loop is compiled.
 
-    If a property is None, it is not known, and the tick has a branch that depends on it.
+    If a property is not known, it is None, and the tick has a branch that depends on it.
     """
 
     phase: int | None

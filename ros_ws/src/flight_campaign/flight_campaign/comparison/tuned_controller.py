@@ -119,7 +119,7 @@ def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
 def _observer(name: str, result: TuningResult, benchmark: Benchmark) -> ObserverConfig:
     """Return the observer of a law, with its bound on u_o.
 
-    The search has already met the margin, so the controller requires none.
+    The search has already met the delay margin, so the controller need not require one.
     """
     controller = benchmark.scenario.controller
     airframe = benchmark.scenario.aircraft.load()[0]

@@ -192,10 +192,10 @@ def turbulence_of(scenario: Scenario) -> dict[str, float]:
 
 
 def _courses(scenario: Scenario) -> dict[str, Course]:
-    """Return the courses of a scenario, by the name of the model of their feedforward.
+    """Return the courses of a scenario, by the model that their feedforward uses.
 
-    They are NONE, AIRCRAFT and INTEGRATORS. The controller of the scenario must have a feedforward
-    with the model of the aircraft.
+    The models are NONE, AIRCRAFT and INTEGRATORS. The controller of the scenario must have a
+    feedforward with the model of the aircraft.
     """
     course, controller, (airframe, _) = (
         build_course(scenario),
@@ -218,8 +218,8 @@ def _courses(scenario: Scenario) -> dict[str, Course]:
 def result_score(result: FleetResult, unit: FloatArray) -> FloatArray:
     """Return the score of each flight, (N,).
 
-    It is the sum over the channels of the rms of the true error divided by its unit, and infinite
-    if the flight diverged.
+    The score is the sum over the channels of the rms of the true error divided by its unit, and
+    infinite if the flight diverged.
     """
     total = statistics.score(np.asarray(result.rms), unit)
     return np.where(np.asarray(result.diverged) | ~np.isfinite(total), np.inf, total)
@@ -228,7 +228,7 @@ def result_score(result: FleetResult, unit: FloatArray) -> FloatArray:
 def cost(result: FleetResult, benchmark: Benchmark) -> FloatArray:
     """Return the cost of each flight, (N,), at most MAX_COST.
 
-    It is the score plus the sum over the channels of mean abs(u_dot) / activity_unit.
+    The cost is the score plus the sum over the channels of mean abs(u_dot) / activity_unit.
     """
     activity = np.sum(np.asarray(result.slew) / benchmark.activity_unit[:, None], axis=0)
     total = result_score(result, benchmark.unit) + activity
