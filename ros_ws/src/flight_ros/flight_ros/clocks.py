@@ -57,7 +57,7 @@ def number_of_host() -> float:
 
 
 class ClockOfPeer(NamedTuple):
-    """The clock of another node minus that of this node, and the mean delay of a message, s."""
+    """By how much the clock of another node is ahead, and the mean delay of a message, s."""
 
     offset: float
     delay: float
@@ -68,7 +68,7 @@ class ClockOfPeer(NamedTuple):
 
 
 class Peers:
-    """The differences of clocks that a node measures, and those that its peers report.
+    """The differences of clocks that a node measures, and the differences that its peers report.
 
     Times whose names end in _ns are in ns, and all others in s.
     """
@@ -87,8 +87,8 @@ class Peers:
     ) -> None:
         """Take a message of another node.
 
-        `sent_ns` is its instant by the clock of the sender, and `received_ns` by the clock of this
-        node. `reported` has the differences that the sender has measured, s, by node.
+        It was sent at `sent_ns` by the clock of the sender, and received at `received_ns` by the
+        clock of this node. `reported` has the differences that the sender has measured, s, by node.
         """
         for name, heard_ns in list(self._heard_ns.items()):
             if received_ns - heard_ns > FORGET_NS:
@@ -168,7 +168,7 @@ class PeerClocks:
         return self._peers.clocks()
 
     def sentence_on(self, sender: str) -> str | None:
-        """Say how far a sender's clock differs, as the end of a sentence about its stamp.
+        """Say how far a sender's clock differs, as the end of a sentence about its time stamp.
 
         Returns None if the clock does not differ, or if this is unknown.
         """
@@ -190,7 +190,7 @@ class PeerClocks:
     def news(self) -> list[str]:
         """Write a sentence for every clock whose offset has changed by more than DIFFERS.
 
-        A clock that differs by no more than DIFFERS counts as one that agrees, with an offset of 0.
+        An offset of at most DIFFERS is taken as 0: the clock agrees.
         """
         sentences = []
         for name, clock in self.clocks().items():

@@ -84,9 +84,9 @@ def run(
 ) -> None:
     """Run a node, or several nodes in one thread, until SIGINT, SIGTERM or SIGHUP.
 
-    The exit status is then 0. It is 2 for invalid parameters, 3 for a flight that cannot continue,
-    5 for a landing, 6 after another node has ended, and 1 for an unexpected exception. The
-    `early_participant` of flight_ros.startup is destroyed once the nodes exist.
+    After such a signal the exit status is 0. It is 2 for invalid parameters, 3 for a flight that
+    cannot continue, 5 for a landing, 6 after another node has ended, and 1 for an unexpected
+    exception. The `early_participant` of flight_ros.startup is destroyed once the nodes exist.
 
     Ticks run in the main thread on the monotonic clock, and poll the subscriptions. In lockstep
     there are no ticks, and a node advances when its input has arrived. The executor serves
@@ -201,8 +201,8 @@ def _start(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
 class _AwaitedInputs:
     """The messages that the nodes of a lockstep flight need next.
 
-    A message that a node takes only later does not wake the node. A wait for all messages would
-    return immediately, again and again, until the node takes this message.
+    The wait must be for these messages only. If it were for all messages, a message that its node
+    takes only later would end the wait at once, again and again.
     """
 
     def __init__(self, nodes: Sequence[FlightNode[Any]]) -> None:
@@ -258,9 +258,9 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
 def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, has_begun: bool) -> None:
     """Raise FlightEnded if a lockstep flight would wait for ever.
 
-    It would if a sample was refused, or if the first sample never comes. `advance_ns` is the
-    instant at which the flight last advanced. A flight that has begun may wait without limit for a
-    peer that is stopped, for example in a debugger.
+    It would wait for ever if a sample was refused, or if the first sample never comes. `advance_ns`
+    is the instant at which the flight last advanced. A flight that has begun may wait without limit
+    for a peer that is suspended, for example in a debugger.
     """
     for node in nodes:
         topic = node.awaited_topic()
@@ -358,7 +358,7 @@ def _start_instants(
 def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     """Run nodes in one thread, one tick after another.
 
-    If several nodes are due, the first of them in `nodes` ticks first.
+    If the ticks of several nodes are due, the node that comes first in `nodes` ticks first.
     """
     executor = _start(nodes)
     starts = _start_instants(nodes, executor, stop)

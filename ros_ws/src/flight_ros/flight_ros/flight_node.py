@@ -174,9 +174,9 @@ class FlightNode(Node, Generic[P]):
     # Used by a subclass
 
     def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
-        """Create a publisher as rclpy does, without its callbacks for peers that do not match.
+        """Create a publisher as rclpy does, but without its callbacks for peers that do not match.
 
-        `EndpointMonitor` reports these peers. With callbacks, an executor would ask for two events
+        `EndpointMonitor` reports such peers. With callbacks, an executor would ask for two events
         of each publisher whenever it looks for a request.
         """
         quiet = PublisherEventCallbacks(use_default_callbacks=False)
@@ -221,7 +221,7 @@ class FlightNode(Node, Generic[P]):
     ) -> Receiver[S]:
         """Create a subscription, and a `Receiver` that checks and takes its samples.
 
-        If this node overruns, the publisher does not count as silent.
+        If this node overruns, this time is not seen as silence of the publisher.
         """
         subscription = self.subscribe(topic, qos)
         receiver = Receiver(
@@ -237,7 +237,7 @@ class FlightNode(Node, Generic[P]):
         return receiver
 
     def publisher_lock(self, timeouts_ns: Callable[[], tuple[int, int]]) -> PublisherLock:
-        """Create the publisher lock of a topic; in lockstep it has no timeouts."""
+        """Create the publisher lock of a topic. A lock in lockstep has no timeouts."""
         return LockstepLock() if self.parameters.lockstep else PublisherLock(timeouts_ns)
 
     def encoder(self, names: Sequence[str]) -> Encoder:
@@ -247,7 +247,7 @@ class FlightNode(Node, Generic[P]):
     def now_ns(self) -> int:
         """Return the time of the ticks, ns.
 
-        It is the system clock at the start plus the monotonic time since then.
+        It is the system clock at the start of the node plus the monotonic time since then.
         """
         return self.host.monotonic_ns() + self.time_offset_ns
 
@@ -291,8 +291,8 @@ class FlightNode(Node, Generic[P]):
         """Warn of a topic without samples. Call this at each tick without a sample.
 
         The warning is logged after 3 s, and then every 2 s. If the topic has no publisher, the
-        warning gives `lack` as the cause. If it has a publisher, this may be a node that waits for
-        `start`. So the warning also says if a node waits for `start` and nobody publishes it.
+        warning gives `lack` as the cause. A publisher that sends nothing may be a node that waits
+        for `start`. So the warning also says if a node waits for `start` and nobody publishes it.
         """
         now_ns = time.monotonic_ns()
         last_ns, log_ns = self._waiting.get(subscription.name, (0, 0))
@@ -394,8 +394,8 @@ class FlightNode(Node, Generic[P]):
     def compare_clocks(self) -> None:
         """Exchange clock differences with the other nodes.
 
-        A warning is logged when a clock begins to differ from that of this node, and when it agrees
-        again.
+        A warning is logged when another clock begins to differ from the clock of this node, and
+        when the two agree again.
         """
         if self.clocks is not None:
             self.clocks.exchange(time.time_ns() - self.now_ns())
@@ -410,9 +410,9 @@ class FlightNode(Node, Generic[P]):
     def graph_checks(self) -> list[Callable[[], None]]:
         """Return the checks of the graph, one for each topic.
 
-        There are several, because asking the middleware about all topics takes about a period of 2
-        ms. A check logs an error for a peer with a wrong message type or an incompatible QoS,
-        because its topic would stay silent.
+        One check for all topics would take about a period of 2 ms, because it asks the middleware.
+        A check logs an error for a peer with a wrong message type or an incompatible QoS, because
+        such a topic would stay silent.
         """
         return [
             *(
@@ -442,7 +442,7 @@ class FlightNode(Node, Generic[P]):
             raise LostContact(f"lost contact with {role}")
 
     def finish(self) -> None:
-        """End the node. In lockstep, wait until its last messages have arrived."""
+        """End the node. In lockstep, first wait until its last messages have arrived."""
         self.close()
         if self.parameters.lockstep and not (self.peers and self.peers.lost_role()):
             for publisher in self.publishers:

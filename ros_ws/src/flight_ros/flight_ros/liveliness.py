@@ -32,10 +32,10 @@ class LivelinessMonitor:
     """Asserts the liveliness of a node on `alive/<role>` and monitors the other roles.
 
     The middleware sends the heartbeats. It reports the end of a process within the lease duration
-    of `LIVELINESS`. If the process ended before its first heartbeat, this takes the lease duration
-    of the participant, two seconds. A role can be lost only after it has appeared, because a flight
-    may run without a recorder. The only message of a role is a report with the name of the lost
-    role.
+    of `LIVELINESS`. For a process that ended before its first heartbeat, the report takes the lease
+    duration of the participant, two seconds. A role can be lost only after it has appeared, because
+    a flight may run without a recorder. The only message of a role is a report with the name of the
+    lost role.
     """
 
     def __init__(self, node: Node, role: str) -> None:
@@ -64,8 +64,8 @@ class LivelinessMonitor:
     def lost_role(self) -> str | None:
         """Return the name of the lost role; None if no role is lost.
 
-        A role that shut down cleanly counts as lost after SHUTDOWN_GRACE_NS. If a report names the
-        role that ended first, this role is returned instead.
+        A role that shut down cleanly is taken as lost after SHUTDOWN_GRACE_NS. If a report names
+        the role that ended first, this role is returned instead.
         """
         # the executor may serve a report only after the end of its publisher
         for subscription in self._subscriptions:

@@ -19,7 +19,7 @@ class Instant(NamedTuple):
 
 
 class LockstepInputs:
-    """Matches the samples of y with those of a second signal.
+    """Matches the samples of y with the samples of a second signal.
 
     A step waits for the y of its instant, and for all samples of the second signal up to this
     instant.

@@ -43,9 +43,10 @@ def addresses(text: str) -> tuple[str, ...]:
 
 
 def own_address(peers: Sequence[str], local: Collection[str]) -> str:
-    """Return the address of this host among the peers; `local` has those of its interfaces.
+    """Return which of the peers' addresses is that of this host.
 
-    Raises ParameterError unless exactly one of the peers is an address of this host.
+    `local` has the addresses of the interfaces of this host. Raises ParameterError unless exactly
+    one of the peers is among them.
     """
     matches = [address for address in peers if address in local]
     own = ", ".join(sorted(local)) or "none"
@@ -61,8 +62,8 @@ def own_address(peers: Sequence[str], local: Collection[str]) -> str:
 def network_profile(own_host: str, peers: Sequence[str]) -> str:
     """Return the profile of the middleware for this host and its peers.
 
-    It is the loopback profile, with the address of this host in place of 127.0.0.1. The hosts are
-    the initial peers in the profile.
+    The profile is the loopback profile, with the address of this host in place of 127.0.0.1. The
+    hosts are the initial peers in the profile.
     """
     text = LOOPBACK_PROFILE.read_text(encoding="utf-8")
     locators = "".join(

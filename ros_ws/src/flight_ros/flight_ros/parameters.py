@@ -31,7 +31,7 @@ def read_parameters(node: Node, schema: type[P]) -> P:
     """Validate the overrides of a node, and declare its parameters.
 
     The node was created with automatically_declare_parameters_from_overrides. Every parameter of
-    the set is declared with its description. It is read-only if it is not tunable. Raises
+    the set is declared with its description. A parameter that is not tunable is read-only. Raises
     ParameterError.
     """
     _require_no_octal(sys.argv)
@@ -81,9 +81,9 @@ def _without_global(
 ) -> dict[str, Any]:
     """Leave out parameters that were given to all nodes and that are unknown to this node.
 
-    The node also undeclares them, because an ordinary node of ROS does not declare a parameter that
-    it does not know. A parameter from a section for this node stays, and is refused later if it is
-    unknown.
+    The node also undeclares these parameters, because an ordinary node of ROS does not declare a
+    parameter that it does not know. An unknown parameter in a section for this node stays, and is
+    refused later.
     """
     known = schema.keys_beside(overrides)
     foreign = [key for key in overrides if key not in known and _is_global(node, key, sys.argv)]

@@ -163,10 +163,10 @@ class Receiver(Generic[S]):
 
     `decode` returns None for a vector without channels. `take` gets a sample and the present
     instant. `lock` admits one publisher at a time; None admits all publishers. `max_age_ns` limits
-    the age of a stamp and its lead over the clock. It is None if the sender does not have the clock
-    of the flight. `max_size`, in bytes, is for a topic of reports, whose lengths differ by more
-    than GROWTH. It is None for a topic of samples. `decode` and `take` refuse a message by a
-    ChannelError.
+    the age of a stamp and how far the stamp may be ahead of the clock; it is None if the sender
+    does not have the clock of the flight. `max_size`, in bytes, is for a topic of reports, whose
+    lengths differ by more than GROWTH; it is None for a topic of samples. `decode` and `take`
+    refuse a message by a ChannelError.
     """
 
     def __init__(

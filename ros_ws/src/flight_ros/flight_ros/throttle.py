@@ -16,9 +16,9 @@ class Throttle:
         self._passed_ns: dict[str, int] = {}  # instant at which a line last passed, by its text
 
     def due(self, line: str) -> bool:
-        """Return whether the line may pass, since it has not passed for a period.
+        """Return whether a line may be logged, because it was not logged for a period.
 
-        If the result is True, the line counts as passed now.
+        If the result is True, the line is remembered as logged now.
         """
         now_ns = time.monotonic_ns()
         due = now_ns - self._passed_ns.get(line, -self._period_ns) >= self._period_ns

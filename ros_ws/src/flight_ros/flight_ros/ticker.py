@@ -87,7 +87,7 @@ class Ticker:
 class TickTimes:
     """Periods and compute times of the ticks since the last report.
 
-    It also counts the missed ticks since the start.
+    The missed ticks are counted as well, since the start.
     """
 
     def __init__(self) -> None:

@@ -79,8 +79,8 @@ class NodeState(StrEnum):
     """State of a node on `node_state`, in the order of time.
 
     READY means that the event loop of the node runs. MATCHED, in real time, means that each input
-    has a publisher. FLYING means that the aircraft has taken the first u of a flight in real time,
-    and COMPLETED that it has completed a lockstep flight.
+    has a publisher. FLYING means that the aircraft has taken the first u of a flight in real time.
+    COMPLETED means that the aircraft has completed a lockstep flight.
     """
 
     READY = "ready"
