@@ -286,9 +286,9 @@ class Control:
             return self.state()
 
     def state(self) -> dict[str, Any]:
-        """Return the state for the page.
+        """Return what the page shows of the control.
 
-        It has the lease, the nodes, the gains with their ranges, the digests, the faults and the
+        It is the lease, the nodes, the gains with their ranges, the digests, the faults and the
         bridge.
         """
         nodes = self._link.nodes()
@@ -449,8 +449,8 @@ class Control:
     def _activate(self, *, active: bool) -> Refusal | None:
         """Activate or deactivate the controller.
 
-        With a bridge this is refused, because the bridge itself does it when it engages or
-        disengages.
+        With a bridge this is refused, because the bridge activates the controller when it engages,
+        and deactivates it when it disengages.
         """
         if "bridge" in self._link.nodes():
             return Refusal(

@@ -48,7 +48,8 @@ def rms_by_model(
 ) -> dict[str, Any]:
     """Return a table of the measured rms errors for each model: its headings and its rows.
 
-    They follow from the ticks of a flight and the stamps at which models were proposed.
+    The errors follow from the ticks of a flight, and the models from the stamps at which they were
+    proposed.
     """
     first_ns: dict[float, int] = {}
     for span in spans:

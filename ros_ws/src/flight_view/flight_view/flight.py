@@ -87,8 +87,8 @@ class _Topic:
 class Flight:
     """A flight in a growing log, of which `update` reads new messages.
 
-    `namespace` selects an aircraft, which is the first in the log by default. `scenario` replaces
-    the scenario in the log. `background` has lines for the map, as `read_background` returns them.
+    `namespace` selects an aircraft, by default the first one in the log. `scenario` replaces the
+    scenario in the log. `background` has lines for the map, as `read_background` returns them.
     `remaps` has the same meaning as in `read_run`.
     """
 
@@ -143,8 +143,8 @@ class Flight:
     def start_ns(self) -> int:
         """Stamp of flight time 0.
 
-        It comes from `truth`. Without `truth`, it is the stamp of the first y_m, where the commands
-        begin, and without y_m the earliest stamp.
+        It comes from `truth`. A log without `truth` begins at the first y_m, where the commands
+        begin, and a log without y_m at its earliest stamp.
         """
         return next(
             (

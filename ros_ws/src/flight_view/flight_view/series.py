@@ -44,8 +44,8 @@ class Series:
     def append(self, stamp_ns: NDArray[np.int64], values: FloatArray) -> None:
         """Append rows.
 
-        If a row is up to DISORDER_NS older than an earlier row, it gets the stamp of that row. If
-        it is even older, it is refused.
+        A row that is up to DISORDER_NS older than an earlier row gets the stamp of the earlier row.
+        A row that is even older is refused.
         """
         earliest = (
             self._stamp_ns[self.count - 1] if self.count else np.iinfo(np.int64).min + DISORDER_NS

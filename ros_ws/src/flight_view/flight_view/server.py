@@ -87,8 +87,8 @@ class Server:
     """The server of flights, which also follows their logs.
 
     A second flight is drawn for comparison, as a ghost. If `fleet` is given, each flight is an
-    aircraft of this fleet, and the number after those of the flights stands for the positions of
-    all aircraft.
+    aircraft of this fleet. A browser asks for a flight by its number. The next number after the
+    flights stands for the positions of all aircraft.
     """
 
     def __init__(
@@ -255,10 +255,10 @@ def answer(
     `ghost` says whether there is a second flight for comparison, and `control` whether the page has
     control.
 
-    The head has the length of its JSON as uint32, and then the JSON. It is little endian, and ends
-    at a multiple of 8 bytes. A topic with `count` rows has as columns the flight time in s as
-    float64, then the channels as float32, filled up to a multiple of 8 bytes. A topic has at most
-    MAX_ROWS rows.
+    The head consists of the length of a JSON text, as uint32, and the text itself. It is little
+    endian, and ends at a multiple of 8 bytes. A topic with `count` rows has as columns the flight
+    time in s as float64, then the channels as float32, filled up to a multiple of 8 bytes. A topic
+    has at most MAX_ROWS rows.
     """
     first = _first_rows(flight, query)
     topics = []
@@ -301,8 +301,8 @@ def answer(
 class _LimitedServer(HTTPServer):
     """A server with at most MAX_CONNECTIONS connections with the token, and RESERVED others.
 
-    WebSockets count as connections. If there are as many as this, a new connection replaces the
-    oldest one that has not shown the token.
+    WebSockets are connections, too. If this number is reached, a new connection replaces the oldest
+    one that has not shown the token.
     """
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
@@ -528,7 +528,8 @@ class _News(_Handler, WebSocketHandler):
 class _Control(_Handler):
     """Answers requests of a page to command the flight.
 
-    They are JSON, must come from the origin of the page, and must have the key that the user typed.
+    A request is JSON, must come from the origin of the page, and must have the key that the user
+    typed.
     """
 
     def get(self, *_: str) -> None:

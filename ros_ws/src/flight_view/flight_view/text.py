@@ -117,7 +117,7 @@ def _table(first: str, *others: str) -> Table:
 
 
 def _names(flight: Flight, group: str) -> Sequence[str]:
-    """Return the names of a group of channels in the ticks or, without ticks, on its topic."""
+    """Return the names of a group of channels, in `internals` or else on its own topic."""
     if "internals" not in flight.samples:
         return flight.samples[group].names if group in flight.samples else ()
     return [
@@ -128,7 +128,7 @@ def _names(flight: Flight, group: str) -> Sequence[str]:
 
 
 def _newest_of(flight: Flight, group: str, name: str) -> float:
-    """Return a channel's newest value in the ticks or, without ticks, on its topic."""
+    """Return a channel's newest value in `internals` or, if that is absent, on its own topic."""
     if "internals" in flight.samples:
         return _newest(flight, "internals", f"{group}.{name}")
     return _newest(flight, group, name)
