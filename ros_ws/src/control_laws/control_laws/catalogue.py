@@ -63,7 +63,7 @@ INTEGRATORS = "integrators"  # y_dot = Omega u
 
 
 class Law(NamedTuple):
-    """A law of the catalogue, with functions that make it and its parameters."""
+    """A law of the catalogue, with functions that make the law and its parameters."""
 
     title: str
     law: str  # its name in `controller.law` of a scenario

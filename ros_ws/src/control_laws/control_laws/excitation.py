@@ -19,7 +19,7 @@ from rise_di_controller.params import ControllerConfig
 
 
 class Pulse(NamedTuple):
-    """A pulse of a doublet, in widths after the begin of the excitation of its input."""
+    """A pulse of a doublet, in widths after the excitation of its input begins."""
 
     first: float
     last: float

@@ -47,14 +47,14 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
         sigma_f  += (1 - exp(-bandwidth dt)) (sigma_hat - sigma_r - sigma_f)
         u         = u_r - Omega^-1 (K e + sigma_f),  sigma_r = y_m_dot - Omega u_r
 
-    y_p and u_p are those of the previous tick, and a is ADAPTATION_POLE. y_hat is a step of the
+    y_p and u_p belong to the previous tick, and a is ADAPTATION_POLE. y_hat is a step of the
     predictor y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat. Within a tick, y_hat - y decays at
-    the rate a, and sigma_hat cancels the rest of it. The reference input is u_r = u_trim + Omega^-1
-    y_m_dot. With `feedforward`, u_r = u_trim, which then contains the feedforward. If y_dot -
-    Omega u were sigma_r, u_r alone would give y_dot = y_m_dot, so only the rest of sigma_hat is fed
-    back. At engagement sigma_f = -K e and u = u_r (bumpless transfer). If y_m_dot = 0, retuning
-    also keeps u. As anti-windup, the predictor takes u after saturation. Source: N. Hovakimyan, C.
-    Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
+    the rate a, and sigma_hat cancels what is left of y_hat - y. The reference input is u_r = u_trim
+    + Omega^-1 y_m_dot. With `feedforward`, u_r = u_trim, which then contains the feedforward. If
+    y_dot - Omega u were sigma_r, u_r alone would give y_dot = y_m_dot, so only the rest of
+    sigma_hat is fed back. At engagement sigma_f = -K e and u = u_r (bumpless transfer). If y_m_dot
+    = 0, retuning also keeps u. As anti-windup, the predictor takes u after saturation. Source: N.
+    Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
     """
 
     def engage(measurements: Measurements, params: L1Params) -> L1State:

@@ -26,7 +26,7 @@ class LqgState(NamedTuple):
 def _limited(
     state: LqgState, measurements: Measurements, dt: Array, params: LqgParams, limits: Limits
 ) -> tuple[LqgState, Array, Array]:
-    """Limit u_trim, shape (m,), and return it without and with the limits.
+    """Limit u_trim, shape (m,), and return both u_trim and the limited u_trim.
 
     The law adds nothing to u_trim, which already contains u_o of the observer.
     """

@@ -49,11 +49,11 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
         u          = u_trim - Omega^-1 (K (e - e_0 + Lambda integral_e) + Pi)
 
     The clip stands for sgn(r), because a measured r is noisy. e_0 is the e at engagement, and e_p
-    is the e of the previous tick. If u_trim is constant and abs(r) > eps, then u_dot = -Omega^-1
-    (K r + beta sgn(r)). With `ideal`, e_dot = y_dot - y_m_dot with the perfect
-    derivative of C x. Otherwise it is a filtered difference, e_dot += (1 - exp(-bandwidth dt))
-    ((e - e_p) / dt - e_dot). Source: W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST
-    18(6), 2010. Here the law inverts the nominal Omega.
+    is the e of the previous tick. If u_trim is constant and abs(r) > eps, then u_dot = -Omega^-1 (K
+    r + beta sgn(r)). With `ideal`, e_dot = y_dot - y_m_dot with the perfect derivative of C x.
+    Otherwise e_dot is a filtered difference, e_dot += (1 - exp(-bandwidth dt)) ((e - e_p) / dt -
+    e_dot). Source: W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST 18(6), 2010. Here
+    the law inverts the nominal Omega.
     """
     Omega = model.Omega
     inverse = model.inverse

@@ -92,7 +92,7 @@ def start_integral(measurements: Measurements, _: Any) -> ErrorIntegral:
 
 
 def state_of(measurements: Measurements, *, vanes: bool = False) -> Array:
-    """Return the full state, shape (n, N). With `vanes`, it is relative to the air.
+    """Return the full state, shape (n, N). With `vanes`, the state is relative to the air.
 
     Raises ValueError if x is not measured.
     """
@@ -116,10 +116,10 @@ def saturate_with_excess(
 def conditional_integration(before: Array, after: Array, effect: Array, excess: Array) -> Array:
     """Return the integral after a step, or the one before if the step increases a saturation.
 
-    This is conditional integration: the result is `before` if effect * excess > 0, else `after`.
-    `effect` is the change of u (or of the scaled input) by the step. `excess` is the part of u
-    beyond the limit, in the same units and channels. Source: K. J. Astrom, T. Hagglund, "Advanced
-    PID Control", 3.5.
+    The result is `before` if effect * excess > 0, else `after` (conditional integration). `effect`
+    is the change of u (or of the scaled input) by the step. `excess` is the part of u beyond the
+    limit, in the same units and channels. Source: K. J. Astrom, T. Hagglund, "Advanced PID
+    Control", 3.5.
     """
     return array_namespace(before).where(effect * excess > 0.0, before, after)
 

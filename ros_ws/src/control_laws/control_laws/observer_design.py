@@ -227,11 +227,11 @@ def vane_correction(
 ) -> FloatArray:
     """Compute the gains that a vane adds to L of `aircraft_correction`, (s, m + 1).
 
-    They are the gains of an observer of y and the vane, minus those of the observer of y alone. The
-    last column acts on the reading of the vane. The observer takes the deviation of this reading
-    from its value in the reference motion. This deviation is `row` z plus white noise with the rms
-    `noise`, where `row` has the shape (s,). `weights` has the weights without the vane, and then
-    those with the vane.
+    An observer of y and the vane has other gains than an observer of y alone. The result is the
+    difference. The last column acts on the reading of the vane. The observer takes the deviation of
+    this reading from its value in the reference motion. This deviation is `row` z plus white noise
+    with the rms `noise`, where `row` has the shape (s,). `weights` has the weights without the
+    vane, and then the weights with the vane.
     """
     without_vane = aircraft_correction(model_by_tick, model, weights[0])
     with_vane = model_by_tick._replace(H=np.vstack([model_by_tick.H, row]))
@@ -244,7 +244,10 @@ def vane_correction(
 def extended_state_observer(
     model: NominalModel, names: Names, weights: ExtendedStateWeights
 ) -> ObserverDesign:
-    """Design the observer with `extended_state_model`, otherwise as `aircraft_observer` does."""
+    """Design the observer with the model `extended_state_model`.
+
+    The method is that of `aircraft_observer`.
+    """
     model_by_tick = extended_state_model(model, names, weights.decay)
     size = model.C @ model.size
     intensities = [
