@@ -200,8 +200,8 @@ class CertificateSources(NamedTuple):
 def certificate_sources(airframe: Airframe, scenario: FilePath | Scenario) -> CertificateSources:
     """Return the sources from which the loop of a certificate was built.
 
-    The constants are the text of rise_di_parameters.h as `export` writes it by default. They are
-    missing for a law that C cannot express. A section `controller` without a scenario has neither
+    The constants are the text of rise_di_parameters.h as `export` writes it by default. A law that
+    C cannot express has no constants. A section `controller` without a scenario has neither
     constants nor a scenario.
     """
     texts = {"airframe": _sha256(as_yaml(airframe))}

@@ -52,7 +52,7 @@ class _Channels:
 def _channels(scenario: Scenario) -> _Channels:
     """Return the spaces of actions u and of observations, which are y followed by y_m.
 
-    u has the controller's limits. Beyond the bounds of y and y_m, an aircraft counts as lost.
+    u has the controller's limits. An aircraft beyond the bounds of y and y_m is lost.
     """
     controller = scenario.controller
     limits = controller.effector_limits()
@@ -106,8 +106,8 @@ sample at a tick do not depend on whether the samples before this tick were meas
 def _is_newest_last(scenario: Scenario) -> bool:
     """Return whether it suffices to measure the last sample of y before each tick.
 
-    It does if the section of the aircraft sets only keys in BY_TICK, and if the controller has no
-    vanes. Otherwise each sample must be measured.
+    This suffices if the section of the aircraft sets only keys in BY_TICK, and if the controller
+    has no vanes. Otherwise each sample must be measured.
     """
     aircraft = scenario.aircraft
     return not unknown_keys(aircraft, BY_TICK) and not scenario.controller.vanes

@@ -195,10 +195,10 @@ def _flying(
 ) -> tuple[str, Refusal | None]:
     """Return the text of a scenario with commands so small that its flight ends as planned.
 
-    Its gains are selected for these commands. The flight must stay clear of the end stops. If there
-    is no such flight, the scenario has the smallest commands, and the second result says what is
-    wrong with its flight. `trial` is the file of the airframe for the trial flights. `files` are
-    the paths of airframe and scenario that the text names.
+    The gains of the scenario are selected for these commands. The flight must stay clear of the end
+    stops. If there is no such flight, the scenario has the smallest commands, and the second result
+    says what is wrong with the flight. `trial` is the file of the airframe for the trial flights.
+    `files` are the paths of airframe and scenario that the text names.
     """
     shortfall = None
     scenario = ""
@@ -238,9 +238,9 @@ def _shortfall(flight: Scenario, tape: Tape, hardest: str) -> Refusal:
 
     The sentence names the input `hardest`, which comes closest to its end stop, and says whether
     the commands or the gusts drive it there. It also names the state or gust that requires the most
-    of this input, and says how large it gets. The input that keeps y constant is
-    u = -Omega^+ C (A x + f), where f includes the gusts. It has a term for each state and gust, and
-    the largest term counts.
+    of this input, and says how large this state or gust gets. The input that keeps y constant is u
+    = -Omega^+ C (A x + f), where f includes the gusts. Each state and each gust has a term in this
+    sum, and the one with the largest term is named.
     """
     airframe = flight.aircraft.load()[0]
     calm = simulate(flight.vary(aircraft={"gusts": {}}))

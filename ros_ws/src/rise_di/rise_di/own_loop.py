@@ -77,8 +77,8 @@ class Loop:
     def mode(self) -> Mode:
         """Mode of the guard.
 
-        It is WAITING until y and y_m are fresh, then ENGAGED, and a failsafe mode if y or y_m is
-        too old.
+        The mode is WAITING until y and y_m are fresh, then ENGAGED, and a failsafe mode if y or y_m
+        is too old.
         """
         return self._controller.mode
 
