@@ -56,13 +56,13 @@ def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> Floa
     """Compute u_m at t, shape (m,): the last u_m up to its age limit, then the ending.
 
     If the attitude is known, the ending uses phi and theta by dead reckoning, and V = V0 + V_m. For
-    `levelling_ns` it commands
+    `levelling_ns` the ending commands
 
         phi_dot_c = -k_phi phi, at most `roll_rate`; theta_dot_c = -k_theta theta
 
     p, q and r follow by the inverse of Euler's equations in a coordinated turn
-    (`flight_core.kinematics`), and all other commands ramp to zero. After this time every command
-    is zero. If the attitude is not known, every command is zero at once.
+    (`flight_core.kinematics`), and all other commands ramp to zero. After `levelling_ns` every
+    command is zero. If the attitude is not known, every command is zero at once.
     """
     silent_ns = t_ns - live.t_ns - params.max_age_ns
     if silent_ns <= 0:

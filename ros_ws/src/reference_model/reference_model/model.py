@@ -39,8 +39,8 @@ class Stepper(NamedTuple):
 def stepper(dt: float, params: ReferenceMatrices) -> Stepper:
     """Return the matrices of x_m(t + dt) = Phi x_m(t) + Gamma [u_m(t), u_m(t + dt/2), u_m(t + dt)].
 
-    Their columns are Runge-Kutta steps that start from unit vectors. Up to rounding, the products
-    with the matrices equal a Runge-Kutta step, and take a quarter of its time.
+    The columns of Phi and Gamma are Runge-Kutta steps that start from unit vectors. Up to rounding,
+    the products with the matrices equal a Runge-Kutta step, and take a quarter of its time.
     """
     n, m = params.B_m.shape
     x = np.eye(n, n + 3 * m)

@@ -31,7 +31,7 @@ class LiveCommand(NamedTuple):
 class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     """Computes x_m(k) from x_m(k-1) at tick k, and publishes y_m(k).
 
-    The commands are those of the scenario's profile until the first u_m is received.
+    Until the first u_m is received, the commands come from the scenario's profile.
 
     In lockstep the node publishes y_m up to the instant of the clock, and computes the next y_m
     ahead. If `u_m_rate` is set, the node first waits for u_m. There must be exactly one message of
@@ -138,8 +138,8 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     def _commands_known(self) -> bool:
         """Return whether all commands are known that the next y_m in lockstep depends on.
 
-        They are if no u_m is due at the instant one period before this y_m. If a u_m is due then,
-        it must have arrived, and this method takes it.
+        They are known if no u_m is due at the instant one period before this y_m. If a u_m is due
+        then, it must have arrived, and this method takes it.
         """
         t_ns = (self._number - 1) * self.period_ns()
         if not self._u_m_ns or t_ns < 0 or t_ns % self._u_m_ns:
