@@ -75,9 +75,9 @@ class FlightBag:
         self.add_topic = self._writer.add_topic
 
     def _free_folder(self, directory: Path) -> Path:
-        """Return the folder for the bag, which is `directory` or a new folder beside it.
+        """Return a folder for the bag: `directory`, or if it is in use, a new folder beside it.
 
-        It is a new folder if `directory` already has the log of a simulation that has ended.
+        `directory` is in use if it already has the log of a simulation that has ended.
         """
         folders = (directory.with_name(f"{directory.name}-{number}") for number in count(2))
         has_log = self._clock is not None and any(directory.glob("*.mcap"))

@@ -76,8 +76,8 @@ class _Subscribed(RecordedTopic):
 class _RecordedTopics:
     """The topics that are recorded.
 
-    They are the topics of a flight, and those of `names`. Each is recorded from the time of its
-    first publisher on.
+    They are the topics of a flight, and the topics in `names`. Each is recorded from the time of
+    its first publisher on.
     """
 
     def __init__(self, node: Node, bag: FlightBag, names: Sequence[str]) -> None:
@@ -97,7 +97,7 @@ class _RecordedTopics:
         return iter(self._topics)
 
     def among(self, topics: Sequence[Topic], *, heard: bool = False) -> list[_Subscribed]:
-        """Return those of `topics` that are recorded.
+        """Return which of the given `topics` are recorded.
 
         If `heard`, a topic without a message so far is left out.
         """
@@ -163,9 +163,9 @@ class _RecordedTopics:
     def weaken_qos(self, topic: _Subscribed, drain: Callable[[], None]) -> None:
         """Subscribe again with a weaker QoS if publishers offer less than is requested.
 
-        A topic that the stack publishes keeps its QoS if at least one publisher offers it.
-        EndpointMonitor then logs the mismatch of the others. `drain` writes the received messages
-        before the subscription is removed.
+        A topic that this flight stack publishes keeps its QoS if at least one publisher offers it.
+        EndpointMonitor then logs the mismatch of the other publishers. `drain` writes the received
+        messages before the subscription is removed.
         """
         subscription = topic.subscription
         offered = self._offered(topic.name, topic.channel.type.name)
@@ -294,7 +294,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self._silences.end(topic, now_ns)
 
     def _publish_span(self) -> None:
-        """In real time, publish the stamp up to which y, y_m and u are in the log.
+        """Publish, in real time, up to which stamp y, y_m and u are in the log.
 
         A flight ends as soon as the log has these topics up to its end.
         """

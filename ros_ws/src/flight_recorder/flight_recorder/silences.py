@@ -23,9 +23,9 @@ TOPIC_SILENCE_NS = NANOSECONDS
 class Silences:
     """The silences of the topics in a flight, and their lines in the log.
 
-    A silence gets a warning, and at its end a line with its length. Instants are in the time of the
-    flight, in which a pause of /clock is no silence. `inform` and `warn` are functions that take a
-    line for the log.
+    A silence gets a warning, and at its end a line that says how long it was. Instants are in the
+    time of the flight, in which a pause of /clock is no silence. `inform` and `warn` are functions
+    that take a line for the log.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Silences:
 
 
 def _is_steady(topic: RecordedTopic) -> bool:
-    """Return whether messages of a topic came so regularly that a pause counts as a silence."""
+    """Return whether messages of a topic came so regularly that a pause is a silence."""
     count = topic.channel.messages
     return (
         count >= STEADY_MESSAGES and topic.heard_ns - topic.first_ns <= count * STEADY_INTERVAL_NS
