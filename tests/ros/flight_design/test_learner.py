@@ -36,12 +36,12 @@ def scenario(folder: Path, **learn: object) -> Scenario:
 def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays_to_the_bit(
     tmp_path: Path,
 ) -> None:
-    """An aircraft off by 30 %: a fallback, then two models.
+    """An aircraft off by 30 %: a fallback, then a model.
 
-    It ends at the tick that waits for the third proposal, and that begins the fourth search.
+    It ends at the tick that waits for the second proposal, and that begins the third search.
     """
-    guided = scenario(tmp_path, updates=[10.0, 10.5, 11.0]).vary(
-        flight={"duration": 11.0},
+    guided = scenario(tmp_path, updates=[10.0, 10.5]).vary(
+        flight={"duration": 10.5},
         aircraft={"kinematics": "euler", "uncertainty": {"A": 0.3, "B": 0.3, "seed": 3}},
         reference_model={"pulses": {}, "coordinated_turn": None, "live": {"speed": 25.0}},
         guidance={
@@ -61,8 +61,8 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
     assert outcome == COMPLETED
     tape = simulate(flight_scenario, learn=learner(flight_scenario), announce=events.append)
     proposals = [event for event in events if event.kind is not EventKind.FALLBACK]
-    assert [event.stamp_ns for event in proposals] == [nanoseconds(t) for t in (0.5, 10.5, 11.0)]
-    # the airframe file, before there is a record, and two models
+    assert [event.stamp_ns for event in proposals] == [nanoseconds(t) for t in (0.5, 10.5)]
+    # the airframe file, before there is a record, and a model
     assert all(event.change for event in proposals)
     assert lines == [f"t = {event.stamp_ns / 1e9:.2f} s: {event.sentence}" for event in events]
     recorded = read_run(run).tape
