@@ -13,7 +13,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from enum import StrEnum
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -29,11 +31,18 @@ from flight_core.parameters import ParameterError
 TIMEOUT = 60.0  # s of processor time
 
 
+class Kind(StrEnum):
+    """A kind of result."""
+
+    WHOLE = "whole"
+
+
 class Found(NamedTuple):
     """A result."""
 
     table: dict[str, np.ndarray]
     fixed: MappingProxyType[str, int]
+    kind: Kind = Kind.WHOLE
     none: None = None
 
 
@@ -66,9 +75,10 @@ def values() -> Found:
     )
 
 
-def test_arrays_and_named_tuples_come_back_bit_by_bit() -> None:
+def test_arrays_named_tuples_and_enums_come_back_bit_by_bit() -> None:
     back = call(values)
     assert isinstance(back, Found)
+    assert back.kind is Kind.WHOLE
     assert back.table["a"].dtype == np.int64
     assert back.table["b"].tobytes() == np.array([0.5, np.nan]).tobytes()
     assert back.fixed == {"x": 1}
@@ -90,6 +100,13 @@ def test_result_of_another_module_is_refused() -> None:
         isolated.IsolatedCallError, match=r"^returned pathlib.*, which is no plain value$"
     ):
         call(path)
+
+
+def test_class_that_the_module_only_imports_is_refused() -> None:
+    """StrEnum itself would make new classes."""
+    pickled = f"c{__name__}\nStrEnum\n.".encode()
+    with pytest.raises(isolated.IsolatedCallError, match=r"\.StrEnum, which is no plain value$"):
+        isolated._Reader(BytesIO(pickled), __name__).load()
 
 
 def ends() -> None:

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from enum import Enum
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType, ModuleType
@@ -57,8 +58,9 @@ def call(
     """Call function(*arguments) in a fresh process, confined to an empty working folder.
 
     The subprocess finds the function by module and name. Arguments must fit into JSON. The return
-    value consists of plain values, arrays, and named tuples of the module `records`, by default the
-    module of the function. If the function raises FlightEnded or ParameterError, so does this call.
+    value consists of plain values, arrays, and named tuples and enums of the module `records`, by
+    default the module of the function. If the function raises FlightEnded or ParameterError, so
+    does this call.
 
     The subprocess has `memory` bytes of data, files of at most FILE_LIMIT, and `timeout` seconds of
     processor time. It is also ended after WAIT times as many seconds of wall time. This ends a
@@ -104,7 +106,7 @@ def call(
 
 
 class _Reader(pickle.Unpickler):
-    """Reads plain values, arrays, and named tuples of a module.
+    """Reads plain values, arrays, and named tuples and enums of a module.
 
     Raises IsolatedCallError if the data name anything else.
     """
@@ -121,7 +123,12 @@ class _Reader(pickle.Unpickler):
         member = (
             getattr(import_module(self._module), name, None) if module == self._module else None
         )
-        if isinstance(member, type) and issubclass(member, tuple):
+        # A class that the module only imports, such as StrEnum, would make new classes.
+        if (
+            isinstance(member, type)
+            and issubclass(member, (tuple, Enum))
+            and member.__module__ == module
+        ):
             return member
         raise IsolatedCallError(f"returned {module}.{name}, which is no plain value")
 

@@ -17,7 +17,7 @@ import numpy as np
 from flight_core.outcome import Refusal, joined
 from flight_core.parameters import ParameterError, require
 from flight_log.log_samples import Instances
-from flight_log.vehicle_tables import PLANE, Choice, MessageTable, Parameters
+from flight_log.vehicle_tables import Choice, MessageTable, Parameters, VehicleKind
 
 # an instance was not flown if it moves by less than this fraction of the largest motion
 STILL = 0.1
@@ -74,7 +74,7 @@ def instances_of_flight(
             number = min(sensors)
             reason = "the first" if name in fields and len(sensors) > 1 else ""
         elif name in SURFACES:
-            if choice.vehicle == PLANE:
+            if choice.vehicle is VehicleKind.PLANE:
                 number, reason = (1, "the surfaces of a VTOL")
             else:
                 number, reason = (0, "the rotors of a VTOL")

@@ -17,7 +17,7 @@ from flight_core.parameters import ParameterError, require
 from flight_log import vehicle_tables
 from flight_log.file_kinds import FileKind, file_kind
 from flight_log.vehicle_readers import READERS
-from flight_log.vehicle_tables import ANY, Choice, VehicleLog
+from flight_log.vehicle_tables import ANY, Choice, VehicleKind, VehicleLog
 
 EXPECTED = "a DataFlash log (.bin, .log), a tlog or a ULog"
 
@@ -111,4 +111,5 @@ def read_foreign_log(path: Path, choice: Choice = ANY) -> VehicleLog:
 
 
 def _read_absolute(path: str, choice: tuple[int | None, Mapping[str, int], str]) -> VehicleLog:
-    return read_vehicle_log(Path(path), Choice(*choice))
+    system, instances, vehicle = choice
+    return read_vehicle_log(Path(path), Choice(system, instances, VehicleKind(vehicle)))

@@ -38,19 +38,20 @@ from flight_log.log_samples import (
 )
 from flight_log.ulog_messages import whole_messages
 from flight_log.vehicle_tables import (
-    COPTER,
     DATAFLASH,
     PARAMETER,
-    PLANE,
     SERVOS,
     STICKS,
     TLOG,
     ULOG_SOURCES,
     ULOG_TORQUES,
+    VEHICLE_TYPES,
     Choice,
     Format,
     Loss,
     MessageTable,
+    OtherVehicle,
+    VehicleKind,
     VehicleLog,
 )
 
@@ -61,20 +62,24 @@ ULOG_HEAD = 16  # bytes of magic, version and time at the beginning of a ULog
 # byte it reads, twice, the head of a message and the message that may follow.
 READS_PER_BYTE = 4
 FIRMWARE = re.compile(r"(?:Ardu|APM:)(Plane|Copter|Rover|Sub)")  # in a MSG of ArduPilot
-FIRMWARES = MappingProxyType(
-    {"Plane": PLANE, "Copter": COPTER, "Rover": "rover", "Sub": "submarine"}
+FIRMWARES: Mapping[str, VehicleKind] = MappingProxyType(
+    {
+        "Plane": VehicleKind.PLANE,
+        "Copter": VehicleKind.MULTICOPTER,
+        "Rover": VehicleKind.ROVER,
+        "Sub": VehicleKind.SUBMARINE,
+    }
 )
-MAV_TYPES: Mapping[int, str] = MappingProxyType(
-    dict.fromkeys((1, 19, 20, 21, 22, 23, 24, 25), PLANE)  # fixed wing, VTOL
-    | dict.fromkeys((2, 3, 4, 13, 14, 15, 29, 35), COPTER)
-    | dict.fromkeys((10, 11), "rover")
-    | {12: "submarine"}
+MAV_TYPES: Mapping[int, VehicleKind] = MappingProxyType(
+    dict.fromkeys((1, 19, 20, 21, 22, 23, 24, 25), VehicleKind.PLANE)  # fixed wing, VTOL
+    | dict.fromkeys((2, 3, 4, 13, 14, 15, 29, 35), VehicleKind.MULTICOPTER)
+    | dict.fromkeys((10, 11), VehicleKind.ROVER)
+    | {12: VehicleKind.SUBMARINE}
 )
 """Kinds of vehicles by MAV_TYPE, common.xml."""
 
 PX4 = 12  # MAV_AUTOPILOT_PX4
 PX4_MANUAL = 1 << 16  # flag of the main mode MANUAL in its custom_mode (px4_custom_mode.h)
-ROTORS = 1  # vehicle_type of vehicle_status: as a multicopter; 2 as a plane
 
 OLD_NAMES = MappingProxyType({"IMU2": ("IMU", 1), "IMU3": ("IMU", 2), "ASP2": ("ARSP", 1)})
 """Messages of the second and the third sensor of ArduPilot before 4.0: name and instance."""
@@ -128,7 +133,7 @@ def _read_dataflash(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
     instances, parameters, parts = tables_of(samples(), fields_and_flags)
     tables, choices = instances_of_flight(instances, fields, parameters, choice)
     _true_airspeed(tables)
-    vehicle = FIRMWARES.get(next(iter(firmwares), ""), "")
+    vehicle = FIRMWARES.get(next(iter(firmwares), ""))
     if (attitude := tables.get("ATT")) is not None:
         attitude.fields["Yaw"][:] = np.remainder(attitude.fields["Yaw"] + 180.0, 360.0) - 180.0
     return VehicleLog(
@@ -195,7 +200,8 @@ def _read_tlog(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
     instances, parameters, parts = tables_of(_dated(messages.get(system, [])), fields)
     tables, _ = instances_of_flight(instances, fields, parameters, choice)
     autopilot, mav_type = autopilots.get(system, (0, -1))
-    vehicle = "" if mav_type < 0 else MAV_TYPES.get(mav_type, f"vehicle of MAV_TYPE {mav_type}")
+    of_type = MAV_TYPES.get(mav_type) or OtherVehicle("MAV_TYPE", mav_type)
+    vehicle = None if mav_type < 0 else of_type
     manual = PX4_MANUAL if autopilot == PX4 else 0
     return VehicleLog(
         kind=kind.value + parts,
@@ -398,25 +404,30 @@ def _angles(attitude: MessageTable) -> dict[str, FloatArray]:
     }
 
 
-def _vehicle(instances: Instances) -> tuple[str, bool]:
-    """Return the kind of vehicle in `vehicle_status`, "" if unknown, and whether it is a VTOL.
+def _vehicle(instances: Instances) -> tuple[VehicleKind | OtherVehicle | None, bool]:
+    """Return the kind of vehicle in `vehicle_status`, if known, and whether it is a VTOL.
 
     In a log before PX4 1.10, this adds the field `vehicle_type` to the table.
     """
     table = instances.get("vehicle_status", {}).get(0)
     if table is None:
-        return "", False
+        return None, False
     fields = dict(table.fields)
     # Logs before PX4 1.10.
     if "vehicle_type" not in fields and "is_rotary_wing" in fields:
-        fields["vehicle_type"] = np.where(fields["is_rotary_wing"] != 0.0, ROTORS, ROTORS + 1)
+        fields["vehicle_type"] = np.where(
+            fields["is_rotary_wing"] != 0.0,
+            VEHICLE_TYPES[VehicleKind.MULTICOPTER],
+            VEHICLE_TYPES[VehicleKind.PLANE],
+        )
         instances["vehicle_status"][0] = table._replace(fields=fields)
     if fields.get("is_vtol", np.zeros(1)).any():
-        return "", True
+        return None, True
     number = int(np.median(fields.get("vehicle_type", np.zeros(1))))
-    return {0: "", ROTORS: COPTER, ROTORS + 1: PLANE, 3: "rover"}.get(
-        number, f"vehicle of vehicle_type {number}"
-    ), False
+    if number == 0:
+        return None, False
+    kinds = {of_kind: kind for kind, of_kind in VEHICLE_TYPES.items()}
+    return kinds.get(number) or OtherVehicle("vehicle_type", number), False
 
 
 def _by_message(places: Iterable[tuple[str, str]]) -> dict[str, set[str]]:

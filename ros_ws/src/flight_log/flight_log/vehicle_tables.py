@@ -8,6 +8,7 @@ PX4 guide, ULog file format, and PX4's msg/*.msg.
 
 import math
 from collections.abc import Mapping, Sequence
+from enum import StrEnum
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -118,8 +119,32 @@ ULOG_TORQUES: Mapping[tuple[str, str], LogField] = MappingProxyType(
 """Where PX4 before 1.14 has the setpoints of torque and thrust (actuator_controls.msg: roll, pitch,
 yaw, thrust)."""
 
-PLANE = "plane"
-COPTER = "multicopter"
+
+class VehicleKind(StrEnum):
+    """A kind of vehicle that an autopilot flies or drives."""
+
+    PLANE = "plane"
+    MULTICOPTER = "multicopter"
+    ROVER = "rover"
+    SUBMARINE = "submarine"
+
+
+VEHICLE_TYPES: Mapping[VehicleKind, int] = MappingProxyType(
+    {VehicleKind.MULTICOPTER: 1, VehicleKind.PLANE: 2, VehicleKind.ROVER: 3}
+)
+"""Values of vehicle_type of vehicle_status (PX4, VehicleStatus.msg), 0 if unknown. A VTOL has that
+of the kind as which it flies."""
+
+
+class OtherVehicle(NamedTuple):
+    """A vehicle of no known kind, by its number in a field of the log."""
+
+    field: str
+    number: int
+
+    def __str__(self) -> str:
+        """Name the vehicle by its number, as in "vehicle of MAV_TYPE 7"."""
+        return f"vehicle of {self.field} {self.number}"
 
 
 class Choice(NamedTuple):
@@ -132,7 +157,7 @@ class Choice(NamedTuple):
     # Number of the chosen instance, such as a sensor, by message. For any other message, the
     # instance by which the autopilot flew is found.
     instances: Mapping[str, int] = MappingProxyType({})
-    vehicle: str = PLANE
+    vehicle: VehicleKind = VehicleKind.PLANE
 
 
 ANY = Choice()
@@ -164,7 +189,8 @@ class VehicleLog(NamedTuple):
     tables: Mapping[str, MessageTable]
     parameters: Parameters
     format: Format | None
-    vehicle: str = PLANE  # "" if the log does not say what flew
+    # None if the log does not say what flew
+    vehicle: VehicleKind | OtherVehicle | None = VehicleKind.PLANE
     # Number of the mode in which the sticks of a plane are the commands; ArduPlane's is 0 (mode.h).
     manual: int = 0
     # The choices among several systems, sensors or instances, with their reasons.

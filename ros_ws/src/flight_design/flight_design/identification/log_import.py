@@ -35,7 +35,15 @@ from flight_design.identification.parameter_agreement import (
 )
 from flight_log.bag import IMPORTED
 from flight_log.tape_reader import RecordedRun
-from flight_log.vehicle_tables import COPTER, PLANE, ULOG_TORQUES, LogField, VehicleLog
+from flight_log.vehicle_tables import (
+    ULOG_SOURCES,
+    ULOG_TORQUES,
+    VEHICLE_TYPES,
+    LogField,
+    OtherVehicle,
+    VehicleKind,
+    VehicleLog,
+)
 
 COMMANDS = "commands"  # topic with the commands trim + u, by input
 # An aircraft counts as on the ground below this share of its typical airspeed, or, for a
@@ -51,7 +59,6 @@ BRIDGED = 1.0
 AROUND = 5  # number of samples in a running median, which is never a damaged value
 
 FLOWN_AS = LogField("vehicle_status", "vehicle_type")
-VEHICLE_TYPES = {COPTER: 1.0, PLANE: 2.0}  # PX4, VehicleStatus.msg
 
 PARAMETERS = "vehicle_parameters.yaml"  # file of the parameters in the folder, and name in the log
 
@@ -82,9 +89,10 @@ class Imported:
     notes: tuple[str, ...]
 
 
-def kind_of_map(channel_map: ChannelMap) -> str:
+def kind_of_map(channel_map: ChannelMap) -> VehicleKind:
     """Return the kind of vehicle: plane for a map with airspeed, multicopter for one with climb."""
-    return PLANE if any(row.motion[0] == "V" for row in channel_map.outputs.values()) else COPTER
+    has_airspeed = any(row.motion[0] == "V" for row in channel_map.outputs.values())
+    return VehicleKind.PLANE if has_airspeed else VehicleKind.MULTICOPTER
 
 
 def imported(
@@ -134,14 +142,15 @@ def _imported(
 ) -> Imported:
     kind = kind_of_map(channel_map)
     logged_kind = log.vehicle
-    log = log._replace(vehicle=logged_kind or kind)
-    _require_kind(log.vehicle, channel_map)
+    _require_kind(logged_kind or kind, channel_map)
+    log = log._replace(vehicle=kind)
     rows = channel_map.outputs
     sources = {name: _measured(log, row.motion[0], f"outputs.{name}") for name, row in rows.items()}
     stamps = log.tables[sources[channel_map.instant].message].stamp_ns
     speed = _speed(channel_map, log, sources, stamps, servos)
-    has_sticks = log.format is not None and log.vehicle == PLANE
-    taken, others = _flight(log, stamps, speed, window, needs_manual=has_sticks and not servos)
+    has_sticks = log.format is not None and kind is VehicleKind.PLANE
+    needs_manual = has_sticks and not servos
+    taken, others = _flight(log, kind, stamps, speed, window, needs_manual=needs_manual)
     first, last = taken
     parameters = log.parameters_at(first)
     notes = [others, *change_sentences(log.parameters, int(stamps[0]), first, last)]
@@ -155,7 +164,7 @@ def _imported(
     rows_compared = compared(sticks, log.parameters, parameters)
     show(
         [
-            Agreement("vehicle", logged_kind, kind),
+            Agreement("vehicle", "" if logged_kind is None else str(logged_kind), kind),
             *(Agreement(*row, "") for row in log.taken),
             *rows_compared,
         ]
@@ -173,13 +182,14 @@ def _imported(
     return Imported(tape=tape, parameters=parameters, notes=tuple(filter(None, notes)))
 
 
-def _require_kind(vehicle: str, channel_map: ChannelMap) -> None:
+def _require_kind(vehicle: VehicleKind | OtherVehicle, channel_map: ChannelMap) -> None:
     """Raise ParameterError if the log is of another kind of vehicle than the map."""
     vehicle_found = f"one of a {vehicle}"
-    require(vehicle in {PLANE, COPTER}, "the log", vehicle_found, "one of a plane or a multicopter")
+    flown = {VehicleKind.PLANE, VehicleKind.MULTICOPTER}
+    require(vehicle in flown, "the log", vehicle_found, "one of a plane or a multicopter")
     kind = kind_of_map(channel_map)
     expected = f"one of a {kind}, as the map {channel_map.name} is for"
-    require(vehicle == kind, "the log", vehicle_found, expected)
+    require(vehicle is kind, "the log", vehicle_found, expected)
 
 
 def _speed(
@@ -260,8 +270,6 @@ def _measured(log: VehicleLog, quantity: str, key: str) -> LogField:
 
 def _messages(log: VehicleLog, quantity: str) -> str:
     """Name the messages of this log format that can have a quantity, for an error sentence."""
-    from flight_log.vehicle_tables import ULOG_SOURCES  # noqa: PLC0415 - only this sentence needs it
-
     sources = ULOG_SOURCES if log.format is None else log.format.sources
     return (
         " or ".join(dict.fromkeys(source.message for source in sources.get(quantity, ())))
@@ -324,7 +332,7 @@ def _commands(
             "a log of ArduPilot: in a ULog the setpoints of torque and thrust are the commands",
         )
         return _Reader(log, source, row.line)
-    if log.vehicle == COPTER:
+    if log.vehicle is VehicleKind.MULTICOPTER:
         return _torque(log, name, row, servos)
     stick = stick_of(channel_map, name)
     servo = servo_of(stick, name, parameters) if servos else None
@@ -372,7 +380,13 @@ def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
 
 
 def _flight(
-    log: VehicleLog, stamps: Stamps, speed: FloatArray | None, window: Window, *, needs_manual: bool
+    log: VehicleLog,
+    kind: VehicleKind,
+    stamps: Stamps,
+    speed: FloatArray | None,
+    window: Window,
+    *,
+    needs_manual: bool,
 ) -> tuple[tuple[int, int], str | None]:
     """Return the first and the last instant to import, and a sentence on other flights.
 
@@ -403,7 +417,7 @@ def _flight(
         in_air = speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
         keep &= _bridged(stamps, in_air)
     if log.has(FLOWN_AS):  # A VTOL flies as a plane and as a multicopter.
-        keep &= log.at(FLOWN_AS, stamps) == VEHICLE_TYPES[log.vehicle]
+        keep &= log.at(FLOWN_AS, stamps) == VEHICLE_TYPES[kind]
     require(
         bool(keep.any()),
         "the log",
@@ -413,10 +427,8 @@ def _flight(
     # The sticks are the commands only in MANUAL.
     if needs_manual:
         expected = "it, for only there the sticks are the commands, or --servos"
-        if log.format is not None:
-            mode = next((source for source in log.format.mode if log.has(source)), None)
-        else:
-            mode = None
+        modes = () if log.format is None else log.format.mode
+        mode = next(filter(log.has, modes), None)
         if mode is None:
             raise ParameterError(
                 f"the log: found no message with the mode, expected MANUAL in {expected}"
