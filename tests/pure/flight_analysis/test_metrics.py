@@ -13,7 +13,7 @@ from scipy.signal import welch
 from tests.recordings import EPOCH, MS, signal
 
 from flight_analysis import metrics
-from flight_analysis.metrics import Transient
+from flight_analysis.metrics import Transient, TransientKind
 from flight_analysis.report.spectra import spectra
 from flight_analysis.report.timing import tick_metrics
 from flight_core.tape import Signal, Tape
@@ -64,9 +64,9 @@ def instants_by_part(t: FloatArray, transients: list[Transient]) -> dict[str, li
 
 def test_each_instant_belongs_to_one_part_of_flight() -> None:
     transients = [
-        Transient(kind="engagement", name="", start=0.0, stop=0.0),
-        Transient(kind="command", name="q", start=3.0, stop=3.1),
-        Transient(kind="gust", name="vertical", start=3.5, stop=4.0),
+        Transient(kind=TransientKind.ENGAGEMENT, name="", start=0.0, stop=0.0),
+        Transient(kind=TransientKind.COMMAND, name="q", start=3.0, stop=3.1),
+        Transient(kind=TransientKind.GUST, name="vertical", start=3.5, stop=4.0),
     ]
     t = np.array([0.0, 0.5, 1.5, 3.0, 3.4, 3.6, 4.5, 5.5])
     assert instants_by_part(t, transients) == {
@@ -79,9 +79,9 @@ def test_each_instant_belongs_to_one_part_of_flight() -> None:
 
 def test_turn_and_capture_replace_commands_of_guided_flight() -> None:
     transients = [
-        Transient(kind="capture", name="", start=1.0, stop=2.0),
-        Transient(kind="turn", name="", start=2.5, stop=3.0),
-        Transient(kind="gust", name="vertical", start=3.5, stop=4.0),
+        Transient(kind=TransientKind.CAPTURE, name="", start=1.0, stop=2.0),
+        Transient(kind=TransientKind.TURN, name="", start=2.5, stop=3.0),
+        Transient(kind=TransientKind.GUST, name="vertical", start=3.5, stop=4.0),
     ]
     t = np.array([0.5, 1.5, 2.2, 2.9, 3.8, 6.0])
     assert instants_by_part(t, transients) == {
@@ -130,7 +130,7 @@ def test_turns_and_captures_follow_from_commands_of_guidance(channels: Any, expe
 def test_errors_split_by_part_and_ultimate_bound_is_largest_undisturbed_error() -> None:
     flight = tape(y=signal([0, 1000, 2000], q=[3.0, 4.0, 0.0]), y_m=signal([0, 2000], q=[0.0, 0.0]))
     table = metrics.errors_by_part(
-        flight, [Transient(kind="gust", name="g", start=0.9, stop=1.1)], settle=0.0
+        flight, [Transient(kind=TransientKind.GUST, name="g", start=0.9, stop=1.1)], settle=0.0
     )
     assert table["q"]["gust"] == metrics.ErrorMetrics(rms=4.0, max=4.0)
     assert table["q"]["calm"].rms == approx(math.sqrt(4.5))
@@ -172,10 +172,12 @@ def test_settling_measured_up_to_next_transient_of_channel() -> None:
     error = np.where(((t > 0.95) & (t < 1.15)) | ((t > 4.95) & (t < 5.15)), 0.5, 0.0)
     flight = tape(y=signal(stamps, q=1.0 + error, p=0.0), y_m=signal(stamps, q=1.0, p=0.0))
     transients = [
-        Transient(kind="gust", name="late", start=9.0, stop=9.5),  # after the end of the flight
-        Transient(kind="command", name="q", start=1.0, stop=1.1),
-        Transient(kind="command", name="p", start=3.0, stop=3.1),
-        Transient(kind="gust", name="vertical", start=5.0, stop=5.1),
+        Transient(
+            kind=TransientKind.GUST, name="late", start=9.0, stop=9.5
+        ),  # after the end of the flight
+        Transient(kind=TransientKind.COMMAND, name="q", start=1.0, stop=1.1),
+        Transient(kind=TransientKind.COMMAND, name="p", start=3.0, stop=3.1),
+        Transient(kind=TransientKind.GUST, name="vertical", start=5.0, stop=5.1),
     ]
     first, second, gust = metrics.settling_times(flight, transients)
     assert first.until == {"q": 5.0}
@@ -193,7 +195,7 @@ def test_control_effort_is_rms_about_trim_and_mean_rate() -> None:
     assert asdict(effort) == approx({"rms": math.sqrt(3.0), "max": 2.0, "rate": 20.0})
     # The step into the gust and the one within it end there: 4 and 0 in 0.2 s.
     parts = metrics.inputs_by_part(
-        flight, [Transient(kind="gust", name="g", start=0.15, stop=0.35)], settle=0.0
+        flight, [Transient(kind=TransientKind.GUST, name="g", start=0.15, stop=0.35)], settle=0.0
     )["elevator"]
     assert asdict(parts["gust"]) == approx({"rms": 2.0, "max": 2.0, "rate": 20.0})
     assert parts["calm"].rate == approx(20.0)  # 2 in 0.1 s

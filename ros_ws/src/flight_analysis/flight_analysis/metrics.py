@@ -9,6 +9,7 @@ how often the sign term switches.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from enum import StrEnum
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -59,14 +60,28 @@ AIRS = (CALM, "wind", "shear", "turbulence", "microburst", UNKNOWN_AIR)
 engagement is named after this disturbance. UNKNOWN_AIR means that no simulated aircraft flew."""
 
 
+class TransientKind(StrEnum):
+    """What disturbs a flight. The word also names the part of the flight that it disturbs."""
+
+    ENGAGEMENT = "engagement"
+    COMMAND = "command"
+    GUST = "gust"
+    TURN = "turn"
+    CAPTURE = "capture"
+
+
+# In a guided flight, turns and captures replace commands. Their commands change until they end.
+GUIDED = (TransientKind.CAPTURE, TransientKind.TURN)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Transient:
-    """A disturbance in a flight: an engagement, a command, a gust, a turn or a capture.
+    """A disturbance in a flight.
 
     `start` and `stop` are its first and its last instant, in s of flight time.
     """
 
-    kind: str  # "engagement", "command", "gust", "turn" or "capture"
+    kind: TransientKind
     name: str  # name of the commanded channel or of the gust, or ""
     start: float
     stop: float
@@ -77,7 +92,7 @@ class Transient:
         A command excites only the channel that it commands. Every other transient excites all
         channels.
         """
-        return self.kind != "command" or self.name == channel
+        return self.kind is not TransientKind.COMMAND or self.name == channel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,7 +234,7 @@ def engagements(tape: Tape) -> list[Transient]:
     is_engaged = tape["internals"]["mode"] == Mode.ENGAGED
     begins = is_engaged & ~np.concatenate([[False], is_engaged[:-1]])
     return [
-        Transient(kind="engagement", name="", start=float(t), stop=float(t))
+        Transient(kind=TransientKind.ENGAGEMENT, name="", start=float(t), stop=float(t))
         for t in tape.time("internals")[begins]
     ]
 
@@ -241,7 +256,12 @@ def live_commands(tape: Tape) -> list[Transient]:
         instants = t[is_change]
         groups = np.split(instants, np.flatnonzero(np.diff(instants) > SETTLING_DWELL) + 1)
         commands += [
-            Transient(kind="command", name=name, start=float(group[0]), stop=float(group[-1]))
+            Transient(
+                kind=TransientKind.COMMAND,
+                name=name,
+                start=float(group[0]),
+                stop=float(group[-1]),
+            )
             for group in groups
             if len(group)
         ]
@@ -265,8 +285,8 @@ def guided_transients(tape: Tape) -> list[Transient]:
     captures |= np.abs(commands["xtrack"]) > CAPTURE_TIME * speed
     captures |= np.diff(speed, prepend=speed[:1]) != 0.0
     spans = {
-        "turn": mask_spans(t, turns, SETTLING_DWELL),
-        "capture": mask_spans(t, captures & ~turns, SETTLING_DWELL),
+        TransientKind.TURN: mask_spans(t, turns, SETTLING_DWELL),
+        TransientKind.CAPTURE: mask_spans(t, captures & ~turns, SETTLING_DWELL),
     }
     transients = [
         Transient(kind=kind, name="", start=start, stop=stop)
@@ -322,19 +342,19 @@ def part_masks(
     instant with only an engagement is in no other part, and one without any transient is in `air`.
     """
     kinds = {transient.kind for transient in transients}
-    commands = ["capture", "turn"] if kinds & {"capture", "turn"} else ["command"]
+    commands = (TransientKind.COMMAND,) if kinds.isdisjoint(GUIDED) else GUIDED
     parts = {}
     free = np.ones(len(t), dtype=bool)
-    for kind in ("gust", *reversed(commands), "engagement"):
+    for kind in (TransientKind.GUST, *reversed(commands), TransientKind.ENGAGEMENT):
         spans = [
-            (transient.start, transient.stop) for transient in transients if transient.kind == kind
+            (transient.start, transient.stop) for transient in transients if transient.kind is kind
         ]
         parts[kind] = in_spans(t, spans, settle) & free
         free &= ~parts[kind]
     return {
         "whole": np.ones(len(t), dtype=bool),
         air: free,
-        **{kind: parts[kind] for kind in (*commands, "gust")},
+        **{kind: parts[kind] for kind in (*commands, TransientKind.GUST)},
     }
 
 
@@ -486,7 +506,7 @@ def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling
     events = [
         transient
         for transient in transients
-        if transient.start <= end and transient.kind not in {"turn", "capture"}
+        if transient.start <= end and transient.kind not in GUIDED
     ]
     for transient in sorted(events, key=attrgetter("start")):
         start = transient.start

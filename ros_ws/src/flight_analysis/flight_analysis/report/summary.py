@@ -21,6 +21,7 @@ from flight_analysis.metrics import (
     TRUE_ERROR,
     UNKNOWN_AIR,
     Transient,
+    TransientKind,
     best_error,
     engagements,
     errors_by_part,
@@ -80,7 +81,7 @@ def command_edges(scenario: Scenario) -> list[Transient]:
     They are the edges of its pulses, doublets and ramps.
     """
     edges = [
-        Transient(kind="command", name=name, start=edge.start, stop=edge.stop)
+        Transient(kind=TransientKind.COMMAND, name=name, start=edge.start, stop=edge.stop)
         for name, of_channel in scenario.reference_model.edges().items()
         for edge in of_channel
         if edge.change != 0.0
@@ -97,7 +98,7 @@ def transients(scenario: Scenario, tape: Tape, *, follows_scenario: bool = True)
     """
     windows = scenario.gust_windows() if is_simulated(tape) else {}
     gusts = [
-        Transient(kind="gust", name=name, start=start, stop=stop)
+        Transient(kind=TransientKind.GUST, name=name, start=start, stop=stop)
         for name, (start, stop) in windows.items()
     ]
     if "guidance" in tape:
@@ -357,7 +358,7 @@ def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
 
 
 def _commands(tape: Tape, events: Sequence[Transient], end: float) -> Commands:
-    commands = [event.start for event in events if event.kind == "command"]
+    commands = [event.start for event in events if event.kind is TransientKind.COMMAND]
     targets = sum(
         tape.recording[topic].found for topic in ("target", "route") if topic in tape.recording
     )

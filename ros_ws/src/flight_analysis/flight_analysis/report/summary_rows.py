@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any
 
-from flight_analysis.metrics import AIRS, CALM
+from flight_analysis.metrics import AIRS, CALM, TransientKind
 from flight_analysis.report.display_units import (
     NO_UNIT,
     NO_VALUE,
@@ -62,23 +62,24 @@ class Column:
         return f"{value * factor:.{self.decimals}f}"
 
 
+# Kinds of transients after which the parts of a flight are named, in the order of the columns.
+DISTURBED = (
+    TransientKind.COMMAND,
+    TransientKind.CAPTURE,
+    TransientKind.TURN,
+    TransientKind.GUST,
+)
 RMS_COLUMNS = (
     Column(group="rms", head="whole", path=("whole", "rms")),
     *(Column(group="rms", head=air, path=(air, "rms")) for air in AIRS),
-    Column(group="rms", head="command", path=("command", "rms")),
-    Column(group="rms", head="capture", path=("capture", "rms")),
-    Column(group="rms", head="turn", path=("turn", "rms")),
-    Column(group="rms", head="gust", path=("gust", "rms")),
+    *(Column(group="rms", head=kind, path=(kind, "rms")) for kind in DISTURBED),
 )
 
 
 ERROR_COLUMNS = (
     *RMS_COLUMNS,
     *(Column(group="max", head=air, path=(air, "max")) for air in AIRS if air != CALM),
-    Column(group="max", head="command", path=("command", "max")),
-    Column(group="max", head="capture", path=("capture", "max")),
-    Column(group="max", head="turn", path=("turn", "max")),
-    Column(group="max", head="gust", path=("gust", "max")),
+    *(Column(group="max", head=kind, path=(kind, "max")) for kind in DISTURBED),
     Column(group="ultimate", head="bound", path=("bound",)),
 )
 """Columns that a table of errors can have. `columns_of` chooses the columns for a flight."""
@@ -103,7 +104,10 @@ columns for a flight."""
 SATURATION_COLUMN = Column(group="saturated", head="%")
 
 
-SETTLING_COLUMNS = {kind: Column(group="settling (s)", head=kind) for kind in ("command", "gust")}
+SETTLING_COLUMNS = {
+    kind: Column(group="settling (s)", head=kind)
+    for kind in (TransientKind.COMMAND, TransientKind.GUST)
+}
 
 
 HELD_COLUMNS = (
@@ -263,7 +267,7 @@ def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> 
     return rows
 
 
-def slowest_settling(summary: Mapping[str, Any], channel: str, kind: str) -> str:
+def slowest_settling(summary: Mapping[str, Any], channel: str, kind: TransientKind) -> str:
     """Return the longest settling time of a channel after transients of a kind, s.
 
     If the error did not settle after one of these transients, the result is "> x". Here x is the
