@@ -29,7 +29,7 @@ from benchmarks.tables import parser_of
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import with_route
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.guided import flown_legs
+from flight_analysis.report.guided import LegResult, flown_legs
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
@@ -167,7 +167,7 @@ def fly(name: str, title: str, case: Case) -> Row:
     route = varied.guidance.plan(varied.guidance.waypoints())
     result = "flown"
     legs = flown_legs(tape)
-    misses = [leg for leg in legs if leg.result == "missed"]
+    misses = [leg for leg in legs if leg.result is LegResult.MISSED]
     if misses:
         result = f"missed leg {misses[0].leg} by {misses[0].missed:.0f} m"
     elif legs[-1].leg < len(route.legs) - 1:

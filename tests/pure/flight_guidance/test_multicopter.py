@@ -14,7 +14,7 @@ from tests.conftest import REPOSITORY, refusing
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.guided import flown_legs, guidance_notices, guidance_summary
+from flight_analysis.report.guided import LegResult, flown_legs, guidance_notices, guidance_summary
 from flight_core.channels import POSE
 from flight_core.kinematics import thrust_axis
 from flight_core.tape import Tape
@@ -90,7 +90,7 @@ def test_square_at_3_m_per_s_stays_on_its_lines_and_replays_to_the_bit(
     scenario, tape = square
     log = tape["guidance"]
     legs = flown_legs(tape)
-    assert [leg.result for leg in legs] == ["flown"] * 7 + ["not ended"]
+    assert [leg.result for leg in legs] == [LegResult.FLOWN] * 7 + [LegResult.NOT_ENDED]
     on_lines = (log["leg"] < 7) & (log["joining"] == 0.0)
     # 0.07 m flown, with noise; a tilt that is late by its lag of 0.4 s would be beside by 0.3 m
     assert np.max(np.abs(log["xtrack"][on_lines])) < 0.15
@@ -117,7 +117,7 @@ def test_wait_hovers_at_its_waypoint_for_its_time_and_the_flight_goes_on() -> No
     hovers = (log["leg"] == 1) & (log["loitered"] > 0.0)
     assert np.ptp(tape.time("guidance")[hovers]) == approx(4.0, abs=0.05)
     assert np.max(beside[hovers]) < 1.5  # within 0.5 s of flight at 3 m/s, where the time begins
-    assert [leg.result for leg in flown_legs(tape)[:2]] == ["flown"] * 2
+    assert [leg.result for leg in flown_legs(tape)[:2]] == [LegResult.FLOWN] * 2
     assert log["leg"][-1] > 1
     assert replay_guidance(tape, scenario.guidance).equal()
 

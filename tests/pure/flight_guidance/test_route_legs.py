@@ -17,7 +17,13 @@ from pytest import approx
 from scipy.integrate import solve_ivp
 from tests.conftest import refusing
 
-from flight_analysis.report.guided import FlownLeg, flown_legs, guidance_notices, leg_results
+from flight_analysis.report.guided import (
+    FlownLeg,
+    LegResult,
+    flown_legs,
+    guidance_notices,
+    leg_results,
+)
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
@@ -473,9 +479,9 @@ def test_summary_says_which_legs_were_flown() -> None:
         missed=[0] * 5 + [321.0] + [0] * 4,
     )
     assert flown_legs(tape) == [
-        FlownLeg(leg=0, start=0.0, joined=2.0, stop=3.0, result="flown", missed=0.0),
-        FlownLeg(leg=1, start=3.0, joined=3.0, stop=5.0, result="missed", missed=321.0),
-        FlownLeg(leg=2, start=5.0, joined=5.0, stop=9.0, result="not ended", missed=0.0),
+        FlownLeg(leg=0, start=0.0, joined=2.0, stop=3.0, result=LegResult.FLOWN, missed=0.0),
+        FlownLeg(leg=1, start=3.0, joined=3.0, stop=5.0, result=LegResult.MISSED, missed=321.0),
+        FlownLeg(leg=2, start=5.0, joined=5.0, stop=9.0, result=LegResult.NOT_ENDED, missed=0.0),
     ]
     assert guidance_notices(tape, CONFIG) == ["guidance at t = 5.0 s: leg 1 missed by 321 m"]
     assert (

@@ -174,8 +174,10 @@ def _route_text(flight: RecordedFlight) -> str:
     legs = (flight.summary["guidance"] or {}).get("legs") or ()
     if not legs:
         return ""
-    flown = sum(leg["result"] == "flown" for leg in legs)
-    on_last = ", the last not to its end" if legs[-1]["result"] == "not ended" else ""
+    flown = sum(leg["result"] == guided.LegResult.FLOWN for leg in legs)
+    on_last = (
+        ", the last not to its end" if legs[-1]["result"] == guided.LegResult.NOT_ENDED else ""
+    )
     text = f"It flew {flown} of the {len(legs)} legs that it began{on_last}"
     log = flight.tape.signals.get("guidance")
     if log is None:

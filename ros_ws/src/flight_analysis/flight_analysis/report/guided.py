@@ -9,6 +9,7 @@ segment are the errors of the quantities that guidance held, such as altitude an
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,6 +75,14 @@ class HoldErrors(ErrorMetrics):
     settling: float | None = None
 
 
+class LegResult(StrEnum):
+    """With which result a leg was flown."""
+
+    FLOWN = "flown"
+    MISSED = "missed"
+    NOT_ENDED = "not ended"  # another command or the end of the flight came before
+
+
 class FlownLeg(NamedTuple):
     """When and with which result a leg of a route was flown."""
 
@@ -81,8 +90,7 @@ class FlownLeg(NamedTuple):
     start: float  # when the aircraft begins to fly to the leg, s
     joined: float | None  # when the aircraft has reached the line of the leg, s; None if never
     stop: float  # s
-    # "flown", "missed", or "not ended" if another command or the end of the flight came before
-    result: str
+    result: LegResult
     missed: float  # distance from the end of the leg, m, if it was missed; else 0
 
 
@@ -169,14 +177,14 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
         ends = after < len(t) and not commands[after]
         ends = ends and legs[after] == legs[first] + 1.0
         distance = float(log["missed"][after]) if ends else 0.0
-        outcome = "missed" if distance else "flown"
+        outcome = LegResult.MISSED if distance else LegResult.FLOWN
         result.append(
             FlownLeg(
                 leg=int(legs[first]),
                 start=float(t[first]),
                 joined=float(t[first + on_leg[0]]) if len(on_leg) else None,
                 stop=float(t[min(after, len(t) - 1)]),
-                result=outcome if ends else "not ended",
+                result=outcome if ends else LegResult.NOT_ENDED,
                 missed=distance,
             )
         )
