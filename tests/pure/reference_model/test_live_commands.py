@@ -22,7 +22,7 @@ from flight_core.channels import POSE
 from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
 from reference_model.params import ReferenceModelConfig
-from reference_model.reference import Reference
+from reference_model.reference import Reference, Source
 from rise_di_controller.controller import Controller
 
 pytestmark = pytest.mark.slow
@@ -49,7 +49,7 @@ def test_command_beyond_bound_refused_and_changes_nothing() -> None:
     with pytest.raises(ChannelError, match="beyond the bounds") as refused:
         model.take(0, np.array([0.0, 0.0, 0.6, 0.0]))
     assert refused.value.reason == "bounds"
-    assert model.source() == "profile"
+    assert model.source() is Source.PROFILE
 
 
 def test_command_that_is_not_newer_refused() -> None:
@@ -88,9 +88,9 @@ def test_without_attitude_command_that_times_out_becomes_zero() -> None:
     model = reference(speed=25.0)
     model.take(0, np.array([0.1, 1.0, 0.2, 0.0]))
     model.sample(40)  # 0.2 s: the age limit
-    assert model.source() == "live commands"
+    assert model.source() is Source.LIVE
     y_m = model.sample(41)[2]
-    assert model.source() == "ending"
+    assert model.source() is Source.ENDING
     assert y_m > 0.05  # rad/s: 0.2 s of a reference of 5 rad/s and a command of 0.2 rad/s
     # 40 s: the slowest channel has a time constant of 2 s
     assert np.abs(model.sample(8000)).max() < 1e-6

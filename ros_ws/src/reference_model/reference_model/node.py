@@ -16,7 +16,7 @@ from flight_ros.messages import Decoder
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, U_M, Y_M
 from reference_model.params import ReferenceModelConfig
-from reference_model.reference import Reference
+from reference_model.reference import Reference, Source
 
 
 class LiveCommand(NamedTuple):
@@ -69,7 +69,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         self._publish_y_m(self._encoder.encode(now_ns, self._sample(tick.number)))
         self._start_ns = now_ns - tick.number * self.period_ns()
         self._u_m.poll(now_ns)
-        if (source := self._reference.source()) != before:
+        if (source := self._reference.source()) is not before:
             self._log_source(source)
 
     def _sample(self, number: int) -> FloatArray:
@@ -109,8 +109,8 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     def _take_u_m(self, command: LiveCommand, now_ns: int) -> None:
         self._reference.take(command.stamp_ns - self._start_ns, command.u_m, command.attitude)
 
-    def _log_source(self, source: str) -> None:
-        if source == "ending":
+    def _log_source(self, source: Source) -> None:
+        if source is Source.ENDING:
             if self.parameters.live.speed is not None:
                 levels = "wings are levelled, then"
             else:
@@ -160,4 +160,5 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         level, _, figures = super().status()
         source = self._reference.source()
         figures["failed steps"] = self._reference.failed
-        return DiagnosticStatus.ERROR if source == "ending" else level, source, figures
+        level = DiagnosticStatus.ERROR if source is Source.ENDING else level
+        return level, source.value, figures

@@ -6,6 +6,7 @@ The node and the simulation in a single process use it.
 """
 
 import math
+from enum import Enum
 
 import numpy as np
 
@@ -21,6 +22,14 @@ from reference_model.params import ReferenceModelConfig
 LAST_GOES_ON = "a step of the reference model failed, the last y_m goes on"
 
 BLOCK = 100  # number of steps for which the profile is evaluated at once
+
+
+class Source(Enum):
+    """Where the commands come from."""
+
+    PROFILE = "profile"
+    LIVE = "live commands"
+    ENDING = "ending"  # u_m has timed out, so the commands go to zero
 
 
 class Reference:
@@ -59,15 +68,12 @@ class Reference:
         """State of the model at the last sample, shape (n,)."""
         return self._x_m
 
-    def source(self) -> str:
-        """Return the source of the commands at the last sample.
-
-        It is "profile", "live commands", or "ending" if u_m has timed out.
-        """
+    def source(self) -> Source:
+        """Return the source of the commands at the last sample."""
         if self._live is None:
-            return "profile"
+            return Source.PROFILE
         aged = self._number * self.period_ns - self._live.t_ns > self._live_params.max_age_ns
-        return "ending" if aged else "live commands"
+        return Source.ENDING if aged else Source.LIVE
 
     def sample(self, number: int) -> FloatArray:
         """Compute y_m at sample `number`, shape (m,), in steps of a period.
