@@ -7,6 +7,7 @@ gains of a search.
 """
 
 from collections.abc import Callable
+from enum import StrEnum
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -56,10 +57,12 @@ axis. Dryden's L / V0 at 100 m and 25 m/s is 4 s vertically and 10 s along the f
 that takes 15 m to its peak takes 0.6 s."""
 
 
-# Models of a feedforward.
-NONE = "none"
-AIRCRAFT = "aircraft"  # A, B and f of the nominal aircraft
-INTEGRATORS = "integrators"  # y_dot = Omega u
+class FeedforwardModel(StrEnum):
+    """A model of the aircraft that a feedforward uses."""
+
+    NONE = "none"  # the law has no feedforward
+    AIRCRAFT = "aircraft"  # A, B and f of the nominal aircraft
+    INTEGRATORS = "integrators"  # y_dot = Omega u
 
 
 class Law(NamedTuple):
@@ -72,7 +75,8 @@ class Law(NamedTuple):
     control_law: Callable[[NominalModel], ControlLaw]
     params: Callable[[Gains, NominalModel], Any]
     tuned: tuple[str, ...]  # names of the gains
-    feedforward: str = NONE  # model of the feedforward
+    # model of the feedforward, or the name of the law if the feedforward is of its controller
+    feedforward: FeedforwardModel | str = FeedforwardModel.NONE
     # gains at which a search begins; None if they follow from the lag of the loop and the constants
     # INITIAL_...
     initial: Gains | None = None
@@ -161,7 +165,7 @@ LAWS: dict[str, Law] = {
         control_law=_soft,
         params=rise_di_law.params_of,
         tuned=_rise_gains,
-        feedforward=AIRCRAFT,
+        feedforward=FeedforwardModel.AIRCRAFT,
     ),
     "rise_observer": Law(
         title="RISE-DI + feedforward + observer",
@@ -171,7 +175,7 @@ LAWS: dict[str, Law] = {
         control_law=_fixed(with_observer(rise.CONTROL_LAWS[Sign.SOFT])),
         params=_over(rise_di_law.params_of),
         tuned=_rise_gains + _observer_gains,
-        feedforward=AIRCRAFT,
+        feedforward=FeedforwardModel.AIRCRAFT,
     ),
     "pi_observer": Law(
         title="PI + feedforward + observer",
@@ -181,7 +185,7 @@ LAWS: dict[str, Law] = {
         control_law=_fixed(with_observer(pi.CONTROL_LAW)),
         params=_over(pi.params_of),
         tuned=("K", "Lambda", *_observer_gains),
-        feedforward=AIRCRAFT,
+        feedforward=FeedforwardModel.AIRCRAFT,
     ),
     "lqg": Law(
         title="LQG + feedforward",
@@ -191,7 +195,7 @@ LAWS: dict[str, Law] = {
         control_law=_fixed(with_observer(lqg.CONTROL_LAW)),
         params=_over(lqg.params_of, 1.0),
         tuned=_observer_gains,
-        feedforward=AIRCRAFT,
+        feedforward=FeedforwardModel.AIRCRAFT,
     ),
     "eso": Law(
         title="PI + feedforward + extended-state observer",
@@ -201,7 +205,7 @@ LAWS: dict[str, Law] = {
         control_law=_fixed(with_observer(pi.CONTROL_LAW)),
         params=_extended_state,
         tuned=("K", "Lambda", "effort", "drift", "rate_drift", "decay"),
-        feedforward=INTEGRATORS,
+        feedforward=FeedforwardModel.INTEGRATORS,
     ),
     "pi": Law(
         title="PI",
@@ -220,7 +224,7 @@ LAWS: dict[str, Law] = {
         control_law=_fixed(pi.CONTROL_LAW),
         params=pi.params_of,
         tuned=("K", "Lambda"),
-        feedforward=AIRCRAFT,
+        feedforward=FeedforwardModel.AIRCRAFT,
     ),
     "l1": Law(
         title="L1",
@@ -239,7 +243,7 @@ LAWS: dict[str, Law] = {
         control_law=_l1_ff,
         params=l1.params_of,
         tuned=("K", "bandwidth"),
-        feedforward=AIRCRAFT,
+        feedforward=FeedforwardModel.AIRCRAFT,
     ),
     "mackunis": Law(
         title="MacKunis RISE, filtered difference",

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from control_laws.catalogue import LAWS, NONE, Gains, Law
+from control_laws.catalogue import LAWS, FeedforwardModel, Gains, Law
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_campaign.batch.campaign_course import build_course
@@ -72,7 +72,7 @@ def registered_law(controller: ControllerConfig, name: str) -> Law:
         control_law=lambda model: controller.tuned_law().control_law,
         params=params,
         tuned=tuple(start),
-        feedforward=NONE if controller.feedforward is None else name,
+        feedforward=FeedforwardModel.NONE if controller.feedforward is None else name,
         initial={key: np.array(value)[:, None] for key, value in start.items()},
         linear=not isinstance(controller, RiseDiConfig)
         or controller.sampled_sign()[0] is Sign.SOFT,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from control_laws.catalogue import AIRCRAFT, INTEGRATORS, LAWS
+from control_laws.catalogue import LAWS, FeedforwardModel
 from control_laws.observed import PART, aircraft_design, extended_state_design
 from control_laws.observer_design import Names
 from flight_campaign.comparison.tuning import Benchmark, as_gains
@@ -109,9 +109,9 @@ def _rise_di(gains: dict[str, FloatArray], input_scale: FloatArray) -> dict[str,
 def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
     """Return the model of a law's feedforward; None for a law without one."""
     controller = benchmark.scenario.controller
-    if LAWS[name].feedforward == AIRCRAFT:
+    if LAWS[name].feedforward is FeedforwardModel.AIRCRAFT:
         return with_feedforward(controller, benchmark.scenario.aircraft.load()[0]).feedforward
-    if LAWS[name].feedforward == INTEGRATORS:
+    if LAWS[name].feedforward is FeedforwardModel.INTEGRATORS:
         return integrator_model(controller, benchmark.model.Omega)
     return None
 
@@ -123,7 +123,7 @@ def _observer(name: str, result: TuningResult, benchmark: Benchmark) -> Observer
     """
     controller = benchmark.scenario.controller
     airframe = benchmark.scenario.aircraft.load()[0]
-    integrators = LAWS[name].feedforward == INTEGRATORS
+    integrators = LAWS[name].feedforward is FeedforwardModel.INTEGRATORS
     states, axes = (
         (controller.outputs, ()) if integrators else (tuple(airframe.states), tuple(airframe.gusts))
     )

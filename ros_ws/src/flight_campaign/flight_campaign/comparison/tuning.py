@@ -18,7 +18,7 @@ import numpy as np
 from aircraft_sim.atmosphere.turbulence import MODERATE
 from aircraft_sim.plant.plant import PlantParams
 from aircraft_sim.uncertainty import gust_directions, nominal_and_sampled
-from control_laws.catalogue import AIRCRAFT, INTEGRATORS, NONE, Gains, Law, initial_gains
+from control_laws.catalogue import FeedforwardModel, Gains, Law, initial_gains
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.linear_loop.input_margins import Margins, input_margins
@@ -192,10 +192,9 @@ def turbulence_of(scenario: Scenario) -> dict[str, float]:
 
 
 def _courses(scenario: Scenario) -> dict[str, Course]:
-    """Return the courses of a scenario, by the model that their feedforward uses.
+    """Return the courses of a scenario, by the model of their feedforward.
 
-    The models are NONE, AIRCRAFT and INTEGRATORS. The controller of the scenario must have a
-    feedforward with the model of the aircraft.
+    The controller of the scenario must have a feedforward with the model of the aircraft.
     """
     course, controller, (airframe, _) = (
         build_course(scenario),
@@ -209,9 +208,9 @@ def _courses(scenario: Scenario) -> dict[str, Course]:
     )
     none = course.segments._replace(u_ff=np.zeros_like(course.segments.u_ff))
     return {
-        NONE: course._replace(segments=none),
-        AIRCRAFT: course,
-        INTEGRATORS: build_course(integrators),
+        FeedforwardModel.NONE: course._replace(segments=none),
+        FeedforwardModel.AIRCRAFT: course,
+        FeedforwardModel.INTEGRATORS: build_course(integrators),
     }
 
 
@@ -245,7 +244,12 @@ def benchmark_fleet(
     aircraft = benchmark.scenario.aircraft
     directions = gust_directions(aircraft.sampled_airframe(), A, aircraft.uncertainty.wind)
     return batch_matrices.assemble(
-        A, B, benchmark.plant, benchmark.courses[wind][NONE], late=late, gust_directions=directions
+        A,
+        B,
+        benchmark.plant,
+        benchmark.courses[wind][FeedforwardModel.NONE],
+        late=late,
+        gust_directions=directions,
     )
 
 
