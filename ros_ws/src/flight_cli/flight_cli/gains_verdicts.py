@@ -9,7 +9,7 @@ import math
 from typing import Any, NamedTuple
 
 from flight_analysis.linear_loop.guarantee import Guarantee
-from flight_design.gains.gain_conditions import GainCondition, failing
+from flight_design.gains.gain_conditions import GainCondition, Relation, failing
 from flight_design.gains.gain_selection import GainAssessment
 
 
@@ -105,15 +105,15 @@ def condition_name(row: tuple[GainCondition, ...], outputs: tuple[str, ...]) -> 
     return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")
 
 
-SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
+SYMBOLS = {Relation.AT_LEAST: ">=", Relation.AT_MOST: "<=", Relation.ABOVE: ">"}
 
 
 def condition_cells(condition: GainCondition) -> tuple[str, str]:
     """Return two cells of a table: the value beside its bound, and the margin, red if it fails."""
     margin = "" if math.isnan(condition.margin) else f"{condition.margin:.2g}"
-    side = SIDES[condition.side]
+    symbol = SYMBOLS[condition.relation]
     return (
-        f"{condition.value:.4g} {side} {condition.bound:.4g}",
+        f"{condition.value:.4g} {symbol} {condition.bound:.4g}",
         margin if condition.holds else f"[red]{margin} ![/red]",
     )
 
@@ -127,7 +127,7 @@ def condition_as_json(
         "part": part,
         "channel": None if condition.channel is None else outputs[condition.channel],
         "found": condition.value,
-        condition.side.replace(" ", "_"): condition.bound,
+        condition.relation.replace(" ", "_"): condition.bound,
         "margin": condition.margin,
         "holds": condition.holds,
         "estimate": condition.estimate,

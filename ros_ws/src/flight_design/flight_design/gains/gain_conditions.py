@@ -23,6 +23,7 @@ which abs(Omega_ii) is about 1.
 
 import math
 from collections.abc import Sequence
+from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -86,36 +87,33 @@ class Bounds(NamedTuple):
     gamma_2: FloatArray
 
 
-class GainCondition(NamedTuple):
-    """A condition on a gain set: value >= bound or value <= bound.
+class Relation(StrEnum):
+    """How the value of a condition must lie to its bound."""
 
-    If the condition is strict, it is value > bound.
-    """
+    AT_LEAST = "at least"
+    AT_MOST = "at most"
+    ABOVE = "above"
+
+
+class GainCondition(NamedTuple):
+    """A condition on a gain set: a value and its bound, in a relation."""
 
     name: str
     channel: int | None  # index of the channel; None for a condition on all channels together
     value: float
     bound: float
-    at_least: bool = True
+    relation: Relation = Relation.AT_LEAST
     estimate: bool = False  # whether it depends on gamma_2, an assumption
-    strict: bool = False  # whether the condition fails if value = bound
-
-    @property
-    def side(self) -> str:
-        """The relation in words: the value must be "at least", "at most" or "above" the bound."""
-        if self.strict:
-            return "above"
-        return "at least" if self.at_least else "at most"
 
     @property
     def holds(self) -> bool:
         """Whether the gain set meets the condition."""
-        if self.strict:
+        if self.relation is Relation.ABOVE:
             return self.value > self.bound
         slack = BOUND_TOLERANCE * abs(self.bound)
-        return (
-            self.value >= self.bound - slack if self.at_least else self.value <= self.bound + slack
-        )
+        if self.relation is Relation.AT_MOST:
+            return self.value <= self.bound + slack
+        return self.value >= self.bound - slack
 
     @property
     def margin(self) -> float:
@@ -124,7 +122,7 @@ class GainCondition(NamedTuple):
         The factor is below 1 if the condition fails, and 0 if no gain can meet it. It is NaN for a
         lower bound of 0.
         """
-        if self.at_least:
+        if self.relation is not Relation.AT_MOST:
             return self.value / self.bound if self.bound > 0.0 else math.nan
         if self.bound <= 0.0:
             return 0.0
@@ -136,7 +134,7 @@ class GainCondition(NamedTuple):
         `channels` are the names of the outputs y.
         """
         where = self.name if self.channel is None else f"{self.name} of {channels[self.channel]}"
-        return f"{where}: found {self.value:.4g}, expected {self.side} {self.bound:.4g}"
+        return f"{where}: found {self.value:.4g}, expected {self.relation} {self.bound:.4g}"
 
 
 def failing(conditions: Sequence[GainCondition]) -> tuple[GainCondition, ...]:
@@ -263,7 +261,7 @@ def check_theorem(gains: GainSet, bounds: Bounds) -> tuple[GainCondition, ...]:
         remaining = least - bounds.rho**2 / (4.0 * gains.k_g)
         largest = int(np.argmax(terms))
         conditions.append(
-            GainCondition("k_d, step 3", largest, float(terms.sum()), remaining, at_least=False)
+            GainCondition("k_d, step 3", largest, float(terms.sum()), remaining, Relation.AT_MOST)
         )
     return tuple(conditions)
 
@@ -363,16 +361,16 @@ def check_rules(
     most = np.full(len(loop.total), MAX_CROSSOVER_LAG_PRODUCT)
     # show beta in the same inputs for every gain set
     rules = (
-        *_by_channel("lag product", bandwidth * loop.total, most, at_least=False),
+        *_by_channel("lag product", bandwidth * loop.total, most, Relation.AT_MOST),
         *_by_channel(
-            "Lambda below K", params.Lambda, MAX_LAMBDA_TO_BANDWIDTH * bandwidth, at_least=False
+            "Lambda below K", params.Lambda, MAX_LAMBDA_TO_BANDWIDTH * bandwidth, Relation.AT_MOST
         ),
-        *_by_channel("beta above slew", params.beta * response, slew * response, at_least=True),
+        *_by_channel("beta above slew", params.beta * response, slew * response, Relation.AT_LEAST),
     )
     if params.sign is not Sign.SOFT:
         return rules
     width = params.eps * params.K / params.beta
-    return (*rules, *_by_channel("softening", width, loop.total, at_least=True))
+    return (*rules, *_by_channel("softening", width, loop.total, Relation.AT_LEAST))
 
 
 def check_loop(
@@ -395,24 +393,24 @@ def check_loop(
     s^2, and infinite without a limit. All have shape (m,).
     """
     fastest = MAX_BETA_TO_RATE_LIMIT * rate_limit * response
-    conditions = _by_channel("beta below rate", params.beta * response, fastest, at_least=False)
+    conditions = _by_channel("beta below rate", params.beta * response, fastest, Relation.AT_MOST)
     if params.sign is not Sign.IMPLICIT:
         return conditions
     half = np.full(len(loop.total), loop.period / 2.0)
     return (
         *conditions,
-        *_by_channel("implicit: lag", loop.lag + loop.delay, half, at_least=False),
-        *_by_channel("implicit: omega", params.omega, largest, at_least=True),
+        *_by_channel("implicit: lag", loop.lag + loop.delay, half, Relation.AT_MOST),
+        *_by_channel("implicit: omega", params.omega, largest, Relation.AT_LEAST),
     )
 
 
 def _by_channel(
-    name: str, values: FloatArray, bounds: FloatArray, *, at_least: bool
+    name: str, values: FloatArray, bounds: FloatArray, relation: Relation
 ) -> tuple[GainCondition, ...]:
     """Return a condition for each channel whose bound is finite."""
     return tuple(
         GainCondition(
-            name=name, channel=i, value=float(value), bound=float(bound), at_least=at_least
+            name=name, channel=i, value=float(value), bound=float(bound), relation=relation
         )
         for i, (value, bound) in enumerate(zip(values, bounds, strict=True))
         if math.isfinite(bound)

@@ -35,7 +35,7 @@ from flight_core.vectors import FloatArray
 from flight_design.gains import gain_conditions
 from flight_design.gains.channel_signs import signs_of_pairing
 from flight_design.gains.feedforward_model import with_feedforward
-from flight_design.gains.gain_conditions import Bounds, GainCondition, GainSet
+from flight_design.gains.gain_conditions import Bounds, GainCondition, GainSet, Relation
 from flight_design.gains.ideal_control import ChannelPairing, Study
 from flight_design.gains.lyapunov import KnownPlant, decay_matrix
 from flight_design.gains.requirement import NAMES as REQUIRED
@@ -492,7 +492,7 @@ def _rise_di_conditions(
         GainCondition("D (11)", None, float(np.mean(has_signs)), 1.0),
         GainCondition("zero dynamics", None, float(np.mean(study.stable)), 1.0),
         *gain_conditions.check_theorem(gains, bounds),
-        GainCondition("V2_dot", None, decay_rate, 0.0, strict=True),
+        GainCondition("V2_dot", None, decay_rate, 0.0, Relation.ABOVE),
     )
     # the engineering rules hold only without an observer
     if controller.observer is not None:

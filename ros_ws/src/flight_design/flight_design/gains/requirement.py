@@ -34,7 +34,7 @@ from flight_design.gains.constrained_search import (
     descend,
     exponent,
 )
-from flight_design.gains.gain_conditions import GainCondition, failing
+from flight_design.gains.gain_conditions import GainCondition, Relation, failing
 from flight_design.gains.linear_error import linear_error
 from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant
 from rise_di_controller.params import ControllerConfig
@@ -185,15 +185,15 @@ def nominal_conditions(nominal: Margins, requirement: Requirement) -> tuple[Gain
     """Return the requirement on the nominal aircraft as conditions, input by input."""
     with np.errstate(divide="ignore"):
         decibels = 20.0 * np.log10(nominal.gain)
-    rows: list[tuple[str, FloatArray, float, bool]] = [
-        (NAMES[0], np.degrees(nominal.phase), math.degrees(requirement.phase), True),
-        (NAMES[1], decibels, 20.0 * math.log10(requirement.gain), True),
-        (NAMES[2], nominal.sensitivity, requirement.sensitivity, False),
+    rows: list[tuple[str, FloatArray, float, Relation]] = [
+        (NAMES[0], np.degrees(nominal.phase), math.degrees(requirement.phase), Relation.AT_LEAST),
+        (NAMES[1], decibels, 20.0 * math.log10(requirement.gain), Relation.AT_LEAST),
+        (NAMES[2], nominal.sensitivity, requirement.sensitivity, Relation.AT_MOST),
     ]
     by_input: list[GainCondition] = []
-    for name, values, bound, at_least in rows:
+    for name, values, bound, relation in rows:
         by_input += [
-            GainCondition(name=name, channel=i, value=float(value), bound=bound, at_least=at_least)
+            GainCondition(name=name, channel=i, value=float(value), bound=bound, relation=relation)
             for i, value in enumerate(values)
         ]
     return (*by_input, GainCondition(NAMES[3], None, float(nominal.damping), requirement.damping))
