@@ -53,7 +53,7 @@ def states(path: Path, begin: str) -> bool:
 
 def has_softened_loop(scenario: Scenario) -> bool:
     controller = scenario.controller
-    return not isinstance(controller, RiseDiConfig) or controller.sampled_sign()[0] is Sign.SOFT
+    return not isinstance(controller, RiseDiConfig) or controller.sampled_sign() is Sign.SOFT
 
 
 def test_every_file_is_found() -> None:

@@ -188,7 +188,7 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
         "ramp_ns": guard.ramp_ns,
         "slope_ns": math.ceil(MIN_SLOPE_SPAN * guard.period_ns),
         "deactivation_holds": int(guard.deactivation_holds),
-        "sign": int(controller.sampled_sign()[0]),
+        "sign": int(controller.sampled_sign()),
     }
     reals: dict[str, ArrayLike] = {
         "period": period,

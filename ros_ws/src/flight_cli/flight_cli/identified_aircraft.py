@@ -111,7 +111,7 @@ def _show_gains(console: Console, aircraft: IdentifiedAircraft) -> None:
             f"with {outputs} constant, sideslip grows at {aircraft.sideslip_zero:.2g} 1/s: a zero "
             f"in the right half plane, outside the theorem; {mend}",
         )
-    sign = controller.sampled_sign()[0].name.lower()
+    sign = controller.sampled_sign().name.lower()
     say(console, f"coupling max abs(U - I) = {aircraft.coupling:.2g}; {sign} sign{margin}")
 
 

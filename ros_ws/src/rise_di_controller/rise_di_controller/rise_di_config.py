@@ -482,7 +482,7 @@ class RiseDiConfig(ControllerConfig):
 
     def control_law(self) -> ControlLaw:
         """Return the law RISE-DI, which samples the sign in the way that the parameters choose."""
-        return CONTROL_LAWS[self.sampled_sign()[0]]
+        return CONTROL_LAWS[self.sampled_sign()]
 
     def law_params(self) -> LawParams:
         """Return the arrays of the law."""
@@ -498,7 +498,7 @@ class RiseDiConfig(ControllerConfig):
             / K
             * self.softening
             * total_lag(np.array(self.lag), self.delay, 1.0 / self.rate),
-            sign=self.sampled_sign()[0],
+            sign=self.sampled_sign(),
         )
 
     def summary(self) -> str:
@@ -506,25 +506,25 @@ class RiseDiConfig(ControllerConfig):
 
         The sentence also says whether input_scale is scheduled.
         """
-        return self.sampled_sign()[1] + (
-            "" if self.schedule is None else "; input_scale follows the dynamic pressure"
-        )
-
-    def sampled_sign(self) -> tuple[Sign, str]:
-        """Choose how the sign is sampled, and give the reason as a sentence."""
+        scaling = "" if self.schedule is None else "; input_scale follows the dynamic pressure"
         if self.sign != "auto":
-            return Sign[self.sign.upper()], f"{self.sign} sign, as configured"
-        lag = max(self.lag) + self.delay
-        half = 0.5 / self.rate
-        if lag < half:
-            return (
-                Sign.IMPLICIT,
-                (
-                    f"implicit sign, because lag and delay of {lag:g} s are below half a period "
-                    f"({half:g} s)"
-                ),
-            )
-        return (
-            Sign.SOFT,
-            f"softened sign, because lag and delay of {lag:g} s reach half a period ({half:g} s)",
-        )
+            return f"{self.sign} sign, as configured{scaling}"
+        late = f"because lag and delay of {self._latest():g} s"
+        half = f"half a period ({0.5 / self.rate:g} s)"
+        if self.sampled_sign() is Sign.IMPLICIT:
+            return f"implicit sign, {late} are below {half}{scaling}"
+        return f"softened sign, {late} reach {half}{scaling}"
+
+    def sampled_sign(self) -> Sign:
+        """Choose how the sign is sampled.
+
+        If `sign` is "auto", the sign is implicit if lag and delay are below half a period, and
+        softened if they are not.
+        """
+        if self.sign != "auto":
+            return Sign[self.sign.upper()]
+        return Sign.IMPLICIT if self._latest() < 0.5 / self.rate else Sign.SOFT
+
+    def _latest(self) -> float:
+        """Return the largest lag plus the delay, s."""
+        return max(self.lag) + self.delay

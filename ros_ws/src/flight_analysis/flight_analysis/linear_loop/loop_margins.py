@@ -533,7 +533,7 @@ def delay_margins(
 
 def is_literal(controller: ControllerConfig) -> bool:
     """Return whether a controller samples the literal sign, which has no linear loop."""
-    return isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.LITERAL
+    return isinstance(controller, RiseDiConfig) and controller.sampled_sign() is Sign.LITERAL
 
 
 def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[int], list[int]]:

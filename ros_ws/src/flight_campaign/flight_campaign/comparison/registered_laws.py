@@ -74,8 +74,7 @@ def registered_law(controller: ControllerConfig, name: str) -> Law:
         tuned=tuple(start),
         feedforward=FeedforwardModel.NONE if controller.feedforward is None else name,
         initial={key: np.array(value)[:, None] for key, value in start.items()},
-        linear=not isinstance(controller, RiseDiConfig)
-        or controller.sampled_sign()[0] is Sign.SOFT,
+        linear=not isinstance(controller, RiseDiConfig) or controller.sampled_sign() is Sign.SOFT,
     )
 
 

@@ -220,7 +220,7 @@ def gain_sets(study: Study, setting: LoopSetting) -> Selection:
     engineering = gain_candidates(study, setting)
     first = engineering(np.ones(len(pairs.rows)), np.ones(len(pairs.rows))).controller
     gains = first
-    if first.sampled_sign()[0] is Sign.SOFT:  # behind servos
+    if first.sampled_sign() is Sign.SOFT:  # behind servos
         rates = study.u_dot[:, 0][:, pairs.columns]
         gains = within_requirement(engineering, setting.requirement, rates).controller
     gains = with_feedforward(gains, study.airframe) if setting.feedforward else gains
@@ -438,7 +438,7 @@ def assess_gains(
     margins = loop_margins(loop)
     stable = (margins.stable + float(margins.nominal.stable)) / len(study.A)
     loop_conditions += (GainCondition(STABILITY, None, stable, 1.0),)
-    if not (isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT):
+    if not (isinstance(controller, RiseDiConfig) and controller.sampled_sign() is Sign.IMPLICIT):
         observer = controller.observer
         requirement = above_zeros(setting.requirement, loop.nominal)
         least = 1.0 / controller.rate if observer is None else observer.margin - loop.loop.delay

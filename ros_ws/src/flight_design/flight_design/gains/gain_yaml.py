@@ -182,7 +182,7 @@ def _comments(selection: Selection, controller: RiseDiConfig) -> dict[str, str]:
         "input_scale": f"units of u s / units of y: {_shown_response(responses)} / "
         "abs(Omega_ii), Omega = C B",
         "omega": f"abs(Omega_ii) in scaled inputs{_within(study.uncertainty)}",
-        "sign": controller.sampled_sign()[0].name.lower() + " with this lag and delay",
+        "sign": controller.sampled_sign().name.lower() + " with this lag and delay",
         "lag": "s, actuators",
         "delay": "s, beyond sampling",
         "softening": "1, width of the softened sign in total lags: wider for the phase margin",
@@ -262,7 +262,7 @@ def chatter_sentence(controller: ControllerConfig, margins: LoopMargins | None) 
     """
     if margins is None or not isinstance(controller, RiseDiConfig):
         return ""
-    if controller.sampled_sign()[0] is not Sign.IMPLICIT:
+    if controller.sampled_sign() is not Sign.IMPLICIT:
         return ""
     latest, delay = (1e3 * value for value in (controller.delay + margins.delay, controller.delay))
     return (

@@ -225,7 +225,7 @@ def _within_margins(
     bandwidth is a smaller input scale, and the K of (22) stays. Without the softened sign, the
     controller does not change, and the margins are None.
     """
-    if controller.sampled_sign()[0] is not Sign.SOFT:
+    if controller.sampled_sign() is not Sign.SOFT:
         return controller, None
     airframe = study.airframe
     A, B = nominal_and_sampled(airframe, UNCERTAINTY, SAMPLES, 1)
