@@ -19,6 +19,7 @@ from tests.recordings import messages, summary_of, truncate
 
 from flight_core.parameters import ParameterError
 from flight_log.repair import repair
+from flight_log.scan import Faults
 from flight_log.tape_reader import read_run
 
 pytestmark = pytest.mark.slow
@@ -101,7 +102,7 @@ def test_damage_inside_loses_only_its_chunk(recorded: Path, run: Path) -> None:
     content = bytearray(file.read_bytes())
     content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
     file.write_bytes(content)
-    assert repair(run).files[0].faults == "1 damaged parts"
+    assert repair(run).files[0].faults == Faults(is_cut=False, damaged=1)
     kept = set(messages(run))
     every = set(messages(recorded))
     assert kept < every

@@ -14,6 +14,7 @@ from flight_core.text import printable
 from flight_log.repair import FileRepair
 from flight_log.repair import repair as repair_bag
 from flight_log.rosbag2_metadata import METADATA
+from flight_log.scan import Faults
 from flight_log.tape_reader import read_run
 
 
@@ -24,11 +25,10 @@ def repair_log(run: Path) -> None:
     """
     repairs = repair_bag(run)
     for file in repairs.files:
-        if file.damaged is not None:
-            damaged = f"the damaged file is {printable(file.damaged.name)}"
+        if file.faults is not None and file.damaged is not None:
             print(
-                f"{printable(file.path.name)} had {file.faults}: {file.messages} messages kept; "
-                f"{damaged}"
+                f"{printable(file.path.name)} had {_faults_text(file.faults)}: {file.messages} "
+                f"messages kept; the damaged file is {printable(file.damaged.name)}"
             )
     if repairs.wrote_metadata:
         print(f"{METADATA} written; {_missing_at_end(run, repairs.files[-1])}")
@@ -39,6 +39,13 @@ def repair_log(run: Path) -> None:
         print(f"{missing_files}: missing, and nothing here restores it; {METADATA} keeps the name")
 
 
+def _faults_text(faults: Faults) -> str:
+    """Name the faults of a file, as in "a truncated end and 2 damaged parts"."""
+    parts = ["a truncated end"] if faults.is_cut else []
+    parts += [f"{faults.damaged} damaged parts"] if faults.damaged else []
+    return " and ".join(parts)
+
+
 def _missing_at_end(run: Path, last: FileRepair) -> str:
     """Return a text on the time that is missing at the end of the log.
 
@@ -46,7 +53,7 @@ def _missing_at_end(run: Path, last: FileRepair) -> str:
     """
     if (missing := seconds(last.known_end_ns - last.last_ns)) > 0:
         return f"{missing:.3f} s are missing at its end"
-    if not last.faults:
+    if last.faults is None:
         return "nothing is missing"
     try:
         tape = read_run(run).tape

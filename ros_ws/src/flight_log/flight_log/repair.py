@@ -29,7 +29,7 @@ from flight_log.rosbag2_metadata import (
     bag_metadata_yaml,
     read_bag_metadata,
 )
-from flight_log.scan import Scan
+from flight_log.scan import Faults, Scan
 
 
 class FileRepair(NamedTuple):
@@ -39,7 +39,7 @@ class FileRepair(NamedTuple):
     messages: int  # number of messages in the file after the repair
     last_ns: int  # log time of the last message
     known_end_ns: int  # the latest log time in any index or metadata; 0 if there is none
-    faults: str | None  # None for an intact file
+    faults: Faults | None  # None for an intact file
     damaged: Path | None  # copy of the damaged file; None for an intact file
 
 

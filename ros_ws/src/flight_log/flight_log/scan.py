@@ -148,6 +148,13 @@ R = TypeVar("R")
 T = TypeVar("T")
 
 
+class Faults(NamedTuple):
+    """What a file lacks that is not intact."""
+
+    is_cut: bool  # whether the file has no footer
+    damaged: int  # number of chunks and other parts that could not be read
+
+
 class Scan:
     """Reads a file, and continues where the last reading ended, because the file may grow.
 
@@ -168,11 +175,10 @@ class Scan:
         self._messages = 0  # number of messages that have been read
 
     @property
-    def faults(self) -> str | None:
+    def faults(self) -> Faults | None:
         """Faults of the file; None for an intact file."""
-        faults = [] if self.complete else ["a truncated end"]
-        faults += [f"{self.damaged} damaged parts"] if self.damaged else []
-        return " and ".join(faults) if faults else None
+        is_intact = self.complete and not self.damaged
+        return None if is_intact else Faults(not self.complete, self.damaged)
 
     def records(self) -> Iterator[McapRecord]:
         """Yield the schemas, channels, messages, attachments and metadata.
