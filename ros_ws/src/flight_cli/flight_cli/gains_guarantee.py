@@ -113,7 +113,7 @@ def write_certificate(
     frame = airframe_to_check(airframe, scenario_to_check(scenario))
     sources = certificate_sources(frame, scenario)
     write_text("certificate", path, certificates.certificate(loop, guarantee, sources.texts))
-    return [f"certificate without constants: {sources.without}"] if sources.without else []
+    return sources.notes()
 
 
 def _require_worst(folder: Path | None, airframe: str, scenario: str) -> None:

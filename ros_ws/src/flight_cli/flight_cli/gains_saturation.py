@@ -56,7 +56,7 @@ def write_limit_certificate(
     frame = airframe_to_check(airframe, scenario_to_check(scenario))
     sources = certificate_sources(frame, scenario)
     write_text("certificate", path, limit_certificate(loop, guarantee, sources.texts))
-    return [f"certificate without constants: {sources.without}"] if sources.without else []
+    return sources.notes()
 
 
 def limit_text(name: str, guarantee: LimitGuarantee | None, certificate: str) -> list[str]:

@@ -131,6 +131,6 @@ def _write_certificate(path: Path, learned: LearnedLoop | None, scenario: Scenar
     stable = f"the linear loop is stable for every aircraft within {within}"
     return [
         f"guarantee: {stable} (certificate {proved.certificate})",
-        *([f"certificate without constants: {sources.without}"] if sources.without else []),
+        *sources.notes(),
         f"certificate: {display_path(path)}",
     ]

@@ -34,6 +34,7 @@ from flight_analysis.linear_loop.loop_margins import is_literal, scenario_loop
 from flight_analysis.report.margin_figures import guarantee_text
 from flight_core.arguments import FilePath, as_number, as_path
 from flight_core.files import write_file, writing
+from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import period_ns, seconds
 from flight_core.text import printable
@@ -194,7 +195,11 @@ class CertificateSources(NamedTuple):
     """The files from which the loop of a certificate was built, as the certificate names them."""
 
     texts: dict[str, str]  # "airframe" and "scenario" as SHA-256, "constants" as the text itself
-    without: str = ""  # a sentence on why there are no constants
+    refusal: Refusal | None = None  # why there are no constants
+
+    def notes(self) -> list[str]:
+        """Say that there are no constants, and why; an empty list if there are some."""
+        return [] if self.refusal is None else [f"certificate without constants: {self.refusal}"]
 
 
 def certificate_sources(airframe: Airframe, scenario: FilePath | Scenario) -> CertificateSources:
@@ -206,13 +211,14 @@ def certificate_sources(airframe: Airframe, scenario: FilePath | Scenario) -> Ce
     """
     texts = {"airframe": _sha256(as_yaml(airframe))}
     if controller_alone(scenario) is not None:
-        return CertificateSources(texts, "a section controller alone has no reference model")
+        refusal = Refusal("a section controller alone has no reference model")
+        return CertificateSources(texts, refusal)
     flight = find_scenario(scenario)
     texts["scenario"] = _sha256(scenario_yaml(flight))
     try:
         controller = exportable(flight.controller)
     except ParameterError as error:
-        return CertificateSources(texts, str(error))
+        return CertificateSources(texts, Refusal(str(error)))
     texts["constants"] = header(
         controller,
         printable(flight.name),
