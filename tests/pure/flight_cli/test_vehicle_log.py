@@ -36,6 +36,7 @@ from flight_design.identification.sign_check import recorded_response
 from flight_log.file_kinds import FileKind, file_kind
 from flight_log.tape_reader import read_run
 from flight_log.vehicle_log import read_vehicle_log
+from flight_log.vehicle_tables import Reason, Taken
 from flight_view.flight import Flight as View
 
 pytestmark = pytest.mark.slow
@@ -679,7 +680,7 @@ def test_system_of_a_tlog_that_flew_is_taken_and_named(flight: Flight, tmp_path:
     path, single = two_systems(tmp_path, flight, still)
     both = read_vehicle_log(path)
     expected = read_vehicle_log(single)
-    assert both.taken == (("system", "1 of 7 and 1: it alone moves"),)
+    assert both.taken == (Taken("system", (1,), (7, 1), Reason.SYSTEM_MOVES),)
     assert both.parameters == expected.parameters
     for name, table in expected.tables.items():
         for field, values in table.fields.items():
@@ -805,21 +806,21 @@ DEAD = np.random.default_rng(3).normal(2.0, 0.3, (round(DURATION * RATE), 1))  #
 
 
 @pytest.mark.parametrize(
-    "flags, taken",
+    "flags, reason",
     [
-        ({"H": (0, 1), "U": (0, 1), "Pri": (1, 1)}, "1 of 0 and 1: the primary"),
-        ({"H": (0, 1), "U": (1, 1), "Pri": (0, 0)}, "1 of 0 and 1: healthy and used"),
-        ({"H": (1, 1), "U": (0, 1)}, "1 of 0 and 1: healthy and used"),
-        ({}, "1 of 0 and 1: healthy and used"),
+        ({"H": (0, 1), "U": (0, 1), "Pri": (1, 1)}, Reason.PRIMARY),
+        ({"H": (0, 1), "U": (1, 1), "Pri": (0, 0)}, Reason.USED),
+        ({"H": (1, 1), "U": (0, 1)}, Reason.USED),
+        ({}, Reason.USED),
     ],
     ids=["primary", "dead primary", "not used", "no flags"],
 )
 def test_airspeed_is_that_of_the_sensor_that_measures(
-    flags: Mapping[str, tuple[int, int]], taken: str, flight: Flight, tmp_path: Path
+    flags: Mapping[str, tuple[int, int]], reason: Reason, flight: Flight, tmp_path: Path
 ) -> None:
     path = sensors(tmp_path / "a.bin", flight, "ARSP", {}, DEAD, flight.y[:, [1]] + SPEED, **flags)
     log = read_vehicle_log(path)
-    assert log.taken == (("ARSP", taken),)
+    assert log.taken == (Taken("ARSP", (1,), (0, 1), reason),)
     assert log.tables["ARSP"].fields["Airspeed"] == approx(flight.y[:, 1] + SPEED, abs=1e-4)
 
 
@@ -865,7 +866,8 @@ def test_airspeed_of_a_primary_that_changes_in_flight_is_that_of_each_instant(
         "ArduPlane V4.6.0 (1f2e3d4c)",
     )
     log = read_vehicle_log(path)
-    assert log.taken == (("ARSP", "0 and 1 of 0 and 1: the primary"),)
+    assert log.taken == (Taken("ARSP", (0, 1), (0, 1), Reason.PRIMARY),)
+    assert log.taken[0].sentence() == "0 and 1 of 0 and 1: the primary"
     assert log.tables["ARSP"].fields["Airspeed"] == approx(flight.y[:, 1] + SPEED, abs=1e-4)
 
 
@@ -877,15 +879,13 @@ def test_gyroscope_is_one_that_is_used_and_two_that_differ_are_refused(
         tmp_path / "a.bin", flight, "IMU", {"INS_USE": 0.0, "INS_USE2": 1.0}, -rates, rates
     )
     log = read_vehicle_log(not_used)
-    assert log.taken == (("IMU", "1 of 0 and 1: it alone is used and moves"),)
+    assert log.taken == (Taken("IMU", (1,), (0, 1), Reason.MOVES),)
     assert log.tables["IMU"].fields["GyrY"] == approx(rates[:, 1], abs=1e-6)
     turned = sensors(tmp_path / "b.bin", flight, "IMU", {}, rates, -rates)
     with refusing("found IMU of 0 and 1, which differ, expected --instance IMU=0 or"):
         read_vehicle_log(turned)
     equal = sensors(tmp_path / "c.bin", flight, "IMU", {}, rates, rates + 0.001)
-    assert read_vehicle_log(equal).taken == (
-        ("IMU", "0 of 0 and 1: the first of those that agree"),
-    )
+    assert read_vehicle_log(equal).taken == (Taken("IMU", (0,), (0, 1), Reason.AGREES),)
 
 
 def test_vtol_of_px4_is_flown_by_its_surfaces_as_a_plane(flight: Flight, tmp_path: Path) -> None:

@@ -14,10 +14,18 @@ from collections.abc import Mapping, Set
 
 import numpy as np
 
-from flight_core.outcome import Refusal, joined
 from flight_core.parameters import ParameterError, require
 from flight_log.log_samples import Instances
-from flight_log.vehicle_tables import Choice, MessageTable, Parameters, VehicleKind
+from flight_log.vehicle_tables import (
+    Choice,
+    MessageTable,
+    Parameters,
+    Reason,
+    Taken,
+    UnusedSensor,
+    VehicleKind,
+    enumeration,
+)
 
 # an instance was not flown if it moves by less than this fraction of the largest motion
 STILL = 0.1
@@ -36,8 +44,8 @@ CORES = ("XKF1", "NKF1", "EKF1")
 
 def instances_of_flight(
     instances: Instances, fields: Mapping[str, Set[str]], parameters: Parameters, choice: Choice
-) -> tuple[dict[str, MessageTable], list[tuple[str, str]]]:
-    """Return a table for each message, and which instance was chosen with the reason.
+) -> tuple[dict[str, MessageTable], list[Taken]]:
+    """Return a table for each message, and which instance was taken and why.
 
     `fields` has the fields that are read, by message. For a message that is not in `fields`, the
     first instance is taken. Raises ParameterError if two different instances remain, if `choice`
@@ -51,43 +59,50 @@ def instances_of_flight(
             f"a message of the log, as {', '.join([*instances][:8])}",
         )
     tables: dict[str, MessageTable] = {}
-    choices: list[tuple[str, str]] = []
+    choices: list[Taken] = []
     for name, sensors in instances.items():
+        among = tuple(sorted(sensors))
         number = choice.instances.get(name)
-        reason = "by --instance"
+        reason: Reason | None = Reason.BY_INSTANCE
         if number is not None:
             require(
-                number in sensors, f"--instance {name}", number, f"one of {_enumeration(sensors)}"
+                number in sensors,
+                f"--instance {name}",
+                number,
+                f"one of {enumeration(among)}",
             )
         elif name == "ARSP":
-            unused = _reason_against_airspeed(sensors, parameters)
+            unused = _unused_sensors(sensors, parameters)
             if unused and _has_estimate(instances):
-                choices.append((name, f"{unused}: V is the estimate in CTUN"))
+                choices.append(Taken(name, (), among, Reason.ESTIMATE, unused))
                 continue
             ways_out = "its estimate in CTUN, or --instance ARSP=0"
-            require(unused is None, "the log", f"no airspeed sensor in use ({unused})", ways_out)
-            tables[name], sentence = _airspeed(sensors)
+            reasons = "; ".join(sensor.sentence() for sensor in unused)
+            require(not unused, "the log", f"no airspeed sensor in use ({reasons})", ways_out)
+            tables[name], numbers, reason = _airspeed(sensors)
             if len(sensors) > 1:
-                choices.append((name, sentence))
+                choices.append(Taken(name, numbers, among, reason))
             continue
         elif len(sensors) == 1 or name not in fields or name in CORES:
             number = min(sensors)
-            reason = "the first" if name in fields and len(sensors) > 1 else ""
+            reason = Reason.FIRST if name in fields and len(sensors) > 1 else None
         elif name in SURFACES:
             if choice.vehicle is VehicleKind.PLANE:
-                number, reason = (1, "the surfaces of a VTOL")
+                number, reason = 1, Reason.SURFACES
             else:
-                number, reason = (0, "the rotors of a VTOL")
+                number, reason = 0, Reason.ROTORS
         else:
             usable = _usable_sensors(sensors, parameters) if name == "IMU" else set(sensors)
             number, reason = _of_motion(name, {k: sensors[k] for k in sorted(usable)}, fields[name])
         tables[name] = sensors[number]
-        if reason:
-            choices.append((name, f"{number} of {_enumeration(sensors)}: {reason}"))
+        if reason is not None:
+            choices.append(Taken(name, (number,), among, reason))
     return tables, choices
 
 
-def _of_motion(name: str, tables: Mapping[int, MessageTable], fields: Set[str]) -> tuple[int, str]:
+def _of_motion(
+    name: str, tables: Mapping[int, MessageTable], fields: Set[str]
+) -> tuple[int, Reason]:
     """Choose the instance of a message that moves, and return its number and the reason.
 
     If several instances move and agree, the first of them is chosen. Raises ParameterError if the
@@ -100,10 +115,10 @@ def _of_motion(name: str, tables: Mapping[int, MessageTable], fields: Set[str]) 
     }
     first, *others = moving
     if all(_agree(moving[first], moving[number], fields) for number in others):
-        return first, "the first of those that agree" if others else "it alone is used and moves"
+        return first, Reason.AGREES if others else Reason.MOVES
     ways_out = " or ".join(f"--instance {name}={number}" for number in moving)
     raise ParameterError(
-        f"the log: found {name} of {_enumeration(moving)}, which differ, expected {ways_out}"
+        f"the log: found {name} of {enumeration(sorted(moving))}, which differ, expected {ways_out}"
     )
 
 
@@ -171,11 +186,13 @@ def _share(table: MessageTable, field: str) -> float:
     return float(np.mean(table.fields[field] != 0.0)) if field in table.fields else 1.0
 
 
-def _airspeed(sensors: Mapping[int, MessageTable]) -> tuple[MessageTable, str]:
+def _airspeed(
+    sensors: Mapping[int, MessageTable],
+) -> tuple[MessageTable, tuple[int, ...], Reason]:
     """Return the airspeed of the primary sensor, or of another sensor in use and healthy.
 
     The primary sensor may change in flight. The airspeed is NaN while the sensor is not healthy.
-    The second result says which sensor was taken.
+    The further results are the numbers of the sensors that were taken, and why.
     """
     tables = {number: _healthy(table) for number, table in sensors.items()}
     live = {
@@ -195,21 +212,21 @@ def _airspeed(sensors: Mapping[int, MessageTable]) -> tuple[MessageTable, str]:
             if number not in numbers and not _agree(candidates[number], table, {"Airspeed"})
         ]
         if not unlike:
-            return table, f"{_enumeration(numbers)} of {_enumeration(tables)}: the primary"
+            return table, tuple(sorted(numbers)), Reason.PRIMARY
         candidates = {number: tables[number] for number in (*numbers, *unlike)}
     number, _ = _of_motion("ARSP", candidates, {"Airspeed"})
-    return tables[number], f"{number} of {_enumeration(tables)}: healthy and used"
+    return tables[number], (number,), Reason.USED
 
 
-def _reason_against_airspeed(
+def _unused_sensors(
     sensors: Mapping[int, MessageTable], parameters: Parameters
-) -> Refusal | None:
-    """Return a refusal if the autopilot flew by none of its airspeed sensors, else None.
+) -> tuple[UnusedSensor, ...]:
+    """Return the airspeed sensors if the autopilot flew by none of them.
 
-    The log shows this by the flags U and H, or if it has no U, by the parameter ARSPD_USE. Returns
-    None as well if the log does not show it.
+    The log shows this by the flags U and H, or if it has no U, by the parameter ARSPD_USE. The
+    result is empty if the autopilot flew by a sensor, or if the log does not show it.
     """
-    reasons = []
+    unused = []
     for number, table in sorted(sensors.items()):
         setting = f"ARSPD{number + 1 if number else ''}_USE"
         records = parameters.get(setting, ())
@@ -218,10 +235,10 @@ def _reason_against_airspeed(
         else:
             is_used = not records or records[0].value != 0.0
         if is_used and _share(table, "H") >= MOST:
-            return None
-        value = f", {setting} {records[0].value:g}" if records else ""
-        reasons.append(Refusal(f"{number} is not {'healthy' if is_used else 'used'}{value}"))
-    return joined(reasons)
+            return ()
+        value = records[0].value if records else None
+        unused.append(UnusedSensor(number, is_used, setting, value))
+    return tuple(unused)
 
 
 def _has_estimate(instances: Instances) -> bool:
@@ -253,7 +270,3 @@ def _primary(tables: Mapping[int, MessageTable]) -> tuple[list[int], MessageTabl
     )
     order = np.argsort(stamps, kind="stable")
     return numbers, MessageTable(stamps[order], {"Airspeed": airspeed[order]})
-
-
-def _enumeration(numbers: Mapping[int, MessageTable] | list[int]) -> str:
-    return " and ".join(map(str, sorted(numbers)))

@@ -51,8 +51,11 @@ from flight_log.vehicle_tables import (
     Loss,
     MessageTable,
     OtherVehicle,
+    Reason,
+    Taken,
     VehicleKind,
     VehicleLog,
+    enumeration,
 )
 
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1, common.xml
@@ -216,17 +219,18 @@ def _read_tlog(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
 
 def _flown_system(
     messages_of: Mapping[int, list[Received]], choice: int | None
-) -> tuple[int, tuple[tuple[str, str], ...]]:
+) -> tuple[int, tuple[Taken, ...]]:
     """Choose which system of a tlog flew, and return its number.
 
     `choice` is the user's choice. The number is 0 if no autopilot sent a heartbeat. If the user
-    chose, or if there were several systems, also returns the choice with its reason. Raises
+    chose, or if there were several systems, also returns what was taken and why. Raises
     ParameterError if two systems moved, or if the log lacks the system that the user chose.
     """
-    numbers = " and ".join(map(str, messages_of)) or "none with a heartbeat"
+    among = tuple(messages_of)
     if choice is not None:
+        numbers = enumeration(among) or "none with a heartbeat"
         require(choice in messages_of, "--system", choice, f"one of {numbers}")
-        return choice, (("system", f"{choice} of {numbers}: by --system"),)
+        return choice, (Taken("system", (choice,), among, Reason.BY_SYSTEM),)
     motions = {}
     for system, messages in messages_of.items():
         attitudes = [message.content for message in messages if message.name == "ATTITUDE"]
@@ -240,11 +244,11 @@ def _flown_system(
     if len(moving) > 1:
         ways_out = " or ".join(f"--system {system}" for system in moving)
         raise ParameterError(
-            f"the log: found motion of the systems {' and '.join(map(str, moving))}, expected "
-            f"{ways_out}"
+            f"the log: found motion of the systems {enumeration(moving)}, expected {ways_out}"
         )
-    reason = f"{moving[0]} of {numbers}: it alone moves"
-    return moving[0], (("system", reason),) * (len(messages_of) > 1)
+    if len(among) == 1:
+        return moving[0], ()
+    return moving[0], (Taken("system", (moving[0],), among, Reason.SYSTEM_MOVES),)
 
 
 # Least share of different times among the messages with a time. With a smaller share, the clock

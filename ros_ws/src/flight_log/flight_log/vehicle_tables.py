@@ -7,7 +7,7 @@ PX4 guide, ULog file format, and PX4's msg/*.msg.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from types import MappingProxyType
@@ -163,6 +163,59 @@ class Choice(NamedTuple):
 ANY = Choice()
 
 
+class Reason(StrEnum):
+    """Why a system, a sensor or an instance of a log was taken."""
+
+    BY_SYSTEM = "by --system"
+    BY_INSTANCE = "by --instance"
+    SYSTEM_MOVES = "it alone moves"
+    FIRST = "the first"
+    SURFACES = "the surfaces of a VTOL"
+    ROTORS = "the rotors of a VTOL"
+    AGREES = "the first of those that agree"
+    MOVES = "it alone is used and moves"
+    PRIMARY = "the primary"
+    USED = "healthy and used"
+    ESTIMATE = "V is the estimate in CTUN"
+
+
+class UnusedSensor(NamedTuple):
+    """An airspeed sensor by which the autopilot did not fly."""
+
+    number: int
+    is_used: bool  # whether the autopilot would use it, but it is not healthy
+    setting: str  # name of the parameter ARSPD..._USE
+    value: float | None  # value of the parameter; None if the log lacks it
+
+    def sentence(self) -> str:
+        """Say why the sensor did not count, as in "0 is not used, ARSPD_USE 0"."""
+        value = "" if self.value is None else f", {self.setting} {self.value:g}"
+        return f"{self.number} is not {'healthy' if self.is_used else 'used'}{value}"
+
+
+class Taken(NamedTuple):
+    """What was taken among several systems, sensors or instances of a log, and why."""
+
+    what: str  # name of the message, or "system"
+    numbers: tuple[int, ...]  # those that were taken; none if an estimate replaces the sensors
+    among: tuple[int, ...]  # those of the log
+    reason: Reason
+    unused: tuple[UnusedSensor, ...] = ()  # the sensors that an estimate replaces
+
+    def sentence(self) -> str:
+        """Say what was taken and why, as in "1 of 0 and 1: the primary"."""
+        if self.reason is Reason.ESTIMATE:
+            taken = "; ".join(sensor.sentence() for sensor in self.unused)
+        else:
+            taken = f"{enumeration(self.numbers)} of {enumeration(self.among)}"
+        return f"{taken}: {self.reason}"
+
+
+def enumeration(numbers: Iterable[int]) -> str:
+    """Write numbers as in "0 and 1"."""
+    return " and ".join(map(str, numbers))
+
+
 class Loss(NamedTuple):
     """What a log has lost, and the last stamps before the first and before the last loss, ns."""
 
@@ -193,8 +246,7 @@ class VehicleLog(NamedTuple):
     vehicle: VehicleKind | OtherVehicle | None = VehicleKind.PLANE
     # Number of the mode in which the sticks of a plane are the commands; ArduPlane's is 0 (mode.h).
     manual: int = 0
-    # The choices among several systems, sensors or instances, with their reasons.
-    taken: tuple[tuple[str, str], ...] = ()
+    taken: tuple[Taken, ...] = ()
     loss: Loss | None = None
 
     def source(self, quantity: str) -> LogField | None:

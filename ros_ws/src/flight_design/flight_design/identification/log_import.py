@@ -165,7 +165,7 @@ def _imported(
     show(
         [
             Agreement("vehicle", "" if logged_kind is None else str(logged_kind), kind),
-            *(Agreement(*row, "") for row in log.taken),
+            *(Agreement(taken.what, taken.sentence(), "") for taken in log.taken),
             *rows_compared,
         ]
     )
