@@ -65,6 +65,8 @@ from flight_core.parameters import (
     Numbers,
     ParameterError,
     Positive,
+    Rate,
+    RateOrZero,
     require,
 )
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
@@ -97,7 +99,7 @@ class AircraftConfig(NodeConfig):
         description="for JSBSim, by input: properties with their values at the command 1; "
         "`rudder: none` for a model without rudder",
     )
-    rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="rate of y and u, Hz")
+    rate: Rate = Field(description="rate of y and u, Hz")
     step: Annotated[float, Field(gt=0, ge=SHORTEST_STEP, le=1)] = Field(
         description="integration step, s; a whole fraction of 1 / rate"
     )
@@ -150,8 +152,8 @@ class AircraftConfig(NodeConfig):
         default=PoseConfig(), description="how the pose is measured; exactly if left out"
     )
 
-    control_rate: float = Field(
-        default=0.0, ge=0, le=1000, description="the controller's rate in lockstep, Hz"
+    control_rate: RateOrZero = Field(
+        default=0.0, description="the controller's rate in lockstep, Hz"
     )
     duration: float = Field(
         default=0.0,
@@ -164,10 +166,7 @@ class AircraftConfig(NodeConfig):
     max_age: float = Field(default=0.2, gt=0, le=1e6, description="age at which u times out, s")
     hold: float = Field(default=0.5, ge=0, le=1e6, description="how long the failsafe holds u, s")
     ramp: float = Field(
-        default=2.0,
-        ge=0,
-        le=1e6,
-        description="how long the failsafe then ramps u to trim, s",
+        default=2.0, ge=0, le=1e6, description="how long the failsafe then ramps u to trim, s"
     )
 
     @classmethod

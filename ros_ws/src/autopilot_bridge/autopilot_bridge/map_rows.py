@@ -9,7 +9,7 @@ from typing import Annotated, Literal, get_args
 
 from autopilot_bridge.channel_map import PATH, LinearConversion
 from flight_core.fields import Field
-from flight_core.parameters import Config, NonNegative, Number, Numbers, Positive, require
+from flight_core.parameters import Config, NonNegative, Number, Numbers, Positive, Rate, require
 
 MAVLINK = "mavlink"  # package of MAVLink's message types, and first part of their topics
 
@@ -39,7 +39,6 @@ UNITS: Mapping[str, str] = MappingProxyType(
 )
 """The unit of the output that shows a motion."""
 
-Rate = Annotated[float, Field(ge=1, le=1000)]
 Function = Literal[
     "value",
     "norm",

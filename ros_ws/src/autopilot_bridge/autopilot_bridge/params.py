@@ -25,13 +25,12 @@ from autopilot_bridge.map_rows import (
     ParameterRow,
     PoseRow,
     QosRow,
-    Rate,
     SilenceConfig,
 )
 from flight_core.channels import POSE
 from flight_core.fields import Field
 from flight_core.files import find_file, names_in, read_yaml
-from flight_core.parameters import Config, Name, NodeConfig, NonNegative, Positive, require
+from flight_core.parameters import Config, Name, NodeConfig, NonNegative, Positive, Rate, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
 # The name of a parameter of the autopilot, up to 16 characters (common.xml, PARAM_VALUE).

@@ -17,6 +17,7 @@ from c_export.proof import SOURCE, write_code
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
+from rise_di_controller.extensions.schedule import TORQUE_SPEEDS
 
 AXES: Mapping[str, int] = MappingProxyType({"p": 0, "q": 1, "r": 2})
 """Channels of y, with the number of the axis in autopilots: roll, pitch, yaw."""
@@ -25,9 +26,6 @@ AXES: Mapping[str, int] = MappingProxyType({"p": 0, "q": 1, "r": 2})
 # reference model up to the instant of this y or past it. So a tick needs only the newest y and two
 # samples of y_m.
 SAMPLES = 8
-# Airspeeds as fractions of the trim speed. The torque for a u follows the dynamic pressure only
-# between these airspeeds.
-SLOWEST, FASTEST = 0.6, 1.6
 
 HOOKS = """ArduPlane/Plane.h, in class Plane, beside void stabilize();
     void rise_di();
@@ -267,6 +265,7 @@ def _axes(scenario: Scenario, suffix: str) -> str:
         )
         per_u.append(f"{float(sign / end)!r}{suffix}")
     speed = channels.speed
+    slowest, fastest = TORQUE_SPEEDS
     observer = exportable(controller).observer
     part = 0.0 if observer is None else observer.part
     slew = 0.0 if observer is None else part / observer.within
@@ -275,8 +274,8 @@ def _axes(scenario: Scenario, suffix: str) -> str:
         per_u=", ".join(per_u),
         scaled=int(speed > 0.0),
         speed=speed,
-        slowest=SLOWEST * speed,
-        fastest=FASTEST * speed,
+        slowest=slowest * speed,
+        fastest=fastest * speed,
         part=f"{part!r}{suffix}",
         slew=f"{slew!r}{suffix}",
     )

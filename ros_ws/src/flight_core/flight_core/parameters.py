@@ -262,6 +262,12 @@ makes products and quotients of the law overflow."""
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0, ge=SMALLEST, le=LARGEST)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+RATES = (1, 1000)
+"""The lowest and the highest rate of a node, Hz. benchmarks/speed.py measures nodes up to the
+highest."""
+Rate = Annotated[float, Field(ge=RATES[0], le=RATES[1])]
+RateOrZero = Annotated[float, Field(ge=0, le=RATES[1])]
+"""Type of a rate that not every flight has; 0 stands for none."""
 Numbers = Annotated[tuple[Number, ...], Field(min_length=1)]
 Positives = Annotated[tuple[Positive, ...], Field(min_length=1)]
 """Type of a parameter: a list of at least one number, each above 0."""

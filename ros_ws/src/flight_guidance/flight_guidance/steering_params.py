@@ -19,6 +19,8 @@ from flight_core.parameters import (
     Numbers,
     Positive,
     Positives,
+    Rate,
+    RateOrZero,
 )
 from flight_core.units import GRAVITY
 from flight_guidance import reach
@@ -72,18 +74,16 @@ STEEPEST = 0.1
 class SteeringConfig(NodeConfig):
     """Parameters of steering, from which the constants in the equations of guidance follow."""
 
-    rate: Annotated[float, Field(ge=1, le=1000)] = Field(
-        default=50.0, description="rate at which u_m is published, Hz"
-    )
+    rate: Rate = Field(default=50.0, description="rate at which u_m is published, Hz")
     start_time: float = Field(
         default=0.0,
         ge=-1,
         le=1e10,
         description="system time of t = 0, s since the epoch; 0: at once; -1: by topic `start`",
     )
-    y_rate: float = Field(default=0.0, ge=0, le=1000, description="rate of y in lockstep, Hz")
-    authority_rate: float = Field(
-        default=0.0, ge=0, le=1000, description="rate of `authority`, Hz; 0 without a learner"
+    y_rate: RateOrZero = Field(default=0.0, description="rate of y in lockstep, Hz")
+    authority_rate: RateOrZero = Field(
+        default=0.0, description="rate of `authority`, Hz; 0 without a learner"
     )
     outputs: Names = Field(default=RATES_AND_SPEED, description="commands u_m, in any order")
     natural_frequency: Positives = Field(

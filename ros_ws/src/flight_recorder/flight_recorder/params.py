@@ -5,7 +5,7 @@
 from typing import Annotated
 
 from flight_core.fields import Field
-from flight_core.parameters import NodeConfig, NonNegative
+from flight_core.parameters import RATES, NodeConfig, NonNegative
 
 OptionalNames = tuple[str, ...]
 
@@ -14,7 +14,7 @@ class RecorderConfig(NodeConfig):
     """Parameters of the recorder's node."""
 
     # The rate of the laws, so that all messages of one tick are written together.
-    rate: Annotated[float, Field(ge=5, le=1000)] = Field(
+    rate: Annotated[float, Field(ge=5, le=RATES[1])] = Field(
         default=100.0, description="rate of writing, Hz"
     )
     directory: str = Field(

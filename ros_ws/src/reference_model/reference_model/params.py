@@ -24,6 +24,8 @@ from flight_core.parameters import (
     ParameterError,
     Positive,
     Positives,
+    Rate,
+    RateOrZero,
     require,
 )
 from flight_core.rates import nanoseconds, period_ns
@@ -230,9 +232,7 @@ class Linear(Config):
 class ReferenceModelConfig(NodeConfig):
     """Parameters of the reference model node."""
 
-    rate: Annotated[float, Field(ge=1, le=1000)] = Field(
-        description="rate at which y_m is published, Hz"
-    )
+    rate: Rate = Field(description="rate at which y_m is published, Hz")
     start_time: float = Field(
         default=0.0,
         ge=-1,
@@ -260,8 +260,8 @@ class ReferenceModelConfig(NodeConfig):
         default=None, description="yaw rate in a coordinated turn"
     )
     live: LiveCommands = Field(default=LiveCommands(), description="limits of live commands u_m")
-    u_m_rate: float = Field(
-        default=0.0, ge=0, le=1000, description="rate of u_m in lockstep, Hz; 0 for no u_m"
+    u_m_rate: RateOrZero = Field(
+        default=0.0, description="rate of u_m in lockstep, Hz; 0 for no u_m"
     )
 
     def _check(self) -> None:

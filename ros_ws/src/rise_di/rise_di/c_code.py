@@ -35,7 +35,7 @@ from flight_analysis.report.margin_figures import guarantee_text
 from flight_core.arguments import FilePath, as_number, as_path
 from flight_core.files import write_file, writing
 from flight_core.outcome import Refusal
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import RATES, ParameterError, require
 from flight_core.rates import period_ns, seconds
 from flight_core.text import printable
 from flight_design.gains.first_scenario import controller_alone
@@ -45,7 +45,6 @@ from rise_di_controller.guard.guard import SAMPLE_BUFFER_SIZE
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 PART = 50_000  # number of drawn steps in a recording
-RATES = (1.0, 1000.0)  # the lowest and the highest rate, Hz
 LONGEST = 20.0  # longest flight if no duration is given, s
 
 

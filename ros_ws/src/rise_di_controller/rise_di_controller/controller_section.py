@@ -19,6 +19,8 @@ from flight_core.parameters import (
     NonNegatives,
     Numbers,
     Positives,
+    Rate,
+    RateOrZero,
     Signs,
     flatten,
 )
@@ -58,10 +60,8 @@ class ControllerSection(NodeConfig):
     """What the law must measure in addition to y and y_m, in words. The controller refuses a law
     that needs such a measurement."""
 
-    rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="rate of the law, Hz")
-    y_rate: Annotated[float, Field(ge=0, le=1000)] = Field(
-        default=0.0, description="rate of y in lockstep, Hz"
-    )
+    rate: Rate = Field(description="rate of the law, Hz")
+    y_rate: RateOrZero = Field(default=0.0, description="rate of y in lockstep, Hz")
     law: str = Field(default="rise_di", description="the law, by its registered name")
     outputs: Names = Field(
         description="channels of y; RISE-DI gives the last one the smallest gain (22)"

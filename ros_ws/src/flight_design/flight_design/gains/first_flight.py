@@ -18,10 +18,13 @@ from flight_design.gains import gain_yaml
 from flight_design.gains.channel_signs import MAX_COUPLING
 from flight_design.gains.effectors import Effectors, LawInputs, design_allocation
 from flight_design.gains.first_scenario import (
+    CONTROL_RATE,
+    RATE,
     Channel,
     Sections,
     first_commands,
     scenario_text,
+    sensor_noise,
     unit_gains,
 )
 from flight_design.gains.gain_conditions import bandwidths
@@ -41,10 +44,6 @@ STOP = 0.35
 SURFACE_RATE = 1.0
 # m/s^2, rad/s^2: assumed effect of any other input at its end stop
 AUTHORITY = {SPEED: 0.3 * GRAVITY, ANGULAR_RATE: 2.0}
-NOISE = {"V": 0.05, "u": 0.05}  # m/s
-RATE_NOISE = 0.001  # rad/s, also for any other output
-RATE = 200.0  # Hz, of y and y_m
-CONTROL_RATE = 100.0  # Hz, of the law
 DELAY = 0.003  # s, beyond sampling
 APART = 3.0  # time between two gusts, s
 
@@ -132,7 +131,7 @@ def _channels(airframe: Airframe, lag: Sequence[float]) -> dict[str, Channel]:
             motion=output,
             authority=float(authority[i]),
             bandwidth=float(bandwidth[i]),
-            noise=NOISE.get(output, RATE_NOISE),
+            noise=sensor_noise(output),
             damping=max(float(damping[i]), 0.0),
         )
         for i, output in enumerate(outputs)

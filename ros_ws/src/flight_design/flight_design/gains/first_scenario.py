@@ -28,6 +28,11 @@ from rise_di_controller.params import ControllerConfig
 
 LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n"
 
+RATE = 200.0  # Hz, of y and y_m
+CONTROL_RATE = 100.0  # Hz, of the law
+# Assumed noise of the sensors, rms of a sample: of an airspeed, m/s, and of any other output.
+SPEED_NOISE = 0.05
+RATE_NOISE = 0.001  # rad/s
 # rad/s, largest natural frequency of the reference model, as in osprey_gust
 FASTEST = {"q": 4.0, "p": 5.0, "r": 4.0}
 # rad/s, largest natural frequency for an airspeed, a climb, and any other output
@@ -59,6 +64,11 @@ LAST = 20.0  # s, time after the last command, for a gust and the return to trim
 COMMANDED = "osprey_servo"
 # parameters that the selection of gains finds
 GAINS = {"k_g", "k_d", "Lambda", "beta", "omega", "input_scale", "D"}
+
+
+def sensor_noise(output: str) -> float:
+    """Return the assumed noise of the sensor of an output, rms of a sample, SI."""
+    return SPEED_NOISE if output in {"V", "u"} else RATE_NOISE
 
 
 class Channel(NamedTuple):

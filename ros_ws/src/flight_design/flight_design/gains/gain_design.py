@@ -31,7 +31,7 @@ from flight_core.arguments import (
     as_numbers,
     as_numbers_by_name,
 )
-from flight_core.parameters import require
+from flight_core.parameters import RATES, require
 from flight_core.units import unit_sizes
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control, tuned_gains
@@ -75,7 +75,6 @@ STABLE = Requirement(phase=1e-3, gain=1.001, sensitivity=1e3, damping=1e-3, wors
 """What gains from a file need: only a stable loop."""
 DIAGONAL, FULL = MIXINGS = ("diagonal", "full")
 MESSAGES = 3.0  # least age limit of the law, in periods of y
-RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
 MAX_SAMPLES = 10_000
 PERFECT_VANE = 1e-4  # rad, noise of a vane that is called perfect
 LEAST_SPEED, MOST_SPEED = 0.6, 1.8  # fractions of the trim speed, in the range of the schedule

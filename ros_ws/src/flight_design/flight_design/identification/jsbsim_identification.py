@@ -35,11 +35,14 @@ from flight_core.vectors import FloatArray, selection_matrix
 from flight_design.gains import gain_selection, gain_yaml, ideal_control
 from flight_design.gains.airframe_properties import invariant_zeros
 from flight_design.gains.first_scenario import (
+    CONTROL_RATE,
+    RATE,
     Channel,
     FirstCommands,
     Sections,
     first_commands,
     scenario_text,
+    sensor_noise,
     unit_gains,
 )
 from flight_design.gains.gain_selection import LoopSetting, Selection
@@ -52,7 +55,6 @@ from flight_design.identification.manoeuvre import (
     GUST_LENGTH,
     GUST_SPEED,
     HEIGHTS,
-    RATE,
     TURN,
     TURN_START,
     ManoeuvreResult,
@@ -65,8 +67,7 @@ from rise_di_controller.law.decomposition import coupling
 from rise_di_controller.law.law import total_lag
 from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiConfig
 
-CONTROL_RATE = 100.0
-STEP = 0.005
+STEP = 1.0 / RATE
 # s, delay over topics. At a tick y is up to 5 ms old, and u waits up to 5 ms. Half of these 10 ms
 # counts, and 1 ms for transport.
 DELAY = 0.006
@@ -83,12 +84,6 @@ LATERAL = ("beta", "p", "r")
 # damping that is added, as a multiple of the unstable zero: it reverses the zero's sign
 HELD_FACTOR = 2.0
 APART = 5.0  # s, time from one gust to the next
-
-NOISE = {"q": 0.001, "V": 0.05, "p": 0.001, "r": 0.001}
-"""Assumed noise of the sensors of an aircraft that learns, rms of a sample, rad/s and m/s.
-
-`first_flight` assumes the same noise.
-"""
 
 
 # The manoeuvre, by one rule for all aircraft
@@ -373,7 +368,7 @@ def learning_selection(
     """
     start = selection.chosen
     name = Path(condition.name).stem
-    noise = np.array([NOISE[output] for output in start.outputs])
+    noise = np.array([sensor_noise(output) for output in start.outputs])
     rough = _in_law_order(Omega, start)
     sketched = with_sketch(start, name, rough, condition.speed, noise, margin)
     learn = LearnConfig(prior=PriorConfig(sketch=True))
@@ -502,7 +497,7 @@ def _text(
     if learns:
         air = {
             "turbulence": moderate_turbulence(condition.altitude),
-            "sensors": {"noise": [NOISE[name] for name in OUTPUTS], "seed": 1},
+            "sensors": {"noise": [sensor_noise(name) for name in OUTPUTS], "seed": 1},
         }
     count = len(condition.inputs())
     stops = {"lower": linear.trim.lower, "upper": linear.trim.upper}

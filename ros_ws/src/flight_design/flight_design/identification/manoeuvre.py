@@ -14,7 +14,6 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error, error_metrics, saturation_shares
 from flight_core.tape import Tape
 
-RATE = 200.0  # Hz, of y and y_m
 HEIGHTS = {"q": 0.05, "V": 2.0, "p": 0.15, "r": 0.05}
 """Heights of the pulses of the outputs, SI. `IdentifiedAircraft.coupling` is measured in these
 units. For an output without a pulse, the largest rms error in calm air of an aircraft that flies is

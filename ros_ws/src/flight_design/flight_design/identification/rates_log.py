@@ -24,6 +24,7 @@ from flight_design.identification.innovation_filters import FlightData, coarser,
 from flight_design.identification.log_import import Imported, Window, imported
 from flight_design.identification.parameter_agreement import Agreement
 from flight_log.vehicle_tables import VehicleLog
+from rise_di_controller.extensions.schedule import TORQUE_SPEEDS
 
 MAPS: Mapping[str, str] = MappingProxyType({"px4": "px4", "ardupilot": "ardupilot"})
 """The channel map that has the topics of an autopilot."""
@@ -31,10 +32,6 @@ CUTOFFS: Mapping[str, str] = MappingProxyType(
     {"px4": "IMU_GYRO_CUTOFF", "ardupilot": "INS_GYRO_FILTER"}
 )
 """The parameter that holds the cut-off frequency of the gyro's low-pass."""
-SLOWEST, FASTEST = (
-    0.6,
-    1.6,
-)  # times the trim speed: c_export.autopilots clips the dynamic pressure at these speeds
 PERIOD = 0.008  # s, least period of the identification: more samples make the search longer
 SPARSE = 1.5  # largest period of a log that has every u, in periods of the law
 # cut-off in Hz of a filter behind which the noise of samples a PERIOD apart is white
@@ -204,5 +201,5 @@ def _pressure(log: VehicleLog, scenario: Scenario, u: Signal) -> FloatArray:
     source = log.source("V")
     if speed <= 0.0 or source is None:
         return np.ones(len(u.stamp_ns))
-    ratio = np.clip(log.at(source, u.stamp_ns) / speed, SLOWEST, FASTEST)
+    ratio = np.clip(log.at(source, u.stamp_ns) / speed, *TORQUE_SPEEDS)
     return np.asarray(np.where(np.isfinite(ratio), ratio, 1.0) ** 2)

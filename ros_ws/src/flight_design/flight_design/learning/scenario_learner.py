@@ -26,11 +26,12 @@ from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
+from flight_design.gains.first_scenario import sensor_noise
 from flight_design.gains.gain_design import selected_observer
 from flight_design.gains.gain_selection import loop_setting
 from flight_design.gains.observer_search import SelectedObserver
 from flight_design.identification.innovation_filters import Actuation
-from flight_design.identification.jsbsim_identification import NOISE, STEP_MARGIN
+from flight_design.identification.jsbsim_identification import STEP_MARGIN
 from flight_design.identification.likelihood import KNOWN
 from flight_design.identification.sketch import ROUGH, sketched, with_sketch
 from flight_design.learning.designs import ACTIVITY, Goal, LearnedLoop, asked_margin
@@ -142,8 +143,7 @@ def that_learns(scenario: Scenario) -> Scenario:
     channels = aircraft.channels()
     measured = aircraft.sensors.noise or (0.0,) * len(channels.outputs)
     by_name = dict(zip(channels.outputs, measured, strict=True))
-    # with_sketch refuses an output that NOISE lacks
-    noise = np.array([by_name[name] or NOISE.get(name, 0.0) for name in start.outputs])
+    noise = np.array([by_name[name] or sensor_noise(name) for name in start.outputs])
     Omega = np.diag(np.array(start.D) * start.omega / start.input_scale)
     name = Path(aircraft.airframe.removeprefix(PREFIX)).stem
     sketched = with_sketch(start, name, Omega, channels.speed, noise, STEP_MARGIN)

@@ -25,6 +25,10 @@ from rise_di_controller.law.saturation import Limits
 SCALE_RANGE = (0.3, 3.0)
 """Least and largest factor of input_scale, reached at 1.83 and 0.58 of the trim speed."""
 
+TORQUE_SPEEDS = (0.6, 1.6)
+"""Airspeeds as fractions of the trim speed. The torque that an exported module gives for a u
+follows the dynamic pressure only between these airspeeds, which lie within those of
+SCALE_RANGE."""
 
 # Number of steps of the model per unit of V / V0. At 25 m/s the model changes every 0.2 m/s, so
 # that most ticks find their model in the cache.
