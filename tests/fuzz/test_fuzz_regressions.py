@@ -90,7 +90,7 @@ def test_lz4_chunk_with_changed_bytes_skipped(tmp_path: Path) -> None:
 
 def test_channel_with_invalid_quality_of_service_repaired(tmp_path: Path) -> None:
     run = write_run(tmp_path, log(Y).replace(b"- depth: 1\n", b"[: \x01 depth:"))
-    assert repair(run).wrote_metadata
+    assert repair(run).has_new_metadata
     information = yaml.safe_load((run / METADATA).read_text())["rosbag2_bagfile_information"]
     assert (
         information["topics_with_message_count"][0]["topic_metadata"]["offered_qos_profiles"] == []
@@ -147,7 +147,7 @@ def test_a_log_with_any_parameters_is_repaired(content: bytes, tmp_path: Path) -
     run = write_run(tmp_path, bag[: len(bag) // 2])
     stored = log(Y[:1], attached={"parameters.yaml": content})
     (run / "run_1.mcap").write_bytes(stored.replace(b"application/yaml", b"text/yaml_______"))
-    assert repair(run).wrote_metadata
+    assert repair(run).has_new_metadata
 
 
 def test_exponential_and_recursive_aliases_are_rejected() -> None:

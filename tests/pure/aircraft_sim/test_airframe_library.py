@@ -20,8 +20,8 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.airframe_properties import (
     ZeroDynamics,
     airframe_facts,
-    controllable,
     invariant_zeros,
+    is_controllable,
     library,
 )
 from rise_di_controller.law.decomposition import coupling
@@ -136,10 +136,10 @@ def test_every_airframe_is_in_theorem_with_zero_dynamics_that_only_outer_loop_bo
     # never strictly stable.
     facts = airframe_facts(airframe)
     angles = [state for state in airframe.states if state in ("theta", "phi")]
-    assert facts.controllable
+    assert facts.is_controllable
     assert facts.zero_dynamics is ZeroDynamics.MARGINAL
     assert np.count_nonzero(np.abs(facts.zeros) < 1e-9) == len(angles)
-    assert facts.in_theorem
+    assert facts.is_in_theorem
     assert len(facts.zeros) == facts.n - facts.m > 0
     assert list(facts.integrated) == angles
 
@@ -149,7 +149,7 @@ def test_every_airframe_is_in_theorem_with_zero_dynamics_that_only_outer_loop_bo
 def test_more_inputs_than_outputs_give_d_equal_to_one_through_the_pseudo_inverse(name: str) -> None:
     facts = airframe_facts(name)
     assert_allclose(facts.Omega, np.eye(len(facts.outputs)), atol=1e-9)
-    assert facts.in_theorem
+    assert facts.is_in_theorem
 
 
 def test_split_effectors_moved_together_are_those_of_the_osprey() -> None:
@@ -345,14 +345,14 @@ def test_zero_dynamics_are_classified_by_their_zeros(
     facts = airframe_facts(toy(k))
     assert_allclose(facts.zeros, [zero], atol=1e-12)
     assert facts.zero_dynamics is kind
-    assert facts.in_theorem is (kind is not ZeroDynamics.UNSTABLE)
+    assert facts.is_in_theorem is (kind is not ZeroDynamics.UNSTABLE)
 
 
 @pytest.mark.equation("Assumption 1")
 def test_an_uncontrollable_airframe_is_outside_the_theorem() -> None:
     facts = airframe_facts(toy(0.0))  # nothing drives z
-    assert not facts.controllable
-    assert not facts.in_theorem
+    assert not facts.is_controllable
+    assert not facts.is_in_theorem
 
 
 def test_airframe_without_s_d_u_has_no_d_and_no_remedy() -> None:
@@ -362,7 +362,7 @@ def test_airframe_without_s_d_u_has_no_d_and_no_remedy() -> None:
     assert facts.D is None
     assert facts.coupling is None
     assert facts.remedy == "none"
-    assert not facts.in_theorem
+    assert not facts.is_in_theorem
 
 
 def test_input_that_drives_another_output_gets_new_pairing() -> None:
@@ -390,4 +390,4 @@ def test_zeros_do_not_depend_on_coordinates_of_state() -> None:
         # Rounding in dense coordinates must not turn infinite zeros into finite ones.
         assert len(result) == 4
         assert_allclose(np.sort(result.real), np.sort(expected.real), atol=1e-6)
-        assert controllable(T @ A @ np.linalg.inv(T), T @ B)
+        assert is_controllable(T @ A @ np.linalg.inv(T), T @ B)

@@ -315,7 +315,7 @@ def test_property_that_does_not_exist_refused_by_name(monkeypatch: pytest.Monkey
             trim_property=None,
             lower=-1.0,
             upper=1.0,
-            each_engine=False,
+            is_per_engine=False,
             positive="nose left",
         )
     }

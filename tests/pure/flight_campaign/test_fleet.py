@@ -253,7 +253,7 @@ def test_loop_without_branches_gives_the_bits_of_the_loop_with_branches(
     scenario = SERVO.vary(aircraft={"sensors": sensors}, flight={"duration": 6.03})
     course = build_course(scenario)
     kinds = {run.pattern[0] for run in batch_schedule.without_branches(course) if run.length > 2}
-    assert len({(kind.phase is None, kind.forced) for kind in kinds}) >= 3
+    assert len({(kind.phase is None, kind.is_forced) for kind in kinds}) >= 3
     A, B = sampled(0.3, 5, 6)
     aircraft = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course)
     results = [
@@ -275,7 +275,7 @@ def test_runs_of_a_course_cover_each_tick_once_with_its_phase_and_forcing() -> N
         for tick in range(k, k + run.length):
             kind = run.pattern[(tick - k) % len(run.pattern)]
             assert kind.phase in {None, segments.phase[tick]}
-            assert kind.forced or not segments.forcing[tick].any()
+            assert kind.is_forced or not segments.forcing[tick].any()
         k += run.length
     assert k == len(segments.t)
     assert any(run.pattern[0].phase is None for run in kinds)  # a run with a dropout asks

@@ -42,8 +42,8 @@ def test_restarted_node_takes_over_earlier() -> None:
     with pytest.raises(ChannelError):
         lock.check("/foreign", TAKEOVER)
     lock.check("/foreign", TAKEOVER + 1)
-    assert lock.timed_out(MAX_AGE + 1, MAX_AGE)
-    assert not lock.timed_out(MAX_AGE, MAX_AGE)
+    assert lock.has_timed_out(MAX_AGE + 1, MAX_AGE)
+    assert not lock.has_timed_out(MAX_AGE, MAX_AGE)
 
 
 def refused(lock: PublisherLock, now_ns: int, sequence: int, sender: str = "/aircraft#1") -> bool:
@@ -103,14 +103,14 @@ def test_overrun_of_receiver_is_no_silence_of_publisher() -> None:
     with pytest.raises(ChannelError, match="already receiving from /aircraft#1"):
         lock.check("/foreign", now_ns)
     lock.check("/foreign", now_ns + 1)
-    assert lock.timed_out(now_ns, MAX_AGE)  # its sample is old, whatever the reason
+    assert lock.has_timed_out(now_ns, MAX_AGE)  # its sample is old, whatever the reason
     lock.refresh("/aircraft#1", now_ns)
     lock.check("/foreign", now_ns + TAKEOVER + 1)  # an overrun counts once
 
 
 def test_a_change_of_publisher_is_returned_once() -> None:
     lock = PublisherLock(lambda: (MAX_AGE, TAKEOVER))
-    assert lock.timed_out(0, MAX_AGE)
+    assert lock.has_timed_out(0, MAX_AGE)
     assert lock.refresh("/aircraft#1", 0)
     assert not lock.refresh("/aircraft#1", 1)
     assert lock.refresh("/aircraft#2", 2)

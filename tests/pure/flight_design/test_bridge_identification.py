@@ -262,7 +262,7 @@ def test_model_of_channel_is_that_of_own_simulation_from_any_start(
     # rad/s, as of a gyroscope
     model = fit_channel(*Known().measured(noise=0.002), "q", "elevator", 1.0)
     assert model is not None
-    assert model.usable
+    assert model.is_usable
     assert model.stiffness == 0.0
     assert_allclose(model.Omega / model.damping, 80.0 / 12.0, rtol=0.02)
     assert_allclose([model.Omega, model.lag + model.delay], [80.0, 0.13], rtol=0.1)
@@ -274,7 +274,7 @@ def test_noise_as_large_as_response_leaves_model_with_standard_errors() -> None:
     model = fit_channel(*Known().measured(noise=0.1), "q", "elevator", 1.0)
     assert model is not None
     assert model.misfit > 0.5
-    assert model.usable
+    assert model.is_usable
     gain, phase = model.at_loop_frequency()
     s = 0.5j / (model.delay + model.lag)
     response = 80.0 / (s + 12.0) / (0.05 * s + 1.0) * np.exp(-0.08 * s)
@@ -288,7 +288,7 @@ def test_fast_oscillation_of_light_airplane_found() -> None:
     channel = Known(Omega=500.0, damping=24.0, stiffness=480.0, lag=0.01, delay=0.02)
     model = fit_channel(*channel.measured(noise=0.02), "q", "elevator", 1.0)
     assert model is not None
-    assert model.usable
+    assert model.is_usable
     assert_allclose(model[2:5], [500.0, 24.0, 480.0], rtol=0.1)
 
 
@@ -333,7 +333,7 @@ def test_thrust_told_from_phugoid_by_climb() -> None:
     place = channel_pairs(MAP)[0].outputs.index("V")
     model = channel_models(MAP, tape, spans, SPEED)[place]
     assert model is not None
-    assert model.usable
+    assert model.is_usable
     assert_allclose([model.Omega, model.damping], [14.0, 0.5], rtol=0.05)
     # s: a bandwidth of 1.5 rad/s turns 30 ms into 3 degrees
     assert model.lag + model.delay == approx(0.1, abs=0.03)

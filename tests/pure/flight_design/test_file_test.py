@@ -117,7 +117,7 @@ def lateral(*errors: float, whiteness: float = 1.0, aileron: float = 0.0) -> Ide
     prediction = Prediction(np.ones(2), np.full(2, whiteness), 1.0)
     inputs = ("aileron", "rudder")
     part = Part(
-        inputs, NAMES, entries + effects, prediction, prediction, None, (0.0, 0.0), gusts=False
+        inputs, NAMES, entries + effects, prediction, prediction, None, (0.0, 0.0), has_gusts=False
     )
     recorded = innovation_filters.FlightData(0.01, *(np.zeros((1, 1)),) * 3)
     nothing = np.zeros((1, 1))

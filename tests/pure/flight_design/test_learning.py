@@ -735,13 +735,13 @@ def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
         Entry("B", "q", "elevator", 56.1499, -0.3, 0.02, 56.1499),
         Entry("B", "V", "thrust", 6.0, 0.0, 0.01, 6.0),
     )
-    part = lateral()._replace(outputs=("q", "V"), entries=effects, gusts=True)
+    part = lateral()._replace(outputs=("q", "V"), entries=effects, has_gusts=True)
     assert str(part_checks.reason_against_effects(part, flown)).startswith(
         "B[q, elevator]: found 70 % of that of the model that flies"
     )
     # a first model, one without gusts, and one that is within the deviation that is allowed
     assert part_checks.reason_against_effects(part, None) is None
-    assert part_checks.reason_against_effects(part._replace(gusts=False), flown) is None
+    assert part_checks.reason_against_effects(part._replace(has_gusts=False), flown) is None
     near = effects[0]._replace(error=-0.09), effects[1]
     assert part_checks.reason_against_effects(part._replace(entries=near), flown) is None
 
@@ -773,7 +773,7 @@ def lateral(*, whiteness: float = 1.0, latest: float = 0.0) -> Part:
     before = Prediction(np.ones(2), np.full(2, 9.0), 1.0)
     after = Prediction(np.ones(2), np.array([1.0, whiteness]), 2.0)
     inputs = ("aileron", "rudder")
-    return Part(inputs, ("p", "r"), LATERAL, before, after, None, (latest, latest), gusts=False)
+    return Part(inputs, ("p", "r"), LATERAL, before, after, None, (latest, latest), has_gusts=False)
 
 
 def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch, **learn: Any) -> Learner:
@@ -1039,7 +1039,7 @@ def test_input_without_effect_in_one_test_is_a_doubt(monkeypatch: pytest.MonkeyP
 def test_tests_for_damage_fill_the_time_between_identifications() -> None:
     updates = Updates(LearnConfig(updates=(10.0, 15.0, 22.0), check=2.0))
     ticks = range(0, 28 * NANOSECONDS, NANOSECONDS // 10)
-    due = [t_ns / NANOSECONDS for t_ns in ticks if updates.due(t_ns)]
+    due = [t_ns / NANOSECONDS for t_ns in ticks if updates.is_due(t_ns)]
     # none before the first model, and none within a period of the next identification
     assert due == [0.0, 10.0, 12.0, 15.0, 17.0, 19.0, 22.0, 24.0, 26.0]
 

@@ -308,7 +308,7 @@ def test_bags_of_other_recorders_are_played(compression: CompressionMode, tmp_pa
     record(tmp_path / "bag", {"/y": SAMPLES}, compression)
     playback = read_playback(tmp_path / "bag", ["y"])
     assert [message.data for message in playback.messages] == SAMPLES
-    assert all(message.stamped for message in playback.messages)
+    assert all(message.is_stamped for message in playback.messages)
 
 
 def test_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ def write(bag: BagWriter, channel: BagChannel, count: int) -> None:
 
 
 def write_until_full(bag: BagWriter, channel: BagChannel) -> None:
-    while not bag.full:
+    while not bag.is_full:
         write(bag, channel, 1)
 
 
@@ -82,7 +82,7 @@ def test_log_whose_chunks_fill_up_between_two_flushes_finished_too(
     monkeypatch.setattr("flight_log.disk.RESERVE_STEP", 4096)
     bag = BagWriter(disk / "run")
     channel = bag.add_topic("/y", JOINT_STATE, "")
-    while not bag.full:
+    while not bag.is_full:
         stamp_ns = 1_000_000 * (channel.messages + 1)
         message = vector(stamp_ns, NAMES, RANDOM.normal(size=40).tolist())
         bag.write(channel, stamp_ns, stamp_ns, channel.messages + 1, message)
@@ -152,7 +152,7 @@ def test_input_output_error_is_not_full_disk(
     monkeypatch.setattr(os, "write", fails)
     with pytest.raises(OSError, match="Input/output error"):
         file.write(b"x")
-    assert not file.full
+    assert not file.is_full
     file.close()
 
 
@@ -167,7 +167,7 @@ def test_what_kept_for_end_survives_disk_that_fills_up(
 
     monkeypatch.setattr(os, "pwrite", fails)
     file.keep(b", memory")
-    assert file.full
+    assert file.is_full
     file.keep(b", too")
     assert file.kept_data() == b"reserve, memory, too"
     file.close()

@@ -95,7 +95,7 @@ def test_whole_flight_is_read_replayed_shown_and_played(
     assert [message.data for message in playback.messages] == [
         m.data for m in messages if m.topic == "/y"
     ]
-    assert all(message.stamped for message in playback.messages)
+    assert all(message.is_stamped for message in playback.messages)
     # Nothing is written.
     assert {path.name for path in whole.parent.rglob("*.yaml")} <= {"metadata.yaml"}
 
@@ -298,7 +298,7 @@ def test_missing_part_stays_named_after_repair(
     before = {path.name: path.read_bytes() for path in bag.iterdir()}
     assert any(line.startswith(note) for line in read_run(bag).tape.notes)
     if metadata and "bag_0.mcap" in names:
-        assert not repair(bag).wrote_metadata
+        assert not repair(bag).has_new_metadata
         assert {path.name: path.read_bytes() for path in bag.iterdir()} == before
     file = next(path for path in sorted(bag.glob("*.mcap")))
     file.write_bytes(file.read_bytes()[:-500])

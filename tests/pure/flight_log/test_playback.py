@@ -39,7 +39,7 @@ def test_every_message_of_flight_in_one_process_is_due_at_stamp(run: Path) -> No
     assert list(playback.types) == ["/internals", "/pose", "/truth", "/u", "/y", "/y_m"]
     for message in playback.messages:
         stamp = STORE.deserialize_cdr(message.data, JOINT_STATE).header.stamp  # type: ignore[attr-defined] # made at run time
-        assert message.stamped
+        assert message.is_stamped
         assert message.due_ns == stamp.sec * NANOSECONDS + stamp.nanosec
     due = [message.due_ns for message in playback.messages]
     assert due == sorted(due)
@@ -140,7 +140,9 @@ def test_in_lockstep_message_is_due_at_stamp_but_not_before_those_sent_before_it
         ("/other", EPOCH + 5 * MS, EPOCH + 5 * MS, 0.0),
     ]
     playback = read_playback(bag_of(tmp_path / "run", messages))
-    assert [(message.topic, message.due_ns, message.stamped) for message in playback.messages] == [
+    assert [
+        (message.topic, message.due_ns, message.is_stamped) for message in playback.messages
+    ] == [
         ("/truth", 0, True),
         ("/y", 0, True),
         ("/truth", 30 * MS, True),

@@ -76,7 +76,7 @@ def test_an_intact_or_repaired_log_is_unchanged(repaired: bool, run: Path) -> No
         truncate(run, 0.5)
         repair(run)
     with unchanged(run):
-        assert not repair(run).wrote_metadata
+        assert not repair(run).has_new_metadata
 
 
 @pytest.mark.parametrize("content", [None, "{"])
@@ -88,7 +88,7 @@ def test_missing_or_damaged_metadata_yaml_restored(
         (run / "metadata.yaml").write_text(content)
     before = (run / "run_0.mcap").stat().st_mtime_ns
     done = repair(run)
-    assert done.wrote_metadata
+    assert done.has_new_metadata
     assert done.files[0].damaged is None
     assert (run / "run_0.mcap").stat().st_mtime_ns == before
     assert (run / "metadata.yaml").read_text("utf-8") == (recorded / "metadata.yaml").read_text(

@@ -44,7 +44,7 @@ def test_step_waits_for_second_signal_of_instant_and_other_instants_do_not() -> 
     flight = Arriving()
     flight.others.append(sample(0))
     flight.y += [sample(Y_NS * k) for k in range(6)]
-    assert [(instant.now_ns, instant.due) for instant in flight.instants()] == [
+    assert [(instant.now_ns, instant.is_due) for instant in flight.instants()] == [
         (0, True),
         (2, False),
         (4, False),
@@ -66,7 +66,7 @@ def test_empty_y_is_instant_and_invalid_sample_of_other_signal_is_none() -> None
     assert not flight.instants()
     flight.others.append(sample(0))
     first, second = flight.instants()
-    assert (first.y, first.due, second.now_ns) == (None, True, Y_NS)
+    assert (first.y, first.is_due, second.now_ns) == (None, True, Y_NS)
 
 
 @given(st.lists(st.booleans(), min_size=80, max_size=80))
@@ -82,7 +82,7 @@ def test_instants_do_not_depend_on_order_of_arrival(order: list[bool]) -> None:
             flight.others.append(others.pop(0))
         found += flight.instants()
     assert [instant.now_ns for instant in found] == [Y_NS * k for k in range(21)]
-    assert [instant.now_ns for instant in found if instant.due] == [0, 10, 20, 30, 40]
+    assert [instant.now_ns for instant in found if instant.is_due] == [0, 10, 20, 30, 40]
     assert all(sample.stamp_ns <= instant.now_ns for instant in found for sample in instant.others)
     received = [sample.stamp_ns for instant in found for sample in instant.others]
     assert received == [Y_NS * k for k in range(21)]

@@ -328,7 +328,7 @@ def test_identifications_begin_at_their_times_and_then_tests_at_theirs() -> None
     updates = Updates(LearnConfig(window=30.0, updates=(10.0, 15.0), check=12.0))
     # 55 s of late ticks from 7 s on
     ticks = [7 * NANOSECONDS + nanoseconds(0.011 * k) for k in range(5_000)]
-    begins = [(now_ns / NANOSECONDS - 7.0) for now_ns in ticks if updates.due(now_ns)]
+    begins = [(now_ns / NANOSECONDS - 7.0) for now_ns in ticks if updates.is_due(now_ns)]
     assert begins == approx([0.0, 10.0, 15.0, 27.0, 39.0, 51.0], abs=0.011)
 
 

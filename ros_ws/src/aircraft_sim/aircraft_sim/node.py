@@ -111,10 +111,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
         if not self._u_received and not self._take_u((self._number - 1) * self.period_ns()):
             return False
         self._u_received = True
-        if self._finished():
+        if self._is_finished():
             self._complete()
             return False
-        if self._ahead_of_log():
+        if self._is_ahead_of_log():
             return False
         # The next instant that needs a u follows.
         waits_ns = -(-self._number * self.period_ns() // self._control_ns) * self._control_ns
@@ -143,10 +143,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
                 f"flight completed at t = {seconds((self._number - 1) * self.period_ns()):g} s"
             )
 
-    def _finished(self) -> bool:
+    def _is_finished(self) -> bool:
         return self._end_ns is not None and self._number * self.period_ns() > self._end_ns
 
-    def _ahead_of_log(self) -> bool:
+    def _is_ahead_of_log(self) -> bool:
         if not self.parameters.recorded:
             return False
         subscription = self._recorded_subscription
@@ -176,7 +176,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
                 self.publish_state(NodeState.FLYING)
         if self._u is not u:
             self._applied.take(self._u, now_ns, transfer=transfer)
-        if self._timed_out(now_ns):
+        if self._has_timed_out(now_ns):
             self.warn_no_publisher(self._u_receiver.subscription)
             if self._publisher_lock.publisher is not None and not self._timeout_logged:
                 self._timeout_logged = True
@@ -211,8 +211,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
             self.parameters.hold + self.parameters.ramp
         )
 
-    def _timed_out(self, now_ns: int) -> bool:
-        return self._publisher_lock.timed_out(now_ns, self._max_age_ns)
+    def _has_timed_out(self, now_ns: int) -> bool:
+        return self._publisher_lock.has_timed_out(now_ns, self._max_age_ns)
 
     @property
     def _failsafe_message(self) -> str:
@@ -224,7 +224,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         if self._publisher_lock.publisher is None:
             return DiagnosticStatus.WARN, "no u received yet: flying in trim", {}
-        if not self.parameters.lockstep and self._timed_out(self.now_ns()):
+        if not self.parameters.lockstep and self._has_timed_out(self.now_ns()):
             return DiagnosticStatus.ERROR, self._failsafe_message, {}
         ages = self._ages_of_u
         self._ages_of_u = []

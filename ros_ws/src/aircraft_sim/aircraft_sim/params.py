@@ -321,7 +321,7 @@ class AircraftConfig(NodeConfig):
         """
         if self.is_jsbsim:
             inputs = self.flight_condition().inputs()
-            return np.array([-float(INPUTS[name].each_engine) for name in inputs])
+            return np.array([-float(INPUTS[name].is_per_engine) for name in inputs])
         return load_airframe(self.airframe).no_thrust()
 
     def _check_jsbsim(self) -> None:

@@ -53,7 +53,7 @@ class FlightDynamicsModel(Protocol):
         The values are absolute, not deviations from trim.
         """
 
-    def diverged(self) -> bool:
+    def has_diverged(self) -> bool:
         """Return whether the state is not finite, or too large for a flight."""
 
     def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
@@ -168,7 +168,7 @@ class Simulator:
         self._number = number
         true = self._model.y()
         # The comparison is also false for NaN.
-        if self._model.diverged() or not (np.abs(true) <= self._largest[: len(true)]).all():
+        if self._model.has_diverged() or not (np.abs(true) <= self._largest[: len(true)]).all():
             raise FlightEnded(f"diverged at t = {seconds(t_ns):.2f} s")
         if self._vanes is not None and self._vane_state is not None:
             angles = self._model.air_angles(t_ns)

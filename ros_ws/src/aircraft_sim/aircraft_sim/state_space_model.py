@@ -191,9 +191,9 @@ class StateSpaceModel:
             wind[blown] += along[[AXES.index(self._axes[place]) for place in blown]]
         return truth.values(self._state, wind, rate, plant_now)
 
-    def diverged(self) -> bool:
+    def has_diverged(self) -> bool:
         """Return whether the state is not finite, or too large for a flight."""
-        return plant.diverged(self._state)
+        return plant.has_diverged(self._state)
 
     def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
         """Use the actuator faults and the gusts of `parameters` from t on."""

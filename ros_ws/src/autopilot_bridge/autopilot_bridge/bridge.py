@@ -272,15 +272,15 @@ class Bridge:
         blindness = self.conditions.blindness(bounded=self._end_ns is not None)
         return joined((warning, self.problem, silent, blindness))
 
-    def u_timed_out(self, now_ns: int) -> bool:
+    def has_u_timed_out(self, now_ns: int) -> bool:
         """Return whether the last u is older than its age limit, or no u was received yet."""
-        return self.u_lock.timed_out(now_ns, self._max_age_ns)
+        return self.u_lock.has_timed_out(now_ns, self._max_age_ns)
 
     def _u_timeout(self, now_ns: int) -> Refusal | None:
         """Say why u is too old or absent, or return None if it is fresh."""
         if self.u_lock.publisher is None:
             return Refusal("u not received yet")
-        if self.u_timed_out(now_ns):
+        if self.has_u_timed_out(now_ns):
             return Refusal(f"u is {seconds(self.u_lock.age_ns(now_ns)):.2f} s old")
         return None
 

@@ -56,7 +56,7 @@ class EngagementClient(Client):
                 U_TIMEOUT,
             )
             self._spin_until(
-                self._at_rest,
+                self._is_at_rest,
                 f"u: not at trim after {SERVICE_TIMEOUT:g} s, expected a ramp to trim",
             )
         self._received_phases().clear()
@@ -64,7 +64,7 @@ class EngagementClient(Client):
             if refusal := self._engage_blind() if blind else self._set_engaged(engaged=True):
                 return refusal
             silent = "bridge/engagement: no change, expected ENGAGED or a reason"
-            self._spin_until(lambda: self._settled(progress), silent, U_TIMEOUT)
+            self._spin_until(lambda: self._is_settled(progress), silent, U_TIMEOUT)
         except BaseException:
             self._withdraw()
             raise
@@ -111,7 +111,7 @@ class EngagementClient(Client):
         ]
         return self._phases
 
-    def _settled(self, progress: Callable[[str], None]) -> bool:
+    def _is_settled(self, progress: Callable[[str], None]) -> bool:
         """Return whether the bridge has engaged, or has given up after it began to engage.
 
         Phases that the bridge reported before the request do not count.
@@ -124,7 +124,7 @@ class EngagementClient(Client):
             progress(f"waiting: {self._waits_for}")
         return bool(phases) and phases[-1] != "ENGAGING"
 
-    def _at_rest(self) -> bool:
+    def _is_at_rest(self) -> bool:
         self._received_u()
         return len(self._u) >= TRIM_SAMPLES and len(set(self._u[-TRIM_SAMPLES:])) == 1
 

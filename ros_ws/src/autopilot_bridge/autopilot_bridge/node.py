@@ -340,7 +340,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
 
     def _send(self, now_ns: int, slack_ns: int) -> None:
         for name, outgoing in self._outgoing.items():
-            if self._bridge.sends(name, now_ns) and outgoing.due(now_ns, slack_ns):
+            if self._bridge.sends(name, now_ns) and outgoing.is_due(now_ns, slack_ns):
                 try:
                     outgoing.send(now_ns, self._bridge.raw().tolist())
                 except ChannelError as error:
@@ -474,7 +474,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
                     f"link: a ground station beside the bridge, system {station}: it may change "
                     "mode and rates"
                 )
-        if self._bridge.u_timed_out(now_ns):
+        if self._bridge.has_u_timed_out(now_ns):
             self.warn_no_publisher(self._u.subscription)
 
     def _require_first_y(self, now_ns: int) -> None:

@@ -43,7 +43,7 @@ class OutgoingMessage:
         self._period_ns = nanoseconds(1.0 / row.rate)
         self._sent_ns = 0
 
-    def due(self, now_ns: int, slack_ns: int) -> bool:
+    def is_due(self, now_ns: int, slack_ns: int) -> bool:
         """Return whether the message's period has passed since it was last sent.
 
         `slack_ns` is the tolerance of the period.

@@ -105,7 +105,7 @@ class Sizes:
     p: int  # effectors of the allocation
     n: int  # states of the nominal model
     s: int  # estimates
-    schedule: bool
+    has_schedule: bool
 
 
 IN_C = frozenset(
@@ -168,7 +168,9 @@ def sizes(controller: RiseDiConfig) -> Sizes:
     n = 0 if controller.feedforward is None else len(controller.feedforward.states)
     s = 0 if controller.observer is None else len(controller.observer.states)
     p = 0 if controller.allocation is None else len(controller.allocation.effectors)
-    return Sizes(m=len(controller.outputs), p=p, n=n, s=s, schedule=controller.schedule is not None)
+    return Sizes(
+        m=len(controller.outputs), p=p, n=n, s=s, has_schedule=controller.schedule is not None
+    )
 
 
 def constants(controller: RiseDiConfig) -> list[Constant]:
@@ -351,8 +353,8 @@ def _names_and_sizes(controller: RiseDiConfig, r: int, samples: int, *, float32:
         f"#define RISE_DI_S {s} /* estimates of the observer, 0: no observer */",
         f"#define RISE_DI_R {r} /* states of the reference model, 0: no reference model */",
         (
-            f"#define RISE_DI_SCHEDULE {int(dimensions.schedule)} /* 1: input_scale follows the "
-            "dynamic pressure */"
+            f"#define RISE_DI_SCHEDULE {int(dimensions.has_schedule)} /* 1: input_scale follows "
+            "the dynamic pressure */"
         ),
         f"#define RISE_DI_FLOAT32 {int(float32)} /* 0: rise_di_real is double, 1: float */",
         f"#define RISE_DI_SAMPLES {samples} /* samples kept of y and of y_m */",

@@ -87,7 +87,7 @@ def real_groups(controller: RiseDiConfig) -> dict[str, int]:
     groups = dict.fromkeys(("u", "u_free", "u_trim", "u_ff", "u_failsafe"), m)
     groups |= {"effectors": p, "effectors_failsafe": p} if p else {}
     groups |= dict.fromkeys(("y", "y_m", "e_0", "e", "integral_e", "Pi"), m)
-    groups |= {"scale": m} if dimensions.schedule else {}
+    groups |= {"scale": m} if dimensions.has_schedule else {}
     groups |= {"z": s, "u_o": m, "sigma": 1} if s else {}
     groups |= (
         {"feedforward.x": n, "feedforward.u": m, "feedforward.dt": 1, "feedforward.ticks": 1}

@@ -80,7 +80,7 @@ class Law(NamedTuple):
     # gains at which a search begins; None if they follow from the lag of the loop and the constants
     # INITIAL_...
     initial: Gains | None = None
-    linear: bool = True  # whether the law is linear near e = 0
+    is_linear: bool = True  # whether the law is linear near e = 0
 
     @property
     def has_margins(self) -> bool:
@@ -88,7 +88,7 @@ class Law(NamedTuple):
 
         A law that measures more than y, or has the implicit sign, has no such loop.
         """
-        return self.linear and self.measurements == "y"
+        return self.is_linear and self.measurements == "y"
 
 
 def initial_gains(law: Law, model: NominalModel) -> Gains:
@@ -155,7 +155,7 @@ LAWS: dict[str, Law] = {
         control_law=_implicit,
         params=rise_di_law.params_of,
         tuned=("K", "Lambda", "beta", "omega"),
-        linear=False,
+        is_linear=False,
     ),
     "rise_ff": Law(
         title="RISE-DI + feedforward",

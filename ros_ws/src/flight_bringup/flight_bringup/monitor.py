@@ -86,7 +86,7 @@ class FlightMonitor(Client):
 
         In simulated time it is known once the first /clock has arrived.
         """
-        return self._simulated is None or self._simulated.known()
+        return self._simulated is None or self._simulated.is_known()
 
     def ahead(self, lead: float) -> float:
         """Return how much flight time, s, passes while at least `lead` s pass on the host."""
@@ -94,14 +94,14 @@ class FlightMonitor(Client):
 
     def end_of_clock(self) -> Outcome | None:
         """Return the outcome if the simulator behind /clock has ended or restarted, else None."""
-        if self._simulated is None or not self._simulated.known():
+        if self._simulated is None or not self._simulated.is_known():
             return None
         try:
             self._simulated.require_one_simulation()
         except ClockRestarted as restart:
             return ended_early(f"ended early: {restart}")
         count = self._simulated.subscription.entity.get_publisher_count
-        if not self._simulated.silent() or count():
+        if not self._simulated.is_silent() or count():
             return None
         return ended_early("ended early: /clock has no publisher: its simulator ended")
 

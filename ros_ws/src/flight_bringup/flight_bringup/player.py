@@ -84,7 +84,7 @@ class Player(Client):
                     progress(due_ns)
             _sleep_until(begin_ns + round((due_ns - first_ns) / rate))
             data = message.data
-            if stamps_now and message.stamped:
+            if stamps_now and message.is_stamped:
                 data = _restamped(data, begin_system_ns, first_ns, rate)
             self._publishers[message.topic].publish(data)
         for publisher in self._publishers.values():

@@ -235,7 +235,7 @@ def write_page(
             "Score",
             "share of the aircraft by score",
             _spread(labels, tallies, ["score"], {}),
-            over_time=False,
+            is_over_time=False,
         ),
         Section(
             "Errors",
@@ -246,9 +246,9 @@ def write_page(
                 [name for name in tallies[0].figures if name.startswith("rms.")],
                 units,
             ),
-            over_time=False,
+            is_over_time=False,
         ),
-        Section("Sweep", "score over the factor", _sweep(definition, tallies), over_time=False),
+        Section("Sweep", "score over the factor", _sweep(definition, tallies), is_over_time=False),
     ]
     page = Page(
         title=title,

@@ -93,7 +93,7 @@ def require_single_flights(scenario: Scenario) -> None:
 class SingleFlight(NamedTuple):
     """The result of a flight of a campaign."""
 
-    diverged: bool
+    has_diverged: bool
     figures: dict[str, float]  # figures by name, SI
 
 
@@ -105,7 +105,7 @@ def fly_single(scenario: Scenario, learner: MakeLearner | None = None) -> Single
     events: list[Event] = []
     learn = None if learner is None else learner(scenario)
     tape = simulate(scenario, learn=learn, announce=events.append)
-    diverged = tape.outcome.end not in {End.COMPLETED, End.LANDED}
+    has_diverged = tape.outcome.end not in {End.COMPLETED, End.LANDED}
     figures: dict[str, float] = {}
     if scenario.guidance is not None:
         figures |= mission_figures(tape, scenario.guidance)
@@ -113,7 +113,7 @@ def fly_single(scenario: Scenario, learner: MakeLearner | None = None) -> Single
     if scenario.learns():
         outcome = learned(tape, events)
         figures |= {name: float(value) for name, value in outcome._asdict().items()}
-    return SingleFlight(diverged, figures)
+    return SingleFlight(has_diverged, figures)
 
 
 def _tracking_figures(tape: Tape, scenario: Scenario) -> dict[str, float]:
@@ -187,4 +187,4 @@ def fly_chunk_singly(definition: Definition, job: Job, learner: MakeLearner | No
     if "score" not in figures:
         rms = np.array([figures[f"rms.{name}"] for name in scenario.controller.outputs])
         figures = {"score": definition.score(rms)} | figures
-    return Chunk(first, np.array([flight.diverged for flight in flights]), figures, entries)
+    return Chunk(first, np.array([flight.has_diverged for flight in flights]), figures, entries)

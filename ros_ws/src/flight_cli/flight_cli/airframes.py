@@ -147,7 +147,7 @@ def _show(console: Console, facts: Sequence[AirframeFacts]) -> None:
         for airframe in facts:
             table.add_row(airframe.name, *cells(airframe))
         print_table(console, table)
-    outside = [airframe.name for airframe in facts if not airframe.in_theorem]
+    outside = [airframe.name for airframe in facts if not airframe.is_in_theorem]
     say(
         console,
         f"Without D, controllability or stable zeros: {', '.join(outside) or 'none'}. Coupling "
@@ -181,7 +181,7 @@ def _signs(facts: AirframeFacts) -> tuple[str, str, str]:
 
 
 def _assumptions(facts: AirframeFacts) -> tuple[str, str, str, str]:
-    controllable = "yes" if facts.controllable else "no"
+    controllable = "yes" if facts.is_controllable else "no"
     integrals = ", ".join(facts.integrated) or "-"
     return f"{facts.n}, {facts.m}", controllable, facts.zero_dynamics, integrals
 
@@ -216,6 +216,6 @@ def _as_json(facts: AirframeFacts) -> dict[str, Any]:
         "D": None if facts.D is None else [int(sign) for sign in facts.D],
         "for_D_I": facts.remedy,
         "coupling": facts.coupling,
-        "controllable": facts.controllable,
-        "in_theorem": facts.in_theorem,
+        "controllable": facts.is_controllable,
+        "in_theorem": facts.is_in_theorem,
     }

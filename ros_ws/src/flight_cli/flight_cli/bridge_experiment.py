@@ -379,7 +379,7 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
             loop.add_row(
                 channel,
                 *(f"{value:.3g}" for value in numbers),
-                "model" if model.usable else "step response",
+                "model" if model.is_usable else "step response",
             )
     print_table(console, table)
     print_table(console, loop)
@@ -387,7 +387,7 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
     uncertain = [
         name
         for name, model in zip(response.outputs, models, strict=True)
-        if model is None or not model.usable
+        if model is None or not model.is_usable
     ]
     if uncertain:
         say(

@@ -395,7 +395,7 @@ def _notes(
     for aim in aims:
         objective = gain_tuning.OBJECTIVES[aim]
         winds = " + ".join(f"{weight:g} x {wind}" for wind, weight in objective.weights.items())
-        whose = "all of them" if objective.all_late else "the nominal one"
+        whose = "all of them" if objective.is_all_late else "the nominal one"
         costs.append(f"{aim}: {winds}; u late by {objective.delay * delay:g} ms on {whose}")
     return NOTES.strip().format(
         titles="\n".join(f"{name}: {law.title}" for name, law in laws.items()),

@@ -102,7 +102,9 @@ def condition_name(row: tuple[GainCondition, ...], outputs: tuple[str, ...]) -> 
     """
     where = {None if condition.channel is None else outputs[condition.channel] for condition in row}
     channel = where.pop() if len(where) == 1 else None
-    return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")
+    return (
+        row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].is_estimate else "")
+    )
 
 
 SYMBOLS = {Relation.AT_LEAST: ">=", Relation.AT_MOST: "<=", Relation.ABOVE: ">"}
@@ -130,5 +132,5 @@ def condition_as_json(
         condition.relation.replace(" ", "_"): condition.bound,
         "margin": condition.margin,
         "holds": condition.holds,
-        "estimate": condition.estimate,
+        "estimate": condition.is_estimate,
     }

@@ -127,7 +127,7 @@ def _innovation_page(identification: Identification, name: str) -> Page:
         for r in identification.innovations
     )
     held_out = [
-        Interval(label="held out", start=start, stop=stop, colour=GUST, labelled=False)
+        Interval(label="held out", start=start, stop=stop, colour=GUST, is_labelled=False)
         for start, stop in mask_spans(t, identification.held_out)
     ]
     context = PlotContext(

@@ -83,7 +83,7 @@ class Learn:
         with console.status(f"learning from {printable(str(self.run))}"):
             result = learn_again(recorded_run.tape, others)
         for step in result.steps:
-            lead = "" if step.proposed else "no model: "
+            lead = "" if step.is_proposed else "no model: "
             say(console, f"t = {step.t:.2f} s: {lead}{step.sentence}")
         account = log_account(recorded_run)
         over = "" if account is None else account.over("internals")
@@ -101,7 +101,10 @@ class Learn:
             for line in _write_certificate(self.certificate, result.loop, others):
                 say(console, line)
         if self.as_json:
-            steps = [step._asdict() for step in result.steps]
+            steps = [
+                {"t": step.t, "proposed": step.is_proposed, "sentence": step.sentence}
+                for step in result.steps
+            ]
             path = None if result.model is None or self.write is None else str(self.write)
             print_json(
                 {

@@ -30,7 +30,7 @@ def repair_log(run: Path) -> None:
                 f"{printable(file.path.name)} had {_faults_text(file.faults)}: {file.messages} "
                 f"messages kept; the damaged file is {printable(file.damaged.name)}"
             )
-    if repairs.wrote_metadata:
+    if repairs.has_new_metadata:
         print(f"{METADATA} written; {_missing_at_end(run, repairs.files[-1])}")
     elif not any(file.damaged for file in repairs.files) and not repairs.missing:
         print(f"{display_path(run)} is intact: nothing to repair")

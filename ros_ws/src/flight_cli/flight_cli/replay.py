@@ -99,7 +99,7 @@ class Replay:
             result,
             parameters.inputs,
             ticks=max(len(result.number), expected_ticks or 0),
-            open_loop=others is not None,
+            is_open_loop=others is not None,
             guided=guidance_replay,
             guarantee=guarantee if result.equal() else None,
             differences=differences if result.equal() else (),
@@ -122,7 +122,7 @@ class Shown(NamedTuple):
     result: ReplayResult
     inputs: tuple[str, ...]
     ticks: int  # number of ticks that were flown; the log may lack some
-    open_loop: bool  # whether u was computed with other parameters
+    is_open_loop: bool  # whether u was computed with other parameters
     guided: GuidanceReplay | None
     guarantee: Guarantee | None  # guarantee that was kept for the loop of the flight, if any
     differences: tuple[str, ...] = ()  # how the aircraft differs from what the controller knew
@@ -132,7 +132,7 @@ class Shown(NamedTuple):
         result = self.result
         notes = [*result.notes, *(() if self.guided is None else self.guided.notes)]
         rows = np.flatnonzero(result.other_parameters)
-        if not self.open_loop and len(rows):
+        if not self.is_open_loop and len(rows):
             begin = f"from tick {result.number[rows[0]]} at t = {result.t[rows[0]]:.6g} s on"
             if rows[0]:
                 why = (
@@ -226,7 +226,7 @@ def _show(answer: Shown, notes: Sequence[str]) -> None:
         groups = ", ".join(f"{name} in {count}" for name, count in _count_by_group(result).items())
         last = result.t[rows[-1]]
         console.print(f"{summary}, {len(rows)} differ, the last at t = {last:.6g} s; {groups}")
-    if answer.open_loop:
+    if answer.is_open_loop:
         headings = ("input", "rms", "max", "at t (s)", "rms recorded")
         table = new_table("u computed minus u recorded", headings)
         for name, figures in _u_figures(result, answer.inputs).items():

@@ -52,7 +52,7 @@ class PublisherLock:
         """Return the time since the last sample of the locked publisher, ns."""
         return now_ns - self._received_ns
 
-    def timed_out(self, now_ns: int, max_age_ns: int) -> bool:
+    def has_timed_out(self, now_ns: int, max_age_ns: int) -> bool:
         """Return whether there is no publisher, or the last sample is older than the age limit."""
         return self.publisher is None or self.age_ns(now_ns) > max_age_ns
 
@@ -61,7 +61,7 @@ class PublisherLock:
 
         A publisher has timed out if its last sample is older than the age limit of a restart.
         """
-        return sender == self.publisher and not self.timed_out(now_ns, self._timeouts_ns()[0])
+        return sender == self.publisher and not self.has_timed_out(now_ns, self._timeouts_ns()[0])
 
     def overran(self, duration_ns: int) -> None:
         """Note that this node did not run for a time, which is no silence of the publisher."""
@@ -79,7 +79,7 @@ class PublisherLock:
             self.publisher is not None
             and sender.partition("#")[0] == self.publisher.partition("#")[0]
         )
-        if not self.timed_out(
+        if not self.has_timed_out(
             now_ns - self._overrun_ns, max_age_ns if is_restarted else takeover_ns
         ):
             raise ChannelError(

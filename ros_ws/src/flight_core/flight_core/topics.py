@@ -47,7 +47,7 @@ class Topic(NamedTuple):
         return _names(self.ends.partition("->")[2])
 
     @property
-    def foreign(self) -> bool:
+    def is_foreign(self) -> bool:
         """Whether programs outside of the stack publish the topic, possibly at another QoS."""
         return EXTERNAL in self.publishers
 

@@ -204,16 +204,16 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
 
     def advance(self) -> bool:
         advanced = False
-        for now_ns, due, y, poses in self._lockstep_inputs.complete():
+        for now_ns, is_due, y, poses in self._lockstep_inputs.complete():
             if y is not None:
                 self._y_receiver.accept(y, now_ns)
             for pose in poses:
                 # A pose without channels means that this instant has no pose.
                 if pose.value.size:
                     self._pose_receiver.accept(pose, now_ns)
-            if due and (output := self._step(now_ns, now_ns)) is not None:
+            if is_due and (output := self._step(now_ns, now_ns)) is not None:
                 self._publish(output, now_ns)
-            elif due:
+            elif is_due:
                 self._publish_u_m(self._empty_encoder.encode(now_ns, NO_CHANNELS))
             advanced = True
         return advanced

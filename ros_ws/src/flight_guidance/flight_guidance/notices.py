@@ -81,7 +81,7 @@ class _Lasting:
         self._since = -math.inf
         self._said = False
 
-    def due(self, t: float, *, holds: bool) -> bool:
+    def is_due(self, t: float, *, holds: bool) -> bool:
         """Return whether a notice is due at the flight time t, s."""
         if holds != self._holds:
             self._holds = holds
@@ -181,24 +181,24 @@ class Notices:
             if self._reach_text != earlier:
                 texts.append(f"from now on {self._reach_text or 'own limits again'}")
         # The conditions that must last are those of the link, the pose, the tilt and the wind.
-        if self._link.due(t, holds=log[LINK_AGE] > self._link_timeout):
+        if self._link.is_due(t, holds=log[LINK_AGE] > self._link_timeout):
             texts.append(f"no message of an operator for {self._link_timeout:g} s: home")
-        if self._stale.due(t, holds=log["age.pose"] > self._max_age):
+        if self._stale.is_due(t, holds=log["age.pose"] > self._max_age):
             texts.append(
                 f"pose is {log['age.pose']:.2f} s old, guidance.max_age {self._max_age:g} s"
             )
         tilt = math.acos(math.cos(log["pose.phi"]) * math.cos(log["pose.theta"]))
-        if self._tilted.due(t, holds=tilt > self._largest_tilt + TILTED):
+        if self._tilted.is_due(t, holds=tilt > self._largest_tilt + TILTED):
             texts.append(
                 f"the tilt is {math.degrees(tilt):.0f} deg, its limit "
                 f"{math.degrees(self._largest_tilt):.0f} deg: a rotor may be lost"
             )
-        if self._blown.due(t, holds=bool(is_blown_back(log))):
+        if self._blown.is_due(t, holds=bool(is_blown_back(log))):
             texts.append(
                 f"the ground speed along the path is below 0 for {DWELL:g} s, in a wind of "
                 f"{wind:.1f} m/s"
             )
-        if self._strong.due(t, holds=wind > largest):
+        if self._strong.is_due(t, holds=wind > largest):
             lacks = "circles of the least radius take more than the largest bank"
             if self._largest_tilt < math.inf:
                 lacks = "the largest tilt does not hold the speed"

@@ -202,9 +202,9 @@ class BagWriter:
         self.close()
 
     @property
-    def full(self) -> bool:
+    def is_full(self) -> bool:
         """Whether the disk is full."""
-        return self._file.full
+        return self._file.is_full
 
     def add_attachments(self, attachments: LogAttachments, now_ns: int) -> None:
         """Store files as attachments, and named sets of strings as metadata records."""

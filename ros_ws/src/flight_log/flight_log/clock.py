@@ -123,7 +123,7 @@ class StampClock:
         self._last_offset_ns = int(offset_ns[-1])
         self._offset_ns = max(self._offset_ns, int(offset_ns.max()))
         if stamp_ns[-1] - stamp_ns[0] > STEP_NS:
-            self._is_history = _in_burst(stamp_ns, offset_ns)
+            self._is_history = _is_in_burst(stamp_ns, offset_ns)
 
     def _catches_up(self, stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool | None:
         """Return whether the samples after a backward step are only late.
@@ -200,7 +200,7 @@ def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArra
     return np.asarray((away_ns >= -STEP_NS) & is_near)
 
 
-def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool:
+def _is_in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool:
     """Return whether the last samples were recorded all at once, as the history of a publisher is.
 
     The last samples are taken over LEAP_NS by their stamps. In a burst they were recorded in less

@@ -67,7 +67,7 @@ class ReservedFile:
         self._end_data = bytearray()
         self._position = 0
         self._closed = False
-        self.full = False  # whether a write has needed the reserve
+        self.is_full = False  # whether a write has needed the reserve
 
     def reserve(self, size: int) -> None:
         """Reserve `size` bytes in total.
@@ -75,14 +75,14 @@ class ReservedFile:
         If there is not enough space, `full` is set and the earlier reserve stays. A call after
         `release` has no effect, because the last chunk is being written then.
         """
-        if self.full or self._reserve.closed or size <= self._reserved_bytes:
+        if self.is_full or self._reserve.closed or size <= self._reserved_bytes:
             return
         self._reserved_bytes = size + RESERVE_STEP
         try:
             os.posix_fallocate(self._reserve.fileno(), 0, self._reserved_bytes)
         except OSError as error:
             # On a file system without fallocate there is no reserve.
-            self.full = error.errno in NO_SPACE
+            self.is_full = error.errno in NO_SPACE
 
     def keep(self, data: bytes) -> None:
         """Keep data for the end of the file, in the reserve or, without a reserve, in memory."""
@@ -95,7 +95,7 @@ class ReservedFile:
                 # On a file system without fallocate the reserve occupies no space.
                 if error.errno not in NO_SPACE:
                     raise
-            self.full = True
+            self.is_full = True
             self.release()
         self._end_data += data
 
@@ -122,7 +122,7 @@ class ReservedFile:
             except OSError as error:
                 if error.errno not in NO_SPACE or self._reserve.closed:
                     raise
-                self.full = True
+                self.is_full = True
                 self.release()
                 continue
             self._position += written

@@ -338,7 +338,7 @@ class TopicSamples:
             if publisher not in of_flight
         ]
 
-    def overlap(self) -> bool:
+    def has_overlap(self) -> bool:
         """Return whether two publishers sent samples at the same time."""
         spans = sorted(self.spans.values())
         return any(before.last_ns >= after.first_ns for before, after in pairwise(spans))

@@ -42,7 +42,7 @@ class ScheduledMessage(NamedTuple):
     due_ns: int  # on the time scale of the stamps in the log
     topic: str
     data: bytes  # CDR, as recorded
-    stamped: bool  # whether the data begin with a stamp on this time scale
+    is_stamped: bool  # whether the data begin with a stamp on this time scale
 
 
 class Playback(NamedTuple):

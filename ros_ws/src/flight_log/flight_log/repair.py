@@ -47,7 +47,7 @@ class Repair(NamedTuple):
     """What the repair of a bag has found and done."""
 
     files: tuple[FileRepair, ...]
-    wrote_metadata: bool
+    has_new_metadata: bool
     # Names of files that metadata.yaml lists but the folder lacks.
     missing: tuple[str, ...] = ()
 

@@ -260,7 +260,7 @@ def _tape(
         recording=recording,
         processes={printable(name): process for name, process in processes.items()},
         refused=refusals,
-        is_by_clock=SIMULATED_TIME in log.metadata or _stamped_by_clock(start_ns, spans),
+        is_by_clock=SIMULATED_TIME in log.metadata or _is_stamped_by_clock(start_ns, spans),
         lost_parts=tuple(replace(lost, sentence=printable(lost.sentence)) for lost in lost_parts),
     )
 
@@ -276,7 +276,7 @@ def _publisher_notes(
     conflicts = defaultdict[tuple[str, ...], list[str]](list)
     foreign = defaultdict[tuple[str, ...], list[str]](list)
     for name, samples in topics.items():
-        if name in AIRCRAFT_TOPICS and samples.overlap():
+        if name in AIRCRAFT_TOPICS and samples.has_overlap():
             conflicts[tuple(sorted(samples.spans))].append(name)
         senders = samples.further_publishers(of_flight[name])
         silent = [sender for sender in senders if sender not in samples.spans]
@@ -302,7 +302,7 @@ def _publishers(senders: Sequence[str]) -> str:
     return ", ".join(bounded(sender) or UNNAMED for sender in senders[:NAMED]) + more
 
 
-def _stamped_by_clock(start_ns: int, spans: Mapping[str, SampleSpan]) -> bool:
+def _is_stamped_by_clock(start_ns: int, spans: Mapping[str, SampleSpan]) -> bool:
     """Return whether the processes took their stamps from /clock.
 
     The stamps then lie long before the present, and the names of the publishers have a process id.

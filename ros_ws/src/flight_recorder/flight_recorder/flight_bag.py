@@ -100,7 +100,7 @@ class FlightBag:
         except OSError as error:
             self._end(f"{self.path} cannot be written ({error.strerror})")
         else:
-            if self._writer.full:
+            if self._writer.is_full:
                 self._end(f"no space left for {self.path}")
 
     def flush(self) -> None:

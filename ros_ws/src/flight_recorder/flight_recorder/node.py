@@ -87,7 +87,7 @@ class _RecordedTopics:
         for topic in FLIGHT:
             # ROS 2 keeps lines of the log for late subscribers, so ROSOUT is recorded like a topic
             # of the stack.
-            qos = RECORD_FOREIGN if topic.foreign and topic is not ROSOUT else RECORD
+            qos = RECORD_FOREIGN if topic.is_foreign and topic is not ROSOUT else RECORD
             self._record(topic, qos, [PUBLISH])
         recorded_names = {topic.name for topic in self._topics}
         self.missing = [name for name in dict.fromkeys(names) if name not in recorded_names]
@@ -115,7 +115,7 @@ class _RecordedTopics:
         )
         subscribed = _Subscribed(
             name=subscription.name,
-            is_foreign=topic.foreign,
+            is_foreign=topic.is_foreign,
             channel=channel,
             subscription=subscription,
         )
@@ -271,7 +271,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
         In lockstep, also publish the stamp of the newest sample of `truth` in the bag.
         """
-        if self.simulated is not None and (self.simulated.restarted or not self.simulated.known()):
+        if self.simulated is not None and (
+            self.simulated.has_restarted or not self.simulated.is_known()
+        ):
             return
         stamps: list[int] = []
         for topic in self._topics:
@@ -311,7 +313,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
                 continue
             if count := topic.lost_before(sequence, sender_of(message)):
                 self.lost[topic.name] += count
-                if self._losses.due(topic.name):
+                if self._losses.is_due(topic.name):
                     self.get_logger().warning(f"{topic.name}: {count} messages lost")
 
     def _last_records(self) -> Records:
@@ -319,7 +321,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         records = {LOST_MESSAGES: {name: str(count) for name, count in self.lost.items()}}
         if silent := self._silences.record([*self._topics], self._flight_time.monotonic_ns()):
             records[SILENCES] = silent
-        if self.simulated is not None and self.simulated.known():
+        if self.simulated is not None and self.simulated.is_known():
             records[SIMULATED_TIME] = {
                 "topic": self.simulated.subscription.name,
                 "speed": f"{self.simulated.speed():.3g}",

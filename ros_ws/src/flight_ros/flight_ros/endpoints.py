@@ -119,5 +119,5 @@ class EndpointMonitor:
 
     def _log(self, topic: str, refusals: Sequence[Refusal | None]) -> None:
         for refusal in refusals:
-            if refusal and self._throttle.due(f"{topic}: {refusal}"):
+            if refusal and self._throttle.is_due(f"{topic}: {refusal}"):
                 self._node.get_logger().error(bounded(f"{topic}: {refusal}"))

@@ -132,7 +132,7 @@ class FlightNode(Node, Generic[P]):
 
         Simulated time is known from the first message of /clock on.
         """
-        return self.host is not self.simulated or self.simulated.known()
+        return self.host is not self.simulated or self.simulated.is_known()
 
     def start_ns(self) -> int | None:
         """Return the system time of tick 0, ns, which depends on the parameter `start_time`.
@@ -404,7 +404,7 @@ class FlightNode(Node, Generic[P]):
 
     def warn_without_time(self) -> None:
         """Log a warning as long as no /clock comes in simulated time."""
-        if self.simulated is not None and self.simulated.silent():
+        if self.simulated is not None and self.simulated.is_silent():
             self.warn_no_publisher(self.simulated.subscription)
 
     def graph_checks(self) -> list[Callable[[], None]]:

@@ -13,7 +13,7 @@ class Instant(NamedTuple):
     """A sample of y, and the `others`: the new samples of a second signal up to its instant."""
 
     now_ns: int
-    due: bool  # whether the node steps at this instant
+    is_due: bool  # whether the node steps at this instant
     y: StampedVector | None  # None if a sample did not arrive, or is invalid
     others: list[StampedVector]
 
@@ -54,8 +54,8 @@ class LockstepInputs:
         self._others_due.extend(sample for sample in self._receive_other() if sample is not None)
         while self._y_due:
             now_ns = self._number * self._y_period_ns
-            due = now_ns % self._period_ns == 0
-            if due and not (
+            is_due = now_ns % self._period_ns == 0
+            if is_due and not (
                 self._others_due
                 and self._others_due[-1].stamp_ns >= now_ns
                 and self._is_ready(now_ns)
@@ -65,7 +65,7 @@ class LockstepInputs:
             others = []
             while self._others_due and self._others_due[0].stamp_ns <= now_ns:
                 others.append(self._others_due.popleft())
-            yield Instant(now_ns, due, self._y_due.popleft(), others)
+            yield Instant(now_ns, is_due, self._y_due.popleft(), others)
 
     @property
     def has_y(self) -> bool:

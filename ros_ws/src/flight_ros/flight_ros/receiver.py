@@ -83,7 +83,7 @@ class Refusals:
         self.last[subscription.name] = time.monotonic_ns(), sentence
         if reason == SENDER:
             self._conflict = Refusal(f"{subscription.name}: {sentence}")
-        if not self._throttle.due(key):
+        if not self._throttle.is_due(key):
             return
         if reason == SENDER:
             self._node.get_logger().error(f"{subscription.name}: sample refused: {sentence}")

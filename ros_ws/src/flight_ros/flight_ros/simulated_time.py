@@ -43,18 +43,18 @@ class SimulatedTime:
         self._first = 0, 0  # first instant, and its reception, ns
         self._jump_ns = 0
 
-    def known(self) -> bool:
+    def is_known(self) -> bool:
         """Return whether a message has come."""
         self._take()
         return bool(self._instants_ns)
 
-    def silent(self) -> bool:
+    def is_silent(self) -> bool:
         """Return whether no message has come for SILENT_NS by the host's clock."""
-        return not self.known() or time.time_ns() - self._received_ns[-1] > SILENT_NS
+        return not self.is_known() or time.time_ns() - self._received_ns[-1] > SILENT_NS
 
     def time_ns(self) -> int:
         """Return the newest instant; 0 before the first message."""
-        return self._instants_ns[-1] if self.known() else 0
+        return self._instants_ns[-1] if self.is_known() else 0
 
     monotonic_ns = time_ns
 
@@ -87,18 +87,18 @@ class SimulatedTime:
         instant_ns, received_ns = self._first
         return (
             (self.time_ns() - instant_ns) / max(self._received_ns[-1] - received_ns, 1)
-            if self.known()
+            if self.is_known()
             else 0.0
         )
 
     @property
-    def restarted(self) -> bool:
+    def has_restarted(self) -> bool:
         """Whether /clock went back or far ahead; the time has stood still since then."""
         return self._jump_ns != 0
 
     def require_one_simulation(self) -> None:
         """Raise ClockRestarted after a jump of /clock."""
-        if self.restarted:
+        if self.has_restarted:
             publishers = self.subscription.entity.get_publisher_count()
             which = f" ({publishers} nodes publish it, expected one)" if publishers > 1 else ""
             raise ClockRestarted(

@@ -15,13 +15,13 @@ class Throttle:
         self._period_ns = period_ns
         self._passed_ns: dict[str, int] = {}  # instant at which a line last passed, by its text
 
-    def due(self, line: str) -> bool:
+    def is_due(self, line: str) -> bool:
         """Return whether a line may be logged, because it was not logged for a period.
 
         If the result is True, the line is remembered as logged now.
         """
         now_ns = time.monotonic_ns()
-        due = now_ns - self._passed_ns.get(line, -self._period_ns) >= self._period_ns
-        if due:
+        is_due = now_ns - self._passed_ns.get(line, -self._period_ns) >= self._period_ns
+        if is_due:
             self._passed_ns[line] = now_ns
-        return due
+        return is_due

@@ -125,7 +125,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         self._clock_ns = max([self._clock_ns, *stamps])
         advanced = False
         while True:
-            if self._next is None and self._commands_known():
+            if self._next is None and self._is_next_known():
                 self._next = self._sample(self._number)
             t_ns = self._number * self.period_ns()
             if self._next is None or t_ns > self._clock_ns:
@@ -135,7 +135,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             self._next = None
             advanced = True
 
-    def _commands_known(self) -> bool:
+    def _is_next_known(self) -> bool:
         """Return whether all commands are known that the next y_m in lockstep depends on.
 
         They are known if no u_m is due at the instant one period before this y_m. If a u_m is due

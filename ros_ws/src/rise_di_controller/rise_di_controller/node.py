@@ -273,16 +273,16 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
 
     def advance(self) -> bool:
         advanced = False
-        for now_ns, due, y, y_m in self._inputs.complete():
+        for now_ns, is_due, y, y_m in self._inputs.complete():
             if y is not None:
                 self._y.accept(y, now_ns)
             for sample in y_m:
                 self._y_m.accept(sample, now_ns)
-            if due:
+            if is_due:
                 self._learn(now_ns)
                 if now_ns % (AUTHORITY_TICKS * self.period_ns()) == 0:
                     self._publish_authority(now_ns)
-            if due and not self._step(now_ns, late_ns=0):
+            if is_due and not self._step(now_ns, late_ns=0):
                 self._publish_u(self._empty_encoder.encode(now_ns, NO_CHANNELS))
             advanced = True
         return advanced
@@ -399,7 +399,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             if receiver.subscription.topic.name in stale:
                 self.warn_no_publisher(receiver.subscription)
                 slowness = receiver.slowness(self._max_age_ns())
-                if slowness and self._slow.due(receiver.name):
+                if slowness and self._slow.is_due(receiver.name):
                     self.get_logger().warning(f"{receiver.name}: {slowness}")
         if not stale:
             publisher = None if self._y.lock is None else self._y.lock.publisher

@@ -43,7 +43,7 @@ class Command(NamedTuple):
     trim_property: str | None
     lower: float  # end stops of the whole command
     upper: float
-    each_engine: bool
+    is_per_engine: bool
     positive: str  # the effect of a positive value in models that follow JSBSim's sign convention
     # properties named by the user, in place of `property` and `trim_property`; empty if none are
     named: "NamedProperties" = ()
@@ -115,7 +115,7 @@ INPUTS: Mapping[str, Command] = {
         trim_property="fcs/pitch-trim-cmd-norm",
         lower=-1.0,
         upper=1.0,
-        each_engine=False,
+        is_per_engine=False,
         positive="nose down",
     ),
     "throttle": Command(
@@ -123,7 +123,7 @@ INPUTS: Mapping[str, Command] = {
         trim_property=None,
         lower=0.0,
         upper=1.0,
-        each_engine=True,
+        is_per_engine=True,
         positive="more thrust",
     ),
     "aileron": Command(
@@ -131,7 +131,7 @@ INPUTS: Mapping[str, Command] = {
         trim_property="fcs/roll-trim-cmd-norm",
         lower=-1.0,
         upper=1.0,
-        each_engine=False,
+        is_per_engine=False,
         positive="roll right",
     ),
     "rudder": Command(
@@ -139,7 +139,7 @@ INPUTS: Mapping[str, Command] = {
         trim_property="fcs/yaw-trim-cmd-norm",
         lower=-1.0,
         upper=1.0,
-        each_engine=False,
+        is_per_engine=False,
         positive="nose left",
     ),
 }

@@ -68,7 +68,7 @@ def command_paths(command: Command, engines: int) -> list[tuple[str, float]]:
     """
     if command.named:
         return list(command.named)
-    if command.each_engine:
+    if command.is_per_engine:
         return [(f"{command.property}[{i}]", 1.0) for i in range(engines)]
     return [(command.property, 1.0)]
 

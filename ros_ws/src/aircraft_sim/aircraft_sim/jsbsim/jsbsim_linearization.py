@@ -119,7 +119,7 @@ def driven(name: str) -> str:
 
 
 def _duration(name: str) -> float:
-    return ENGINE_TIME if INPUTS[name].each_engine else SURFACE_TIME
+    return ENGINE_TIME if INPUTS[name].is_per_engine else SURFACE_TIME
 
 
 class _InputSteps(NamedTuple):

@@ -107,7 +107,9 @@ class JsbsimModel:
         self._structure = [self._node(path) for path in jsbsim_trim.structure_contacts(self._fdm)]
         inputs = condition.inputs()
         self._no_thrust = np.where(
-            [INPUTS[name].each_engine for name in inputs], -self.trim.commands[: len(inputs)], 0.0
+            [INPUTS[name].is_per_engine for name in inputs],
+            -self.trim.commands[: len(inputs)],
+            0.0,
         )
         self._actuator_model = actuator_model._replace(no_thrust=self._no_thrust)
         self._wind_model = wind_model
@@ -224,7 +226,7 @@ class JsbsimModel:
     def _ground_velocity(self) -> FloatArray:
         return np.array([node.get_double_value() * si for node, si in self._pose_nodes[4:6]])
 
-    def diverged(self) -> bool:
+    def has_diverged(self) -> bool:
         """Return whether a state is not finite, or has a component above DIVERGENCE_LIMIT."""
         return not bool(np.all(np.abs(self._x) < DIVERGENCE_LIMIT))
 

@@ -207,7 +207,7 @@ def advance(
     return AircraftState(x, position, z)
 
 
-def diverged(state: AircraftState) -> bool:
+def has_diverged(state: AircraftState) -> bool:
     """Return whether a state is not finite, or has a component above DIVERGENCE_LIMIT."""
     # The comparison is also false for NaN.
     return not all(abs(x) < DIVERGENCE_LIMIT for x in state.x.tolist())

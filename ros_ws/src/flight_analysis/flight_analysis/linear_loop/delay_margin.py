@@ -39,7 +39,7 @@ def delay_margin(
         stride *= 2
     part = loop.period / 2.0 / stride
 
-    def stable(place: int) -> bool:
+    def is_stable_at(place: int) -> bool:
         return is_stable(plant, law, loop, place * part * delayed)
 
     lower = 0
@@ -48,18 +48,18 @@ def delay_margin(
         lower = round(near / part)
         stride = NEAR
         growth = 2
-        while lower > 0 and not stable(lower):
+        while lower > 0 and not is_stable_at(lower):
             lower = max(lower - stride, 0)
             stride *= growth
         stride = max(stride // growth, NEAR)
-    if lower == 0 and not stable(0):
+    if lower == 0 and not is_stable_at(0):
         return 0.0
-    while stable(lower + stride):
+    while is_stable_at(lower + stride):
         lower += stride
         stride *= growth
         if lower * part > longest:
             return math.inf
     while stride > 1:
         stride //= 2
-        lower += stride * stable(lower + stride)
+        lower += stride * is_stable_at(lower + stride)
     return lower * part

@@ -124,7 +124,7 @@ class LoopMargins(NamedTuple):
     worst_delay: float | None = None  # least delay margin of the uncertain aircraft, s
     aircraft: int = 0  # number of uncertain aircraft that were drawn
     stable: int = 0  # number of stable ones among them
-    by_search: bool = False  # whether `worst` comes from a search over the box, not from samples
+    is_searched: bool = False  # whether `worst` comes from a search over the box, not from samples
 
 
 def margins(
@@ -217,7 +217,7 @@ def _assessed_by_search(linear: LinearLoop, box: Box) -> LoopMargins:
         worst_delay=_least_delay(linear._replace(plant=aircraft), nominal.delay),
         aircraft=len(radii),
         stable=int((radii <= 1.0 + SPECTRAL_RADIUS_TOLERANCE).sum()),
-        by_search=True,
+        is_searched=True,
     )
 
 

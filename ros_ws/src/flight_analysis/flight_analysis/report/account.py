@@ -165,7 +165,7 @@ def account(
     unguided = bool(guided) and all(
         topic.expected and not topic.found and not topic.unset for topic in guided
     )
-    first = _late_first_u(tape, topics, scenario) if span.from_start else None
+    first = _late_first_u(tape, topics, scenario) if span.is_from_start else None
     starved = Starvation() if scenario is None else starvation(tape, scenario, topics, end)
     lacks = []
     host_lacks = []
@@ -214,10 +214,10 @@ def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bo
         if name in RATED and len(signal.stamp_ns)
     ]
     if planned_ns is None or not simulated:
-        return Span(max(lasts, default=tape.start_ns), from_start=False, simulated=simulated)
+        return Span(max(lasts, default=tape.start_ns), is_from_start=False, is_simulated=simulated)
     if outcome.end in {End.COMPLETED, End.UNKNOWN}:
-        return Span(planned_ns, from_start=True, simulated=True)
-    return Span(max(lasts, default=tape.start_ns), from_start=True, simulated=True)
+        return Span(planned_ns, is_from_start=True, is_simulated=True)
+    return Span(max(lasts, default=tape.start_ns), is_from_start=True, is_simulated=True)
 
 
 def _processes(tape: Tape) -> dict[str, ProcessAccount]:

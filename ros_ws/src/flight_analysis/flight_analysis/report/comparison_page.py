@@ -67,8 +67,8 @@ def comparison_page(flights: Sequence[RecordedFlight], tolerances: Mapping[str, 
                 title="Differences of the signals from the first flight",
                 contents="Differences",
             ),
-            Section("Spectrum of u", "", figures.spectrum_figure(context), over_time=False),
-            Section("Timing of the ticks", "", figures.timing_figure(context), over_time=False),
+            Section("Spectrum of u", "", figures.spectrum_figure(context), is_over_time=False),
+            Section("Timing of the ticks", "", figures.timing_figure(context), is_over_time=False),
         ],
         samples=context.samples,
     )
@@ -112,7 +112,7 @@ def _tracks(flights: Sequence[RecordedFlight], colours: Mapping[str, str]) -> li
     routes = guided_figures.flown_routes(first.scenario, first.tape)
     tracks = {label: (flight.tape, colours[label]) for label, flight in guided.items()}
     figure = guided_figures.tracks_figure(tracks, routes)
-    return [Section("Ground track", "", figure, over_time=False, contents="Ground track")]
+    return [Section("Ground track", "", figure, is_over_time=False, contents="Ground track")]
 
 
 def _metrics(
@@ -180,7 +180,7 @@ def _overlay_page(
             ),
             Section("Input u", "", figures.input_figure(context), contents="Inputs"),
             Section("Pose", "", figures.overlay_figure(context, "pose"), contents="Pose"),
-            Section("Spectrum of u", "", figures.spectrum_figure(context), over_time=False),
+            Section("Spectrum of u", "", figures.spectrum_figure(context), is_over_time=False),
             Figures(
                 groups=[differences],
                 title="Differences from the first log",

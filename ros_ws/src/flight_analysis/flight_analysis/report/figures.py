@@ -43,7 +43,7 @@ from flight_analysis.report.plotting import (
     Run,
     SampleStore,
     add_line,
-    first_in_legend,
+    is_first_in_legend,
     set_layout,
     time_series_figure,
 )
@@ -173,7 +173,8 @@ def _references(context: PlotContext) -> dict[str, Curve]:
         (curve,) = references.values()
         return {"y_m": curve._replace(colour=REFERENCE, width=6.0)}
     return {
-        f"y_m {label}": curve._replace(width=5.0, faint=True) for label, curve in references.items()
+        f"y_m {label}": curve._replace(width=5.0, is_faint=True)
+        for label, curve in references.items()
     }
 
 
@@ -249,13 +250,13 @@ def input_figure(
     `limits` has the limits of the inputs by kind. At most two kinds are drawn, as lines. Marks show
     where an input was saturated.
     """
-    curves = _curves(context, "u", lambda tape: tape.signals.get("u"), steps=True)
+    curves = _curves(context, "u", lambda tape: tape.signals.get("u"), is_held=True)
     if context.is_comparison or not curves:
         return time_series_figure(context, curves) if curves else None
     tape = context.tape
     if (position := _truth_group(tape, "actuator")).names:
         curves = {
-            "command u": Curve(tape["u"], REFERENCE, 4.0, steps=True),
+            "command u": Curve(tape["u"], REFERENCE, 4.0, is_held=True),
             "actuator": Curve(position, PLANT),
         }
     figure = time_series_figure(context, curves)
@@ -376,7 +377,7 @@ def spectrum_figure(context: PlotContext) -> Figure | None:
             style: dict[str, Any] = {
                 "line": {"color": run.colour, "width": 1.4},
                 "legendgroup": label,
-                "showlegend": len(runs) > 1 and first_in_legend(figure, label),
+                "showlegend": len(runs) > 1 and is_first_in_legend(figure, label),
                 "hovertemplate": f"%{{y:.3g}} {unit.unit}/√Hz at %{{x:.3g}} Hz",
             }
             figure.add_scatter(
@@ -435,7 +436,7 @@ def timing_figure(context: PlotContext) -> Figure | None:
                 "name": label,
                 "marker": {"color": runs[label].colour},
                 "legendgroup": label,
-                "showlegend": len(runs) > 1 and first_in_legend(figure, label),
+                "showlegend": len(runs) > 1 and is_first_in_legend(figure, label),
                 "opacity": 1.0 if len(runs) == 1 else 0.6,
                 "hovertemplate": "%{y} ticks around %{x:.4g} ms",
             }

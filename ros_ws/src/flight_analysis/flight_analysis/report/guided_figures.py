@@ -62,7 +62,7 @@ def guided_context(context: PlotContext) -> PlotContext:
     for shaded, colour in MODE_SHADES.items():
         label = f"guidance: {shaded.name.lower().replace('_', ' ')}"
         stale += [
-            Interval(label=label, start=start, stop=stop, colour=colour, labelled=False)
+            Interval(label=label, start=start, stop=stop, colour=colour, is_labelled=False)
             for start, stop in mask_spans(t, mode == shaded)
         ]
     return context._replace(units=QUANTITY_UNITS, intervals=[*context.intervals, *stale])
@@ -267,7 +267,7 @@ def cross_track_figure(context: PlotContext) -> Figure | None:
     for leg in np.unique(legs[legs >= 0.0]):
         colour = END_STOP if leg % 2 else "#ffffff"
         spans += [
-            Interval(label=f"{int(leg)}", start=start, stop=stop, colour=colour, labelled=True)
+            Interval(label=f"{int(leg)}", start=start, stop=stop, colour=colour, is_labelled=True)
             for start, stop in mask_spans(t, legs == leg)
         ]
     return time_series_figure(context._replace(intervals=[*context.intervals, *spans]), {"": error})

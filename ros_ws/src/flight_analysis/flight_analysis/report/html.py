@@ -144,7 +144,7 @@ def _imported_page(flight: RecordedFlight) -> Page:
             *([] if replay is None else [ReplayBlock(replay=replay)]),
             Section("Input u", "about trim", figures.input_figure(context), contents="Inputs"),
             Section("Pose", "", pose, contents="Pose"),
-            Section("Spectrum of u", "amplitude spectral density", spectrum, over_time=False),
+            Section("Spectrum of u", "amplitude spectral density", spectrum, is_over_time=False),
             Figures(groups=[TableGroup(flight_tables)], is_folded=True),
         ],
         samples=context.samples,
@@ -266,7 +266,7 @@ def _causes(
             contents="Law",
         ),
         Section("Error of the sensors", "y less the true output", figures.sensor_figure(context)),
-        Section("Spectrum of u", "amplitude spectral density", spectrum, over_time=False),
+        Section("Spectrum of u", "amplitude spectral density", spectrum, is_over_time=False),
         *_loop_sections(_drawn_loops(flown.loops)),
         Section(
             "Ticks of the controller",
@@ -274,7 +274,7 @@ def _causes(
             figures.tick_figure(context),
             contents="Timing",
         ),
-        Section("Timing of the ticks", "", figures.timing_figure(context), over_time=False),
+        Section("Timing of the ticks", "", figures.timing_figure(context), is_over_time=False),
     ]
 
 
@@ -338,12 +338,14 @@ def _loop_sections(loops: Mapping[str, LinearLoop]) -> list[Section]:
         f"and hold; {next(iter(loops.values())).model}"
     )
     return [
-        Section("Bode plot of the loop", hint, margin_figures.bode_figure(loops), over_time=False),
+        Section(
+            "Bode plot of the loop", hint, margin_figures.bode_figure(loops), is_over_time=False
+        ),
         Section(
             "Nyquist plot of the loop",
             "Inside the circle around -1 the sensitivity is above 2.",
             margin_figures.nyquist_figure(loops),
-            over_time=False,
+            is_over_time=False,
         ),
     ]
 
@@ -366,7 +368,7 @@ def _guidance_sections(
             guided_figures.track_figure(
                 flight.tape, routes, speed, None if guidance is None else guidance.fence_zones()
             ),
-            over_time=False,
+            is_over_time=False,
             contents="Ground track",
         ),
         Section(

@@ -41,7 +41,7 @@ def gust_intervals(tape: Tape, gusts: Windows) -> list[Interval]:
             start=start,
             stop=min(stop, end),
             colour=GUST,
-            labelled=True,
+            is_labelled=True,
         )
         for name, (start, stop) in gusts.items()
         if start < end
@@ -58,7 +58,9 @@ def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
     for mode, colour in MODE_COLOURS.items():
         spans = mask_spans(t, modes == mode, min_length)
         intervals += [
-            Interval(label=mode.name.lower(), start=start, stop=stop, colour=colour, labelled=False)
+            Interval(
+                label=mode.name.lower(), start=start, stop=stop, colour=colour, is_labelled=False
+            )
             for start, stop in spans
         ]
     return intervals
@@ -69,7 +71,7 @@ def fault_intervals(flight: RecordedFlight, end: float) -> list[Interval]:
     if flight.scenario is None:
         return []
     return [
-        Interval(label=fault.subject, start=fault.at, stop=end, colour=FAULT, labelled=True)
+        Interval(label=fault.subject, start=fault.at, stop=end, colour=FAULT, is_labelled=True)
         for fault in flight.scenario.aircraft.actuators.read_faults()
         if fault.at < end
     ]
@@ -79,7 +81,7 @@ def starved_intervals(flight: RecordedFlight) -> list[Interval]:
     """Return the intervals in which the host was too busy to fly in real time."""
     spans = (flight.summary.get("account") or {}).get("starved", ())
     return [
-        Interval(label="host too busy", start=start, stop=stop, colour=STARVED, labelled=False)
+        Interval(label="host too busy", start=start, stop=stop, colour=STARVED, is_labelled=False)
         for start, stop in spans
     ]
 
@@ -99,7 +101,7 @@ def gap_intervals(tape: Tape) -> list[Interval]:
             start=float(t[before]),
             stop=float(t[before + 1]),
             colour=NO_SAMPLE,
-            labelled=False,
+            is_labelled=False,
         )
         for before in np.flatnonzero(np.diff(t) > longest)
     ]

@@ -14,7 +14,7 @@ from flight_analysis.linear_loop.loop_margins import LinearLoop, LoopMargins
 from flight_analysis.report.display_units import NO_VALUE
 from flight_analysis.report.figures import COLOURS
 from flight_analysis.report.flown_models import FlownLoops
-from flight_analysis.report.plotting import Figure, add_line, axis, first_in_legend, set_layout
+from flight_analysis.report.plotting import Figure, add_line, axis, is_first_in_legend, set_layout
 from flight_analysis.report.summary_rows import Column
 from flight_analysis.report.tables import MetricTable
 from flight_core.vectors import FloatArray
@@ -376,7 +376,7 @@ def add_curve(
     hover = f"%{{y:.3g}} {unit} at %{{x:.3g}} rad/s" if unit else "%{x:.3g} %{y:+.3g} j"
     figure.add_scatter(
         label, x, y, place, legendgroup=label, line={"color": colour, "width": 1.4},
-        showlegend=bool(label) and first_in_legend(figure, label), hovertemplate=hover,
+        showlegend=bool(label) and is_first_in_legend(figure, label), hovertemplate=hover,
     )  # fmt: skip
 
 

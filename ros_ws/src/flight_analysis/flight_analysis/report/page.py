@@ -109,7 +109,7 @@ class Section(NamedTuple):
     title: str
     hint: str
     figure: Figure | None
-    over_time: bool = True  # all figures over time are zoomed together
+    is_over_time: bool = True  # all figures over time are zoomed together
     contents: str = ""  # name in the line of contents, or "" to leave it out there
 
     @property
@@ -254,7 +254,7 @@ class Page(NamedTuple):
     @property
     def has_times(self) -> bool:
         """Whether the page has figures over time, which are all zoomed together."""
-        return any(isinstance(block, Section) and block.over_time for block in self.shown)
+        return any(isinstance(block, Section) and block.is_over_time for block in self.shown)
 
     @property
     def has_angles(self) -> bool:

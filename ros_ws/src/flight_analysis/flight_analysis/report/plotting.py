@@ -156,7 +156,7 @@ class Interval:
     start: float
     stop: float
     colour: str
-    labelled: bool  # whether the label stands over the interval, not in the legend
+    is_labelled: bool  # whether the label stands over the interval, not in the legend
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,8 +195,8 @@ class Curve(NamedTuple):
     signal: Signal
     colour: str
     width: float = 1.4
-    steps: bool = False  # each value is held until the next sample, like u
-    faint: bool = False
+    is_held: bool = False  # each value is held until the next sample, like u
+    is_faint: bool = False
     start_ns: int | None = None  # stamp of t = 0; None for the start of the page's flight
 
 
@@ -318,7 +318,7 @@ def time_series_figure(
             if channel in curve.signal.names:
                 trace = _trace(context, curve, channel, unit.factor, MAX_POINTS // columns)
                 values = curve.signal[channel] * unit.factor
-                in_legend = len(curves) > 1 and first_in_legend(figure, label)
+                in_legend = len(curves) > 1 and is_first_in_legend(figure, label)
                 trace |= {
                     "name": label,
                     # If all entries of a legend are in one group, plotly stacks them.
@@ -379,7 +379,7 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
     return figure
 
 
-def first_in_legend(figure: Figure, label: str) -> bool:
+def is_first_in_legend(figure: Figure, label: str) -> bool:
     """Return whether a label is new to the figure. The legend shows each label only once."""
     return all(trace["name"] != label for trace in figure.data)
 
@@ -395,7 +395,7 @@ def add_line(
     """Add a line to a subplot, with an entry in the legend. A None in x breaks the line."""
     if not x:
         return
-    in_legend = first_in_legend(figure, label)
+    in_legend = is_first_in_legend(figure, label)
     figure.add_scatter(
         label, x, y, index, legendgroup=label, line=style, hoverinfo="skip", showlegend=in_legend
     )
@@ -408,11 +408,11 @@ def _trace(
     style = {
         "color": curve.colour,
         "width": curve.width,
-        "shape": "hv" if curve.steps else "linear",
+        "shape": "hv" if curve.is_held else "linear",
     }
     # The line is not simplified, because plotly would cut off peaks.
     trace = {"type": "scatter", "mode": "lines", "line": style | {"simplify": False}} | (
-        {"opacity": 0.35} if curve.faint else {}
+        {"opacity": 0.35} if curve.is_faint else {}
     )
     if len(values) <= most:
         return trace | {"x": t_ns / NANOSECONDS, "y": values}
@@ -442,7 +442,7 @@ def _drawn(
     time.
     """
     start_ns = context.tape.start_ns if curve.start_ns is None else curve.start_ns
-    drawn = context.samples.instants(curve.signal.stamp_ns, start_ns, steps=curve.steps)
+    drawn = context.samples.instants(curve.signal.stamp_ns, start_ns, steps=curve.is_held)
     values = curve.signal[channel] * factor
     values = np.insert(values, drawn.gaps, np.nan) if len(drawn.gaps) else values
     return drawn.t_ns, values if drawn.width == 1 else _extremes_of_bins(values, drawn.width)
@@ -493,7 +493,7 @@ def _shade_intervals(figure: Figure, intervals: Sequence[Interval], columns: int
             )  # fmt: skip
     has_labels = columns == 1  # two columns are too narrow for labels
     for interval in sorted(intervals, key=lambda interval: interval.start):
-        if interval.labelled and has_labels:
+        if interval.is_labelled and has_labels:
             position = {"x": interval.start, "xanchor": "left", "y": 1.0, "yref": "paper"}
             text = {"text": interval.label, "font": {"size": INTERVAL_LABEL}}
             style = {"name": INTERVAL, "yanchor": "bottom", "showarrow": False}
@@ -501,7 +501,7 @@ def _shade_intervals(figure: Figure, intervals: Sequence[Interval], columns: int
     for label, colour in {
         interval.label: interval.colour
         for interval in intervals
-        if not (interval.labelled and has_labels)
+        if not (interval.is_labelled and has_labels)
     }.items():
         mark = {"symbol": "square", "size": 12, "color": colour, "opacity": 2 * INTERVAL_OPACITY}
         figure.add_scatter(label, [None], [None], mode="markers", marker=mark, showlegend=True)

@@ -85,8 +85,8 @@ class Span(NamedTuple):
     """The part of a flight in which samples are counted, from its beginning or first sample on."""
 
     end_ns: int  # stamp of the end
-    from_start: bool  # whether it begins at t = 0, not at the first sample of a topic
-    simulated: bool  # whether the aircraft of the scenario flew, no autopilot
+    is_from_start: bool  # whether it begins at t = 0, not at the first sample of a topic
+    is_simulated: bool  # whether the aircraft of the scenario flew, no autopilot
 
 
 class Leeway(NamedTuple):
@@ -107,10 +107,10 @@ def topic_accounts(
     controller count from the first tick on. If a controller or a publisher outside the stack leaves
     out up to a tenth of the samples, these do not count as missing.
     """
-    periods = {} if scenario is None else _periods(tape, scenario, simulated=span.simulated)
+    periods = {} if scenario is None else _periods(tape, scenario, simulated=span.is_simulated)
     expected = {} if scenario is None else _expected(tape, scenario, span, periods)
     names = [*dict.fromkeys([*(name for name in tape.signals if name in RATED), *expected])]
-    begin_ns = tape.start_ns if span.from_start else None
+    begin_ns = tape.start_ns if span.is_from_start else None
     topics = {name: _topic(tape, name, expected.get(name), begin_ns, span.end_ns) for name in names}
     leeways = {} if scenario is None else _leeways(scenario)
     has_clock = tape.is_by_clock or (
@@ -150,9 +150,9 @@ def _expected(
     for name, step_ns in periods.items():
         is_of_stack = is_sent_by_stack(tape, name)
         first_ns = tape.start_ns
-        if name in tape and (name in TICKS or not span.from_start):
+        if name in tape and (name in TICKS or not span.is_from_start):
             first_ns = int(tape[name].stamp_ns[0])
-            if span.from_start:
+            if span.is_from_start:
                 first_ns = max(first_ns, tape.start_ns)
         delay_ns = nanoseconds(delays.get(name, 0.0)) if is_of_stack else 0
         count = max((span.end_ns - delay_ns - first_ns) // step_ns + 1, 0)
@@ -160,7 +160,7 @@ def _expected(
             mean = count * (1.0 - sensors.dropout)
             count = max(math.floor(mean - 4.0 * math.sqrt(mean * sensors.dropout)), 0)
         expected[name] = count
-    if not span.simulated:  # then the controller is inactive until the bridge engages
+    if not span.is_simulated:  # then the controller is inactive until the bridge engages
         return expected
     guided_time = seconds(span.end_ns - tape.start_ns)
     if is_sent_by_stack(tape, "u"):
@@ -359,7 +359,7 @@ def _ticks(tape: Tape, scenario: Scenario, span: Span) -> tuple[int, float]:
     ]
     if not begins:
         return max((end_ns - tape.start_ns) // step_ns + 1, 0), 0.0
-    first_ns = tape.start_ns if span.from_start else min(begins)
+    first_ns = tape.start_ns if span.is_from_start else min(begins)
     begin_ns = max(min(begins), first_ns)
     if "internals" not in tape or not {"number", "age", "mode"} <= set(tape["internals"].names):
         instants = max((end_ns - begin_ns) // step_ns + 1, 1)

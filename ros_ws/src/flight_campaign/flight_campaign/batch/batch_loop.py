@@ -337,7 +337,7 @@ def advance(
         parts.append(_product(matrix, [moves[j] for j in block.columns]))
     x = rows_of(jnp.concatenate(parts), places)
     x = _chosen(
-        kind.forced,
+        kind.is_forced,
         jnp.any(segment.forcing != 0.0).astype(int),
         (lambda x: x, lambda x: x + fleet.wind * _product(matrices.forced, segment.forcing)),
         x,

@@ -33,7 +33,7 @@ class TickKind(NamedTuple):
     """
 
     phase: int | None
-    forced: bool | None  # whether biases, gusts or turbulence act
+    is_forced: bool | None  # whether biases, gusts or turbulence act
 
 
 UNKNOWN = TickKind(None, None)  # branches at the tick depend on both properties

@@ -74,7 +74,8 @@ def registered_law(controller: ControllerConfig, name: str) -> Law:
         tuned=tuple(start),
         feedforward=FeedforwardModel.NONE if controller.feedforward is None else name,
         initial={key: np.array(value)[:, None] for key, value in start.items()},
-        linear=not isinstance(controller, RiseDiConfig) or controller.sampled_sign() is Sign.SOFT,
+        is_linear=not isinstance(controller, RiseDiConfig)
+        or controller.sampled_sign() is Sign.SOFT,
     )
 
 

@@ -56,25 +56,28 @@ class Objective(NamedTuple):
     weights: dict[str, float]  # weight of each wind
     delay: int  # delay of u in the late flights, in multiples of `Benchmark.delay`
     # whether the late flights are those of all aircraft, and not only of the nominal one
-    all_late: bool
+    is_all_late: bool
     # requirement that the nominal loop must meet if the law has margins
     requirement: Requirement | None = None
 
 
 # Turbulence has half the weight, because scores in turbulence are about twice those in gusts.
 OBJECTIVES = {
-    "gust": Objective("gusts", {GUST: 1.0}, 1, all_late=False),
+    "gust": Objective("gusts", {GUST: 1.0}, 1, is_all_late=False),
     "gust_turbulence": Objective(
-        "gusts and turbulence", {GUST: 1.0, TURBULENCE: 0.5}, 1, all_late=False
+        "gusts and turbulence", {GUST: 1.0, TURBULENCE: 0.5}, 1, is_all_late=False
     ),
     "delay": Objective(
-        "gusts and turbulence with a large delay", {GUST: 1.0, TURBULENCE: 0.5}, 2, all_late=True
+        "gusts and turbulence with a large delay",
+        {GUST: 1.0, TURBULENCE: 0.5},
+        2,
+        is_all_late=True,
     ),
     "margins": Objective(
         title="gusts and turbulence within margins of 45 deg and 6 dB",
         weights={GUST: 1.0, TURBULENCE: 0.5},
         delay=1,
-        all_late=False,
+        is_all_late=False,
         requirement=REQUIREMENT,
     ),
 }
@@ -273,7 +276,7 @@ def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
     airframe, _ = benchmark.scenario.aircraft.load()
     A, B = nominal_and_sampled(airframe, UNCERTAINTY, UNCERTAIN_AIRCRAFT, UNCERTAINTY_SEED)
     aircraft = np.arange(len(A))
-    late_aircraft = aircraft if objective.all_late else aircraft[:1]
+    late_aircraft = aircraft if objective.is_all_late else aircraft[:1]
     numbers = np.concatenate([aircraft, late_aircraft])
     counts = [len(A), len(late_aircraft)]
     late = np.repeat([0, objective.delay * benchmark.delay], counts)

@@ -72,12 +72,12 @@ class AirframeFacts(NamedTuple):
     # has such a change
     pairing: Pairing | None
     zero_dynamics: ZeroDynamics
-    controllable: bool  # Assumption 1
+    is_controllable: bool  # Assumption 1
     # states that are integrals of outputs alone. Each of them gives a zero at the origin.
     integrated: tuple[str, ...]
 
     @property
-    def in_theorem(self) -> bool:
+    def is_in_theorem(self) -> bool:
         """Whether the theorem applies to the airframe.
 
         It does if Assumption 1 holds, if D of (10)-(11) exists, and if no zero lies in the right
@@ -85,7 +85,7 @@ class AirframeFacts(NamedTuple):
         the angles to which they belong.
         """
         return (
-            self.controllable
+            self.is_controllable
             and self.D is not None
             and self.zero_dynamics is not ZeroDynamics.UNSTABLE
         )
@@ -162,7 +162,7 @@ def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
         inputs=tuple(airframe.inputs),
         pairing=search(Omega),
         zero_dynamics=zero_dynamics(zeros),
-        controllable=controllable(A, B),
+        is_controllable=is_controllable(A, B),
         integrated=tuple(
             state
             for i, state in enumerate(airframe.states)
@@ -255,7 +255,7 @@ def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
     return ZeroDynamics.MARGINAL if rightmost >= -ZERO_REAL_PART else ZeroDynamics.STABLE
 
 
-def controllable(A: FloatArray, B: FloatArray) -> bool:
+def is_controllable(A: FloatArray, B: FloatArray) -> bool:
     """Return whether Assumption 1 holds, by the test of Popov, Belevitch and Hautus.
 
     The test is rank [A - s I, B] = n at every eigenvalue s of A. Shapes: A (n, n), B (n, m).

@@ -103,7 +103,7 @@ class GainCondition(NamedTuple):
     value: float
     bound: float
     relation: Relation = Relation.AT_LEAST
-    estimate: bool = False  # whether it depends on gamma_2, an assumption
+    is_estimate: bool = False  # whether it depends on gamma_2, an assumption
 
     @property
     def holds(self) -> bool:
@@ -248,7 +248,7 @@ def check_theorem(gains: GainSet, bounds: Bounds) -> tuple[GainCondition, ...]:
             i,
             float(gains.beta[i]),
             float(smallest[i]),
-            estimate=True,
+            is_estimate=True,
         )
         for i in reversed(range(m))
     ]

@@ -163,7 +163,7 @@ def select_gains(
     setting = loop._replace(
         inputs=_pairing(inputs, flight.controller, airframe_of_law),
         gamma_2=as_number(gamma_2, "gamma_2", 0.0, unit="1/s"),
-        feedforward=feedforward,
+        has_feedforward=feedforward,
         requirement=requirement(phase_margin, accept=accept),
     )
     require(observer or weights is None, "weights", weights, "an observer too: it has the weights")

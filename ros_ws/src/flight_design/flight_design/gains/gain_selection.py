@@ -102,7 +102,7 @@ class LoopSetting(NamedTuple):
     # input of each output, in the airframe's order; if empty, the airframe's pairing holds
     inputs: tuple[str, ...] = ()
     # whether the result uses the published airframe as model of a feedforward
-    feedforward: bool = False
+    has_feedforward: bool = False
     requirement: Requirement = Requirement()
 
 
@@ -223,7 +223,7 @@ def gain_sets(study: Study, setting: LoopSetting) -> Selection:
     if first.sampled_sign() is Sign.SOFT:  # behind servos
         rates = study.u_dot[:, 0][:, pairs.columns]
         gains = within_requirement(engineering, setting.requirement, rates).controller
-    gains = with_feedforward(gains, study.airframe) if setting.feedforward else gains
+    gains = with_feedforward(gains, study.airframe) if setting.has_feedforward else gains
     return Selection(study, setting, _literal(study, setting, pairs), gains)
 
 

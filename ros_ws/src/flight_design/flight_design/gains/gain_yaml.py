@@ -247,7 +247,7 @@ def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) 
     damping = float(margins.nominal.damping)
     worst = ""
     if margins.worst is not None:
-        origin = "found" if margins.by_search else f"of {margins.aircraft}"
+        origin = "found" if margins.is_searched else f"of {margins.aircraft}"
         worst = f"; worst {origin} {np.degrees(margins.worst.phase.min()):.0f} deg"
     return (
         f"Phase margins {phases} deg{worst}; largest sensitivity {largest:.2f}, damping "

@@ -176,7 +176,7 @@ def margin_conditions(margins: LoopMargins, requirement: Requirement) -> tuple[G
         return nominal
     worst = math.degrees(float(margins.worst.phase.min()))
     least = requirement.uncertain_phase
-    if margins.by_search:
+    if margins.is_searched:
         least = min(least, requirement.searched_phase)
     return (*nominal, GainCondition(NAMES[4], None, worst, math.degrees(least)))
 

@@ -301,7 +301,7 @@ def join(
     for i, (name, output, model) in enumerate(
         zip(pairing.inputs, pairing.outputs, models, strict=True)
     ):
-        if model is not None and model.usable:
+        if model is not None and model.is_usable:
             Omega[i, i] = model.Omega
             deviation[i] = np.sqrt(model.covariance[2, 2])
             lag[i] = model.lag

@@ -93,7 +93,7 @@ class Part(NamedTuple):
     after: Prediction  # prediction by the identified model
     refusal: Refusal | None  # why this part must not be used
     latest: tuple[float, ...]  # s, the delay of each input plus two standard deviations
-    gusts: bool  # whether the share of its spans with gusts is FEW or more
+    has_gusts: bool  # whether the share of its spans with gusts is FEW or more
     delays: tuple[float, ...] = ()  # s, the delay of each input
     # advantage of the model in flight over the nominal one, see `identify_model`
     advantage: float = 0.0
@@ -190,7 +190,7 @@ class _Study(NamedTuple):
             reason_against_prediction(before, after, outputs),
         )
         delays, deviations = search.delays(fit)
-        gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
+        has_gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
         return Part(
             inputs=search.names.inputs,
             outputs=outputs,
@@ -199,7 +199,7 @@ class _Study(NamedTuple):
             after=after,
             refusal=next(filter(None, reasons), None),
             latest=tuple((delays + 2.0 * deviations).tolist()),
-            gusts=gusts,
+            has_gusts=has_gusts,
             delays=tuple(delays.tolist()),
             advantage=0.0 if fit.flown is None else self.advantage(fit.flown, fit.before),
             wind=float(LEVELS[np.bincount(fit.levels).argmax(), 0]),

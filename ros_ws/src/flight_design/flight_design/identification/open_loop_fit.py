@@ -80,7 +80,7 @@ class ChannelModel(NamedTuple):
     misfit: float  # rms of the output error divided by the rms of y
 
     @property
-    def usable(self) -> bool:
+    def is_usable(self) -> bool:
         """Whether gain and phase of the loop are certain, and a feedforward can follow the zero.
 
         A model can be usable even if the noise is as large as y.

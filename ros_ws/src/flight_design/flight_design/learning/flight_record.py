@@ -92,7 +92,7 @@ class FlightRecord:
         held = u[np.searchsorted(place, np.arange(len(t)), side="right") - 1]
         return FlightData(self.period, t, padded_y[:, self._rows], held[:, self._columns])
 
-    def fell_back(self, after_ns: int, proposals: Collection[int]) -> bool:
+    def has_fallen_back(self, after_ns: int, proposals: Collection[int]) -> bool:
         """Return whether the law fell back after an instant.
 
         This is so if the parameters changed, and the new parameters are no proposal. `proposals`
@@ -101,7 +101,7 @@ class FlightRecord:
         flown = [sample.flown for sample in self._after(after_ns)]
         return any(new != old and new not in proposals for old, new in pairwise(flown))
 
-    def oscillated(self, after_ns: int) -> bool:
+    def has_oscillated(self, after_ns: int) -> bool:
         """Return whether an output oscillated during the whole time after an instant."""
         y = np.array([sample.y for sample in self._after(after_ns)])
         return bool(divergence.oscillating(y, self._least).any())

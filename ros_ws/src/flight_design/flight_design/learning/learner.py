@@ -221,7 +221,7 @@ class Learner:
         self._note_given_up(flown, given_up)
         lost = flown != self._proposed
         # The last proposal cannot act any more if the law fell back from the parameters before it.
-        has_fallen = self._record.fell_back(self._proposed_ns, self._proposals)
+        has_fallen = self._record.has_fallen_back(self._proposed_ns, self._proposals)
         if lost and end_ns < self._proposed_ns + self._latency_ns and not has_fallen:
             return LearnerResult(None, None)  # the last proposal has yet to act
         self._distrust(lost=lost)
@@ -377,7 +377,7 @@ class Learner:
     def _distrust(self, *, lost: bool) -> None:
         """Use the rough model no longer if its design was refused or the law fell back from it."""
         is_rough_alone = not self._known and not self._dead
-        if lost and (is_rough_alone or self._record.fell_back(-1, self._proposals)):
+        if lost and (is_rough_alone or self._record.has_fallen_back(-1, self._proposals)):
             self._design_of_rough = None
 
     def _rough_proposal(self) -> LearnerResult:
@@ -431,7 +431,7 @@ class Learner:
         is_wanted = lost or (bool(self._changed) and self._record.length >= SHORTEST)
         is_rested = end_ns >= self._tried_ns + nanoseconds(RETRY)
         after_ns = end_ns - nanoseconds(AFTER_FALLBACK)
-        has_fallen = self._record.fell_back(after_ns, self._proposals)
+        has_fallen = self._record.has_fallen_back(after_ns, self._proposals)
         return is_planned or (is_wanted and is_rested and not has_fallen)
 
     def _identified(self) -> Identification:
@@ -505,7 +505,7 @@ class Learner:
         if (
             not learned
             or self._record.length < RECORD
-            or self._record.oscillated(end_ns - nanoseconds(RETRY))
+            or self._record.has_oscillated(end_ns - nanoseconds(RETRY))
         ):
             return []
         whole = self._record.recording(begin_ns)
@@ -516,7 +516,7 @@ class Learner:
         delays = {part: np.array(known.delays) for part, known in learned.items()}
         model = self._at_speed(self._model, ratio)
         changes = change_test(recent, model, self._actuation, delays, self._believed.drift)
-        has_fallen = self._record.fell_back(begin_ns, self._proposals)
+        has_fallen = self._record.has_fallen_back(begin_ns, self._proposals)
         found = []
         for change in changes:
             is_counted = change.gain >= SURE_GAIN or not has_fallen

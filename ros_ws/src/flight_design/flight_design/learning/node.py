@@ -179,7 +179,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
         self._given_up = tuple(
             name for name, is_left in zip(self._start.outputs, given_up, strict=True) if is_left
         )
-        self._is_due = self._updates.due(self._end_ns) or self._is_due
+        self._is_due = self._updates.is_due(self._end_ns) or self._is_due
 
     def _propose(self) -> None:
         if not self.parameters.lockstep:

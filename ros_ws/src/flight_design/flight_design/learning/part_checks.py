@@ -153,7 +153,7 @@ def reason_against_effects(part: Part, flown: Airframe | None) -> Refusal | None
     Gusts hide the effects of the inputs. The identified effects are then too weak, and the gains of
     a design with these effects would be too high.
     """
-    if flown is None or not part.gusts:
+    if flown is None or not part.has_gusts:
         return None
     for entry in best_known(part.entries, part.outputs):
         share = (

@@ -205,7 +205,7 @@ class LearnStep(NamedTuple):
     """What the learner found at a time of the flight."""
 
     t: float  # s
-    proposed: bool
+    is_proposed: bool
     sentence: str
 
 
@@ -302,7 +302,7 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
         flown = proposed if ticks.flown is None else int(ticks.flown[k])
         if ticks.mode[k] == Mode.ENGAGED:
             learned.take(int(ticks.stamp_ns[k]), ticks.y[k].copy(), ticks.u[k].copy(), flown)
-        if updates.due(now_ns):
+        if updates.is_due(now_ns):
             proposal = learned.propose(flown, ticks.left(k))
             proposed = proposed if proposal.controller is None else proposal.controller.digest()
             t = (now_ns - tape.start_ns) / NANOSECONDS
@@ -341,7 +341,7 @@ def learned_yaml(result: LearnResult, origin: str) -> str:
     assert result.model is not None  # noqa: S101 - for the type checker
     lines = [f"The airframe {result.model.name}, with A and B learned from {origin}.", ""]
     lines += [
-        f"t = {step.t:.2f} s: {'' if step.proposed else 'no model: '}{step.sentence}"
+        f"t = {step.t:.2f} s: {'' if step.is_proposed else 'no model: '}{step.sentence}"
         for step in result.steps
     ]
     return comment(lines) + as_yaml(result.model)

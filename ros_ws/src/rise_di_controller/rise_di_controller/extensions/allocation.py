@@ -84,11 +84,11 @@ def allocate(
     """
     low, high = bounds(u_before, dt, params.limits)
     u = product(params.T, v)
-    if _inside(u, low, high):
+    if _is_inside(u, low, high):
         return u, v
     stops = params.limits
     target = _exchanged(u, stops.lower, stops.upper, params.exchange)
-    if not _inside(target, stops.lower, stops.upper):
+    if not _is_inside(target, stops.lower, stops.upper):
         target = _towards(
             np.zeros_like(u),
             [params.T[:, i] * v[i] for i in params.order],
@@ -97,7 +97,7 @@ def allocate(
             params,
         )
     u = target
-    if not _inside(target, low, high):
+    if not _is_inside(target, low, high):
         start = np.minimum(np.maximum(u_before, low), high)
         change = product(params.effect, target - start)
         u = _towards(start, [params.T[:, i] * change[i] for i in params.order], low, high, params)
@@ -116,7 +116,7 @@ def limits_of_effectors(v_free: Array, v: Array) -> Limits:
     return Limits(xp.where(v_free < v, v, -infinite), xp.where(v_free > v, v, infinite), infinite)
 
 
-def _inside(u: FloatArray, low: FloatArray, high: FloatArray) -> bool:
+def _is_inside(u: FloatArray, low: FloatArray, high: FloatArray) -> bool:
     return bool(((u >= low) & (u <= high)).all())
 
 
@@ -137,7 +137,7 @@ def _towards(
     for move in moves:
         begin = u
         target = _exchanged(u + move, low, high, params.exchange)
-        if _inside(target, low, high):
+        if _is_inside(target, low, high):
             u = target
             continue
         part = 0.0
@@ -145,7 +145,7 @@ def _towards(
         for _ in range(HALVINGS):
             size *= 0.5
             halfway = _exchanged(begin + (part + size) * move, low, high, params.exchange)
-            if _inside(halfway, low, high):
+            if _is_inside(halfway, low, high):
                 u = halfway
                 part = part + size
             else:

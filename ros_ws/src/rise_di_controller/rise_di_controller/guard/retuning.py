@@ -43,7 +43,7 @@ def retune_state(
     before, after = (
         (None, None) if guards is None else (nominal_at_speed(guard, law) for guard in guards)
     )
-    has_new_nominal = not _same_arrays(before, after)
+    has_new_nominal = not _has_same_arrays(before, after)
     inner = law  # state of the law that a schedule may wrap
     observers = (old.params, new.params)
     if isinstance(law, ScheduleState):
@@ -66,7 +66,7 @@ def retune_state(
             inner = _with_estimates(state, inner, z, change, observers)
     else:
         # Without a history both begin again, and their contributions become part of u_trim.
-        if has_new_observer and not _same_model(*observers):
+        if has_new_observer and not _has_same_model(*observers):
             z = observer.initial_estimates(y.value - y_m, observers[1])
             state = state._replace(u_trim=state.u_trim + inner.u_o)
             inner = inner._replace(
@@ -137,18 +137,20 @@ def _is_replaced(old: ObserverParams, new: ObserverParams) -> bool:
 
     An observer does not act if the limits of its u_o are 0.
     """
-    return not _same_model(old, new) or bool(np.any(old.limits.upper) != np.any(new.limits.upper))
+    return not _has_same_model(old, new) or bool(
+        np.any(old.limits.upper) != np.any(new.limits.upper)
+    )
 
 
-def _same_model(old: ObserverParams, new: ObserverParams) -> bool:
+def _has_same_model(old: ObserverParams, new: ObserverParams) -> bool:
     same = all(
         np.array_equal(getattr(old, name), getattr(new, name))
         for name in ("Phi", "Gamma", "H", "L", "F")
     )
-    return same and _same_arrays(old.vanes, new.vanes)
+    return same and _has_same_arrays(old.vanes, new.vanes)
 
 
-def _same_arrays(old: tuple[Any, ...] | None, new: tuple[Any, ...] | None) -> bool:
+def _has_same_arrays(old: tuple[Any, ...] | None, new: tuple[Any, ...] | None) -> bool:
     if old is None or new is None:
         return old is new
     return all(np.array_equal(before, after) for before, after in zip(old, new, strict=True))

@@ -105,7 +105,7 @@ class Fallback(NamedTuple):
     input_scale: tuple[float, ...]  # input_scale of the parameters before
     fallen: int  # digest of the parameters after
 
-    def outlived_by(self, proposal: Proposal, digest: int) -> bool:
+    def is_outlived_by(self, proposal: Proposal, digest: int) -> bool:
         """Return whether a proposal may still act although it was made before this fallback.
 
         It may act if it stops the use of one more input that has no effect.
@@ -131,7 +131,7 @@ class Updates:
         self._first_ns: int | None = None
         self._last_ns = 0  # time of the last identification or test after the first tick
 
-    def due(self, now_ns: int) -> bool:
+    def is_due(self, now_ns: int) -> bool:
         """Return whether an identification or a test begins at this tick.
 
         Ticks must come in order.
@@ -194,7 +194,7 @@ class Learning:
 
         None begins while the law is deactivated.
         """
-        due = controller.mode is not Mode.INACTIVE and self._updates.due(now_ns)
+        due = controller.mode is not Mode.INACTIVE and self._updates.is_due(now_ns)
         if due and self._simulated:
             self._due.append(now_ns)
         return due
@@ -416,7 +416,9 @@ class Learning:
             )
         if proposal.flown == controller.digest:
             return None
-        if self._fallback is not None and self._fallback.outlived_by(proposal, controller.digest):
+        if self._fallback is not None and self._fallback.is_outlived_by(
+            proposal, controller.digest
+        ):
             return None
         return Refusal(
             f"found a proposal made with the parameters {proposal.flown}, expected "
