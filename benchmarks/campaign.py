@@ -88,7 +88,7 @@ def floor(scenario: Scenario, aircraft: int) -> float:
     fleet = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course)
     tick = sum(matrix.nbytes for matrix in fleet.tick)
     size = sum(
-        run.length * (tick + bool(run.pattern[0].is_forced) * fleet.forced.nbytes)
+        run.length * (tick + (fleet.forced.nbytes if run.pattern[0].is_forced else 0))
         for run in without_branches(course)
     )
     copy = jax.jit(lambda numbers: numbers + 1.0)

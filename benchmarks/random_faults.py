@@ -37,7 +37,7 @@ def main(
     """Inject random faults and print what failed; exit status 1 if any did."""
     options = [f"--faults-random={count}", f"--faults-lockstep={lockstep}", f"--faults-seed={seed}"]
     options += [f"--timeout={30 * (count + lockstep) + 300}", "-k", "random or log_holds"]
-    total = len(FOUND) * bool(count) + count + lockstep
+    total = count + lockstep + (len(FOUND) if count else 0)
     rows, status = run_campaign(options, total)
     failed = [row for row in rows if not row["passed"]]
     two = sum("," in row["case"] for row in rows)

@@ -143,7 +143,8 @@ def duration(route: Route, section: GuidanceConfig) -> float:
             if path.turns_back(leg, next(iter(route.legs[k + 1 :]), None)):
                 length += 4.0 * math.pi * route.radius  # at most two turns to join the next leg
         elif path.is_orbit(leg):
-            length += 2.0 * math.pi * route.radius * (leg.end is not None)
+            if leg.end is not None:
+                length += 2.0 * math.pi * route.radius
             change = route.altitude[k] - route.from_altitude[k]
             time += 1.2 * abs(change) / (climb if change > 0.0 else sink)
         else:

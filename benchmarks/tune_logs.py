@@ -210,7 +210,8 @@ def flown(case: Case, nominal: Airframe, plane: Plane) -> FlightData:
         is_climbing = bool(case.climb) and k < count // 3
         axis = axes[int(number) % len(axes)]
         setpoint[axis] = plane.size[axis] * ((phase < 0.5) - float(0.5 <= phase < 1.0))
-        setpoint = setpoint * (not is_climbing)
+        if is_climbing:
+            setpoint = np.zeros(m)
         noise = case.colour * noise + np.sqrt(1.0 - case.colour**2) * rng.normal(size=m)
         y[k] = C @ x + np.array(plane.noise) * noise
         error = setpoint - y[k]
@@ -218,7 +219,8 @@ def flown(case: Case, nominal: Airframe, plane: Plane) -> FlightData:
         torque = controlled * np.clip(FF * setpoint + P * error + integral, -1.0, 1.0)
         u[k] = plane.end * torque
         acting = plane.end * allocation.on_axes @ np.clip(allocation.servos @ torque, -1.0, 1.0)
-        acting[outputs.index("q")] -= case.climb * is_climbing
+        if is_climbing:
+            acting[outputs.index("q")] -= case.climb
         for _ in range(steps):
             line.append(acting)
             air = air - air * STEP / 0.5 + case.gusts * np.sqrt(4.0 * STEP) * rng.normal(size=G)

@@ -57,7 +57,7 @@ def drawn_calls(
     unit = controller.law_params().eps
     schedule = controller.schedule
     airspeed = np.array(
-        [0.0 if schedule is None else schedule.speed * (name == "V") for name in controller.outputs]
+        [0.0 if schedule is None or name != "V" else schedule.speed for name in controller.outputs]
     )
     recorder = Recorder(sets, samples=samples)
     now_ns = EPOCH_NS
@@ -72,7 +72,8 @@ def drawn_calls(
         now_ns += _interval_ns(draw[0], draw[1], period_ns)
         # Draw the size of the error, and how long both topics are silent.
         if k % 50 == 0:
-            size = unit * 10.0 ** rng.uniform(-3.0, 2.5, m) * (rng.random(m) < 0.9)
+            drawn = unit * 10.0 ** rng.uniform(-3.0, 2.5, m)
+            size = np.where(rng.random(m) < 0.9, drawn, 0.0)
         silence = int(draw[2] * 100.0) if draw[3] < 0.005 else max(silence - 1, 0)
         y_m = 0.98 * y_m + size * rng.normal(size=m)
         with suppress(ChannelError):
@@ -281,7 +282,8 @@ def _drawn_states(
         "e": size, "integral_e": size,
         "Pi": 10.0 * size, "u_o": 0.1 * u_size, "z": size[:1], "feedforward.x": size[:1],
         "feedforward.u": u_size,
-        "feedforward.u_0": u_size, "u_ff": 0.3 * u_size * (controller.feedforward is not None),
+        "feedforward.u_0": u_size,
+        "u_ff": (0.0 if controller.feedforward is None else 0.3) * u_size,
     }  # fmt: skip
     if controller.allocation is not None:
         stops = controller.effector_limits()

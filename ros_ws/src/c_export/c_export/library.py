@@ -74,7 +74,8 @@ class CController:
         events = recording.events
         ticks = events[events["kind"] == GUARD_TICK]
         before = np.zeros(len(events), dtype=np.int64)  # code of the event before each tick
-        before[1:] = 4 * (events["kind"] == START)[:-1] + 8 * (events["kind"] == RESTART)[:-1]
+        kinds = events["kind"][:-1]
+        before[1:] = np.select([kinds == START, kinds == RESTART], [4, 8])
         flags = ticks["flag"] + before[events["kind"] == GUARD_TICK]
         integers = [
             np.ascontiguousarray(values)

@@ -58,9 +58,11 @@ def _write_beneath(folder: Path) -> bool:
     version = _LIBC.syscall(CREATE_RULESET, None, 0, VERSION_FLAG)
     if version < 1:
         return False
-    changes = (
-        CHANGES | REFER * (version >= REFER_VERSION) | TRUNCATE * (version >= TRUNCATE_VERSION)
-    )
+    changes = CHANGES
+    if version >= REFER_VERSION:
+        changes |= REFER
+    if version >= TRUNCATE_VERSION:
+        changes |= TRUNCATE
     ruleset = _LIBC.syscall(CREATE_RULESET, struct.pack("=Q", changes), 8, 0)
     if ruleset < 0:
         return False

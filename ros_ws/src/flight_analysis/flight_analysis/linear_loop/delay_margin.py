@@ -61,5 +61,6 @@ def delay_margin(
             return math.inf
     while stride > 1:
         stride //= 2
-        lower += stride * is_stable_at(lower + stride)
+        if is_stable_at(lower + stride):
+            lower += stride
     return lower * part

@@ -165,7 +165,7 @@ def _attack(ticks: Ticks, choices: IntArray) -> tuple[Attack, FloatArray]:
     z, left, right = modes
     moved = np.linalg.norm(right[ticks.u] - right[ticks.u_before], axis=0)
     is_fast = (moved > SLOW * np.linalg.norm(right[ticks.u], axis=0)) & (np.abs(z - 1.0) > AT_ONE)
-    fastest = int(np.argmax(np.abs(z) * is_fast))
+    fastest = int(np.argmax(np.where(is_fast, np.abs(z), 0.0)))
     forward, backward = [right[:, fastest]], [left[:, fastest].conj()]
     for each in sequence:
         forward.append(each @ forward[-1])
@@ -177,7 +177,7 @@ def _attack(ticks: Ticks, choices: IntArray) -> tuple[Attack, FloatArray]:
         / across
     )
     turns = [np.angle(np.vdot(x, y)) for x, y in pairwise(forward)]
-    growth = float(np.abs(z[fastest]) * is_fast[fastest])
+    growth = float(np.abs(z[fastest])) if is_fast[fastest] else 0.0
     return Attack(growth, float(np.abs(np.mean(turns))), choices), values
 
 

@@ -345,7 +345,8 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
     The margin above the rows has room for the legend, if any, and `labels` pixels for labels. The
     margin below the rows has `below` pixels for the axis.
     """
-    above = 24 * any(trace.get("showlegend") for trace in figure.data) + labels
+    has_legend = any(trace.get("showlegend") for trace in figure.data)
+    above = labels + (24 if has_legend else 0)
     rows = figure.height * figure.rows
     for axes, standoff in ((figure.x, 4), (figure.y, 6)):
         for axis in axes:

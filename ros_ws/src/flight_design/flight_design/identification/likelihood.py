@@ -203,7 +203,7 @@ class Likelihood:
         wind_prior = np.full(len(self._block.winds), WIND_PRIOR)
         if self.coarse is not self:
             self.coarse.believe(deviation, centre)
-        shear_prior = np.full(len(SHEARED) * self._is_sheared, SHEAR_PRIOR)
+        shear_prior = np.full(len(SHEARED) if self._is_sheared else 0, SHEAR_PRIOR)
         begin_prior = np.ones(len(self._angles))
         lag_prior = np.ones(1 if self._lag_deviation else 0)
         servo_prior = np.ones(2 * len(self._block.inputs) if self._servo_deviation else 0)
@@ -475,7 +475,7 @@ class Likelihood:
         """
         angles = [self.names.states[k] for k in self._angles]
         names = [entry.name for entry in self.nominal_entries()]
-        shears = [f"shear of {name}" for name in SHEARED * self._is_sheared]
+        shears = [f"shear of {name}" for name in SHEARED] if self._is_sheared else []
         delays = [f"delay of {name}" for name in self.names.inputs]
         lag = ["lag of y"] if self._lag_deviation else []
         servo = [f"{kind} of {name}" for kind in ("lag", "inertia") for name in self.names.inputs]

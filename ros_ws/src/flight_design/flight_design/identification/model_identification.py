@@ -418,7 +418,8 @@ def _counter(
     """
     starts = len(STARTS) + len(SIGNS) + starts_at_flown
     total = parts * (starts * START_STEPS + REFINED * STEPS)
-    total += (parts > 1) * (START_STEPS + STEPS)
+    if parts > 1:
+        total += START_STEPS + STEPS
     steps = count(1)
 
     def step() -> None:

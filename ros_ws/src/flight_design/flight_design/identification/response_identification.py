@@ -421,9 +421,8 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
                 fit = np.linalg.solve(normal + ridge * np.eye(len(normal)), product)
                 residual[k] += np.sum((X[in_fold] - Z[in_fold] @ fit) ** 2, axis=0)
         total += np.sum(X**2, axis=0)
-    return np.asarray(1.0 - residual.min(axis=0) / np.where(total > 0.0, total, np.inf)) * (
-        total > 0.0
-    )
+    unexplained = residual.min(axis=0) / np.where(total > 0.0, total, np.inf)
+    return np.where(total > 0.0, 1.0 - unexplained, 0.0)
 
 
 # The step response

@@ -381,7 +381,8 @@ class _Heights:
             reference,
             "--altitude with that of the home, as the aircraft counts",
         )
-        return altitude + (self._zero or 0.0) - (self._sea or 0.0) * (above is Above.SEA)
+        above_home = altitude + (self._zero or 0.0)
+        return above_home - (self._sea or 0.0) if above is Above.SEA else above_home
 
 
 def _home_of_fence(
