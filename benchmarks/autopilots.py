@@ -52,7 +52,8 @@ from benchmarks.tables import parser_of
 
 from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
-from flight_analysis.metrics import errors_by_part, in_spans
+from flight_analysis.metrics.by_part import errors_by_part
+from flight_analysis.metrics.time_spans import in_spans
 from flight_analysis.report.guided import control_errors
 from flight_analysis.report.summary import transients
 from flight_core.rates import NANOSECONDS

@@ -36,7 +36,7 @@ from aircraft_sim.uncertainty import sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import true_error
+from flight_analysis.metrics.errors import true_error
 from flight_campaign import engines
 from flight_campaign.batch import batch_matrices, device
 from flight_campaign.batch.batch_schedule import without_branches

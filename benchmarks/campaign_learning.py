@@ -25,7 +25,7 @@ from flight_analysis.closed_loop.learning_loop import Learn, LearnerResult
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import true_error
+from flight_analysis.metrics.errors import true_error
 from flight_campaign.campaign import define
 from flight_campaign.statistics import score, score_units
 from flight_core.parameters import ParameterError

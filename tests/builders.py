@@ -12,7 +12,7 @@ from tests.closed_loop import error
 
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
-from flight_analysis.metrics import error_metrics
+from flight_analysis.metrics.errors import error_metrics
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 

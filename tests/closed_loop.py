@@ -19,7 +19,7 @@ from aircraft_sim.plant.dynamics import Aircraft
 from aircraft_sim.plant.plant import AircraftState, PlantParams
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.metrics import true_error
+from flight_analysis.metrics.errors import true_error
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray

@@ -33,7 +33,7 @@ from tests.sitl.shared_link import STATION
 
 from autopilot_bridge.params import find_map
 from flight_analysis.closed_loop.scenario import load_scenario
-from flight_analysis.metrics import in_spans
+from flight_analysis.metrics.time_spans import in_spans
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_log.tape_reader import read_run

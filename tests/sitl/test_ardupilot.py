@@ -24,7 +24,7 @@ from tests.sitl.kit import (
 
 from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.metrics import in_spans
+from flight_analysis.metrics.time_spans import in_spans
 from flight_analysis.report.guided import BANDS, control_errors
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run

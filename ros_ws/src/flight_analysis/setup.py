@@ -16,6 +16,7 @@ setup(
         "flight_analysis",
         "flight_analysis.closed_loop",
         "flight_analysis.linear_loop",
+        "flight_analysis.metrics",
         "flight_analysis.report",
     ],
     package_data={

@@ -26,7 +26,8 @@ import rise_di
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.metrics import error_metrics, sample_times
+from flight_analysis.metrics.errors import error_metrics
+from flight_analysis.metrics.time_spans import sample_times
 from flight_analysis.report.account import Account, account
 from flight_analysis.report.html import write_page
 from flight_analysis.report.recorded_flight import read_flight

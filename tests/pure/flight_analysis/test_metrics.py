@@ -12,8 +12,17 @@ from pytest import approx
 from scipy.signal import welch
 from tests.recordings import EPOCH, MS, signal
 
-from flight_analysis import metrics
-from flight_analysis.metrics import Transient, TransientKind
+from flight_analysis.metrics.by_part import errors_by_part, inputs_by_part
+from flight_analysis.metrics.controller_log import saturation_shares, sign_switches
+from flight_analysis.metrics.errors import ErrorMetrics, error_metrics, noise_floor, tracking_error
+from flight_analysis.metrics.settling import settling_bands, settling_time, settling_times
+from flight_analysis.metrics.time_spans import in_spans
+from flight_analysis.metrics.transients import (
+    Transient,
+    TransientKind,
+    guided_transients,
+    part_masks,
+)
 from flight_analysis.report.spectra import spectra
 from flight_analysis.report.timing import tick_metrics
 from flight_core.tape import Signal, Tape
@@ -28,14 +37,14 @@ def tape(**signals: Signal) -> Tape:
 
 def test_rms_and_max() -> None:
     # sqrt((9 + 16 + 0 + 0) / 4) = 2.5
-    errors = metrics.error_metrics(np.array([3.0, -4.0, 0.0, 0.0]))
+    errors = error_metrics(np.array([3.0, -4.0, 0.0, 0.0]))
     assert (errors.rms, errors.max) == (2.5, 4.0)
 
 
 def test_error_formed_at_stamps_of_y_by_name() -> None:
     y = signal([0, 1, 2], q=[1.0, 2.0, 3.0], V=[0.0, 0.0, 0.0])
     y_m = signal([0, 2], V=[1.0, 1.0], q=[0.0, 4.0])  # q is 2 half way
-    error = metrics.tracking_error(tape(y=y, y_m=y_m))
+    error = tracking_error(tape(y=y, y_m=y_m))
     assert error.names == ("q", "V")
     assert error["q"].tolist() == [1.0, 0.0, -1.0]
     assert error["V"].tolist() == [-1.0, -1.0, -1.0]
@@ -44,11 +53,11 @@ def test_error_formed_at_stamps_of_y_by_name() -> None:
 def test_y_outside_the_reference_is_left_out() -> None:
     y = signal([0, 1, 2, 3], q=[9.0, 1.0, 1.0, 9.0])
     y_m = signal([1, 2], q=[0.0, 0.0])
-    assert metrics.tracking_error(tape(y=y, y_m=y_m))["q"].tolist() == [1.0, 1.0]
+    assert tracking_error(tape(y=y, y_m=y_m))["q"].tolist() == [1.0, 1.0]
 
 
 def test_a_span_extends_beyond_its_end() -> None:
-    assert metrics.in_spans(np.array([0.9, 1.0, 2.0, 2.5, 2.6]), [(1.0, 2.0)], 0.5).tolist() == [
+    assert in_spans(np.array([0.9, 1.0, 2.0, 2.5, 2.6]), [(1.0, 2.0)], 0.5).tolist() == [
         False,
         True,
         True,
@@ -58,7 +67,7 @@ def test_a_span_extends_beyond_its_end() -> None:
 
 
 def instants_by_part(t: FloatArray, transients: list[Transient]) -> dict[str, list[float]]:
-    masks = metrics.part_masks(t, transients, settle=1.0)
+    masks = part_masks(t, transients, settle=1.0)
     return {part: t[mask].tolist() for part, mask in masks.items()}
 
 
@@ -104,7 +113,7 @@ def guided(**channels: Any) -> list[Any]:
         name: np.where((t >= 5_000) & (t < 8_000), value, level[name])
         for name, value in channels.items()
     }
-    transients = metrics.guided_transients(tape(guidance=signal(t.tolist(), **level | changes)))
+    transients = guided_transients(tape(guidance=signal(t.tolist(), **level | changes)))
     return [(transient.kind, transient.start, transient.stop) for transient in transients]
 
 
@@ -129,10 +138,10 @@ def test_turns_and_captures_follow_from_commands_of_guidance(channels: Any, expe
 
 def test_errors_split_by_part_and_ultimate_bound_is_largest_undisturbed_error() -> None:
     flight = tape(y=signal([0, 1000, 2000], q=[3.0, 4.0, 0.0]), y_m=signal([0, 2000], q=[0.0, 0.0]))
-    table = metrics.errors_by_part(
+    table = errors_by_part(
         flight, [Transient(kind=TransientKind.GUST, name="g", start=0.9, stop=1.1)], settle=0.0
     )
-    assert table["q"]["gust"] == metrics.ErrorMetrics(rms=4.0, max=4.0)
+    assert table["q"]["gust"] == ErrorMetrics(rms=4.0, max=4.0)
     assert table["q"]["calm"].rms == approx(math.sqrt(4.5))
     assert table["q"]["calm"].max == 3.0
     assert table["q"]["whole"].max == 4.0
@@ -148,8 +157,8 @@ def test_settling_time_ends_where_error_begins_to_stay_in_band() -> None:
         ([5.0, 0.0, 0.0, 0.0, 5.0, 0.0], 1.0),  # in the band for the dwell of 3 s
         ([5.0, 0.0, 0.0, 5.0, 5.0, 0.0], 5.0),  # in the band for 2 s, then to the end
     ):
-        assert metrics.settling_time(t, np.array(e), band=1.0, leaves=2.0, dwell=3.0) == settling
-    assert metrics.settling_time(np.zeros(0), np.zeros(0), band=1.0, leaves=2.0) is None
+        assert settling_time(t, np.array(e), band=1.0, leaves=2.0, dwell=3.0) == settling
+    assert settling_time(np.zeros(0), np.zeros(0), band=1.0, leaves=2.0) is None
 
 
 def test_settling_band_of_measured_error_is_at_least_four_noise_floors() -> None:
@@ -159,9 +168,9 @@ def test_settling_band_of_measured_error_is_at_least_four_noise_floors() -> None
     noisy = signal(stamps, q=[1.0, -1.0] * 50)
     y_m = signal(stamps, q=10.0)
     floor = 4.0 / (0.6745 * math.sqrt(6.0))
-    assert metrics.settling_bands(tape(y=noisy, y_m=y_m)) == {"q": approx(4.0 * floor)}
+    assert settling_bands(tape(y=noisy, y_m=y_m)) == {"q": approx(4.0 * floor)}
     truth = signal(stamps, **{"x.q": 10.0})
-    assert metrics.settling_bands(tape(y=noisy, y_m=y_m, truth=truth)) == {"q": approx(0.1)}
+    assert settling_bands(tape(y=noisy, y_m=y_m, truth=truth)) == {"q": approx(0.1)}
 
 
 def test_settling_measured_up_to_next_transient_of_channel() -> None:
@@ -179,7 +188,7 @@ def test_settling_measured_up_to_next_transient_of_channel() -> None:
         Transient(kind=TransientKind.COMMAND, name="p", start=3.0, stop=3.1),
         Transient(kind=TransientKind.GUST, name="vertical", start=5.0, stop=5.1),
     ]
-    first, second, gust = metrics.settling_times(flight, transients)
+    first, second, gust = settling_times(flight, transients)
     assert first.until == {"q": 5.0}
     assert first.time == {"q": approx(0.2)}
     assert (second.transient.name, second.until, second.time) == ("p", {"p": 5.0}, {"p": 0.0})
@@ -191,26 +200,26 @@ def test_control_effort_is_rms_about_trim_and_mean_rate() -> None:
     # 0 -> 2 -> -2 -> -2 in 0.1 s each: a total variation of 6 in 0.3 s. sqrt((0 + 4 + 4 + 4) / 4) =
     # sqrt(3).
     flight = tape(u=signal([0, 100, 200, 300], elevator=[0.0, 2.0, -2.0, -2.0]))
-    effort = metrics.inputs_by_part(flight, [])["elevator"]["whole"]
+    effort = inputs_by_part(flight, [])["elevator"]["whole"]
     assert asdict(effort) == approx({"rms": math.sqrt(3.0), "max": 2.0, "rate": 20.0})
     # The step into the gust and the one within it end there: 4 and 0 in 0.2 s.
-    parts = metrics.inputs_by_part(
+    parts = inputs_by_part(
         flight, [Transient(kind=TransientKind.GUST, name="g", start=0.15, stop=0.35)], settle=0.0
     )["elevator"]
     assert asdict(parts["gust"]) == approx({"rms": 2.0, "max": 2.0, "rate": 20.0})
     assert parts["calm"].rate == approx(20.0)  # 2 in 0.1 s
     assert math.isnan(parts["command"].rms)
     assert math.isnan(parts["command"].rate)
-    assert metrics.inputs_by_part(tape(), []) == {}
+    assert inputs_by_part(tape(), []) == {}
 
 
 def test_saturated_ticks_are_counted_by_kind() -> None:
     kinds = [Saturation.NO, Saturation.MAGNITUDE, Saturation.RATE, Saturation.RATE]
     internals = signal([0, 10, 20, 30], **{"limited.thrust": kinds})
-    assert metrics.saturation_shares(tape(internals=internals)) == {
+    assert saturation_shares(tape(internals=internals)) == {
         "thrust": {"magnitude": 0.25, "rate": 0.5}
     }
-    assert metrics.saturation_shares(tape()) == {}
+    assert saturation_shares(tape()) == {}
 
 
 def test_sign_switches_counted_on_increments_of_pi() -> None:
@@ -218,14 +227,14 @@ def test_sign_switches_counted_on_increments_of_pi() -> None:
     internals = signal(
         [10.0 * k for k in range(7)], **{"Pi.q": [0.0, 1.0, 1.0, 2.0, 1.0, 0.0, 1.0]}
     )
-    assert metrics.sign_switches(tape(internals=internals)) == {"q": approx(2 / 0.06)}
+    assert sign_switches(tape(internals=internals)) == {"q": approx(2 / 0.06)}
 
 
 def test_the_noise_floor_is_the_recorded_noise() -> None:
     flight = tape(
         y=signal([0, 10], q=[1.0, 2.0]), truth=signal([0, 10], **{"noise.q": [3.0, -4.0]})
     )
-    assert metrics.noise_floor(flight) == {"q": approx(math.sqrt(12.5))}
+    assert noise_floor(flight) == {"q": approx(math.sqrt(12.5))}
 
 
 def test_noise_floor_estimated_from_y_without_truth() -> None:
@@ -234,7 +243,7 @@ def test_noise_floor_estimated_from_y_without_truth() -> None:
     k = np.arange(20_000)
     y = np.sin(k / 2000.0) + 0.02 * np.random.default_rng(1).standard_normal(len(k))
     flight = tape(y=Signal(EPOCH + k * 2 * MS, ("q",), y[:, None]))
-    assert metrics.noise_floor(flight)["q"] == approx(0.02, rel=0.05)
+    assert noise_floor(flight)["q"] == approx(0.02, rel=0.05)
 
 
 def test_spectrum_of_sine_peaks_at_frequency_and_has_variance() -> None:

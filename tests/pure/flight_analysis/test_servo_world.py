@@ -19,7 +19,7 @@ from tests.pure.rise_di_controller.test_saturation import last_beyond, pulse, st
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import error_metrics
+from flight_analysis.metrics.errors import error_metrics
 
 pytestmark = pytest.mark.slow
 

@@ -16,7 +16,7 @@ from tests.closed_loop import calm_osprey
 import rise_di
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.metrics import best_error
+from flight_analysis.metrics.errors import best_error
 from flight_analysis.report.account import Account
 from flight_analysis.report.linear_flight import Reach, _reach, _share_within, error_pair
 from flight_analysis.report.shortfalls import judge

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import fly, simulate
-from flight_analysis.metrics import tracking_error
+from flight_analysis.metrics.errors import tracking_error
 from flight_analysis.report.run_folder import attachments_for
 from flight_core.outcome import COMPLETED
 from flight_core.tape import Signal

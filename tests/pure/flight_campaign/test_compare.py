@@ -26,7 +26,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.linear_loop.loop_margins import margins
-from flight_analysis.metrics import error_metrics
+from flight_analysis.metrics.errors import error_metrics
 from flight_campaign.batch import batch
 from flight_campaign.comparison import law_comparison, registered_laws, tuned_controller, tuning
 from flight_campaign.comparison.tuning import (

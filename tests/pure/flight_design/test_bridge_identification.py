@@ -25,7 +25,7 @@ from control_laws import excitation
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import best_error, error_metrics
+from flight_analysis.metrics.errors import best_error, error_metrics
 from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape

@@ -24,7 +24,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.linear_loop.input_margins import input_margins
 from flight_analysis.linear_loop.loop_margins import LinearLoop, law_order, linear_loop, margins
-from flight_analysis.metrics import best_error, error_metrics
+from flight_analysis.metrics.errors import best_error, error_metrics
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control
 from flight_design.gains import requirement as requirement_module

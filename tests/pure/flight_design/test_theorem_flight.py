@@ -21,7 +21,7 @@ from flight_analysis.closed_loop.scenario import (
 )
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import best_error
+from flight_analysis.metrics.errors import best_error
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, gain_yaml
 from flight_design.gains.gain_design import select_gains

@@ -35,7 +35,7 @@ from tornado.httpclient import AsyncHTTPClient, HTTPRequest, HTTPResponse
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.metrics import settling_bands
+from flight_analysis.metrics.settling import settling_bands
 from flight_core.tape import Tape
 from flight_guidance.routes.route_file import Origin, Waypoint
 from flight_guidance.steering.path import route_outline

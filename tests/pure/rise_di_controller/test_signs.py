@@ -18,7 +18,7 @@ from tests.closed_loop import CALM_SERVO, error, fly, law_params, still_air
 from aircraft_sim.airframes.airframe import LIBRARY
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import error_metrics
+from flight_analysis.metrics.errors import error_metrics
 from flight_core.vectors import FloatArray
 
 pytestmark = pytest.mark.slow

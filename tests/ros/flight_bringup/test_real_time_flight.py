@@ -14,7 +14,7 @@ from tests.ros.conftest import Start
 
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import tracking_error
+from flight_analysis.metrics.errors import tracking_error
 from flight_core.modes import Mode
 from flight_core.outcome import STATUS_HOST
 from flight_core.vectors import FloatArray

@@ -15,7 +15,7 @@ from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import WindEffect, as_yaml, with_entries
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.linear_loop.loop_margins import LoopMargins
-from flight_analysis.metrics import CAPTURE_TIME
+from flight_analysis.metrics.transients import CAPTURE_TIME
 from flight_analysis.report import plotting
 from flight_analysis.report.display_units import (
     NO_UNIT,

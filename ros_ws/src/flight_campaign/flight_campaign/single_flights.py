@@ -14,7 +14,9 @@ import numpy as np
 from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import CAPTURE_TIME, error_metrics, inputs_by_part, true_error
+from flight_analysis.metrics.by_part import inputs_by_part
+from flight_analysis.metrics.errors import error_metrics, true_error
+from flight_analysis.metrics.transients import CAPTURE_TIME
 from flight_analysis.report.guided import control_errors, time_outside
 from flight_campaign.definition import Definition
 from flight_campaign.engines import Job

@@ -13,7 +13,7 @@ from rich.console import Console
 from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import mask_spans
+from flight_analysis.metrics.time_spans import mask_spans
 from flight_analysis.report.display_units import DisplayUnit, display_unit
 from flight_analysis.report.figures import ERROR, PLANT
 from flight_analysis.report.intervals import GUST

@@ -32,7 +32,7 @@ from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.linear_loop.certificate import kept_guarantee
 from flight_analysis.linear_loop.guarantee import Guarantee
-from flight_analysis.metrics import error_metrics
+from flight_analysis.metrics.errors import error_metrics
 from flight_analysis.report.flown_models import flown_loops
 from flight_analysis.report.model_spans import parameter_spans
 from flight_analysis.report.recorded_flight import log_account

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from rosbags.serde.errors import SerdeError
 
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
-from flight_analysis.metrics import known_entries, settling_bands
+from flight_analysis.metrics.controller_log import known_entries
+from flight_analysis.metrics.settling import settling_bands
 from flight_analysis.report.display_units import display_unit
 from flight_analysis.report.recorded_flight import log_account
 from flight_core.modes import Mode

@@ -8,7 +8,7 @@ from flight_analysis.closed_loop.replay import ReplayResult, recorded_scenario, 
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario, scenarios
 from flight_analysis.linear_loop.loop_margins import LoopMargins, margins
-from flight_analysis.metrics import error_metrics
+from flight_analysis.metrics.errors import error_metrics
 from flight_analysis.report.account import best_error_over as best_error
 from flight_analysis.report.data_frame import data_frame
 from flight_analysis.report.recorded_flight import read_accounted as read_run

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import TRUE_ERROR, best_error
+from flight_analysis.metrics.errors import TRUE_ERROR, best_error
 from flight_analysis.report.sample_counts import (
     GUIDED,
     LEAST,

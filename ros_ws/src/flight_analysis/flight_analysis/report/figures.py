@@ -14,12 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import (
-    best_error,
-    mask_spans,
-    tracking_error,
-    true_error,
-)
+from flight_analysis.metrics.errors import best_error, tracking_error, true_error
+from flight_analysis.metrics.time_spans import mask_spans
 from flight_analysis.report.display_units import (
     NO_UNIT,
     POSE_UNITS,

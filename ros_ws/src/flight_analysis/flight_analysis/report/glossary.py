@@ -10,13 +10,12 @@ import math
 from collections.abc import Iterable
 from types import MappingProxyType
 
-from flight_analysis.metrics import (
+from flight_analysis.metrics.settling import MIN_BAND_NOISE_FLOORS, SETTLING_BAND
+from flight_analysis.metrics.transients import (
     AIRS,
     CALM,
     CAPTURE_ANGLE,
     CAPTURE_TIME,
-    MIN_BAND_NOISE_FLOORS,
-    SETTLING_BAND,
     SETTLING_DWELL,
     TURN_BANK,
     UNKNOWN_AIR,

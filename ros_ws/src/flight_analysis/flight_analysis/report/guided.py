@@ -16,14 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.guidance_replay import known_routes
-from flight_analysis.metrics import (
-    SETTLING_DWELL,
-    ErrorMetrics,
-    best_pose,
-    error_metrics,
-    sample_times,
-    settling_time,
-)
+from flight_analysis.metrics.errors import ErrorMetrics, best_pose, error_metrics
+from flight_analysis.metrics.settling import settling_time
+from flight_analysis.metrics.time_spans import sample_times
+from flight_analysis.metrics.transients import SETTLING_DWELL
 from flight_core.outcome import End
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape

@@ -13,7 +13,7 @@ import numpy as np
 
 from flight_analysis.closed_loop.guidance_replay import known_routes
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import mask_spans
+from flight_analysis.metrics.time_spans import mask_spans
 from flight_analysis.report.display_units import QUANTITY_UNITS, DisplayUnit
 from flight_analysis.report.figures import END_STOP, ERROR, PLANT, REFERENCE, WIND
 from flight_analysis.report.guided import flown_speed

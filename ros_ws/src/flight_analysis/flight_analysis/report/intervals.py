@@ -4,7 +4,7 @@
 
 import numpy as np
 
-from flight_analysis.metrics import Windows, mask_spans
+from flight_analysis.metrics.time_spans import Windows, mask_spans
 from flight_analysis.report.plotting import MIN_GAP_PERIODS, Interval
 from flight_analysis.report.summary import RecordedFlight
 from flight_core.modes import Mode

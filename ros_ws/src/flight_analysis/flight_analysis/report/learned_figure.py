@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flight_analysis.metrics import known_entries
+from flight_analysis.metrics.controller_log import known_entries
 from flight_analysis.report.figures import PLANT, REFERENCE
 from flight_analysis.report.plotting import Figure, PlotContext, add_line, set_layout
 

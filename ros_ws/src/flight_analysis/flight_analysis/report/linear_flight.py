@@ -32,7 +32,8 @@ from flight_analysis.linear_loop.loop_margins import (
     loop_of,
     through_allocation,
 )
-from flight_analysis.metrics import LONGEST_INTERVAL, best_error, noise_floor
+from flight_analysis.metrics.errors import best_error, noise_floor
+from flight_analysis.metrics.time_spans import LONGEST_INTERVAL
 from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flight_analysis.closed_loop.learning_loop import GUARANTEE, LOOP_DIGITS
-from flight_analysis.metrics import best_error, error_metrics
+from flight_analysis.metrics.errors import best_error, error_metrics
 from flight_core.modes import Mode
 from flight_core.tape import Tape
 

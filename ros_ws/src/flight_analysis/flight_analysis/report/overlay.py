@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flight_analysis.metrics import LONGEST_INTERVAL
+from flight_analysis.metrics.time_spans import LONGEST_INTERVAL
 from flight_analysis.report.display_units import (
     NO_UNIT,
     NO_VALUE,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flight_analysis.metrics import best_error
+from flight_analysis.metrics.errors import best_error
 from flight_analysis.report.display_units import (
     NO_UNIT,
     about_trim,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flight_analysis.metrics import best_pose
+from flight_analysis.metrics.errors import best_pose
 from flight_core.outcome import Aim, Shortfall
 from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape

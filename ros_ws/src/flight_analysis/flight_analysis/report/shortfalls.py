@@ -24,7 +24,8 @@ import numpy as np
 
 from aircraft_sim.params import AircraftConfig
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import best_pose, mask_spans
+from flight_analysis.metrics.errors import best_pose
+from flight_analysis.metrics.time_spans import mask_spans
 from flight_analysis.report.account import Account
 from flight_analysis.report.flown_reference import reference_shortfalls
 from flight_analysis.report.guided import (

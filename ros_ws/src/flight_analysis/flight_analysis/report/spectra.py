@@ -5,7 +5,7 @@
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from flight_analysis.metrics import LONGEST_INTERVAL
+from flight_analysis.metrics.time_spans import LONGEST_INTERVAL
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray

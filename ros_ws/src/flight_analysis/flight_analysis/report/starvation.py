@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import mask_spans
+from flight_analysis.metrics.time_spans import mask_spans
 from flight_analysis.report.sample_counts import TopicAccount, is_real_time, is_sent_by_stack
 from flight_core.tape import Recording, Tape
 from flight_core.vectors import FloatArray

@@ -16,24 +16,18 @@ from aircraft_sim.params import AircraftConfig
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.linear_loop.delay_margin import delay_margin
 from flight_analysis.linear_loop.told import FlightFacts
-from flight_analysis.metrics import (
+from flight_analysis.metrics.by_part import errors_by_part, inputs_by_part
+from flight_analysis.metrics.controller_log import saturation_shares, sign_switches
+from flight_analysis.metrics.errors import TRUE_ERROR, best_error, noise_floor, tracking_error
+from flight_analysis.metrics.settling import settling_bands, settling_times
+from flight_analysis.metrics.transients import (
     CALM,
-    TRUE_ERROR,
     UNKNOWN_AIR,
     Transient,
     TransientKind,
-    best_error,
     engagements,
-    errors_by_part,
     guided_transients,
-    inputs_by_part,
     live_commands,
-    noise_floor,
-    saturation_shares,
-    settling_bands,
-    settling_times,
-    sign_switches,
-    tracking_error,
 )
 from flight_analysis.report.account import (
     Account,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any
 
-from flight_analysis.metrics import AIRS, CALM, TransientKind
+from flight_analysis.metrics.transients import AIRS, CALM, TransientKind
 from flight_analysis.report.display_units import (
     NO_UNIT,
     NO_VALUE,

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import MEASURED_ERROR, TRUE_ERROR, Windows
+from flight_analysis.metrics.errors import MEASURED_ERROR, TRUE_ERROR
+from flight_analysis.metrics.time_spans import Windows
 from flight_analysis.report.account import account_of_json
 from flight_analysis.report.display_units import DisplayUnit, format_seconds, format_value
 from flight_analysis.report.glossary import legend, words_in

@@ -11,7 +11,8 @@ import numpy as np
 from aircraft_sim.atmosphere.turbulence import HIGH, LOW, LOWEST, MODERATE_SIGMA, MODERATE_WIND
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import best_error, error_metrics, saturation_shares
+from flight_analysis.metrics.controller_log import saturation_shares
+from flight_analysis.metrics.errors import best_error, error_metrics
 from flight_core.tape import Tape
 
 HEIGHTS = {"q": 0.05, "V": 2.0, "p": 0.15, "r": 0.05}
