@@ -26,7 +26,7 @@ from flight_guidance.steering.path import Route
 
 
 class GuidanceReplay(NamedTuple):
-    """The result of a replay of guidance: how many recorded steps the computation repeats."""
+    """The result of a replay of guidance: the numbers of checked and of differing steps."""
 
     steps: int
     checked: int
@@ -67,8 +67,8 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
 
     If a step failed in flight, the replay checks that the state of guidance did not change and that
     the last u_m was published again. A step is not checked if the log lacks its route or the state
-    before it. No step is checked if the channels of the topic are other than those of this version.
-    Raises ParameterError if the log lacks the scenario's section of guidance.
+    before it. No step is checked if the log is from a version whose topic `guidance` had other
+    channels. Raises ParameterError if the log lacks the scenario's section of guidance.
     """
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")
@@ -150,8 +150,8 @@ class _Comparison:
     ) -> FloatArray:
         """Compute the step that follows the state `previous`, and return its channels and u_m.
 
-        If `goes_on` is True, the step failed in flight, so guidance kept its state and the last
-        u_m.
+        If `goes_on` is True, the step failed in flight, so the result has the state and the u_m of
+        the step before.
         """
         route = int(channels["route"])
         if goes_on and previous is not None:

@@ -25,7 +25,10 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 
 class ModelGuarantee(NamedTuple):
-    """The guarantee for a proposal: the deviations from its model with proved stability."""
+    """The guarantee for a proposal: how far A and B may deviate from its model.
+
+    Within these deviations, stability is proved.
+    """
 
     # Every aircraft is stable if each of its entries differs from the model by at most so many
     # times the stated deviation of this entry. 0 if nothing is proved.
@@ -37,7 +40,7 @@ NO_GUARANTEE = ModelGuarantee(0.0, "0")
 
 
 class LearnerResult(NamedTuple):
-    """The result of an identification in flight: parameters to fly, or why there are none."""
+    """Result of an identification in flight: parameters to fly, or why there are none."""
 
     controller: RiseDiConfig | None
     sentence: str | None  # None if no identification was due
@@ -53,7 +56,7 @@ class Learner(Protocol):
     """
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
-        """Record one tick of the engaged law.
+        """Record one tick in which the law was engaged.
 
         y and u have the shape (m,), and u is the input after the limits were applied. `flown` is
         the digest of the parameters with which the law computed u.
@@ -75,8 +78,8 @@ class Entry(NamedTuple):
     """An entry of A or B with its nominal value, and the error of this value as found in flight.
 
     The nominal value is in SI. `error` is a fraction of `unit`, which is the nominal value, or
-    another value if the nominal value is 0. `deviation` is the standard deviation that the error
-    still has after the flight, also as a fraction of `unit`.
+    another value if the nominal value is 0. `deviation` is the standard deviation of the error that
+    was found, also as a fraction of `unit`.
     """
 
     matrix: str
@@ -124,8 +127,8 @@ def learned_sample(
 ) -> Learned:
     """Return the sample of the topic `learned` for an identification and its proposal.
 
-    `entries` are those of the identification. The function computes the guarantee of the proposal.
-    If nothing was proposed, the channels of GUARANTEE are 0.
+    `entries` has the entries that the identification found. The function computes the guarantee of
+    the proposal. If nothing was proposed, the channels of GUARANTEE are 0.
     """
     output_entries = [entry for entry in entries if entry.row in outputs]
     channels = {"proposed": float(proposal.controller is not None)}
@@ -188,7 +191,7 @@ def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown
 def proposed(
     learner: Learner, learning: Learning, controller: Controller, t_ns: int
 ) -> LearnerResult:
-    """Ask the learner for a proposal at a tick, give it to the controller, and return it."""
+    """Ask the learner for a proposal at a tick, pass it to the controller, and return it."""
     proposal = learner.propose(controller.digest, outputs_without(controller.parameters))
     received = as_received(proposal, learning.start, t_ns, controller.digest)
     learning.receive(received, controller, t_ns)

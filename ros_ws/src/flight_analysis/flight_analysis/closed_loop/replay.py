@@ -52,7 +52,10 @@ class ReplayDifference:
 
     @property
     def ulps(self) -> int | None:
-        """Distance of the two values in units in the last place (ULP), or None if one is NaN."""
+        """Distance of the computed from the recorded value in units in the last place (ULP).
+
+        The distance is None if one of the two values is NaN.
+        """
         if np.isnan(self.recorded) or np.isnan(self.computed):
             return None
         return abs(_ordinal(self.computed) - _ordinal(self.recorded))
@@ -91,7 +94,7 @@ class ReplayResult(NamedTuple):
     def equal(self) -> bool:
         """Return whether the computed ticks equal the log, and used the recorded parameters.
 
-        Only checked ticks count, and they must be equal in every bit.
+        Every checked tick must be equal in every bit. Ticks that were not checked do not matter.
         """
         return not self.different().any() and not self.other_parameters.any()
 
@@ -311,7 +314,7 @@ class _Steps:
         self.other_parameters = self.checked.copy()
 
     def compute(self) -> None:
-        """Compute every tick if the state of the controller before it is known."""
+        """Compute every tick for which the state of the controller before the tick is known."""
         ticks = self._ticks
         in_force = self._in_force
         state: ControllerState | None = None

@@ -149,7 +149,7 @@ class Ticks:
     def begin(self, before: ControllerState | None = None) -> ControllerState:
         """Return the initial state of a controller.
 
-        If `before` is given, the initial state has the u of that state.
+        If the state `before` is given, the initial state has the u of `before`.
         """
         state = guard.initial_state(self.m, self._allocation)
         return state if before is None else state._replace(u=before.u, effectors=before.effectors)
@@ -299,7 +299,7 @@ def _as_published(
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return the samples of a topic at N stamps, (N, m), and a mask of the stamps with a sample.
 
-    A stamp without a sample gets the values of `otherwise` at this stamp.
+    A stamp without a sample gets its row of the argument `otherwise`.
     """
     matched = np.zeros(len(stamp_ns), dtype=bool)
     if topic not in tape or not set(names) <= set(tape[topic].names):

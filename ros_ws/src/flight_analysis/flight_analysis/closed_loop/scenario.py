@@ -196,8 +196,8 @@ class Scenario:
     def gust_windows(self) -> dict[str, tuple[float, float]]:
         """Return the times at which each gust starts and ends, s, by the name of the gust.
 
-        A gust of length H starts when the aircraft enters it, and ends 2 H / V0 later. If a gust is
-        repeated, its name has a number from the second time on.
+        A gust of length H starts when the aircraft enters it, and ends 2 H / V0 later. From the
+        second time on, a repeated gust has a number after its name.
         """
         speed = self.aircraft.channels().speed
         windows = {}

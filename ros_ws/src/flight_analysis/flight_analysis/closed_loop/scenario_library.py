@@ -108,8 +108,8 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
     The scenario keeps its own file if the nodes read the same values from it. If this file names
     recorded commands, or has sections for another namespace, such as /uav7/controller, a new file
     is written into the folder `run`. The new file has sections for any namespace. It holds the
-    values of the recorded commands, so that the log can be flown again without another file. Raises
-    ParameterError if the file cannot be written.
+    values of the recorded commands, so that the flight can be repeated without a second file.
+    Raises ParameterError if the new file cannot be written.
     """
     if not scenario.reference_model.recorded and _reaches_nodes(scenario.path, namespace):
         return scenario
@@ -119,8 +119,8 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
 def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
     """Return the scenario with values replaced by those of a ROS parameter file.
 
-    Only the sections of the file for the nodes in `namespace` count. Raises ParameterError if a
-    value is invalid. The message names the parameter file, because the scenario was valid before.
+    Sections of the file for nodes outside `namespace` are ignored. Raises ParameterError if a value
+    is invalid. The message names the parameter file, because the scenario was valid before.
     """
     content = read_file(path, str(path), "a ROS parameter file")
     further = parse_sections(content, path, SCHEMAS, tuple(SCHEMAS), namespace, with_general=True)

@@ -90,7 +90,7 @@ class Topics:
         self._subscriptions[topic].append((channels, take))
 
     def is_taken(self, topic: str) -> bool:
-        """Return whether a topic is recorded or has a subscriber."""
+        """Return whether the samples of a topic are needed: by a subscriber, or to be recorded."""
         return self._recorded or topic in self._subscriptions
 
     def publish(self, topic: str, sample: StampedVector, t_ns: int) -> None:
@@ -121,7 +121,10 @@ class Topics:
 
 
 def _or_refuse(take: Take) -> Take:
-    """Wrap a subscriber so that it ignores a sample that raises ChannelError, as a node does."""
+    """Wrap a subscriber so that a sample for which it raises ChannelError is dropped.
+
+    A node drops such a sample as well.
+    """
 
     def take_or_refuse(sample: StampedVector, t_ns: int) -> None:
         with suppress(ChannelError):

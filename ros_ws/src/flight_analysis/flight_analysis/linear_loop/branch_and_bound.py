@@ -57,7 +57,8 @@ class Region(NamedTuple):
     def outside(self, begin: float, end: float) -> list["Region"]:
         """Return the region at the frequencies outside the interval from `begin` to `end`, rad/s.
 
-        The result has a region below the interval and a region above it. An empty one is left out.
+        The result has one region with the frequencies below the interval and one with the
+        frequencies above it. A region without frequencies is left out.
         """
         below = self._replace(high=begin)
         above = self._replace(low=end)
@@ -116,12 +117,13 @@ def proof_of(
 
 
 def _as_step(scaling: Scaling, part: Channels) -> dict[str, list[float]]:
-    """Round the scalings X and G, and return them as the lists `t` and `g` of a step.
+    """Round the scalings X and G, and return them as the lists `t` and `g` of a step of the proof.
 
     The lists have only the scalings of the uncertain entries. Rounding is safe, because any X and G
-    prove a bound. If the X and G of the second Legendre coefficients follow from those of the means
-    over a period, as in `least_bound_at`, the lists have only the X and G of the means. A common
-    factor of all X changes no bound, so X is divided by its value at the channels of a delay.
+    prove a bound. If the X and G of the second Legendre coefficients follow from the X and G of the
+    means over a period, as in `least_bound_at`, the lists have only the X and G of the means. A
+    common factor of all X changes no bound, so X is divided by its value at the channels of a
+    delay.
     """
     k = len(part.entries)
     count = part.uncertain if scaling.g[k:].any() else k
@@ -134,8 +136,8 @@ def _as_step(scaling: Scaling, part: Channels) -> dict[str, list[float]]:
 def frequency_in(region: Region, highest: float) -> float:
     """Choose the frequency, rad/s, at which the bound of a region is computed.
 
-    This is an end of the region if the end is 0 or `highest`, pi / T, because M is real there.
-    Otherwise it is the geometric mean of the ends.
+    If an end of the region is 0 or `highest`, pi / T, the frequency is this end, because M is real
+    there. If no end is, the frequency is the geometric mean of the ends.
     """
     if region.low == 0.0:
         return 0.0
@@ -143,19 +145,19 @@ def frequency_in(region: Region, highest: float) -> float:
 
 
 def _sizes(part: Channels, size: float, disk: float) -> FloatArray:
-    """Return the size to which the deviation in each channel is proved.
+    """Return, for each channel, the size up to which its deviation is proved.
 
-    The channels are those of the entries, of a late u and of the disks, in this order.
+    The channels of the entries come first, then the channels of a late u, then the disks.
     """
     late, disks = len(part.late), len(part.D) - part.disks.start
     return np.repeat([size, LATE, disk], [part.uncertain, late, disks])
 
 
 def levels_of(part: Channels, size: float, disk: float) -> FloatArray:
-    """Return t = log(X) / 2 of the channels of a late u, rounded, with the mean 0.
+    """Return t = log(X) / 2 of the channels of a late u, rounded and shifted to the mean 0.
 
     A delay can change from tick to tick, so the ratios of X between its channels must be the same
-    at all frequencies. They are taken from the frequency at which the bound is largest. The
+    at all frequencies. The ratios are taken from the frequency at which the bound is largest. The
     Legendre coefficients of one block of the delay have the same X.
     """
     k, late = len(part.entries), len(part.late)
@@ -187,8 +189,8 @@ def levelled(part: Channels, levels: FloatArray) -> Channels:
 def effects_of(part: Channels, M: ComplexArray, scaling: Scaling) -> FloatArray:
     """Estimate how much the bound of M falls if the half width of an entry becomes smaller.
 
-    The result has a value for each entry of the part. Only the ratios of these values count,
-    because all have the same unknown factor.
+    The result has a value for each entry of the part of the loop. Only the ratios of these values
+    matter, because all values have the same unknown factor.
     """
     scale = np.exp(scaling.t)
     N = scale[:, None] * M / scale

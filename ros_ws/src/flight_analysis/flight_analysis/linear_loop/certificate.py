@@ -41,8 +41,8 @@ def certificate(linear: LinearLoop, guarantee: Guarantee, sources: Mapping[str, 
             the scenario, and the text of the exported constants.
 
     Raises:
-        ParameterError: Nothing is proved, or u can be late in a part of the loop in which all
-            entries are exact.
+        ParameterError: The guarantee proves nothing, or u can be late in a part of the loop in
+            which all entries are exact.
     """
     require(guarantee.stable > 0.0, "certificate", "no stable box", "a loop with a guarantee")
     parts = [{key: part[key] for key in ("entries", "steps")} for part in guarantee.proof]
@@ -69,7 +69,7 @@ def limit_certificate(
 
 
 def _text(linear: LinearLoop, deviation: float, proof: Mapping[str, Any]) -> str:
-    """Return a loop with its box and a proof as JSON. `deviation` is the proved relative one."""
+    """Return a loop with its box and a proof as JSON, for the relative deviation that is proved."""
     box = linear.box
     assert box is not None  # noqa: S101 - a guarantee has a box
     content = {
@@ -105,9 +105,10 @@ def keep(guarantee: Guarantee) -> None:
 
 
 def kept_guarantee(linear: LinearLoop) -> Guarantee | None:
-    """Return the guarantee that was computed for a loop, if it holds for the aircraft that flies.
+    """Return the guarantee that was kept for a loop, if it holds for the aircraft that flies.
 
-    Returns None if no guarantee is kept, if its file is damaged, or if `unstated` has a reason.
+    Returns None if no guarantee is kept, if its file is damaged, or if `unstated` gives a reason
+    not to state the guarantee.
     """
     guarantee = _kept(linear)
     return None if guarantee is None or unstated(linear, guarantee) else guarantee
@@ -125,9 +126,9 @@ def unstated(linear: LinearLoop, guarantee: Guarantee) -> tuple[str, ...]:
 
 
 def beyond_kept(linear: LinearLoop) -> tuple[str, ...]:
-    """Return a sentence if the aircraft lies beyond the guarantee kept for its loop.
+    """Return a sentence if the aircraft lies outside the box of the guarantee kept for its loop.
 
-    The result is empty if the aircraft lies within this guarantee, or if no guarantee is kept.
+    The result is empty if the aircraft lies inside this box, or if no guarantee is kept.
     """
     guarantee = _kept(linear)
     return () if guarantee is None else _beyond_box(linear, guarantee)

@@ -67,7 +67,7 @@ class Unstable(NamedTuple):
 
 
 class Zeros(NamedTuple):
-    """How far entries that are 0 in the airframe file may deviate while all others are exact."""
+    """Proved deviation of entries that are 0 in the airframe file, while all others are exact."""
 
     # fraction of its row up to which each of these entries may deviate in a stable aircraft
     stable: float
@@ -109,7 +109,7 @@ class Guarantee(NamedTuple):
         return self.loop[:NAMED] if self.stable else ""
 
     def as_json(self) -> dict[str, Any]:
-        """Return the guarantee as a mapping for JSON, without the proof."""
+        """Return the guarantee as a dict that JSON can hold, without the proof."""
         content = self._asdict() | {"holds": self.holds}
         del content["proof"]
         if self.unstable is not None:
@@ -170,7 +170,7 @@ def loop_guarantee(
 
 
 def _none(linear: LinearLoop, late: float) -> Guarantee:
-    """Return a guarantee for the box of a loop in which nothing is proved yet.
+    """Return the guarantee for the box of a loop with which a search starts: nothing is proved.
 
     The stable deviation and the disk margins are 0. Raises ParameterError if the loop has no box.
     """
@@ -198,9 +198,9 @@ def _is_lag(box: Box) -> NDArray[np.bool_]:
 def zeros_alone(linear: LinearLoop, late: float = 0.0) -> Zeros | None:
     """Compute how far entries that are 0 in the airframe file may deviate if all others are exact.
 
-    The box of `linear` must have only such entries. They can be very many, so search and proof stop
-    early, as in `quick_guarantee`. Returns None if there is no box, or if the nominal loop is
-    unstable.
+    The box of `linear` must have only entries that are 0 in the file. There can be very many of
+    them, so search and proof stop early, as in `quick_guarantee`. Returns None if there is no box,
+    or if the nominal loop is unstable.
     """
     box = linear.box
     if box is None or not _is_nominal_stable(linear):
@@ -260,7 +260,7 @@ def _exact_entries(linear: LinearLoop, box: Box) -> tuple[str, ...]:
 
 
 def _loops(linear: LinearLoop, late: float) -> list[LoopTiming]:
-    """Return the timing of the loop with u in time, and with every u late by `late`, s."""
+    """Return two timings of the loop: with u in time, and with every u late by `late`, s."""
     loop = linear.loop
     return [loop._replace(delay=loop.delay + extra) for extra in sorted({0.0, late})]
 
@@ -275,8 +275,8 @@ def _unstable(
 ) -> list[Unstable]:
     """Search for unstable aircraft up to a size of the box, and sort them by their deviation.
 
-    `largest` is this size, as a factor on the deviations of the box. The search takes constant
-    delays, of 0 and of `late`, s.
+    `largest` is the largest size that is searched, as a factor on the deviations of the box. The
+    search is made for two constant delays of u, 0 and `late`, s.
     """
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
@@ -292,10 +292,11 @@ def _unstable(
 def _leaving(
     linear: LinearLoop, late: float, known: Unstable, nearest: Unstable | None
 ) -> Unstable:
-    """Search for an aircraft that a sequence of delays makes unstable, and that deviates less.
+    """Search for an aircraft that deviates less and is unstable with delays that change in time.
 
-    The search begins at the size of `nearest`, in the direction of the deviations of the unstable
-    aircraft `known`. Returns `known` if nothing is found.
+    The search looks for a sequence of delays that makes the aircraft unstable. It begins at the
+    size of `nearest`, in the direction of the deviations of the unstable aircraft `known`. Returns
+    `known` if nothing is found.
     """
     assert nearest is not None  # noqa: S101 - the known one is found
     box = linear.box
@@ -397,8 +398,9 @@ def _proof(
 ) -> list[dict[str, Any]] | None:
     """Prove each part of the loop for a size, or return None if `most` steps are not enough.
 
-    The proof covers deviations that are larger than the size by the fraction SLACK. If `reserve` is
-    not 0, the half widths of each region are larger by the fraction `reserve` instead of this.
+    If `reserve` is 0, the proof covers deviations that are larger than the size by the fraction
+    SLACK. If `reserve` is not 0, the half widths of each region are larger by the fraction
+    `reserve`, and SLACK is not used.
     """
     proof = []
     whole = size if reserve else (1.0 + SLACK) * size
@@ -420,8 +422,8 @@ def _proof(
 def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:
     """Confirm that the aircraft with deviations d is unstable, or return None.
 
-    The search that found it has left out small terms. So if the exact loop is stable at d, d grows
-    a little, up to CONFIRMED times.
+    The search that found the aircraft has left out small terms, so the exact loop may still be
+    stable at d. In this case d is enlarged a little, up to CONFIRMED times.
     """
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Margins of the sampled linear loop of a law at the inputs of an aircraft.
 
-They are phase and gain margin, sensitivity, disk margin and damping.
+The margins are phase margin, gain margin, sensitivity, disk margin and damping.
 
 P(z) is the sampled aircraft from u to y, with actuators and delay, and K(z) the law from y to u:
 
@@ -87,7 +87,7 @@ class Margins(NamedTuple):
             return np.minimum(self.gain_increase, 1.0 / self.gain_decrease)
 
     def at(self, place: int | slice) -> "Margins":
-        """Return the margins of one or some of N aircraft. `place` is their index or slice."""
+        """Return the margins of one or some of N aircraft. `place` is an index or a slice."""
         return Margins(**{name: value[place] for name, value in self._asdict().items()})
 
     def worst(self) -> "Margins":
@@ -264,10 +264,10 @@ def schur_form(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> SchurFor
 def _modal_form(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming
 ) -> tuple[SchurForm, NDArray[np.bool_]]:
-    """Return the loops as a `SchurForm` with a diagonal T, and whether each loop permits it.
+    """Return the loops as a `SchurForm` with a diagonal T, and a mask of the loops that permit it.
 
-    A loop permits it if its modes are independent, which means that the condition number of their
-    eigenvectors is at most MOST_CONDITION.
+    A loop permits a diagonal T if its modes are independent, which means that the condition number
+    of its eigenvectors is at most MOST_CONDITION.
     """
     A, B, K = _from_inputs_to_inputs(plant, law, loop)
     eigenvalues, modes = (part.astype(np.complex128) for part in np.linalg.eig(A))
@@ -361,7 +361,7 @@ def _stable(form: SchurForm) -> NDArray[np.bool_]:
 
 
 def on_grid(form: SchurForm, period: float) -> tuple[FloatArray, ComplexArray]:
-    """Return frequencies of each aircraft, (N, F), rad/s, and S there, balanced, (N, F, m, m)."""
+    """Return frequencies of each aircraft, (N, F), rad/s, and balanced S there, (N, F, m, m)."""
     w = _frequencies(form.eigenvalues, period)
     return w, _balanced(_sensitivity(form, np.exp(1j * w * period)))
 
@@ -375,7 +375,7 @@ def _loop_of_sensitivity(S: ComplexArray) -> ComplexArray:
 def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:
     """Return the ascending frequencies at which each aircraft is evaluated, (N, F), rad/s.
 
-    They are a common grid and the frequencies of the modes of the aircraft.
+    An aircraft has the frequencies of a common grid and the frequencies of its own modes.
     """
     highest = np.pi / period
     turns = np.log(np.where(np.abs(eigenvalues) > VANISHED, eigenvalues, VANISHED)) / period
@@ -386,10 +386,10 @@ def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:
 
 
 def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
-    """Return four frequencies on either side of each peak, (N, G), rad/s.
+    """Return four frequencies below and four above each peak, (N, G), rad/s.
 
-    A peak is a maximum of abs(S_ii), abs(S_ii - 1/2), or the norm of S or S - I/2, where S is
-    balanced.
+    A peak is a maximum over frequency of abs(S_ii), of abs(S_ii - 1/2), or of the norm of the
+    balanced S or S - I/2.
     """
     diagonal = np.einsum("NFii->NFi", S)
     half = S - np.eye(S.shape[-1]) / 2.0
@@ -415,7 +415,8 @@ def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
 def _crossings(values: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
     """Find the changes of sign along the second axis of `values`, (N, F, m).
 
-    Returns the index of the aircraft, of the frequency before the change, and of the input.
+    Returns three indices for each change: that of the aircraft, that of the last frequency before
+    the change, and that of the input.
     """
     return np.nonzero(np.signbit(values[:, :-1]) != np.signbit(values[:, 1:]))  # type: ignore[return-value]
 
@@ -489,7 +490,7 @@ def _gain_margins(
 ) -> tuple[FloatArray, FloatArray]:
     """Find the gain factors next to 1, below and above, that make L_i = -1, each (N, m).
 
-    L_i is also real at w = 0 and at pi / T, so these ends are crossings, too.
+    L_i is also real at w = 0 and at pi / T, so both ends of the grid are tried as well.
     """
     imaginary = np.imag(L) / (1.0 + np.abs(L))
     imaginary[:, -1] = 0.0  # L is real at pi / T, except for rounding
@@ -513,7 +514,7 @@ def _gain_margins(
 
 
 def _narrow(decrease: FloatArray, increase: FloatArray, place: tuple[int, int], L: float) -> None:
-    """Lower the gain margin of an input in place, given a real L at some frequency.
+    """Lower the gain margin of an input in place, given a value of L at which L is real.
 
     If L is negative, the loop passes through -1 at the gain factor 1 / abs(L). `place` is the index
     of the aircraft and of the input.

@@ -76,7 +76,7 @@ def ticks_of(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, late: float) 
 
     The states are, in this order, x and the actuators, u of this tick, u of the tick before, any
     further u that is on its way, and the states of the law. A tick begins at the instant at which
-    its u arrives if it is in time, so the next u is computed within the tick.
+    its u arrives if this u is in time, so the next u is computed within the tick.
     """
     n, m = plant.B.shape
     q, T = len(law.A), loop.period
@@ -107,7 +107,7 @@ def ticks_of(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, late: float) 
 
 
 def loops_of(ticks: Ticks) -> list[Ticks]:
-    """Split the states into strongly connected parts, and keep the parts that contain inputs."""
+    """Split the states into strongly connected parts, and return the parts that contain inputs."""
     from scipy.sparse import csr_array  # noqa: PLC0415 - a flight starts without it
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
@@ -150,10 +150,10 @@ def ascended(ticks: Ticks, choices: IntArray) -> Attack:
 
 
 def _attack(ticks: Ticks, choices: IntArray) -> tuple[Attack, FloatArray]:
-    """Compute the fastest mode of a sequence, and how each other choice would change it.
+    """Compute the fastest mode of a sequence, and the effect of every other choice at each tick.
 
-    The second result has the size of the mode if tick k gets choice c, (ticks, choices), to first
-    order.
+    The second result, (ticks, choices), has to first order the size of the fastest mode if tick k
+    gets choice c.
     """
     from scipy.linalg import eig  # noqa: PLC0415 - a flight starts without it
 
@@ -205,10 +205,11 @@ def attacked(ticks: Ticks, known: IntArray | None = None) -> Attack | None:
 def nearest_leaving(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box, late: float, d: FloatArray
 ) -> Leaving | None:
-    """Search for an aircraft nearer than d that a sequence of delays makes unstable.
+    """Search for an aircraft that deviates less than d and is unstable with late inputs.
 
-    `late` is at most a period, s. The aircraft lies in the direction of d, or of d with some of its
-    signs changed. Returns None if none is found.
+    The search looks for a periodic sequence of delays that makes the aircraft unstable. `late` is
+    at most a period, s. The aircraft lies in the direction of d, or of d with some of its signs
+    changed. Returns None if none is found.
     """
 
     def ticks_at(d: FloatArray) -> Ticks:

@@ -87,16 +87,16 @@ class LinearLoop(NamedTuple):
 
     @property
     def plant_states(self) -> tuple[str, ...]:
-        """States of the aircraft, and u[INPUT] as the state of each actuator whose lag deviates."""
+        """States of the aircraft, and a state u[INPUT] for each actuator whose lag deviates."""
         entries = () if self.box is None else self.box.names
         lags = [name for name in entries if name.startswith(LAG_ENTRY)]
         return (*self.states, *(f"u{name.removeprefix(LAG_ENTRY)}" for name in lags))
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the names in the loop and its box, and of their numbers to DIGITS digits.
+        """SHA-256 of the loop and its box: of their names, and of their numbers to DIGITS digits.
 
-        The box is scaled to the size 1 first, because its size is a result of a guarantee.
+        The box is scaled to the size 1 first, because the size is a result of a guarantee.
         """
         loop = self.loop
         arrays = [*self.nominal, *self.law, loop.lag, loop.delay, loop.period]
@@ -204,7 +204,7 @@ def loop_margins(linear: LinearLoop) -> LoopMargins:
 
 
 def _assessed_by_search(linear: LinearLoop, box: Box) -> LoopMargins:
-    """Search the box for the worst margins, and use the samples only to count stable aircraft."""
+    """Search the box for the worst margins, and count the stable ones of the drawn aircraft."""
     nominal = loop_margins(linear._replace(plant=_some(linear.plant, slice(1)), box=None))
     samples = closed_loop(
         _some(linear.plant, slice(1, None)), linear.law, linear.loop, np.zeros(len(linear.inputs))
@@ -277,14 +277,14 @@ def scenario_loop(
 
 
 def as_compared(linear: LinearLoop, scenario: Scenario, comparison: Comparison) -> LinearLoop:
-    """Return the loop with the differences of a comparison, and with `off` of the aircraft."""
+    """Return the loop with the differences of a comparison, and with `off` by `_with_deviation`."""
     return _with_deviation(linear._replace(differences=comparison.differences), scenario)
 
 
 def _with_deviation(linear: LinearLoop, scenario: Scenario) -> LinearLoop:
     """Return the loop with `off`: how far the scenario's aircraft is from its airframe file.
 
-    `off` is 0 if the aircraft flies as in this file. It is infinite if the scenario changes an
+    `off` is 0 if the aircraft flies as the file says. It is infinite if the scenario changes an
     entry that is exact in the box.
     """
     if linear.box is None or scenario.aircraft.is_jsbsim:
@@ -344,7 +344,7 @@ def with_box(
     seed: int,
     spread: Spread,
 ) -> LinearLoop:
-    """Return the loop with a box: intervals of entries that contain all its aircraft.
+    """Return the loop with a box: intervals of entries that contain every aircraft of the loop.
 
     The box is None if nothing deviates. If a lag deviates, its actuator becomes a state of the
     plant, and the lag becomes 0 in the timing of the loop:
@@ -363,10 +363,10 @@ def with_box(
 def of_matrices_and_lags(
     spread: Spread, timing: LoopTiming, inputs: Sequence[str]
 ) -> tuple[Spread, dict[int, float]]:
-    """Separate the entries of A and B in `spread` from those of lags, named 1/lag[INPUT].
+    """Separate the entries of A and B in `spread` from the entries of lags, named 1/lag[INPUT].
 
     The second result has the relative deviation of 1 / lag by the index of the law's input. Raises
-    ParameterError for an unknown entry, a lag below LEAST_LAG periods, and a deviation outside [0,
+    ParameterError for an unknown entry, a lag below LEAST_LAG periods, or a deviation not in [0,
     1).
     """
     least = LEAST_LAG * timing.period
@@ -438,9 +438,9 @@ def box_of(
 ) -> Box:
     """Return the box (intervals of the entries of A and B) that `nominal_and_sampled` draws from.
 
-    Its channels are in the law's order. If there is an allocation, B of every effector is
-    uncertain. If `spread.zeros` is above 0, entries that are 0 in the file deviate as well, by this
-    fraction of their `row_sizes`.
+    The channels of the box are in the law's order. If there is an allocation, B of every effector
+    is uncertain. If `spread.zeros` is above 0, entries that are 0 in the file deviate as well, by
+    this fraction of their `row_sizes`.
     """
     airframe_of_law = through_allocation(airframe, controller)
     T = distribution(airframe, controller)[:, law_order(airframe_of_law, controller)[1]]
@@ -502,7 +502,7 @@ def distribution(airframe: Airframe, controller: ControllerConfig) -> FloatArray
 def _has_effectors(airframe: Airframe, controller: ControllerConfig) -> bool:
     """Return whether an allocation stands between the law and the inputs of an airframe.
 
-    The model of an aircraft of JSBSim already has the inputs of the law, so the result is False.
+    The model of a JSBSim aircraft already has the inputs of the law, so for it the result is False.
     """
     return controller.allocation is not None and set(airframe.inputs) != set(controller.inputs)
 
@@ -550,11 +550,11 @@ def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[in
 
 
 def scenario_model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
-    """Return the airframe of a scenario, or y_dot = Omega u for an aircraft of JSBSim.
+    """Return the airframe of a scenario, or the model y_dot = Omega u for an aircraft of JSBSim.
 
     The model y_dot = Omega u has the inputs of the law. Its Omega comes from the feedforward of the
-    controller. Without a feedforward, it is abs(Omega_ii) = omega / input_scale of RISE-DI, which
-    is an upper bound.
+    controller. Without a feedforward, Omega is diagonal with abs(Omega_ii) = omega / input_scale of
+    RISE-DI, which is an upper bound.
     """
     aircraft = scenario.aircraft
     if not aircraft.is_jsbsim:

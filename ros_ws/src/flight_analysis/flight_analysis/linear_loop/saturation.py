@@ -96,7 +96,7 @@ class LimitGuarantee(NamedTuple):
         return self.size >= self.uncertainty
 
     def as_json(self) -> dict[str, Any]:
-        """Return the guarantee as a mapping for JSON, without the proof and the taps."""
+        """Return the guarantee as a dict that JSON can hold, without the proof and the taps."""
         return {
             "input": self.input,
             "uncertainty": self.uncertainty,
@@ -143,7 +143,7 @@ def guarantee_with_limit(linear: LinearLoop, name: str) -> LimitGuarantee | None
 def limit_guarantee(
     linear: LinearLoop, name: str, part: float, slowest: float
 ) -> LimitGuarantee | None:
-    """Prove the guarantee for the box scaled by `part`, or return None if no proof is found.
+    """Prove the guarantee for the box scaled by the factor `part`, or return None without a proof.
 
     The proof covers the frequencies from `slowest`, rad/s, upwards. If `slowest` is 0, the proof
     shows that every aircraft settles. `name` is the input with the limits. Raises ParameterError as
@@ -188,8 +188,8 @@ def _proof(
 def _with_limit(part: Channels) -> Channels:
     """Turn a part of the loop with a disk in one input into a part with a limit of that input.
 
-    The inputs of the result are those of the entries, and last w, what the limit cuts off from u.
-    The outputs are those of the entries, and last a = u - w, what is left of u.
+    The inputs of the result are the inputs of the entries and, last, w: what the limit cuts off
+    from u. The outputs are the outputs of the entries and, last, a = u - w: what is left of u.
     """
     W, D = part.W.copy(), part.D.copy()
     D[-1, -1] += 0.5
@@ -210,11 +210,12 @@ def sensitivity(part: Channels, w: FloatArray, radius: float) -> ComplexArray:
 def multiplier_for(part: Channels, size: float, slowest: float) -> Multiplier | None:
     """Find taps with which the middle of a box and its worst corners meet the inequality.
 
-    The room of an aircraft, by which it meets the inequality, is the least Re(m S) / abs(S) over
-    the frequencies, divided by `_expected`. A corner is an aircraft with each entry at an end of
-    its range. A linear program finds the taps that leave the most room to some aircraft. A search
-    then adds the corners with the least room, until these have at least ENOUGH of the room in the
-    program. Returns None if no taps leave room to all these aircraft.
+    The room of an aircraft is the least Re(m S) / abs(S) over the frequencies, divided by
+    `_expected`. If the room is positive, the aircraft meets the inequality. A corner is an aircraft
+    with each entry at an end of its range. A linear program finds the taps for which the least room
+    of some aircraft is largest. A search then adds the corners with the least room, until all of
+    them have at least ENOUGH of the room in the program. Returns None if no taps leave room to all
+    these aircraft.
     """
     k = len(part.entries)
     generator = np.random.default_rng(SEED)
@@ -236,11 +237,11 @@ def multiplier_for(part: Channels, size: float, slowest: float) -> Multiplier | 
 
 
 def _expected(slowest: float, w: FloatArray) -> FloatArray:
-    """Return the Re(m S) / abs(S) that counts as a room of 1 at the frequencies w, rad/s.
+    """Return the Re(m S) / abs(S) that is taken as a room of 1 at the frequencies w, rad/s.
 
-    If `slowest` is 0, the result is 1 at all frequencies. Otherwise it falls below the frequency
-    KNEE, because an integrator in the loop turns S away from the positive real axis towards 0
-    rad/s.
+    If `slowest` is 0, the result is 1 at all frequencies. If not, the result falls below the
+    frequency KNEE, because an integrator in the loop turns S away from the positive real axis
+    towards 0 rad/s.
     """
     return np.minimum(w / KNEE, 1.0) ** 2 if slowest else np.ones(len(w))
 
@@ -248,8 +249,8 @@ def _expected(slowest: float, w: FloatArray) -> FloatArray:
 def _rooms(part: Channels, multiplier: Multiplier, d: FloatArray, w: FloatArray) -> FloatArray:
     """Return the room of N aircraft, (N,): the least Re(m S) / (abs(S) `_expected`) over w, rad/s.
 
-    It is negative if an aircraft fails the inequality. d has the k deviations of each aircraft,
-    (N, k).
+    The room is negative if the aircraft fails the inequality. d has the k deviations of each
+    aircraft, (N, k).
     """
     S = np.array([sensitivity(part.at(each), w, multiplier.radius) for each in d])
     phases = (multiplier.at(w * part.period) * S).real / np.abs(S)
@@ -261,8 +262,8 @@ def _worst_corners(
 ) -> FloatArray:
     """Search for the corners of a box with the least `_rooms`, starting from N corners, (N, k).
 
-    The search only uses the CLIMBERS starts with the least room. Each step changes the sign of one
-    deviation, the one for which the room becomes least. The search ends when the room no longer
+    The search only uses the CLIMBERS starts with the least room. Each step changes the sign of the
+    one deviation whose change makes the room least. The search ends when the room no longer
     shrinks, or after LONGEST_CLIMB steps.
     """
     flips = 1.0 - 2.0 * np.eye(len(part.entries))
@@ -321,10 +322,10 @@ def _program(
 def inequality(M: ComplexArray, m: ComplexArray | None, step: dict[str, Any]) -> ComplexArray:
     """Compute, at F frequencies, the matrices that are positive definite if a step is valid.
 
-    They are diag(1, ..., 1, 0) - N_d* N_d - Y N - N* Y*, where M has the shape (F, q, q) and m has
-    (F,). t, g and s are the scalings of the step, with N = diag(e^t, 1) M diag(e^-t, e^-s) and Y =
-    diag(j g, e^-s m). N_d has those rows of N that belong to t. If m is None, the part has no
-    limit, and the matrices lack the last row and column.
+    Each matrix is diag(1, ..., 1, 0) - N_d* N_d - Y N - N* Y*, where M has the shape (F, q, q) and
+    m has (F,). t, g and s are the scalings of the step, with N = diag(e^t, 1) M diag(e^-t, e^-s)
+    and Y = diag(j g, e^-s m). N_d has those rows of N that belong to t. If m is None, the part of
+    the loop has no limit, and the matrices lack the last row and column.
     """
     t, g = np.array(step["t"]), np.array(step["g"])
     one = M.shape[-1] - len(t)
@@ -345,8 +346,9 @@ def limit_proof(
 ) -> list[dict[str, Any]] | None:
     """Find the steps that prove a part of the loop for abs(d_i) <= size, or return None.
 
-    The steps are those of `proof_of`, at the radius of the multiplier and from its lowest frequency
-    on. In the part with the limit, each step has a further scaling "s".
+    The steps have the form that `proof_of` describes. The proof is made at the radius of the
+    multiplier and from its lowest frequency on. In the part with the limit, each step has a further
+    scaling "s".
     """
     k, highest = len(part.entries), np.pi / part.period
     whole = Region(np.zeros(k), np.full(k, size), multiplier.slowest, highest)
@@ -403,7 +405,7 @@ def _plain_step(scaling: Scaling) -> dict[str, Any]:
 
 
 def _step(scaling: Scaling, mS: complex, factor: float) -> dict[str, Any]:
-    """Return the scalings t, g and s of a step. s makes Re(m S) 1 in the middle of the box."""
+    """Return the scalings t, g and s of a step. With s, Re(m S) is 1 in the middle of the box."""
     t = scaling.t[:-1] - scaling.t[-1] - np.log(2.0 * factor) / 2.0
     s = np.log(2.0 * max(mS.real, 1e-300)) / 2.0
     return {"t": _rounded(t), "g": _rounded(scaling.g[:-1]), "s": _rounded(np.array([s]))[0]}
@@ -414,8 +416,8 @@ def _interval(
 ) -> tuple[float, float] | None:
     """Find the interval around w, rad/s, in which the inequality of a step holds with MARGIN.
 
-    The inequality is tried at samples of the interval. Returns None if it fails at w itself, or at
-    the next samples on both sides.
+    The inequality is tried at samples of the interval. Returns None if the inequality fails at w
+    itself, or at the next samples on both sides.
     """
     has_limit = "s" in step
     farthest = (

@@ -56,7 +56,7 @@ class Scaling(NamedTuple):
 
 
 def balancing_t(M: ComplexArray, share: FloatArray | None = None) -> FloatArray:
-    """Find the t = log(X) / 2 with which row and column of each factor of X are about equal.
+    """Find t = log(X) / 2 such that the row and the column of each factor of X are about equal.
 
     t has the shape (p,). `share` maps the f factors of X to the p channels, (p, f). Without
     `share`, each channel has a factor of its own. The method is Osborne's iteration.
@@ -114,8 +114,8 @@ def least_bound(
     """Search for the X and G with the least bound of M, (p, p), and return the bound, X and G.
 
     The first `real_count` channels are real. Channels that have the same number in `factors`, (p,),
-    share one factor of X. The search begins at the balanced X, or at `near` if its bound is
-    smaller. `near` has the X and G of a similar matrix.
+    share one factor of X. `near` has the X and G of a similar matrix. The search begins at `near`
+    if the bound there is smaller than at the balanced X, and at the balanced X if not.
 
     If the bound gets below `target`, the search ends with X and G in the middle of the set that
     reaches the target. The method of centres on the linear matrix inequality
@@ -160,8 +160,8 @@ def least_bound_at(
 
     To save time, the search first has only the channels of the means over a period. The channels of
     the second Legendre coefficients get the X that balances their rows and columns. If the bound
-    with this X and G is below 1, or w is low, it is returned. Otherwise a second search has all
-    channels.
+    with this X and G is below 1, or if w is low, this bound is the result. If not, a second search
+    has all channels.
     """
     k = len(part.entries)
     rows = np.r_[0:k, part.uncertain : len(scaled)]
@@ -202,7 +202,10 @@ class Centre(NamedTuple):
         return np.asarray(level * np.diag(self.X) - right)
 
     def bound(self, N: ComplexArray) -> float:
-        """Return the least level for which F > 0 can hold with this X and G: the bound squared."""
+        """Return the least level for which F > 0 can hold with this X and G.
+
+        This level is the bound squared.
+        """
         root = np.sqrt(self.X)
         return -float(np.linalg.eigvalsh(self.inequality(N, 0.0) / root[:, None] / root)[0])
 
@@ -257,7 +260,7 @@ class Centre(NamedTuple):
 
 
 def crossings(part: Channels, scaling: Scaling, scale: FloatArray) -> FloatArray:
-    """Find the frequencies, rad/s, at which the bound of diag(scale) M(z) for X and G can be 1.
+    """Find the frequencies, rad/s, at which the bound of diag(scale) M(z), given X and G, can be 1.
 
     At a z on abs(z) = RADIUS, N* N + j (G N - N* G) has the eigenvalue 1 exactly if z is an
     eigenvalue of a pencil with twice as many states. Source: S. Boyd, V. Balakrishnan, P. Kabamba,

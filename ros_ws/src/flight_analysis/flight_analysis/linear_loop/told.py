@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compare what the controller was told of its aircraft with the aircraft that flies.
 
-The section `controller` of a scenario has the lags and the delay that the controller was told. The
-section `aircraft` has those of the simulated aircraft, and a log shows those that were measured.
-`compare` finds the differences, and the timing of the loop that flies. Margins and guarantees refer
-to this timing. If something acts that no linear loop contains, such as a fault, no guarantee is
-stated.
+The section `controller` of a scenario states lags and a delay, for which the controller was
+designed. The section `aircraft` has the lags and the delay of the simulated aircraft, and a log
+shows the measured ones. `compare` finds the differences, and the timing of the loop that flies.
+Margins and guarantees refer to this timing. If something acts that no linear loop contains, such as
+a fault, no guarantee is stated.
 """
 
 from dataclasses import replace
@@ -98,7 +98,7 @@ class Difference(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """Sentence with the fact, and with its consequence for margins and guarantee."""
+        """Sentence that states the fact, and what it means for the margins and the guarantee."""
         return f"{self.fact}; {MEANING[self.standing]}"
 
 
@@ -126,7 +126,7 @@ class Comparison(NamedTuple):
 
 
 def loop_of(controller: ControllerConfig) -> LoopTiming:
-    """Return the lags, the delay and the period that the controller was told."""
+    """Return the lags, the delay and the period in the parameters of a controller."""
     lag = np.array(controller.lag, dtype=np.float64)
     return LoopTiming(lag, controller.delay, 1.0 / controller.rate)
 
@@ -134,9 +134,9 @@ def loop_of(controller: ControllerConfig) -> LoopTiming:
 def compare(
     scenario: Scenario, controller: ControllerConfig, flight: FlightFacts = PLANNED
 ) -> Comparison:
-    """Compare what a controller was told of lags, delay and effects with the aircraft that flies.
+    """Compare lags, delay and effects in a controller's parameters with the aircraft that flies.
 
-    If the two agree, the timing of the result is that of the controller to the last bit.
+    If the two agree, the timing of the result equals the timing in the parameters to the last bit.
     """
     timing = loop_of(controller)
     differences = [*_of_log(controller, flight)]
@@ -158,8 +158,8 @@ def lag_through(effect: FloatArray, T: FloatArray, lag: FloatArray) -> FloatArra
         lag_i = sum_j effect_ij T_ji lag_j / sum_j effect_ij T_ji,  exact to first order in the lags
 
     `effect` (m, p) is the effect of the p effectors u on the outputs, T has the shape (p, m), and
-    `lag` (p,) has the lags of the effectors, s. If the effectors have no effect on an output, its
-    lag is the longest one.
+    `lag` (p,) has the lags of the effectors, s. If no effector has an effect on output i, lag_i is
+    the longest lag of an effector.
     """
     share = effect * T.T
     total = share.sum(axis=1)
@@ -187,7 +187,8 @@ def _compare_lags(
     """Compare the lags of the actuators, and return the actual lags, (m,), s, and the differences.
 
     A model of JSBSim contains actuators of its own, whose lag is not among the parameters of the
-    scenario. So the controller can be told a longer lag than these parameters, but no shorter one.
+    scenario. So the lag in the controller's parameters can be longer than the lag in the scenario's
+    section `aircraft`, but not shorter.
     """
     lag = np.array(controller.lag, dtype=np.float64)
     flown = flown_lag(scenario.aircraft, controller)
@@ -213,8 +214,7 @@ def _compare_delays(
     In simulation, y waits for the next tick and u for the next step of the aircraft, each up to a
     period of the aircraft. Any controller.delay within this range is accepted. For any other
     controller.delay, the longest delay of the range is assumed. For a user's own aircraft, the
-    delay of its sensors and actuators is unknown, so the delay that the controller was told is
-    accepted.
+    delay of its sensors and actuators is unknown, so controller.delay is accepted.
 
     The law steps with each y. If y comes less often than the ticks, the delay of one and a half
     ticks becomes one and a half periods of y.
@@ -252,7 +252,7 @@ def _is_within(value: float, least: float, most: float) -> bool:
 
 
 def _of_log(controller: ControllerConfig, flight: FlightFacts) -> list[Difference]:
-    """Return the differences between the period and the parameters of the controller and a log."""
+    """Return how the period and the parameters of the controller differ from those in a log."""
     differences = []
     period = 1.0 / controller.rate
     if flight.tick is not None and abs(flight.tick - period) > SAME_PERIOD * period:
@@ -270,7 +270,7 @@ def _of_log(controller: ControllerConfig, flight: FlightFacts) -> list[Differenc
 def _beyond_loop(scenario: Scenario, controller: ControllerConfig) -> list[Difference]:
     """Return the differences in end stops, rate limits and signs, and what no linear loop contains.
 
-    A linear loop cannot contain, for example, the faults of an aircraft.
+    An example of what a linear loop cannot contain is a fault of the aircraft.
     """
     aircraft = scenario.aircraft
     known = IN_LOOP | OUTSIDE_LOOP
@@ -295,8 +295,8 @@ def _beyond_loop(scenario: Scenario, controller: ControllerConfig) -> list[Diffe
 def _other_effect(scenario: Scenario) -> list[str]:
     """Return a sentence for each output whose row in allocation.effect differs from its row in C B.
 
-    Two rows agree if they differ only by a positive factor, because input_scale contains this
-    factor.
+    Rows that differ only by a positive factor are accepted as equal, because input_scale contains
+    this factor.
     """
     controller = scenario.controller
     allocation = controller.allocation

@@ -78,7 +78,10 @@ class Box(NamedTuple):
 
     @property
     def largest_zero(self) -> float:
-        """Largest deviation of entries that are 0 in the airframe file, as a part of their row."""
+        """Largest deviation of entries that are 0 in the airframe file.
+
+        It is a fraction of their `row_sizes`.
+        """
         return float(np.max(self.part[np.isin(self.names, self.zeros)], initial=0.0))
 
 
@@ -224,7 +227,7 @@ def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
     """Return the rows that map the state to the Legendre coefficients of the k signals z.
 
     The coefficients follow from the integrals of z over a period, and from the integrals of these
-    integrals. The rows of `matrix` give the n states first, and then these integrals.
+    integrals. In `matrix`, the rows of the n states come first, and then the rows of the integrals.
     """
     once = matrix[n : n + k]
     twice = matrix[n + k : n + 2 * k]
@@ -240,9 +243,9 @@ def _blocks(D: FloatArray, V: FloatArray) -> FloatArray:
 def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int) -> Channels:
     """Add the channels of a late u to a loop with n states of the aircraft and k entries.
 
-    The loop with w = 0 becomes the loop with e_j = 0. `ramps` is the motion that an input causes
-    which rises over the period. The loop gets further states: first the c states that the rising
-    inputs of earlier ticks need, and then u of earlier ticks.
+    The loop with w = 0 becomes the loop with e_j = 0. `ramps` describes the motion caused by an
+    input that rises linearly over the period. The loop gets further states: first the c states that
+    the rising inputs of earlier ticks need, and then u of earlier ticks.
     """
     E, U, K = exact.W[:, : exact.uncertain], exact.W[:, exact.disks], exact.Z[exact.disks]
     m, q = K.shape
@@ -297,9 +300,8 @@ def sensitivity_slopes(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Compute S and its slopes along d at the frequencies w, rad/s.
 
-    S and its slopes are those of the aircraft with the deviations d, (k,). w has the shape (F,), S
-    has (F, m, m), and the slopes have (F, k, m, m). The loop must have disks in all inputs, and no
-    late u.
+    Both refer to the aircraft with the deviations d, (k,). w has the shape (F,), S has (F, m, m),
+    and the slopes have (F, k, m, m). The loop must have disks in all inputs, and no late u.
     """
     around = loop.at(d)
     p, k = loop.uncertain, len(d)
@@ -354,7 +356,8 @@ def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
 def _reduced(every: Channels, channels: IntArray) -> Channels:
     """Keep some channels, and the states that lie between the w and the z of these channels.
 
-    The other states, which are constants, integrals and states of other parts, are left out.
+    The other states, which are constants, integrals and states of other parts of the loop, are left
+    out.
     """
     part = every.some(channels)
     coupled = np.abs(part.A) > NO_COUPLING

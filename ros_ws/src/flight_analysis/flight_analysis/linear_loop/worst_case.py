@@ -173,9 +173,9 @@ def _climbed(
 ) -> tuple[FloatArray, float]:
     """Climb from corners at a given size to the largest mode near a frequency.
 
-    Returns the corner and abs(z) of this mode. A climb flips one entry at a time as long as abs(z)
-    grows. At first it flips the entry with the steepest slope. From the POLISHED best corners, it
-    then flips the entry that raises abs(z) most.
+    Returns the best corner, and abs(z) of its mode. A climb flips one entry at a time as long as
+    abs(z) grows. At first it flips the entry with the steepest slope. From the POLISHED best
+    corners, it then flips the entry that raises abs(z) most.
     """
     corners = starts.copy()
     radii = _radii(part, size * corners, frequency)
@@ -245,7 +245,7 @@ def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float)
 def _growth(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
     """Compute the slopes d log abs(z) / d d_i of the largest mode near a frequency, (N, k).
 
-    They are evaluated at the deviations d, (N, k), one row for each of N aircraft.
+    The slopes are evaluated at the deviations d, (N, k), one row for each of N aircraft.
     """
     around = part.at(d)
     z, X = np.linalg.eig(around.A)
@@ -268,7 +268,10 @@ WALKED = 6  # largest number of rounds of the walk over the corners
 
 
 class WorstCase(NamedTuple):
-    """The least margins that a search has found in a box. Each can belong to another aircraft."""
+    """The least margins that a search has found in a box.
+
+    Each margin can belong to a different aircraft.
+    """
 
     worst: Margins
     corners: FloatArray  # deviations of all aircraft that were tried, (N, k)
@@ -313,14 +316,14 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box)
 
 
 def _corners(slopes: FloatArray) -> FloatArray:
-    """Return, for each figure, the corner of the box towards which its slopes point downwards."""
+    """Return, for each figure, the corner of the box in whose direction the figure falls."""
     return np.asarray(np.where(slopes > 0.0, -1.0, 1.0))
 
 
 def _figures(margins: Margins) -> FloatArray:
-    """Stack the margins of N aircraft as figures, (N, 4 m + 3). A smaller figure is a worse one.
+    """Arrange the margins of N aircraft as one row of figures each, (N, 4 m + 3).
 
-    The order of the figures is the order of the rows of `_slopes`.
+    A smaller figure is a worse one. The figures have the order of the rows of `_slopes`.
     """
     all_inputs = (1.0 / margins.sensitivity_all, margins.disk_all, margins.damping)
     return np.concatenate(

@@ -58,7 +58,7 @@ def inputs_by_part(
 
     The metrics are rms and max abs(u) about trim, and mean abs(u_dot), which is sum abs(u_k -
     u_(k-1)) / sum (t_k - t_(k-1)) over the steps that end in the part. This mean is NaN if there is
-    no such step. If `topic` is "y", the metrics are those of y.
+    no such step. If `topic` is "y", the metrics are computed from y in place of u.
     """
     if topic not in tape:
         return {}

@@ -21,8 +21,8 @@ MAX_DEVIATION = 0.15
 def known_entries(learned: Signal) -> list[str]:
     """Return the names of the entries of A and B that the flight has identified.
 
-    `learned` has the samples of the topic `learned`. An entry counts as identified if, in a sample,
-    its standard deviation is below MAX_DEVIATION times its value.
+    `learned` has the samples of the topic `learned`. An entry is identified if at least one sample
+    has a standard deviation of the entry below MAX_DEVIATION times its value.
     """
     values = learned.group("value")
     deviations = learned.group("deviation")
@@ -34,9 +34,9 @@ def known_entries(learned: Signal) -> list[str]:
 
 
 def saturation_shares(tape: Tape) -> dict[str, dict[str, float]]:
-    """Return the share of ticks with a saturated input, by input and kind of saturation.
+    """Return the fraction of the ticks in which an input is saturated, by input and kind.
 
-    The kinds are "magnitude" and "rate".
+    The kinds of saturation are "magnitude" and "rate".
     """
     limited = tape["internals"].group("limited") if "internals" in tape else None
     if limited is None or len(limited.stamp_ns) == 0:

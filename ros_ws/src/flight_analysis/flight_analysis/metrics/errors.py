@@ -123,11 +123,11 @@ def _columns(signal: Signal, names: Sequence[str]) -> FloatArray:
 def noise_floor(tape: Tape) -> dict[str, float]:
     """Return the noise floor of y by channel, SI: the error below which the sensors tell nothing.
 
-    A true error can be smaller than the floor. The floor is the rms of "noise.CHANNEL" of the topic
-    `truth` if the tape has it. Otherwise it is estimated for white noise from the second
-    differences d_k = y_(k+1) - 2 y_k + y_(k-1), as rms = median(abs(d)) / (0.6745 sqrt(6)). d has 6
-    times the variance of the noise, and half of a normal distribution lies within 0.6745 rms. The
-    floor is at least the rounding of the largest y.
+    The floor is the rms of "noise.CHANNEL" of the topic `truth` if the tape has this channel. If
+    not, the floor is estimated for white noise from the second differences d_k = y_(k+1) - 2 y_k +
+    y_(k-1), as rms = median(abs(d)) / (0.6745 sqrt(6)). d has 6 times the variance of the noise,
+    and half of a normal distribution lies within 0.6745 rms. The floor is at least the rounding of
+    the largest y. A true error, which only a simulation knows, can be smaller than the floor.
     """
     noise = tape["truth"].group("noise") if "truth" in tape else None
     floor = {}

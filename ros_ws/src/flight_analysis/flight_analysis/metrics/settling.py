@@ -23,8 +23,9 @@ a probability of 97 %, 500 samples of normal noise stay within 4 noise floors.""
 def settling_bands(tape: Tape) -> dict[str, float]:
     """Return the half-width of the settling band by channel, SI: SETTLING_BAND max abs(y_m).
 
-    If y_m is zero, max abs(e) replaces max abs(y_m). The half-width for a measured error is at
-    least MIN_BAND_NOISE_FLOORS noise floors, because noise alone would leave a narrower band.
+    If y_m is zero throughout, max abs(e) replaces max abs(y_m). If the error is a measured one, the
+    half-width is at least MIN_BAND_NOISE_FLOORS noise floors, because noise alone would leave a
+    narrower band.
     """
     kind, error = best_error(tape)
     floors = noise_floor(tape) if kind == MEASURED_ERROR else {}
@@ -46,9 +47,9 @@ def settling_time(
 ) -> float | None:
     """Return the time, s, after which abs(e) stays in the band for `dwell` s or until the end.
 
-    The time counts from t[0], and t and e have the shape (N,). `leaves` is the time, s, within
+    The time is measured from t[0], and t and e have the shape (N,). `leaves` is the time, s, within
     which a transient moves e out of the band. If abs(e) stays in the band for this time, the result
-    is 0, even if it leaves the band later. The result is None if abs(e) does not return to the
+    is 0, even if abs(e) leaves the band later. The result is None if abs(e) does not return to the
     band, or if there is no sample.
     """
     if len(t) == 0:
@@ -74,8 +75,8 @@ class Settling(NamedTuple):
 def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling]:
     """Return, for each transient, how long `best_error` takes to settle in the `settling_bands`.
 
-    The time counts from the start of the transient. Only samples before the next transient that
-    excites the channel count. Transients after the end of the flight are left out. Turns and
+    The time is measured from the start of the transient. Samples are used up to the next transient
+    that excites the same channel. Transients after the end of the flight are left out. Turns and
     captures are also left out, because their commands change until they end.
     """
     _, error = best_error(tape)

@@ -51,9 +51,9 @@ def in_spans(
 def sample_times(stamp_ns: NDArray[np.int64]) -> FloatArray:
     """Return the length of time that each sample represents, (N,), s.
 
-    It is half the sum of the intervals to both neighbours, where an interval counts as at most
-    LONGEST_INTERVAL. The first and the last sample represent a whole interval, so that equal
-    intervals give equal times.
+    It is half the sum of the intervals to both neighbours. An interval longer than LONGEST_INTERVAL
+    is replaced by LONGEST_INTERVAL. The first and the last sample represent a whole interval, so
+    that equal intervals give equal times.
     """
     if len(stamp_ns) < 2:
         return np.ones(len(stamp_ns))

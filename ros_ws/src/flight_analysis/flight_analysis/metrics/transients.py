@@ -52,7 +52,7 @@ GUIDED = (TransientKind.CAPTURE, TransientKind.TURN)
 
 @dataclass(frozen=True, kw_only=True)
 class Transient:
-    """A disturbance in a flight.
+    """A disturbance in a flight: an engagement, a command, a gust, a turn or a capture.
 
     `start` and `stop` are its first and its last instant, in s of flight time.
     """
@@ -117,7 +117,8 @@ def guided_transients(tape: Tape) -> list[Transient]:
 
     In a turn, guidance commands more bank than TURN_BANK. In a capture, it climbs, descends,
     returns to its path or changes speed. `u_m` changes all the time in a guided flight, so it shows
-    no transients. Transients of the same kind that are less than SETTLING_DWELL apart count as one.
+    no transients. Transients of the same kind that are less than SETTLING_DWELL apart are joined to
+    one.
     """
     if "guidance" not in tape:
         return []
@@ -148,10 +149,11 @@ def part_masks(
 ) -> dict[str, NDArray[np.bool_]]:
     """Return a mask of the instants t, (N,), for each part of the flight.
 
-    The parts are "whole", `air`, "command" and "gust". In a guided flight, "capture" and "turn"
-    replace "command". Every instant is in "whole", and in at most one more part. During a transient
-    this is the part of the transient, or the last one in the order above if transients overlap. An
-    instant with only an engagement is in no other part, and one without any transient is in `air`.
+    The parts are "whole", the part named by `air`, "command" and "gust". In a guided flight,
+    "capture" and "turn" replace "command". Every instant is in "whole", and in at most one more
+    part. During a transient this is the part of the transient. If transients overlap, it is the one
+    whose part comes last in the order above. An instant with only an engagement is in no other
+    part. An instant without any transient is in the part `air`.
     """
     kinds = {transient.kind for transient in transients}
     commands = (TransientKind.COMMAND,) if kinds.isdisjoint(GUIDED) else GUIDED

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find what the log of a flight holds and what it lacks.
 
-This includes the processes of the flight, its commands, and the legs of its route.
+An account also names the processes of the flight, its commands, and the legs of its route.
 """
 
 import math
@@ -37,7 +37,7 @@ STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight inte
 
 
 class ProcessAccount(NamedTuple):
-    """When a process of the flight began and what it sent.
+    """When a process of the flight began, and when it sent its messages.
 
     The times are flight times in s. A time is None if it is unknown, or if the process sent
     nothing.
@@ -51,7 +51,7 @@ class ProcessAccount(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Commands:
-    """How many commands a flight had. The legs of a route do not count."""
+    """Numbers of commands in a flight. The legs of a route are not included."""
 
     given: int  # edges of the scenario's commands and of u_m
     flown: int  # edges that began before the end of the flight
@@ -81,9 +81,9 @@ class Account(NamedTuple):
         return Starvation(self.starved)
 
     def over(self, *topics: str) -> str:
-        """Say how much of each of these topics the log has, as in "over 49 % of truth".
+        """Say how much of each of the given topics the log has, as in "over 49 % of truth".
 
-        Topics that the log has in full are left out. Returns "" if it has all of them in full.
+        Topics that the log has in full are left out. Returns "" if the log has all of them in full.
         """
         accounts = {name: self.topics[name] for name in topics if name in self.topics}
         parts = [
@@ -121,8 +121,8 @@ def best_error_over(tape: Tape) -> tuple[str, Signal]:
 
     Returns:
         "true error" or "measured error", and e = y - y_m, shape (N, m), SI. If the log lacks
-        samples, the name also says what part of the flight is left, as in "true error, over 49 %
-        of truth".
+        samples, the name also says how much of the flight the log has, as in "true error, over
+        49 % of truth".
 
     Raises:
         ParameterError: `tape` is no Tape, or has no y and y_m.
@@ -153,9 +153,9 @@ def account(
 ) -> Account:
     """Find what the log of a flight holds, and what it lacks.
 
-    If the log has both t = 0 and the planned end, the account covers the time between them.
-    Otherwise each topic counts from its first sample to the last sample of any topic. `simulated`
-    is False if an autopilot flew an aircraft other than that of the scenario.
+    If the log has both t = 0 and the planned end, the account covers the time between them. If not,
+    it covers, for each topic, the time from the first sample of the topic to the last sample of any
+    topic. `simulated` is False if an autopilot flew an aircraft other than that of the scenario.
     """
     planned_ns = planned_end_ns(tape)
     span = _span(tape, planned_ns, outcome, simulated=simulated)
@@ -203,9 +203,9 @@ def account(
 def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bool) -> Span:
     """Return the time over which the samples of the flight are counted.
 
-    If the flight was simulated and its planned end is known, this time begins at t = 0. Otherwise
-    it begins, for each topic, at the first sample of the topic. A flight that begins at t = 0, and
-    did not end early, is counted up to the planned end. Any other flight is counted up to its last
+    If the flight was simulated and its planned end is known, this time begins at t = 0. If not, it
+    begins, for each topic, at the first sample of the topic. A flight that begins at t = 0, and did
+    not end early, is counted up to the planned end. Any other flight is counted up to its last
     sample.
     """
     lasts = [
@@ -221,7 +221,7 @@ def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bo
 
 
 def _processes(tape: Tape) -> dict[str, ProcessAccount]:
-    """Return when each process of a flight began and what it sent, by name.
+    """Return when each process of a flight began and sent its messages, by name of the process.
 
     In lockstep the stamps are no times of day, so it is unknown when a process was ready. A process
     is left out if nothing is known of it, such as a recorder in lockstep.
@@ -267,9 +267,9 @@ def _late_first_u(
 ) -> float | None:
     """Return the time of the first u, s, if it is more than SILENCE after the first possible y.
 
-    Returns None if u came in time. If the log begins later than u, the time of the first u follows
-    from the number of the first tick in the log. If a user activates the controller, the result is
-    always None.
+    Returns None if u came in time. If the log begins after the first u, the time of the first u
+    follows from the number of the first tick in the log. If a user activates the controller, the
+    result is always None.
     """
     if scenario is None or not (scenario.controller.autostart and scenario.controller.start_active):
         return None
@@ -288,9 +288,9 @@ def _late_first_u(
 def _lack(
     name: str, topic: TopicAccount, end: float, leeway: Leeway, *, late_u: bool
 ) -> str | None:
-    """Say what a topic lacks, as the object of "the log lacks", or return None if it is complete.
+    """Say what the log lacks of a topic, or return None if the topic is complete.
 
-    `late_u` is True if the first u of the flight was late.
+    The text continues "the log lacks ...". `late_u` is True if the first u of the flight was late.
     """
     facts = []
     missing = not topic.holds(topic.found + topic.unsent) or (
@@ -356,7 +356,7 @@ def _is_of_host(
 
 
 def account_of_json(summary: Mapping[str, Any]) -> Account | None:
-    """Return the account that is stored in a summary, or None if the summary has none."""
+    """Return the account of a flight that its summary holds, or None if it holds none."""
     content = summary.get("account")
     if content is None:
         return None

@@ -131,7 +131,7 @@ def _guarantee_card(guarantee: Guarantee | None, command: str) -> Card:
 
 
 def _changed_card(flown: FlownLoops) -> Card:
-    """Return the card for a flight with several linear loops: how many of them are stable."""
+    """Return the card for a flight with several linear loops: how many of the loops are stable."""
     is_stable = [bool(each.margins.nominal.stable) for each in flown.loops]
     count = len(flown.loops)
     sentence = (
@@ -152,7 +152,7 @@ def _changed_card(flown: FlownLoops) -> Card:
 def _learned_card(flight: RecordedFlight) -> Card:
     """Return the card about the models, A and B, that were learned in flight.
 
-    It says how many of them flew, and how the error changed.
+    The card says how many of these models flew, and how the error changed.
     """
     spans = flight.summary["models"]
     learned = learned_spans(flight)

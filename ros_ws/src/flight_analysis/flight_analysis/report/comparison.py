@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compare several flights, whose channels are matched by name.
 
-The result has the ratio of each metric to that of the first flight, and the conditions that differ.
+The result has each metric as a ratio to the same metric of the first flight, and the conditions
+that differ between the flights.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +35,10 @@ EQUAL_RATIO_TOLERANCE = 0.05  # metrics count as equal if their ratio differs fr
 
 
 class ComparisonRow(NamedTuple):
-    """A metric of every flight, and its ratio to the metric of the first flight, if it has one."""
+    """One metric of every flight, and its ratio to the metric of the first flight.
+
+    The ratio is None if it cannot be computed.
+    """
 
     name: str
     texts: tuple[str, ...]
@@ -46,8 +50,8 @@ class ComparisonRow(NamedTuple):
     def verdict(self, flight: int) -> str:
         """Compare a flight with the first one: "better", "worse" or "same".
 
-        The result is also "same" if no judgement is possible: if the flight had other conditions,
-        or if a smaller value of this metric is not better.
+        The result is also "same" if no judgement is possible. This is so if the flight had other
+        conditions than the first, or if a smaller value of the metric is not better.
         """
         ratio = self.ratios[flight]
         if self.alike and not self.alike[flight]:
@@ -111,7 +115,10 @@ def _parameters(flight: RecordedFlight) -> dict[str, str]:
 
 
 def _shortened(texts: Sequence[str]) -> tuple[str, ...]:
-    """Replace each long list of numbers by its count, and add ", others" to one that differs."""
+    """Replace each long list of numbers by the number of its values, as in "12 values".
+
+    If two lists differ but have the same number of values, ", others" is added to the later one.
+    """
     counts = [f"{text.count(',') + 1} values" if len(text) > LONG else text for text in texts]
     return tuple(
         f"{count}, others" if texts.index(text) and count in counts[: texts.index(text)] else count
@@ -136,7 +143,7 @@ def has_same_conditions(
 ) -> tuple[bool, ...]:
     """Return whether each flight had the conditions of the first, except for the controller.
 
-    If `timed` is True, it must also have had the same pace, such as real time.
+    If `timed` is True, the flight must also have had the same pace as the first, such as real time.
     """
     rows = [
         row

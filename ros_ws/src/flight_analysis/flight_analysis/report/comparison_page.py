@@ -27,8 +27,8 @@ from flight_analysis.report.tables import TIMES, MetricTable
 def comparison_page(flights: Sequence[RecordedFlight], tolerances: Mapping[str, float]) -> Page:
     """Return the page of several flights, each with its own colour and compared with the first one.
 
-    If one of them is an imported log, without a scenario, the page only draws signals of the same
-    name over each other. `tolerances` has the allowed difference of each channel, SI.
+    If one of the flights is an imported log, without a scenario, the page only draws signals of the
+    same name over each other. `tolerances` has the allowed difference of each channel, SI.
     """
     context = figures.plot_context(flights)
     colours = {label: run.colour for label, run in context.runs.items()}
@@ -97,7 +97,7 @@ def _common_trim(scenarios: Sequence[Scenario]) -> dict[str, str]:
 
 
 def _tracks(flights: Sequence[RecordedFlight], colours: Mapping[str, str]) -> list[Section]:
-    """Return the ground tracks of the guided flights, over the routes of the first of them.
+    """Return the ground tracks of the guided flights, over the routes of the first guided flight.
 
     The list is empty if no flight is guided.
     """

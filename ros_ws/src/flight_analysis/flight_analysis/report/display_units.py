@@ -112,7 +112,7 @@ def unlike_numbers(first: float, second: float) -> tuple[str, str]:
 def aligned_numbers(first: float, second: float) -> tuple[str, str]:
     """Return two numbers as texts with the same number of decimals.
 
-    The smaller number has two digits, or up to 6 if two digits do not tell the numbers apart.
+    The smaller number has two significant digits, or up to 6 if the texts would be equal with two.
 
     Examples:
         >>> aligned_numbers(1.0, 3.21), aligned_numbers(0.3012, 0.3021), aligned_numbers(9.0, 123.4)

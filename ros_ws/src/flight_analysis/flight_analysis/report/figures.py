@@ -141,8 +141,8 @@ def _curves(
 ) -> dict[str, Curve]:
     """Return a curve for each flight that has a signal. `signal` takes this signal from a tape.
 
-    The curve of a single flight is called `name`. The curves of several flights have the labels of
-    the flights.
+    If there is only one flight, its curve is called `name`. If there are several, their curves have
+    the labels of the flights.
     """
     curves = {}
     for label, run in context.runs.items():
@@ -177,7 +177,7 @@ def _references(context: PlotContext) -> dict[str, Curve]:
 def _is_same_curve(first: Curve, second: Curve) -> bool:
     """Return whether two curves of y_m are equal over the time that they share.
 
-    They may differ by the fraction SAME_CURVE_TOLERANCE of the largest value.
+    A difference of up to the fraction SAME_CURVE_TOLERANCE of the largest value is allowed.
     """
     one, two = first.signal, second.signal
     if set(one.names) != set(two.names) or not (len(one.stamp_ns) and len(two.stamp_ns)):
@@ -215,8 +215,9 @@ def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None
     """Draw e = y - y_m of every output.
 
     For one simulated flight with errors of the sensors, the true error is drawn over the measured
-    one. For several flights, only the most accurate error of each is drawn. `floors` has the noise
-    floors by channel, SI. They are lines above and below 0 if they are wide enough to see.
+    one. For several flights, only the most accurate error of each flight is drawn. `floors` has the
+    noise floors by channel, SI. Each floor is drawn as two lines, above and below 0, if it is wide
+    enough to see.
     """
     if context.is_comparison:
         errors = _curves(context, "e", lambda tape: best_error(tape)[1])
@@ -388,7 +389,10 @@ def spectrum_figure(context: PlotContext) -> Figure | None:
 
 
 def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
-    """Return samples of the controller's timing, ms, by quantity, without those that are 0."""
+    """Return samples of the controller's timing, ms, by quantity.
+
+    Quantities that are 0 throughout are left out.
+    """
     samples: dict[str, FloatArray] = {}
     if "internals" in tape:
         periods = tick_periods(tape)
@@ -409,7 +413,8 @@ def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
 def timing_figure(context: PlotContext) -> Figure | None:
     """Draw histograms of the controller's timing, ms, or return None if all times are 0.
 
-    Each quantity has a subplot, in which the flights share their bins. The counts are logarithmic.
+    Each quantity has a subplot, in which the flights share their bins. The axis with the number of
+    ticks in a bin is logarithmic.
     """
     runs = context.runs
     timing = {label: _timing_samples(run.tape, run.period_ns) for label, run in runs.items()}
@@ -455,7 +460,7 @@ def wind_figure(context: PlotContext) -> Figure | None:
 def state_figure(
     context: PlotContext, units: Mapping[str, DisplayUnit], labels: Mapping[str, str]
 ) -> Figure | None:
-    """Draw the states of a simulated aircraft, beginning with those that are outputs.
+    """Draw the states of a simulated aircraft, beginning with the states that are outputs.
 
     `units` has the unit of each state. `labels` has axis labels that replace the names of channels.
     Returns None if the tape has no states.
@@ -469,7 +474,7 @@ def state_figure(
 
 
 def sensor_figure(context: PlotContext) -> Figure | None:
-    """Draw the error of every sensor that has one: y less the true output."""
+    """Draw the error of every sensor that has an error: y less the true output."""
     noise = _nonzero_group(context.tape, "noise")
     if noise.names:
         return time_series_figure(
@@ -499,7 +504,7 @@ def tick_figure(context: PlotContext) -> Figure | None:
 
 
 def _truth_group(tape: Tape, group: str) -> Signal:
-    """Return the channels "group.NAME" of the topic `truth`, or none if the tape lacks it."""
+    """Return the channels "group.NAME" of the topic `truth`, or no channels without this topic."""
     if "truth" in tape:
         return tape["truth"].group(group)
     return Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))

@@ -154,8 +154,8 @@ def verdict_of(flight: RecordedFlight, scenario: Scenario) -> Verdict:
 def _next_step(outcome: Mapping[str, Any], scenario: Scenario, name: str, otherwise: Step) -> Step:
     """Return the step that the user should try after a flight that falls short.
 
-    It is chosen by the gravest shortfall. `name` is the argument that stands for the scenario in
-    commands. The result is `otherwise` if no step is known for this shortfall.
+    The step is chosen by the gravest shortfall. `name` is the argument that stands for the scenario
+    in commands. If no step is known for this shortfall, the result is the argument `otherwise`.
     """
     order = list(Aim)
     aims = sorted((Aim(each["aim"]) for each in outcome["shortfalls"]), key=order.index)
@@ -202,7 +202,8 @@ def _models_text(flight: RecordedFlight) -> str:
 def learned_spans(flight: RecordedFlight) -> list[Mapping[str, Any]]:
     """Return the spans of time in which the law flew with a model that was learned in flight.
 
-    The spans before the first learned model, or with the model of the airframe file, are left out.
+    Spans before the first learned model are left out, and spans with the model of the airframe
+    file.
     """
     _, *later = flight.summary["models"]
     return [span for span in later if span["name"] != FILE_MODEL]
@@ -221,8 +222,8 @@ def _injected(scenario: Scenario) -> str:
 def scenario_argument(flight: RecordedFlight, scenario: Scenario) -> str:
     """Return the command argument that names the scenario of a flight, to fly it again.
 
-    If the flight had the parameters of a shipped scenario, this is the scenario's name. Otherwise
-    it is the file in the folder of the run that has the parameters of the flight.
+    If the flight had the parameters of a shipped scenario, the argument is the scenario's name. If
+    not, it is the file in the folder of the run that has the parameters of the flight.
     """
     if scenario.name in scenarios():
         shipped = find_scenario(scenario.name)

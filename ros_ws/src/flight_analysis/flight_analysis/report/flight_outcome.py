@@ -22,11 +22,11 @@ def has_ticks(tape: Tape) -> bool:
 def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcome:
     """Return the outcome of a flight, found from its signals.
 
-    This is for a log without an outcome, for example if the nodes were started singly. The flight
-    is completed if y, y_m and u last for its whole duration. The duration comes from the log or, if
-    the log lacks it, from the scenario. If the log has only a part of the flight, the outcome is
-    UNKNOWN. If the flight is not simulated, u does not count, because an autopilot may disengage
-    the controller before the end.
+    This function is for a log without an outcome, for example if the nodes were started singly. The
+    flight is completed if y, y_m and u last for its whole duration. The duration comes from the log
+    or, if the log lacks it, from the scenario. If the log has only a part of the flight, the
+    outcome is UNKNOWN. If the flight is not simulated, u need not last, because an autopilot may
+    disengage the controller before the end.
     """
     is_part = bool(tape.lost_parts) or any(
         recording.step_ns for recording in tape.recording.values()
@@ -48,9 +48,11 @@ def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcom
 def until_last_tick(tape: Tape) -> Tape:
     """Cut the tape after the controller's last tick.
 
-    Later samples belong to the shutdown of the processes. If u ends more than LATE_TICK_NS earlier
-    than planned, and y or y_m goes on, the log has a gap. In this case the tape is cut only at the
-    planned end. Otherwise, if both y and y_m go on for more than SILENCE, nothing is cut.
+    Later samples belong to the shutdown of the processes. There are two exceptions:
+
+    - If u ends more than LATE_TICK_NS earlier than planned, and y or y_m goes on, the log has a
+      gap. The tape is then cut at the planned end.
+    - If u does not end so early, but both y and y_m go on for more than SILENCE, nothing is cut.
     """
     ticks = [
         int(tape[name].stamp_ns[-1]) for name in TICKS if name in tape and len(tape[name].stamp_ns)

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find which parameters the controller had during a flight, and build their linear loops.
+"""Find which parameters the controller had during a flight, and build the loops that flew.
 
-Each loop is around the aircraft of the airframe file, or around the true aircraft of a simulation.
+Each linear loop is built around the aircraft of the airframe file, or around the true aircraft of a
+simulation.
 """
 
 import re
@@ -78,8 +79,8 @@ def flown_controllers(
 ) -> tuple[FlownController, ...]:
     """Return the controller's parameters that flew, in order, and when each of them flew.
 
-    `start` has the parameters of the start, and `changes` has the changes in flight. The digest of
-    the parameters in each tick shows when they flew.
+    `start` has the parameters with which the flight started, and `changes` has the changes in
+    flight. The digest of the parameters in each tick shows when each set flew.
     """
     by_digest = {start.digest(): start}
     latest = start
@@ -97,7 +98,7 @@ def flown_controllers(
 
 
 class FlownLoops(NamedTuple):
-    """The linear loops of a flight, and in what the controller was told wrong values."""
+    """The linear loops of a flight, and how its aircraft differs from the controller's data."""
 
     loops: list[FlownLoop]  # empty without a linear model, or if it is unknown what flew
     sentences: tuple[str, ...]  # how the aircraft differs from what the controller was told
@@ -117,9 +118,9 @@ def flown_loops(
 ) -> FlownLoops:
     """Return the linear loops of a flight, one for each set of parameters that flew.
 
-    They have the lags and the delay of the aircraft that flew. If the true aircraft of a simulation
-    differs from its file, there is a second loop around it. `later` has the parameters of the
-    aircraft after each change in flight.
+    The loops have the lags and the delay of the aircraft that flew. If the true aircraft of a
+    simulation differs from its airframe file, each set has a second loop, around the true aircraft.
+    `later` has the parameters of the aircraft after each change in flight.
     """
     loops = []
     sentences: list[str] = []
@@ -164,7 +165,7 @@ def facts_of(
 
 
 def _period_of_ticks(tape: Tape) -> float | None:
-    """Return the median time between two ticks, s, or None if the log has fewer than two."""
+    """Return the median time between two ticks, s, or None if the log has fewer than two ticks."""
     if "internals" not in tape or "number" not in tape["internals"].names:
         return None
     steps = np.diff(tape["internals"]["number"])
@@ -184,7 +185,8 @@ def _period_of(tape: Tape, topic: str) -> float | None:
 def true_airframe(tape: Tape, scenario: Scenario) -> Airframe | None:
     """Return the airframe that was simulated, before any drift, if it differs from the file.
 
-    Returns None if it does not differ, or if no airframe file was simulated.
+    Returns None if the simulated airframe does not differ from the file, or if no airframe file was
+    simulated.
     """
     aircraft = scenario.aircraft
     uncertainty = aircraft.uncertainty

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Check that the y_m of a flight is the one that its scenario commands.
+"""Check that the y_m of a flight is the y_m that its scenario commands.
 
 The error e = y - y_m does not show that the reference model hangs or flies other commands, because
 y follows any y_m. Therefore this module computes y_m again, by the code of the node. Until the
@@ -8,11 +8,11 @@ first u_m of the log it takes the commands of the scenario, and from then on the
 
     x_m+ = Phi x_m + Gamma [u_m(t), u_m(t + T/2), u_m(t + T)],  y_m = C x_m      (2)
 
-Every bit must be equal, except for ROUNDING. In real time the log does not show before which step a
-u_m arrived. The computation finds the step, within the age limit of u_m, from which on y_m has the
-right bits. If several steps give the right bits, it follows all of them until they differ from the
-log. If the log lost a y_m or a u_m, the check only finds an error above HARMLESS times the least
-rms error that counts as a divergence (LEAST, LEAST_RATE).
+Every bit must be equal, except for ROUNDING. If the flight was in real time, the log does not show
+before which step a u_m arrived. The computation finds the step, within the age limit of u_m, from
+which on y_m has the right bits. If several steps give the right bits, it follows all of them until
+they differ from the log. If the log lost a y_m or a u_m, the check only finds an error above
+HARMLESS times the least rms error that is judged as a divergence (LEAST, LEAST_RATE).
 """
 
 import copy
@@ -75,7 +75,7 @@ class ReferenceErrors(NamedTuple):
 
 
 class _Command(NamedTuple):
-    """A u_m of the log, with its time and the attitude that it commands."""
+    """A message u_m of the log, with its time and the attitude that it commands."""
 
     t_ns: int  # flight time of its stamp
     u_m: FloatArray
@@ -83,7 +83,7 @@ class _Command(NamedTuple):
 
 
 class _History(NamedTuple):
-    """A hypothesis on how many u_m of the log have arrived at the reference model so far."""
+    """A hypothesis on how many messages u_m have arrived at the reference model so far."""
 
     reference: Reference
     taken: int  # number of u_m, in order, that have been taken or are too old
@@ -92,7 +92,7 @@ class _History(NamedTuple):
 def reference_errors(tape: Tape, scenario: Scenario) -> ReferenceErrors | NotCompared:
     """Compute y_m again, and return how far the y_m of the log is from it.
 
-    Returns a NotCompared if they cannot be compared.
+    Returns a NotCompared if the two cannot be compared.
     """
     if (reason := _reason_in_signal(tape, scenario)) is not None:
         return reason
@@ -117,9 +117,9 @@ def reference_errors(tape: Tape, scenario: Scenario) -> ReferenceErrors | NotCom
 
 
 def reference_shortfalls(tape: Tape, scenario: Scenario) -> list[Shortfall]:
-    """Return a shortfall if y_m is not the one that the scenario commands, else [].
+    """Return a shortfall if the y_m of the log is not the y_m of the scenario, else [].
 
-    It names the channel of y_m that is farthest off.
+    The shortfall names the channel of y_m that is farthest off.
     """
     errors = reference_errors(tape, scenario)
     if not isinstance(errors, ReferenceErrors):
@@ -147,8 +147,8 @@ def reference_shortfalls(tape: Tape, scenario: Scenario) -> list[Shortfall]:
 def reason_not_compared(tape: Tape, scenario: Scenario) -> NotCompared | None:
     """Return why y_m cannot be compared with the scenario, or None if it can.
 
-    The answer usually follows from the log. Only if the log does not tell when t = 0 was, y_m is
-    computed to find it out.
+    The reason usually follows from the log alone. But if the log does not tell when t = 0 was, y_m
+    has to be computed to find this instant.
     """
     reason = _reason_in_signal(tape, scenario)
     if reason is not None or _has_known_start(tape):
@@ -169,7 +169,10 @@ def _reason_in_signal(tape: Tape, scenario: Scenario) -> NotCompared | None:
 
 
 def _is_whole(tape: Tape) -> bool:
-    """Return whether the log shows which u_m acted. In real time, a lost message hides it."""
+    """Return whether the log shows which u_m acted at each step.
+
+    If the flight was in real time, a lost message hides this.
+    """
     if "u_m" not in tape or tape.start_ns < SINCE_EPOCH_NS:
         return True
     return all(name in tape.recording and tape.recording[name].lost == 0 for name in ("y_m", "u_m"))
@@ -207,9 +210,10 @@ def _explained(
 ) -> FloatArray:
     """Return the y_m that best explains the log, at the instants t_ns, (N, m).
 
-    The result is y_m of the reference model with `commands`. In a flight in one process each u_m
-    acts at once. One history (order of arrival of the u_m) then gives every bit of `y_m`, the y_m
-    of the log. Only if it does not, many histories are searched.
+    The result is the y_m of the reference model with `commands`. `y_m` is the y_m of the log. A
+    history says in which order the u_m arrived. At first only one history is tried. It gives every
+    bit of a flight in one process, where each u_m acts at once. If it does not give every bit, many
+    histories are searched.
     """
     expected = _computed(parameters, t_ns, y_m, commands, most=1)
     if (expected != y_m).any():
@@ -227,8 +231,8 @@ def _computed(
 ) -> FloatArray:
     """Return y_m of the reference model at the instants t_ns, (N, m), by at most `most` histories.
 
-    A history says which u_m had arrived before which sample. `y_m` is the y_m of the log, (N, m).
-    It only serves to choose the histories that give the right bits.
+    A history says which u_m had arrived before which sample. The argument `y_m` is the y_m of the
+    log, (N, m). It only serves to choose the histories that give the right bits.
     """
     histories = [_History(Reference(parameters), 0)]
     max_age_ns = nanoseconds(parameters.live.max_age)
@@ -293,6 +297,6 @@ def _distinct(histories: Sequence[_History]) -> list[_History]:
 
 
 def _take(reference: Reference, command: _Command) -> None:
-    """Give a u_m to the reference model, which may refuse it, as the node does."""
+    """Pass a u_m to the reference model. As in the node, the model may refuse it."""
     with suppress(ChannelError):
         reference.take(command.t_ns, command.u_m, command.attitude)

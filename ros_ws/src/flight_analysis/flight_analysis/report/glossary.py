@@ -97,7 +97,7 @@ GLOSSARY = MappingProxyType(
 
 
 def words_in(texts: Iterable[str]) -> tuple[str, ...]:
-    """Return those of the texts that the glossary explains, without repetition."""
+    """Return which of the texts are words that the glossary explains, without repetition."""
     return tuple(dict.fromkeys(text for text in texts if text in GLOSSARY))
 
 

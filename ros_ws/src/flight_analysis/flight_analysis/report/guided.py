@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute the metrics of a guided flight.
 
-A flight is split into segments, in which guidance keeps its modes and commands. The metrics of a
-segment are the errors of the quantities that guidance held, such as altitude and course.
+A flight is split into segments. Within a segment, guidance keeps its modes and commands. The
+metrics of a segment are the errors of the quantities that guidance held, such as altitude and
+course.
 """
 
 import math
@@ -157,7 +158,7 @@ def segments(tape: Tape) -> list[Segment]:
 def flown_legs(tape: Tape) -> list[FlownLeg]:
     """Return the legs of routes that guidance flew, in order, each with its result.
 
-    They are found in the topic `guidance`.
+    The topic `guidance` shows the legs and their results.
     """
     t = tape.time("guidance")
     log = tape["guidance"]
@@ -190,10 +191,10 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
 def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
     """Return the numbers of the legs of the route that are not flown yet when the flight ends.
 
-    The leg under way counts as not flown. The last leg of a route is left out, because it is an
-    orbit without an end. The result is empty if a command replaced the route, or if the route is
-    not in the log. If the fence, a lost pose or a lost link ended the route, its remaining legs
-    count as not flown.
+    The leg under way is not flown yet. The last leg of a route is left out, because it is an orbit
+    without an end. The result is empty if a command replaced the route, or if the route is not in
+    the log. If the fence, a lost pose or a lost link ended the route, the result has its remaining
+    legs.
     """
     log = tape["guidance"]
     on_route = np.flatnonzero(log["mode.lateral"] == Lateral.ROUTE)
@@ -214,7 +215,7 @@ def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
 def orbit_missed_by(tape: Tape, section: GuidanceConfig) -> float:
     """Return how far the aircraft is from the circle of the last orbit when the flight ends, m.
 
-    The result is 0 if this distance is so small that a leg would count as flown. It is also 0 if
+    The result is 0 if the distance is so small that a leg would be taken as flown. It is also 0 if
     the flight does not end on the last orbit of a route.
     """
     log = tape["guidance"]
@@ -299,8 +300,8 @@ class Outside(NamedTuple):
 def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
     """Return how long and how far the aircraft was outside the fence while guidance flew.
 
-    The time counts from the first step of guidance on. Returns None if there is no fence, or no
-    pose from this step on.
+    The time from the first step of guidance on is examined. Returns None if there is no fence, or
+    no pose from this step on.
     """
     fence = None if section is None else section.fence_zones()
     pose = _guided_pose(tape)
@@ -312,8 +313,8 @@ def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
 def altitude_excess(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
     """Return how long and how far the aircraft was above its ceiling or below its altitude floor.
 
-    The time counts from the first step of guidance on. Returns None if there are no such limits, or
-    no pose from this step on.
+    The time from the first step of guidance on is examined. Returns None if there are no such
+    limits, or no pose from this step on.
     """
     pose = _guided_pose(tape)
     if section is None or (section.ceiling is None and section.altitude_floor is None):
@@ -348,7 +349,7 @@ def _outside(tape: Tape, pose: Signal, inside: FloatArray) -> Outside:
 
 
 def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[str, Any]:
-    """Return what a map shows of a mission, ready for JSON, with lengths in m.
+    """Return what a map shows of a mission, as a dict that JSON can hold, with lengths in m.
 
     `route` has the points of the line of all routes, and `legs` has [number, north, east] for each
     leg. `to_end` has, for each leg of the last route, the length of the path from the end of this

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draw the figures of a guided flight.
 
-They are the ground track, altitude, airspeed and attitude with their commands, and the cross-track
-error.
+The figures show the ground track, the altitude, airspeed and attitude with their commands, and the
+cross-track error.
 """
 
 import math
@@ -119,13 +119,13 @@ def track_figure(
 def _add_mark(
     figure: Figure, name: str, east: float, north: float, colour: str, symbol: str
 ) -> None:
-    """Mark a position. Its name stands in the legend, so that it covers no number of a leg."""
+    """Mark a position. Its name stands in the legend, where it covers no number of a leg."""
     mark = {"color": colour, "size": 9, "symbol": symbol}
     figure.add_scatter(name, [east], [north], mode="markers", marker=mark, hoverinfo="skip")
 
 
 def _add_numbers(figure: Figure, route: Route) -> None:
-    """Write the numbers of the legs. Call this last, so that they lie over the wind arrows."""
+    """Write the numbers of the legs. Call this last, so that the wind arrows lie below them."""
     for number, (north, east) in enumerate(leg_places(route)):
         place = {"x": east, "y": north, "text": f"{number}", "showarrow": False}
         box = {"bgcolor": PAPER, "bordercolor": REFERENCE, "borderwidth": 1.5, "borderpad": 2}
@@ -176,8 +176,9 @@ def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
     """Return the mean wind, north and east, in each of equal parts of the flight, m/s, (parts, 2).
 
     The wind is the velocity over ground less the velocity through the air. The velocity through the
-    air has the size (V0 + V) cos(gamma), with V of y, and the direction psi + beta. `speed` is the
-    trim speed V0, m/s. For a multicopter, the log has the wind.
+    air has the size (V0 + V) cos(gamma), where V comes from y, and the direction psi + beta.
+    `speed` is the trim speed V0, m/s. If the aircraft is a multicopter, the wind comes from the
+    log.
     """
     log = tape["guidance"]
     pose = log.group("pose")

@@ -99,7 +99,7 @@ def _write(path: Path, page: Page) -> None:
 def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
     """Write the page of a linear loop, with its margins, Bode and Nyquist plots.
 
-    The loop need not have flown.
+    No flight with this loop is needed.
     """
     differences = [each.sentence for each in loop.differences]
     table = margin_figures.margin_table(loop_margins(loop), kept_guarantee(loop), differences)
@@ -185,7 +185,7 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
 def _blocks(
     flight: RecordedFlight, scenario: Scenario, context: PlotContext, flown: FlownLoops
 ) -> list[Block]:
-    """Return what stands below the head: what the aircraft did, why it did so, and the tables."""
+    """Return the blocks below the head: what the aircraft did, why it did so, and the tables."""
     return [
         *_motion(flight, scenario, context),
         Cards(
@@ -324,7 +324,7 @@ def _margin_tables(flown: FlownLoops) -> list[tables.MetricTable]:
 def _drawn_loops(loops: Sequence[FlownLoop]) -> dict[str, LinearLoop]:
     """Return the loops that Bode and Nyquist plots show, by name.
 
-    They are around the true aircraft if it is known.
+    If the true aircraft is known, these are the loops around the true aircraft.
     """
     aircraft = TRUE if any(each.aircraft == TRUE for each in loops) else FILE
     return {each.name: each.loop for each in loops if each.aircraft == aircraft}

@@ -33,7 +33,7 @@ def flight_end(tape: Tape) -> float:
 
 
 def gust_intervals(tape: Tape, gusts: Windows) -> list[Interval]:
-    """Return the gusts up to the end of the flight. A gust that repeats has a single label."""
+    """Return the gusts up to the end of the flight. All repetitions of a gust share a label."""
     end = flight_end(tape)
     return [
         Interval(
@@ -67,7 +67,7 @@ def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
 
 
 def fault_intervals(flight: RecordedFlight, end: float) -> list[Interval]:
-    """Return the faults that the scenario injects: each lasts from its start to the end."""
+    """Return the faults that the scenario injects, each from its start to the time `end`, s."""
     if flight.scenario is None:
         return []
     return [

@@ -11,9 +11,9 @@ times the error of the linear loop.
 
 Because the loop is linear, e is the sum of three errors, which the commands, the noise and the wind
 cause. An error of the flight is excused if these three explain it. Noise and wind must not excuse
-too much, so only a part of them counts. Noise counts only up to the declared noise of the sensor,
-and only as far as the actuators can follow the law's response to it. Wind counts only as far as the
-travel of the actuators can counter it. Gravity acts along the path of y_m, not along the path that
+too much, so both are limited before they are applied. Noise is limited to the declared noise of the
+sensor, and to what the actuators can follow of the law's response to it. Wind is limited to what
+the travel of the actuators can counter. Gravity acts along the path of y_m, not along the path that
 was flown, so a pitch angle that was not commanded excuses no error.
 """
 
@@ -77,7 +77,7 @@ class Knowledge(NamedTuple):
 
 
 class ErrorPair(NamedTuple):
-    """The errors of a flight and those of the linear loop, at the ticks of the controller."""
+    """The errors of a flight and the errors of the linear loop, at the ticks of the controller."""
 
     t: FloatArray  # flight time, s, (N,)
     names: tuple[str, ...]
@@ -93,8 +93,9 @@ class ErrorPair(NamedTuple):
 class LinearErrors(NamedTuple):
     """Absolute errors of the linear loop, (N, m), SI, or 0 if the linear loop is unstable.
 
-    If the aircraft drifts, there are two loops: one with the aircraft before the drift, and from
-    its start on also one with the aircraft after it. Each error is the larger one of the two.
+    If the aircraft drifts, there are two loops. One has the aircraft before the drift, over the
+    whole flight. The other has the aircraft after the drift, from the start of the drift on. Each
+    error is the larger one of the two.
     """
 
     whole: FloatArray
@@ -104,9 +105,9 @@ class LinearErrors(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """How far and how fast the actuators can move each input of the law, (m,), in its unit.
+    """Limits of how far and how fast the actuators can move each input of the law, (m,).
 
-    The values are infinite if there is no limit.
+    The values are in the unit of the input, and infinite if there is no limit.
     """
 
     travel: FloatArray
@@ -124,7 +125,7 @@ def error_pair(
 
     Returns None if the log has no error, or if the law has no feedback. `aircraft` is the simulated
     aircraft, or None if the plant is unknown. If `may_pause` is True, ticks of an inactive
-    controller do not count.
+    controller are left out.
     """
     kind, error = best_error(tape)
     names = tuple(name for name in controller.outputs if name in error.names)
@@ -154,7 +155,7 @@ def error_pair(
 
 
 def _has_feedback(controller: ControllerConfig) -> bool:
-    """Return whether u depends on y, as in every law except those that only excite the aircraft."""
+    """Return whether u depends on y. It does, except in laws that only excite the aircraft."""
     if is_literal(controller):
         return True
     law = linear_law(controller.tuned_law(), len(controller.outputs), 1.0 / controller.rate)
@@ -274,9 +275,9 @@ def _reach(controller: ControllerConfig, aircraft: AircraftConfig | None) -> Rea
 def _share_within(reach: Reach, u: FloatArray, period: float) -> FloatArray:
     """Return the fraction of a noisy u that the actuators can follow, (m,), at most 1.
 
-    u has the shape (N, m). The result is a factor: NOISE_PEAK standard deviations of u times this
-    factor lie within the travel of the actuators, and those of its rate lie within their rate
-    limit.
+    u has the shape (N, m). The result is a factor on u. With this factor, NOISE_PEAK standard
+    deviations of u lie within the travel of the actuators, and NOISE_PEAK standard deviations of
+    its rate within their rate limit.
     """
     if len(u) < 2:
         return np.ones(u.shape[1])
@@ -288,8 +289,8 @@ def _share_within(reach: Reach, u: FloatArray, period: float) -> FloatArray:
 def _share_within_travel(reach: Reach, u: FloatArray) -> FloatArray:
     """Return the fraction of u, (N, m), within the travel of the actuators, (m,), at most 1.
 
-    The largest abs(u) counts, because a gust has a peak rather than a standard deviation. The rate
-    is left out, because a slow engine cannot follow a gust.
+    The fraction follows from the largest abs(u), because a gust has a peak rather than a standard
+    deviation. The rate limit is not applied, because a slow engine cannot follow a gust.
     """
     return np.asarray(1.0 / np.maximum(np.abs(u).max(axis=0, initial=0.0) / reach.travel, 1.0))
 
@@ -307,7 +308,7 @@ def _known_loop(
 def _bare_loop(controller: ControllerConfig) -> tuple[LinearPlant, LinearLaw, LoopTiming]:
     """Return the linear loop around y_dot = Omega u, for an aircraft that is unknown.
 
-    Omega is what the controller was told: abs(Omega_ii) = omega / input_scale.
+    Omega follows from the parameters of the controller: abs(Omega_ii) = omega / input_scale.
     """
     if controller.vanes:
         controller = controller.without_vanes()
@@ -395,7 +396,7 @@ def _noise(
     """Return the noise of the sensors in the log, (N, m), in the units of y.
 
     The noise is the error of each sensor less its moving mean over NOISE_TIME, or 0 if the log has
-    no errors of sensors. Bias and drift do not count as noise, because the law follows them, so the
+    no errors of sensors. Bias and drift are no noise in this sense: the law follows them, so the
     aircraft is off by as much. The noise is limited to the declared one, because more is a fault.
     """
     count = max(round(NOISE_TIME * controller.rate), 1)
@@ -456,7 +457,7 @@ def _slope_of_wind(tape: Tape, controller: ControllerConfig, ticks: FloatArray) 
 
         V_dot = -W_dot
 
-    d is 0 for the rates q, p, r. It is 0 for V as well if the log has no wind.
+    d is 0 for the rates q, p, r. If the log has no wind, d is also 0 for V.
     """
     d = np.zeros((len(ticks), len(controller.outputs)))
     if _has_path(tape, controller) and len(ticks) > 1:
@@ -472,9 +473,10 @@ def _gravity_along_path(
 
         theta_dot = q_m cos(phi) - r_m sin(phi),   V_dot = -g sin(theta)
 
-    theta is the deviation from trim, and its first value comes from the log. phi comes from the log
-    throughout. An aircraft without a rudder has no r_m, so its true r is used there. If the law has
-    an integral of e, it keeps the true theta within 0.01 rad of this theta, whatever the gusts.
+    theta is the deviation from trim. Its first value comes from the log, and phi comes from the log
+    throughout. If the aircraft has no rudder, there is no r_m, so the true r replaces r_m. If the
+    law has an integral of e, it keeps the true theta within 0.01 rad of this computed theta,
+    whatever the gusts.
     """
     d = np.zeros((len(ticks), len(controller.outputs)))
     names = controller.outputs
@@ -505,7 +507,7 @@ def _flown(tape: Tape, ticks: FloatArray, *, may_pause: bool) -> NDArray[np.bool
     """Return a mask of the ticks from the first engagement on.
 
     If `may_pause` is True, the ticks of an inactive controller are left out. If the log has no
-    topic `internals`, no tick counts.
+    topic `internals`, the mask is False throughout.
     """
     if "internals" not in tape:
         return np.zeros(len(ticks), dtype=bool)

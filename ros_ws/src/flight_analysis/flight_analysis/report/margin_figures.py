@@ -113,7 +113,10 @@ inputs at once."""
 
 
 def least_margins(margins: LoopMargins | None) -> list[str]:
-    """Return the margins of LEAST_MARGINS as text, with the worst aircraft in parentheses."""
+    """Return the margins of LEAST_MARGINS as text, with the worst aircraft in parentheses.
+
+    LEAST_MARGINS are the columns of a table with one row for each loop.
+    """
     if margins is None:
         return [NO_VALUE] * len(LEAST_MARGINS)
     nominal = _least(margins.nominal, margins.delay)
@@ -195,7 +198,10 @@ def flown_margin_table(flown: FlownLoops) -> MetricTable:
 
 
 def margins_as_json(margins: LoopMargins) -> dict[str, Any]:
-    """Return the margins for JSON in SI, with gains as factors. An infinite value is None."""
+    """Return the margins in SI as a dict that JSON can hold.
+
+    Gains are factors, not dB. An infinite value is None.
+    """
     nominal = _aircraft_as_json(margins.nominal, margins.inputs) | {
         "stable": bool(margins.nominal.stable)
     }

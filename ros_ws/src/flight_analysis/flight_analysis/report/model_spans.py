@@ -60,8 +60,8 @@ def model_names(first: Sequence[float], proposals: Sequence[float]) -> list[str]
     """Name the sets of parameters that flew, given the times at which they first flew, s.
 
     The times in `first` ascend, and the first set is named "start". `proposals` has the times of a
-    learner's proposals, s. A set that first flew before all of them is "file", "file 2" and so on.
-    The other sets are "model 1", "model 2" and so on.
+    learner's proposals, s. A set that first flew before all proposals is "file", "file 2" and so
+    on. The other sets are "model 1", "model 2" and so on.
     """
     names = ["start"]
     for time in first[1:]:
@@ -101,7 +101,7 @@ def parameter_spans(tape: Tape) -> list[ParameterSpan]:
 def errors_by_model(tape: Tape) -> list[ModelSpan]:
     """Return the rms of `best_error` for each span of time with the same parameters.
 
-    The result is empty if nothing was learned. Only the time in which the law is engaged counts.
+    The result is empty if nothing was learned. The rms covers the time in which the law is engaged.
     """
     if "learned" not in tape or "internals" not in tape:
         return []

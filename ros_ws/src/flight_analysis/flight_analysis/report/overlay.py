@@ -5,8 +5,8 @@
 The difference of a signal is taken at the instants of the first log. At these instants the other
 log must have samples at most LONGEST_INTERVAL apart. Between its samples, y and pose are
 interpolated linearly, and u is held. A value that is not finite is not compared. The table states
-which part was compared. The tolerance of a signal can be given by its name. Otherwise it is the
-fraction TOLERANCE of the largest absolute value in the first log.
+which part of the time was compared. The tolerance of a signal can be given by its name. If it is
+not given, it is the fraction TOLERANCE of the largest absolute value in the first log.
 """
 
 from collections.abc import Mapping, Sequence
@@ -107,8 +107,8 @@ def difference_table(
 ) -> MetricTable:
     """Return the differences of each later log from the first, with a row for each common signal.
 
-    `tolerances` has the tolerances of channels by name, SI. Raises ParameterError if it names a
-    channel that no two logs have in common.
+    `tolerances` has the tolerances of channels by name, SI. Raises ParameterError if `tolerances`
+    names a channel that no two logs have in common.
     """
     first, *others = flights
     rows = []

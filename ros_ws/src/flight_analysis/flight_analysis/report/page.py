@@ -58,7 +58,7 @@ class Step:
 class Verdict:
     """The verdict on a flight: a bold sentence, more text, details to unfold, and a next step.
 
-    In a comparison, a verdict has the label and the colour of its flight.
+    On a page that compares flights, a verdict has the label and the colour of its flight.
     """
 
     headline: str
@@ -175,7 +175,7 @@ Tables = Sequence[MetricTable] | Sequence[ComparisonTable]
 class TableGroup(NamedTuple):
     """Tables that are shown together, and the same tables with angles in radians.
 
-    In a comparison, `colours` has the colours of the flights.
+    On a page that compares flights, `colours` has the colours of the flights.
     """
 
     tables: Tables
@@ -284,7 +284,7 @@ def page_html(page: Page) -> str:
 
 
 def page_parts(page: Page) -> Iterator[str]:
-    """Yield the HTML of a page in parts, because the page of a long flight has some 100 MB."""
+    """Yield the HTML of a page in pieces, because the page of a long flight has some 100 MB."""
     return _template().generate(
         page=page,
         dark=plotting.DARK | figures.DARK,

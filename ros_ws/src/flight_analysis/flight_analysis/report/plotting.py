@@ -161,7 +161,7 @@ class Interval:
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """A flight with what figures need to draw it: its signals, its period and its colour."""
+    """A flight and what figures need to draw it: its signals, its period and its colour."""
 
     tape: Tape
     period_ns: int  # period of the controller's ticks
@@ -271,7 +271,7 @@ class Figure:
 
     @property
     def text(self) -> str:
-        """The figure in words, with the smallest and largest value of each curve by subplot."""
+        """The figure in words: by subplot, the smallest and the largest value of each curve."""
         by_plot: dict[int, list[str]] = {}
         for extent in self.extents:
             words = f"{extent.name} from {extent.low:.3g} to {extent.high:.3g}"
@@ -381,7 +381,7 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
 
 
 def is_first_in_legend(figure: Figure, label: str) -> bool:
-    """Return whether a label is new to the figure. The legend shows each label only once."""
+    """Return whether a label is new to the figure, because the legend shows each label once."""
     return all(trace["name"] != label for trace in figure.data)
 
 

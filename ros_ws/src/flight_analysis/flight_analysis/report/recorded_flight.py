@@ -67,7 +67,7 @@ def read_accounted(
     """Read the folder or a file of a run, and return its signals, scenario and files.
 
     The signals are named vectors, by topic name without the namespace. The bag, which is the log as
-    ROS stores it, comes from this stack or from `ros2 bag record`. It is MCAP, in one or several
+    ROS stores it, comes from this package or from `ros2 bag record`. It is MCAP, in one or several
     files, compressed or not. A truncated MCAP file is read up to the last complete chunk.
 
     In the result, `tape.account` has the number of samples of each topic, and `tape.notes` say what
@@ -77,8 +77,8 @@ def read_accounted(
         run: Folder of a run, or a file of the bag.
         namespace: Namespace of the aircraft, for a log with several aircraft.
         scenario: Scenario file in place of the scenario in the log.
-        remaps: Topics of the log by the names that the stack gives them, as in {"y": "/sensors/y"}.
-            They are needed if the nodes were remapped.
+        remaps: Topics of the log by the names that the nodes of this package give them, as in
+            {"y": "/sensors/y"}. They are needed if the nodes were remapped.
 
     Returns:
         The content of the log: a tape with signals of shape (N, k), SI, the scenario and the files.
@@ -179,7 +179,7 @@ def _imported_flight(recorded: RecordedRun, name: str, source: Mapping[str, str]
 
 
 def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedFlight:
-    """Return the flight of a user's own aircraft, whose log only describes the controller."""
+    """Return the flight of a user's own aircraft, of which the log has only the controller."""
     recorded.require("y", "u")
     controller = recorded_parameters(recorded.scenario_file(), recorded.namespace)
     summary = summarise_own(recorded.tape, controller.law, name, outcome)
@@ -235,7 +235,7 @@ def _with_cause(
 ) -> ParameterError:
     """Turn an error into an UnflownError with the last messages of the nodes.
 
-    This is only done if the log lacks y or y_m. Otherwise the error itself is returned.
+    If the log has both y and y_m, the error is returned as it is.
     """
     if {"y", "y_m"} <= set(recorded.tape.signals):
         return error
@@ -250,7 +250,8 @@ def _with_cause(
 def _with_times_of_messages(recorded: RecordedRun) -> Tape:
     """Return the tape with the latency and the age of u as further signals.
 
-    In lockstep and in one process there is no latency, because the nodes wait for each other.
+    If the flight was in lockstep or in one process, there is no latency, because the nodes wait for
+    each other.
     """
     latency = recorded.latency if is_real_time(recorded.tape) else None
     timed = {"latency": latency, "age_of_u": recorded.age_of_u}
@@ -298,8 +299,8 @@ def _engagement(tape: Tape, engagement: Engagement) -> dict[str, Any]:
 def _identity(recorded: RecordedRun) -> dict[str, Any]:
     """Return the values by which a flight is recognised.
 
-    They are the stamp of t = 0, ns, and the time of day at which the flight started, if the log has
-    it.
+    The values are the stamp of t = 0, ns, and the time of day at which the flight started, if the
+    log has this time.
     """
     started = recorded.metadata.get(FLIGHT, {}).get("start")
     return {"start_ns": recorded.tape.start_ns, "started": started}
@@ -308,8 +309,9 @@ def _identity(recorded: RecordedRun) -> dict[str, Any]:
 def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scenario) -> Outcome:
     """Return the outcome of a flight that was stated earlier, or find it from the samples.
 
-    The log, the summary and a launch can state an outcome, and the first of them that does so
-    counts. If nodes were started by hand, only the samples of the log show how the flight ended.
+    The log, the summary and a launch can state an outcome. The first of them that does, in this
+    order, is used. If nodes were started by hand, only the samples of the log show how the flight
+    ended.
     """
     stated = _stated_outcomes(recorded, folder)
     known = next((outcome for outcome in stated if outcome.end is not End.UNKNOWN), None)
@@ -341,7 +343,7 @@ def _stated_outcomes(recorded: RecordedRun, folder: Path | None) -> Iterator[Out
 
 
 def _outcome_in_summary(recorded: RecordedRun, folder: Path) -> Outcome | None:
-    """Return the outcome in a run's summary, or None if the summary is not of this flight."""
+    """Return the outcome in a run's summary, or None if the summary is of another flight."""
     with suppress(OSError, ValueError, TypeError, KeyError):
         summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
         if summary["flight"] == _identity(recorded):

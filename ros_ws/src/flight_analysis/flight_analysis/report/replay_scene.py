@@ -84,7 +84,7 @@ def replay_of(flight: RecordedFlight, context: PlotContext) -> Replay | None:
 def _topic(context: PlotContext, signal: Signal, channels: dict[str, str]) -> dict[str, Any]:
     """Store a topic on the page, and return the names of its arrays and the factors of its units.
 
-    `channels` maps each channel to the name under which its unit is known.
+    `channels` maps each channel to the name under which the display unit of the channel is known.
     """
     stored_channels = {}
     times = ""
@@ -112,7 +112,8 @@ def _thinned(pose: Signal) -> Signal:
 def _code() -> str:
     """Return the scripts of the replay as a single JavaScript function that calls itself.
 
-    It joins modules, without their imports, exports, comment lines and indentation.
+    The function contains all modules of the replay, without their imports, exports, comment lines
+    and indentation.
     """
     text = "\n".join(path.read_text(encoding="utf-8") for path in SCRIPTS)
     text = re.sub(r"^(import |\s*//).*\n|^\s+", "", text, flags=re.MULTILINE)

@@ -80,8 +80,8 @@ def report(
         channels: Channels of the figure: outputs, inputs, and "e.NAME" for the error of an output.
             If empty, the figure has every output.
         namespace: Namespace of the aircraft, for logs with several aircraft.
-        remaps: Topics of the log by the names that the stack gives them, as in {"y": "/sensors/y"}.
-            They are needed if the nodes were remapped.
+        remaps: Topics of the log by the names that the nodes of this package give them, as in
+            {"y": "/sensors/y"}. They are needed if the nodes were remapped.
         scenario: Scenario file of the flights, for logs without a scenario. If None, each log has
             its scenario.
         tolerances: Tolerance of the difference between several runs by channel, SI, as in {"q":
@@ -145,9 +145,9 @@ def report(
 
 
 def _require_no_figure(channels: str | Sequence[str], width: str | float) -> None:
-    """Check that no channels and no width are given. They need a figure.
+    """Check that no channels and no width are given, because only a figure uses them.
 
-    Raises ParameterError otherwise.
+    Raises ParameterError if one of them is given.
     """
     key = "channels" if channels else "width"
     is_default = not channels and width == WIDTH

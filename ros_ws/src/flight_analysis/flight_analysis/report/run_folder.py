@@ -47,9 +47,9 @@ def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
 
 
 def remove_empty(*runs: Path) -> None:
-    """Remove those of the runs' folders that are empty.
+    """Remove the folders of runs that are empty, and keep the others.
 
-    The flights of such runs were interrupted before they began.
+    A folder is empty if its flight was interrupted before it began.
     """
     for run in runs:
         with suppress(OSError):
@@ -65,10 +65,10 @@ def attachments_for(
 ) -> LogAttachments:
     """Return the files that the log of a flight attaches, and write those that do not exist yet.
 
-    They are the scenario, the airframe or the user's model of JSBSim, every parameter after
-    validation, the `further` files, and the provenance. The new files are written into the folder
-    of the run. `overrides` are parameters of the scenario's nodes by the name of the node, or None
-    for a flight without nodes. `replaced` names the nodes of the stack that other nodes replaced,
+    The files are the scenario, the airframe or the user's model of JSBSim, every parameter after
+    validation, the `further` files, and the provenance. New files are written into the folder of
+    the run. `overrides` are parameters of the scenario's nodes by the name of the node, or None for
+    a flight without nodes. `replaced` names the nodes of this package that other nodes replaced,
     and the attachments state this. Raises ParameterError if a file cannot be written.
     """
     unflown = {

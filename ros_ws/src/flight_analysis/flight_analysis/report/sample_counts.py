@@ -42,9 +42,9 @@ SHORT_RUN = 6
 
 
 class TopicAccount(NamedTuple):
-    """How many samples of a topic were planned, logged and never sent.
+    """Numbers of samples of a topic that were planned, logged and never sent.
 
-    Times are flight times in s, and None if there is no sample.
+    Times are flight times in s. A time is None if there is no sample.
     """
 
     # None if unknown, as in a log without the rates or the start of its flight
@@ -66,15 +66,18 @@ class TopicAccount(NamedTuple):
 
     @property
     def share(self) -> float | None:
-        """The share of the expected samples, at most 1, or None if their number is unknown."""
+        """The fraction of the expected samples that the log has, at most 1.
+
+        It is None if the expected number of samples is unknown.
+        """
         return None if self.expected is None else min(self.found / max(self.expected, 1), 1.0)
 
     def holds(self, count: int) -> bool:
         """Return whether `count` samples are as good as all that were expected.
 
-        This is also the case if the expected number is unknown. In a short topic one missing sample
-        does not count, because the first instant may lie just before the beginning of the flight,
-        or the last one just after its end.
+        This is also the case if the expected number is unknown. If the topic is short, one missing
+        sample is accepted, because the first instant may lie just before the beginning of the
+        flight, or the last instant just after its end.
         """
         return self.expected is None or count >= min(
             WHOLE * self.expected, max(self.expected - 1, 1)
@@ -82,7 +85,10 @@ class TopicAccount(NamedTuple):
 
 
 class Span(NamedTuple):
-    """The part of a flight in which samples are counted, from its beginning or first sample on."""
+    """The part of a flight in which samples are counted. It has one end for all topics.
+
+    It begins at t = 0, or for each topic at the first sample of the topic.
+    """
 
     end_ns: int  # stamp of the end
     is_from_start: bool  # whether it begins at t = 0, not at the first sample of a topic
@@ -100,12 +106,12 @@ class Leeway(NamedTuple):
 def topic_accounts(
     tape: Tape, scenario: Scenario | None, span: Span
 ) -> tuple[dict[str, TopicAccount], dict[str, Leeway]]:
-    """Return the counts of each topic, and the leeway of each topic that has one.
+    """Return the account of each topic, and the leeway of each topic that has one.
 
-    The expected number of samples is rate times time. If a node of the stack sends the samples in
-    the host's time, the rate comes from the scenario, otherwise from the log. Ticks of the
-    controller count from the first tick on. If a controller or a publisher outside the stack leaves
-    out up to a tenth of the samples, these do not count as missing.
+    The expected number of samples is rate times time. If a node of this package sends the samples
+    in the host's time, the rate comes from the scenario. If not, the rate comes from the log. For
+    ticks of the controller, the time begins at the first tick. If a controller or a publisher
+    outside this package leaves out up to a tenth of the samples, none is taken as missing.
     """
     periods = {} if scenario is None else _periods(tape, scenario, simulated=span.is_simulated)
     expected = {} if scenario is None else _expected(tape, scenario, span, periods)
@@ -187,8 +193,8 @@ def is_real_time(tape: Tape) -> bool:
 def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, int]:
     """Return the period of each topic that has samples at a fixed rate, ns.
 
-    An aircraft outside the stack may publish no truth and no pose. Commands u_m from outside the
-    stack have no rate.
+    An aircraft outside this package may publish no truth and no pose. Commands u_m from outside
+    have no rate.
     """
     y_m_ns = period_ns(scenario.reference_model.rate, "reference_model.rate")
     if not simulated:
@@ -209,10 +215,10 @@ def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, in
 
 
 def is_sent_by_stack(tape: Tape, name: str) -> bool:
-    """Return whether a node of the stack sent a topic. The log names the nodes that flew.
+    """Return whether a node of this package sent a topic. The log names the nodes that flew.
 
-    A flight in one process has no such names, and counts as one of the stack. A controller outside
-    the stack publishes no topic `internals`.
+    A flight in one process has no such names, and is taken as sent by this package. A controller
+    outside this package publishes no topic `internals`.
     """
     if name in TICKS and ("internals" in tape or "u" not in tape):
         return True
@@ -224,16 +230,16 @@ def is_sent_by_stack(tape: Tape, name: str) -> bool:
 
 
 def is_simulated(tape: Tape) -> bool:
-    """Return whether the simulated aircraft of the stack flew, in the wind of the scenario."""
+    """Return whether the simulated aircraft of this package flew, in the wind of the scenario."""
     return tape.scenario is not None or "truth" in tape or is_sent_by_stack(tape, "y")
 
 
 def _period(tape: Tape, name: str, nominal_ns: int) -> int:
     """Return the period of the samples of a topic, ns.
 
-    In the host's time, a node of the stack has the period of its parameters. If the time comes from
-    the topic /clock, a node skips the instants between two messages of the clock, so its period can
-    be longer.
+    If a node of this package flies in the host's time, it has the period of its parameters. If the
+    time comes from the topic /clock, a node skips the instants between two messages of the clock,
+    so its period can be longer.
     """
     is_of_stack = is_sent_by_stack(tape, name)
     if is_of_stack and not tape.is_by_clock:
@@ -250,8 +256,8 @@ def period_of(stamp_ns: NDArray[np.int64], lost: int, otherwise_ns: int) -> int:
 
     `lost` is the number of lost messages. A steady publisher takes the same time for any STEADY_RUN
     samples, to within an interval, even if a coarse clock makes the intervals differ. If samples
-    are missing, these times scatter, so the period follows from the quickest tenth of short runs.
-    If there are too few samples, the result is `otherwise_ns`.
+    are missing, these times scatter, so the period follows from the quickest tenth of short runs of
+    samples. If there are too few samples, the result is `otherwise_ns`.
     """
     stamp_ns = np.unique(stamp_ns)
     intervals_ns = np.diff(stamp_ns)
@@ -275,8 +281,8 @@ def _with_unsent(tape: Tape, name: str, topic: TopicAccount, step_ns: int) -> To
     """Return the account of a topic with `unsent`, the number of samples that were never sent.
 
     This is the number of instants without a sample between the first and the last sample, less the
-    messages that were lost, as the numbers of the messages show. Samples with unusable stamps were
-    sent, so they do not count.
+    lost messages, which the numbers of the messages show. Samples with unusable stamps were sent,
+    so they are not included.
     """
     recording = tape.recording.get(name, Recording(0))
     if (
@@ -292,10 +298,10 @@ def _with_unsent(tape: Tape, name: str, topic: TopicAccount, step_ns: int) -> To
 
 
 def _of_foreign(topic: TopicAccount) -> TopicAccount:
-    """Return the account of a topic whose publisher is outside the stack.
+    """Return the account of a topic whose publisher is outside this package.
 
-    It is unknown how many samples such a publisher planned. What it sent counts as complete if it
-    left out at most a tenth of the samples, and no gap is longer than SILENCE.
+    It is unknown how many samples such a publisher planned. The samples that it sent are taken as
+    complete if it left out at most a tenth of them, and no gap is longer than SILENCE.
     """
     is_silent = topic.gap is not None and topic.gap > SILENCE
     if topic.expected is None or is_silent or topic.unsent > (1.0 - LEAST) * topic.expected:
@@ -321,9 +327,9 @@ def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
     """Return at how many instants, from the last sample to the end, a publisher sent nothing.
 
     The result is 0 unless the log proves that the publisher did not send. For this, the numbers of
-    the messages must show that none was lost, and the topic must have a sample after the end. A
-    topic of OF_AIRCRAFT needs no such sample if the log has every y. Then its instants up to the
-    last y count, but only if y has no sample at any of them.
+    the messages must show that no message was lost, and the topic must have a sample after the end.
+    A topic of OF_AIRCRAFT needs no sample after the end if the log has every y. The instants of
+    such a topic are counted up to the last y, but only if y has no sample at any of them.
     """
     signal = tape.signals.get(name)
     if signal is None or tape.recording.get(name, Recording(0)).lost != 0:
@@ -350,7 +356,7 @@ def _ticks(tape: Tape, scenario: Scenario, span: Span) -> tuple[int, float]:
 
     Each controller numbers its ticks from 1, so the ticks are counted for each publisher. If y and
     y_m come from nodes of the user, the controller can fly before t = 0. If the flight is counted
-    from t = 0 on, such ticks do not count.
+    from t = 0 on, the ticks before t = 0 are left out.
     """
     end_ns = span.end_ns
     step_ns = period_ns(scenario.controller.rate, "controller.rate")
@@ -397,9 +403,9 @@ def _ticks(tape: Tape, scenario: Scenario, span: Span) -> tuple[int, float]:
 def _instants_with_y(tape: Tape, internals: Signal, step_ns: int) -> int:
     """Return the number of ticks that have a new y or are in a failsafe.
 
-    Only in these ticks the controller publishes u. They are counted if an aircraft outside the
-    stack has another rate of y, or if a sensor is declared to drop samples. A y that only the log
-    lost is counted as well, because the controller received it.
+    The controller publishes u only in these ticks. They are counted if an aircraft outside this
+    package has another rate of y, or if a sensor is declared to drop samples. A y that only the log
+    lost is included, because the controller received it.
     """
     age_ns = internals["age"] * NANOSECONDS
     first_tick_ns = internals.stamp_ns[0] + age_ns[0]

@@ -23,7 +23,7 @@ PLACE = ("north", "east", "altitude")  # m
 
 
 class Track(NamedTuple):
-    """The positions of an aircraft over time, in the channels of PLACE, and its map's origin."""
+    """The positions of an aircraft over time, in the channels of PLACE, and their origin."""
 
     start_ns: int  # stamp of t = 0 of this aircraft's flight
     place: Signal

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Judge whether a flight that was completed or landed did what it should.
 
-What it did not do are its shortfalls. A flight succeeds if
+A shortfall is something that the flight did not do. A flight succeeds if
 
 - the law was engaged in at least the fraction ENGAGED of the ticks in which it should fly,
 - y_m was the one that the scenario commands (`flown_reference`),
@@ -13,8 +13,8 @@ What it did not do are its shortfalls. A flight succeeds if
 - a landing ended in the touch-down zone,
 - and the log holds the whole flight.
 
-If the host was too busy for a flight in real time, the flight says nothing about the law. If this
-alone explains what is wrong, the flight has no shortfall, and its end is HOST.
+If the host was too busy for a flight in real time, the flight says nothing about the law. If the
+busy host alone explains what is wrong, the flight has no shortfall, and its end is HOST.
 """
 
 import math
@@ -62,7 +62,7 @@ def judge(
 ) -> Outcome:
     """Return the outcome of a flight with its shortfalls. A flight that ended early has none.
 
-    If `scenario` is None, `controller` must be given, or else errors are not judged.
+    If `scenario` is None and no `controller` is given, errors are not judged.
     """
     starved = account.starvation
     seems_unflown = outcome.end is End.NEVER_FLEW or account.late is not None
@@ -129,9 +129,9 @@ def _never_flown_by_host(starved: Starvation, end: float) -> Outcome:
 
 
 def _may_pause(tape: Tape, scenario: Scenario | None) -> bool:
-    """Return whether the law may be inactive at times, because somebody else decides about it.
+    """Return whether the law may be inactive at times, because somebody else activates it.
 
-    Behind a bridge the autopilot decides. With `start_active: false` the user decides. In any other
+    Behind a bridge this is the autopilot. With `start_active: false` it is the user. In any other
     simulated flight, the law must fly from its first u to the end.
     """
     if scenario is None or not is_simulated(tape):
@@ -142,7 +142,7 @@ def _may_pause(tape: Tape, scenario: Scenario | None) -> bool:
 def _engagement(tape: Tape, *, may_pause: bool, starved: Starvation = FED) -> list[Shortfall]:
     """Return a shortfall if the law was engaged in too few of the ticks.
 
-    Ticks in the spans `starved`, in which the host was too busy, do not count.
+    Ticks in the spans `starved`, in which the host was too busy, are left out.
     """
     if "internals" not in tape or "mode" not in tape["internals"].names:
         return []
@@ -167,8 +167,8 @@ def _height(
 ) -> list[Shortfall]:
     """Return a shortfall if the aircraft was below the ground.
 
-    The height of the ground comes from the scenario, or else from the landing. It is unknown for an
-    aircraft of JSBSim.
+    The height of the ground comes from the scenario or, without one, from the landing. It is
+    unknown for an aircraft of JSBSim.
     """
     ground = None if aircraft is None or aircraft.is_jsbsim else aircraft.ground()
     if ground is None and section is not None and not (aircraft and aircraft.is_jsbsim):

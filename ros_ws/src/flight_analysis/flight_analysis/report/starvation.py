@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the spans of a flight in real time in which the host was too busy to run the nodes.
 
-A node of the stack sends a sample at each instant of its rate, and numbers its messages. If an
+A node of this package sends a sample at each instant of its rate, and numbers its messages. If an
 instant has no sample and yet no number is missing, the node did not send, because the host did not
 let it run. The errors of the flight are not used to find such spans.
 
-A law that computes for too long also leaves out ticks. Ticks therefore count only if another node
-has left out samples as well. If a publisher was replaced, or if messages were lost, a gap proves
-nothing.
+A law that computes for too long also leaves out ticks. Missing ticks are therefore used only if
+another node has left out samples as well. If a publisher was replaced, or if messages were lost, a
+gap proves nothing.
 """
 
 import math
@@ -36,7 +36,7 @@ osprey has settled by then."""
 class Starvation(NamedTuple):
     """The spans of a flight in which the host was too busy, flight time in s, in order.
 
-    These spans say nothing about the law.
+    The flight in these spans says nothing about the law.
     """
 
     spans: tuple[tuple[float, float], ...] = ()
@@ -59,9 +59,9 @@ def starvation(
 ) -> Starvation:
     """Return the spans in which the host was too busy to run the nodes.
 
-    Each span is lengthened by RECOVERY, because the errors that it caused decay only after it.
-    `end` is the length of the flight, s. There are no such spans in lockstep, in one process or by
-    the clock of a simulator.
+    Each span is lengthened by RECOVERY, because the errors that the busy host caused decay only
+    after it. `end` is the length of the flight, s. A flight in lockstep, in one process or by the
+    clock of a simulator has no such spans.
     """
     if not is_real_time(tape) or tape.is_by_clock or end <= 0.0:
         return Starvation()
@@ -119,7 +119,7 @@ def _missing(tape: Tape, name: str, period: float, step: float, count: int) -> N
 
 
 def _windowed(is_missing: NDArray[np.bool_], length: int) -> FloatArray:
-    """Count, for each instant, the missing ones among the `length` instants around it, (N,)."""
+    """Count, for each instant, the missing samples at the `length` instants around it, (N,)."""
     total = np.concatenate([[0.0], np.cumsum(is_missing)])
     k = np.arange(len(is_missing))
     first = np.maximum(k - length // 2, 0)

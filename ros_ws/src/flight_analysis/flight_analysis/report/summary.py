@@ -86,9 +86,9 @@ def command_edges(scenario: Scenario) -> list[Transient]:
 def transients(scenario: Scenario, tape: Tape, *, follows_scenario: bool = True) -> list[Transient]:
     """Return the transients of a flight: engagements, commands and gusts.
 
-    From the first live command on, live commands replace those of the scenario. In a guided flight,
-    turns and captures replace commands. If `follows_scenario` is False, y_m did not follow the
-    scenario's commands, so these commands are left out.
+    From the first live command on, live commands replace the commands of the scenario. In a guided
+    flight, turns and captures replace commands. If `follows_scenario` is False, y_m did not follow
+    the scenario's commands, so these commands are left out.
     """
     windows = scenario.gust_windows() if is_simulated(tape) else {}
     gusts = [
@@ -178,7 +178,7 @@ def summarise(
     outcome: Outcome | None = None,
     flight_account: Account | None = None,
 ) -> dict[str, Any]:
-    """Return the metrics of a flight, SI, ready for JSON.
+    """Return the metrics of a flight, SI, as a dict that JSON can hold.
 
     The keys are explained in docs/log.md, section Figures.
 
@@ -251,7 +251,7 @@ def summarise(
 
 
 def _flown_scenario(tape: Tape, scenario: Scenario | None) -> Scenario:
-    """Return `scenario`, or else the tape's scenario. Raises ParameterError without a scenario."""
+    """Return `scenario` or, if it is None, the tape's scenario. Raises ParameterError if none."""
     of_flight = as_tape(tape).scenario if scenario is None else scenario
     require(
         of_flight is not None,
@@ -263,7 +263,7 @@ def _flown_scenario(tape: Tape, scenario: Scenario | None) -> Scenario:
 
 
 def _require_topics(tape: Tape) -> None:
-    """Check that a tape has y and y_m. Raises ParameterError if it lacks one."""
+    """Check that a tape has y and y_m. Raises ParameterError if one of them is missing."""
     for topic in ("y", "y_m"):
         unset = " with a stamp" if topic in tape.recording and tape.recording[topic].unset else ""
         refusal = f" ({refusal_note(topic, tape.refused[topic])})" if topic in tape.refused else ""
@@ -277,9 +277,9 @@ def _finite(metrics: TickMetrics | LatencyMetrics | AgeMetrics | None) -> dict[s
 
 
 def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
-    """Return the metrics of an imported log, whose flight was not flown by this stack.
+    """Return the metrics of an imported log, whose flight was flown by another controller.
 
-    The result has metrics of y and u about trim, and the counts of samples by topic. Such a flight
+    The result has metrics of y and u about trim, and the numbers of samples by topic. Such a flight
     has no reference y_m, so it has no error. `source` is the metadata record IMPORTED of `rise-di
     import`.
     """
@@ -321,9 +321,9 @@ def summarise_own(tape: Tape, law: str, log: str, outcome: Outcome) -> dict[str,
 def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
     """Return a sentence if u at the aircraft is older than `controller.delay` by a period or more.
 
-    The linear loop is computed with the delay that the controller was told. Any further delay uses
-    up the delay margin of this loop. The sentence states this margin. If there is no linear model,
-    there is no sentence.
+    The linear loop is computed with `controller.delay`. Any further delay uses up the delay margin
+    of this loop. The sentence states this margin. If there is no linear model, there is no
+    sentence.
     """
     controller = scenario.controller
     if age is None or age.mean - controller.delay < 1.0 / controller.rate:
@@ -366,9 +366,10 @@ def _commands(tape: Tape, events: Sequence[Transient], end: float) -> Commands:
 
 
 def command_results(summary: Mapping[str, Any]) -> str:
-    """Say how many commands were flown if some were not, and how many targets were given.
+    """Say how many commands of a flight were not flown, and how many targets were given.
 
-    An example is "8 of 24 commands flown". Returns "" if there is nothing to say.
+    An example is "8 of 24 commands flown". Returns "" if all commands were flown and no targets
+    were given.
     """
     flight_account = account_of_json(summary)
     if flight_account is None or flight_account.commands is None:
@@ -396,9 +397,9 @@ def _with_late_ticks(
 ) -> Account:
     """Return the account with a sentence on the busy host if too many ticks had no new y.
 
-    These ticks are the host's fault only if the log has every y, and if y comes at least about as
-    often as the controller ticks. In any other case, for example if y comes from outside the stack,
-    the account is returned as it is.
+    The host is to blame for these ticks only if the log has every y, and if y comes at least about
+    as often as the controller ticks. In any other case, for example if y comes from outside this
+    package, the account is returned as it is.
     """
     log_complete = (
         not (flight_account.over("y", "internals") and not flight_account.busy)
@@ -466,8 +467,8 @@ def time_flown(summary: Mapping[str, Any]) -> str:
 def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
     """Return sentences on the engagements of a flight behind a bridge.
 
-    `has_figures` is False if the engagements are so short that no y lies in them. The metrics are
-    then those of the whole flight.
+    `has_figures` is False if the engagements are so short that no y lies in them. In this case the
+    summary has the metrics of the whole flight.
     """
     if not engagements:
         return ["never engaged: the figures are of an aircraft that this controller did not fly"]
@@ -490,8 +491,8 @@ def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: b
 def mode_notes(tape: Tape, part: str) -> list[str]:
     """Return a sentence if the law was not engaged in more than 1 % of the ticks.
 
-    Ticks count from the first engagement on. `part` says which part of the ticks the log has, as in
-    "over 49 % of internals", or is "" if it has all.
+    The ticks from the first engagement on are examined. `part` says which part of the ticks the log
+    has, as in "over 49 % of internals", or is "" if the log has all ticks.
     """
     if "internals" not in tape:
         return []
@@ -583,7 +584,7 @@ def _inputs(tape: Tape, events: Sequence[Transient], air: str) -> dict[str, Any]
 
 
 def finite_or_null(value: Any) -> Any:
-    """Return a value for JSON, with None in place of NaN and infinity, at any depth.
+    """Return a value that JSON can hold, with None in place of NaN and infinity, at any depth.
 
     Metrics are NaN if their part of the flight has no samples, and infinite after an overflow.
     """

@@ -26,7 +26,7 @@ MILLISECONDS = DisplayUnit(unit="ms", factor=1e3)
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """A column of a table: how to find and write one metric of a summary.
+    """A column of a table: where the summary has its metric, and how the metric is written.
 
     `head` is the heading of the column. `group` is the heading above it that neighbouring columns
     share. `path` has the keys that lead to the metric in a summary.
@@ -54,7 +54,7 @@ class Column:
         return value if isinstance(value, float | int) else None
 
     def text(self, figures: Mapping[str, Any], row_unit: DisplayUnit = NO_UNIT) -> str:
-        """Return the metric as text, in the unit of the column or else of the row."""
+        """Return the metric as text, in the unit of the column or, if it has none, of the row."""
         value = self.value(figures)
         factor = (self.unit or row_unit).factor
         if value is None or self.decimals is None:
@@ -150,7 +150,7 @@ TIMING_COLUMNS = (
 
 
 def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[Column, ...]:
-    """Return those of the columns that have a value for a channel.
+    """Return the columns that have a value for at least one channel.
 
     For example, a flight without gusts has no value in the columns of gusts.
     """
@@ -204,7 +204,7 @@ def table_rows(
 
 
 def timing_rows(summary: Mapping[str, Any], *, is_timed: bool) -> list[tuple[str, str, str]]:
-    """Return the rows of a table of the controller's timing, one for all metrics of a group.
+    """Return the rows of a table of the controller's timing, with one row for a group of metrics.
 
     A row has the entry of the summary, the heading with its unit, and the values. If `is_timed` is
     False, the flight was not flown by the host's clock, and rows with times are left out.
@@ -271,7 +271,7 @@ def slowest_settling(summary: Mapping[str, Any], channel: str, kind: TransientKi
     """Return the longest settling time of a channel after transients of a kind, s.
 
     If the error did not settle after one of these transients, the result is "> x". Here x is the
-    longest time of all, whether the error settled or not.
+    longest time of all, which includes the times after which an error had still not settled.
     """
     times: list[float] = []
     unsettled: list[float] = []

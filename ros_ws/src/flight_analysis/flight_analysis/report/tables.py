@@ -121,7 +121,7 @@ def aligned(cells: Sequence[str]) -> list[str]:
 class EventInterval(NamedTuple):
     """An event: a gust, a fault, a failsafe mode, a saturation, or a vane that stands still.
 
-    It lasts from `start` to `stop`, s.
+    The event lasts from `start` to `stop`, s.
     """
 
     name: str
@@ -149,8 +149,8 @@ def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.b
 def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list[EventInterval]:
     """Return gusts, faults, modes except ENGAGED, saturated inputs and vanes that stand still.
 
-    They are sorted by their starts. By default the scenario is that of the tape. The tape of a log
-    has no scenario, so it needs this argument.
+    The events are sorted by their starts. If `scenario` is None, it is the scenario on the tape.
+    The tape of a log has no scenario, so this argument is needed.
     """
     of_flight = scenario if scenario is not None else tape.scenario
     listed = []
@@ -305,7 +305,8 @@ def model_table(
 ) -> MetricTable:
     """Return a table of rms errors: before the first learned model, and with each model.
 
-    `part` is the end of the caption. If the log has only a part of the flight, it names this part.
+    `part` is appended to the caption, as in ", over 49 % of truth". It is empty if the log has the
+    whole flight.
     """
     headings, rows = model_rows(models, units)
     columns = [Column(group="", head=head) for head in headings]
@@ -315,7 +316,7 @@ def model_table(
 
 
 def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
-    """Return the table of the controller's timing. In simulated time it has only tick counts."""
+    """Return the table of the controller's timing. Without the host's clock, it has no times."""
     caption = f"Ticks of the controller{taken_over(summary, 'ticks')}"
     rows = []
     for topic, label, text in timing_rows(summary, is_timed=is_in_host_time(summary)):

@@ -52,10 +52,10 @@ def tick_periods(tape: Tape) -> NDArray[np.int64]:
 
 
 def tick_metrics(tape: Tape, period_ns: int) -> TickMetrics | None:
-    """Return the metrics of the controller's ticks, or None if there are fewer than two.
+    """Return the metrics of the controller's ticks, or None if there are fewer than two ticks.
 
-    The topic `internals` only has ticks with a new y. A period without such a tick counts as one
-    without a new y, although the controller may have missed the tick.
+    The topic `internals` only has ticks with a new y. So a period without a tick in the log is
+    counted as a tick without a new y, although the controller may have missed this tick.
     """
     internals = tape["internals"]
     if len(internals.stamp_ns) < 2:

@@ -15,15 +15,16 @@ If an aircraft shakes more than this, the flight is no success, whatever the cau
 
 The floor is the sum of
 
-- the fraction HARMLESS of the least errors of a divergence, which is 0.02 rad/s for a rate and 0.2
-  m/s for the airspeed. If the wind is unknown, it is the whole of these least errors, 0.1 rad/s and
-  1 m/s;
+- the fraction HARMLESS of the least errors of a divergence, 0.02 rad/s for a rate and 0.2 m/s for
+  the airspeed. If the wind is unknown, the whole of these least errors is taken, 0.1 rad/s and 1
+  m/s;
 - FACTOR times the noise of a measured error, at most MOST.
 
-If the model of the aircraft is unknown, its drag is unknown too. While V changes by its command or
-by the wind, the floor of V is then at least the fraction SPEED_PART of the trim speed.
+If the model of the aircraft is unknown, its drag is unknown as well. While V changes by its command
+or by the wind, the floor of V is then at least the fraction SPEED_PART of the trim speed.
 
-`rise_di_controller.learning.divergence` keeps a learned model below these least errors.
+`rise_di_controller.learning.divergence` keeps a learned model below the least errors of a
+divergence.
 """
 
 import math
@@ -112,11 +113,11 @@ def tracking_verdict(
     may_pause: bool = True,
     starved: Starvation | None = None,
 ) -> TrackingVerdict:
-    """Judge the tracking errors: return those that are too large, and those that are excused.
+    """Judge the tracking errors: return which of them are too large, and which are excused.
 
-    Noise or wind can excuse an error. Each error is that of an output in the worst part of the
-    flight. If `may_pause` is True, ticks of an inactive controller do not count. The spans
-    `starved`, in which the host was too busy, do not count either.
+    Noise or wind can excuse an error. Each error is the error of one output in the worst part of
+    the flight. If `may_pause` is True, ticks of an inactive controller are left out. The spans
+    `starved`, in which the host was too busy, are left out as well.
     """
     nothing = TrackingVerdict([], [])
     if not {"y", "y_m"} <= set(tape.signals):
@@ -134,7 +135,7 @@ def tracking_verdict(
 
 
 def _verdict(pair: ErrorPair, aircraft: AircraftConfig | None) -> TrackingVerdict:
-    """Judge the errors in the ticks that count, which are those of `pair.is_flown`."""
+    """Judge the errors in the ticks that `pair.is_flown` selects."""
     if not pair.is_flown.any():
         sentence = "no error in the log while the law was engaged"
         return TrackingVerdict([Shortfall(aim=Aim.LOG, sentence=sentence)], [])
@@ -165,7 +166,7 @@ def _verdict(pair: ErrorPair, aircraft: AircraftConfig | None) -> TrackingVerdic
 
 
 class _Limits(NamedTuple):
-    """The errors that an output may have in addition to that of the linear loop, SI."""
+    """Errors, SI, that an output may have in addition to the error of the linear loop."""
 
     floor: float
     most: float  # largest excuse for noise and wind
@@ -190,7 +191,7 @@ def _floor(pair: ErrorPair, i: int, unit: str) -> float:
 
 
 def _drag(pair: ErrorPair, i: int, speed: float) -> float:
-    """Return the error that an unknown drag causes in output i while it changes, SI.
+    """Return the error, SI, that an unknown drag causes in output i while the output changes.
 
     `speed` is the trim speed V0, m/s.
     """
@@ -206,9 +207,9 @@ def _most(unit: str) -> float:
 def _excesses(pair: ErrorPair, i: int, group: list[int], limits: _Limits) -> list[Excess]:
     """Return the worst parts of the flight for output i.
 
-    There are up to two for each span in which the law flew, and two for the last END of the flight.
-    Spans shorter than END are left out if there is a longer one. `group` holds the outputs of the
-    same kind as output i, which is the airspeed or the rates.
+    The result has up to two parts for each span in which the law flew, and two for the last END of
+    the flight. Spans shorter than END are left out if there is a longer one. `group` holds the
+    outputs of the same kind as output i. The kinds are the airspeed and the rates.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], pair.is_flown, [False]])))
     spans = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
@@ -228,8 +229,8 @@ def _largest_excesses(
 ) -> list[Excess]:
     """Return the two worst parts of a span of ticks for output i, each of the length WINDOW.
 
-    The first has the largest ratio of rms error to allowed error, and the second needs the largest
-    excuse. A span that is shorter than WINDOW has only one part.
+    The first part has the largest ratio of rms error to allowed error. The second part needs the
+    largest excuse. If the span is shorter than WINDOW, its only part is the whole span.
     """
     start, stop = span
     count = min(_ticks(pair, WINDOW), stop - start)
@@ -308,10 +309,10 @@ def _allowance(excess: Excess, unit: DisplayUnit) -> Allowance:
 def saturation_notes(tape: Tape) -> list[str]:
     """Return sentences on inputs that jump between their two limits in most ticks of a WINDOW.
 
-    Such an input is at a limit in at least the share SATURATED of the ticks, and at each of its two
-    limits in at least the share SIDE. A throttle that is full in a climb is at one limit only, so
-    it has no sentence. A limit of the rate does not count, because noise drives a slow engine to
-    both of its rate limits.
+    Such an input is at a limit in at least the fraction SATURATED of the ticks, and at each of its
+    two limits in at least the fraction SIDE. A throttle that is full in a climb is at one limit
+    only, so there is no sentence on it. A limit of the rate is not examined, because noise drives a
+    slow engine to both of its rate limits.
     """
     if "internals" not in tape:
         return []
