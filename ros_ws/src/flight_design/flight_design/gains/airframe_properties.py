@@ -4,7 +4,8 @@
 
 The checks cover Remark 1 and Assumptions 1 and 3. Assumption 2 (f is C1, and f and f_dot are
 bounded) needs no check, because f consists of gusts and sine terms, which the schema of an airframe
-file bounds. They are C1, and their rates are bounded as long as the angular rates are.
+file bounds. Gusts and sine terms are C1, and their rates are bounded as long as the angular rates
+are.
 """
 
 from collections.abc import Sequence
@@ -44,7 +45,7 @@ published data have five digits."""
 
 
 class ZeroDynamics(StrEnum):
-    """Location of the invariant zeros, which decides whether Assumption 3 holds."""
+    """Location of the invariant zeros of an airframe, which decides whether Assumption 3 holds."""
 
     STABLE = "stable"  # all in the open left half plane
     # some on the imaginary axis. Assumption 3 does not cover them, so an outer loop must control
@@ -80,9 +81,9 @@ class AirframeFacts(NamedTuple):
     def is_in_theorem(self) -> bool:
         """Whether the theorem applies to the airframe.
 
-        It does if Assumption 1 holds, if D of (10)-(11) exists, and if no zero lies in the right
-        half plane. Zeros on the imaginary axis are allowed here, because an outer loop can control
-        the angles to which they belong.
+        The theorem applies if Assumption 1 holds, if D of (10)-(11) exists, and if no zero lies in
+        the right half plane. Zeros on the imaginary axis are allowed here, because an outer loop
+        can control the angles to which these zeros belong.
         """
         return (
             self.is_controllable
@@ -94,8 +95,8 @@ class AirframeFacts(NamedTuple):
     def remedy(self) -> str:
         """The change of pairs and signs that makes D = I, in words.
 
-        Examples are "none needed", "flip rudder", "pair p-rudder, r-aileron, flip rudder", and
-        "none" if no change does.
+        Examples are "none needed", "flip rudder", and "pair p-rudder, r-aileron, flip rudder". If
+        no change makes D = I, the text is "none".
         """
         if self.pairing is None:
             return "none" if self.m <= MANY else "none of three orders tried"
@@ -115,9 +116,9 @@ def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
     """Compute poles, zeros, Omega = C B with D, and Assumptions 1 and 3 of an airframe, in SI.
 
     Source: Assumptions 1 and 3, equations (10)-(11) and Remark 1 of Tanyer, Tatlicioglu,
-    Zergeroglu. The zeros are those of the linear part (A, B, C), so f has no effect on them. If an
-    airframe has more inputs than outputs, the pseudo-inverse of C B, in SI, combines them to m
-    inputs of the law. A published A may contain gravity, which then affects poles and zeros.
+    Zergeroglu. The zeros are computed from the linear part (A, B, C), so f has no effect on them.
+    If an airframe has more inputs than outputs, the pseudo-inverse of C B, in SI, combines them to
+    m inputs of the law. A published A may contain gravity, which then affects poles and zeros.
 
     Args:
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
@@ -182,10 +183,10 @@ def library() -> list[AirframeFacts]:
 def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:
     """Find the invariant zeros, 1/s, in the order of their real parts.
 
-    They are the finite s at which Rosenbrock's pencil [[A - s I, B], [C, 0]] loses rank. The shapes
-    are A (n, n), B (n, m), C (m, n). There are n - m zeros if C B is nonsingular. The zeros are the
-    poles of the zero dynamics, which is the motion of the aircraft while y = 0. Source: H. H.
-    Rosenbrock, "State-Space and Multivariable Theory", 1970.
+    The zeros are the finite s at which Rosenbrock's pencil [[A - s I, B], [C, 0]] loses rank. The
+    shapes are A (n, n), B (n, m), C (m, n). There are n - m zeros if C B is nonsingular. The zeros
+    are the poles of the zero dynamics, which is the motion of the aircraft while y = 0. Source: H.
+    H. Rosenbrock, "State-Space and Multivariable Theory", 1970.
     """
     n, m = B.shape
     pencil = np.block([[A, B], [C, np.zeros((m, m))]])
@@ -196,9 +197,9 @@ def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray
 
 
 def fastest_zero(A: FloatArray, B: FloatArray, C: FloatArray) -> float:
-    """Return the largest real part of the zeros, 1/s; minus infinity if there are none.
+    """Return the largest real part of the zeros, 1/s; minus infinity if there are no zeros.
 
-    If it is above 0, the aircraft diverges while y is held.
+    If the largest real part is above 0, the aircraft diverges while y is held.
     """
     return float(np.max(invariant_zeros(A, B, C).real, initial=-np.inf))
 
@@ -206,8 +207,8 @@ def fastest_zero(A: FloatArray, B: FloatArray, C: FloatArray) -> float:
 def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return P (n, m), N (n, n - m) and H (n, n - m) with x = P y + N eta and eta = H' x.
 
-    They split the state x into the outputs y and the n - m other coordinates eta. A QR
-    decomposition of C with pivoting picks the m states on which y depends most. Raises
+    The three matrices split the state x into the outputs y and the n - m other coordinates eta. A
+    QR decomposition of C with pivoting picks the m states on which y depends most. Raises
     ParameterError unless C (m, n) has full rank. If C selects states, P = C' and N = H.
     """
     m, n = C.shape
@@ -246,8 +247,8 @@ def marginal_sentence(facts: Sequence[AirframeFacts]) -> str | None:
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
     """Return in which half plane the invariant zeros lie, the poles of the zero dynamics (5)-(9).
 
-    `zeros` has shape (n - m,), in 1/s. A zero counts as on the imaginary axis if its real part is
-    at most ZERO_REAL_PART in magnitude.
+    `zeros` has shape (n - m,), in 1/s. A zero is taken to lie on the imaginary axis if its real
+    part is at most ZERO_REAL_PART in magnitude.
     """
     rightmost = float(np.max(zeros.real, initial=-np.inf))
     if rightmost > ZERO_REAL_PART:

@@ -30,8 +30,9 @@ def signs_of_pairing(
     the input of channel k is flipped, D_k changes its sign, and no other entry of D does. If `D` is
     given, it is checked and not computed. The checks are made in this order:
 
-    1. Omega has a decomposition S D U, and max abs(U - I) is at most 10. 2. The input signs fit the
-    D that is given. 3. D fits Omega.
+    - Omega has a decomposition S D U, and max abs(U - I) is at most 10.
+    - The input signs fit the D that is given.
+    - D fits Omega.
 
     If a check fails, raises ParameterError. The error names the value that contradicts Omega, and
     one that fits Omega.

@@ -33,7 +33,7 @@ class Moves(NamedTuple):
 
 
 class Trial(NamedTuple, Generic[Content]):
-    """A place that the search has tried, with its loop, what the loop lacks, and what it costs."""
+    """A place that the search has tried, with its loop, the shortage of the loop, and its cost."""
 
     place: Place
     shortage: float  # sum of 1 - found / needed over the goals that the loop misses

@@ -32,7 +32,7 @@ SMALL = 1e-9
 class Effectors(NamedTuple):
     """The limits and lags of an airframe's effectors, in the airframe's order, shape (p,) each.
 
-    They are in SI, and the stops are deviations from trim.
+    The values are in SI, and the stops are deviations from trim.
     """
 
     lower: FloatArray  # lower end stops
@@ -64,10 +64,10 @@ def design_allocation(
     The input v is the part of y_dot that the effectors cause, so D = S = U = I on this airframe.
     For a given v, T finds the u with the least sum of squares of (lag_j + SERVO) u_j / range_j.
     Here range_j is half the distance between the stops, and SERVO is the lag of a fast servo. So a
-    slow effector does little of what a fast one can do. The lag of v_i is lag_i = sum_j Omega_ij
-    T_ji lag_j, exact to first order. `priority` lists outputs. If an effector saturates, the input
-    of the first output in the list is kept the longest. The outputs that are not listed follow in
-    the airframe's order.
+    slow effector is used little if a fast one can do the same. The lag of v_i is lag_i = sum_j
+    Omega_ij T_ji lag_j, exact to first order. `priority` lists outputs. If an effector saturates,
+    the input of the first output in the list is kept the longest. The outputs that are not listed
+    follow in the airframe's order.
 
     Raises ParameterError for fewer effectors than outputs, for infinite stops, and for dependent
     rows of Omega. Source of the pseudo-inverse: M. W. Oppenheimer, D. B. Doman, M. A. Bolender,
@@ -153,7 +153,7 @@ def _alone(T: FloatArray, sides: tuple[FloatArray, FloatArray]) -> FloatArray:
 
     All other inputs are 0. `sides` are two arrays of stops, one per effector. An effector with a
     negative T_ji moves towards its stop in the first array, and one with a positive T_ji towards
-    its stop in the second. Only the magnitudes of the stops count.
+    its stop in the second. The signs of the stops are ignored.
     """
     against, along = (np.abs(side)[:, None] for side in sides)
     counts = np.abs(T) > SMALL * np.abs(T).max(axis=0)
@@ -172,8 +172,8 @@ def _rounded(matrix: FloatArray) -> list[float]:
 def lags_by_input(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:
     """Return the lag of each input, s, by the input's name.
 
-    `lag` is one value for all inputs, or one for each. Raises ParameterError for another number of
-    values, and for a negative one.
+    `lag` is one value for all inputs, or one for each. Raises ParameterError for a wrong number of
+    values, and for a negative lag.
     """
     names = list(airframe.inputs)
     values = as_numbers(lag, "lag", expected := "seconds, 0 or more")

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Select gains of the law for a loop with an extended-state observer.
 
-This observer models each output of the aircraft as the integral of its input times a gain. It knows
-nothing of the aircraft but the sign and the size of these gains.
+This observer models each output of the aircraft as the integral of its input times a gain. All that
+the observer knows of the aircraft is the sign and the size of these gains.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,10 @@ from rise_di_controller.params import ControllerConfig
 
 @dataclass(frozen=True, kw_only=True)
 class WeightProducts:
-    """Each weight in `ExtendedStateWeights` of an output, times or over the loop's total lag T."""
+    """The weights in `ExtendedStateWeights` of an output, made independent of the loop's lag.
+
+    Each weight is multiplied or divided by the total lag T of the loop, s.
+    """
 
     effort: float  # effort / T
     drift: float  # drift T

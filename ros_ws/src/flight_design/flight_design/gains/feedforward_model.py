@@ -43,11 +43,11 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
 
 
 def with_states_of(airframe: Airframe, model: FeedforwardConfig) -> Airframe:
-    """Return the airframe with the states that the model of a feedforward has in addition.
+    """Return the airframe with the further states that the model of a feedforward has.
 
-    They are angles such as the bank angle, which an airframe of body rates lacks. Their rows and
-    columns of A are those of the feedforward, and no input acts on them. Raises ParameterError if
-    the feedforward has sine terms of gravity, which would be lost.
+    These states are angles such as the bank angle, which an airframe of body rates lacks. Their
+    rows and columns of A come from the feedforward, and no input acts on them. Raises
+    ParameterError if the feedforward has sine terms of gravity, which would be lost.
     """
     further = [name for name in model.states if name not in airframe.states]
     if not further:

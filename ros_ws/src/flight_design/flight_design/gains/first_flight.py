@@ -59,10 +59,10 @@ def first_flight(
 ) -> str:
     """Write a scenario file for the airframe that is in the file `path`.
 
-    `controller` is the text of the section controller. The commands are those of `first_commands`,
-    and `part` multiplies the heights of their pulses. `shortfall` says which required margins the
-    loop misses, and becomes the first line of the scenario. The gusts blow across the flight path,
-    at 3 % of the trim speed.
+    `controller` is the text of the section controller. The commands come from `first_commands`, and
+    `part` multiplies the heights of their pulses. `shortfall` says which required margins the loop
+    misses, and becomes the first line of the scenario. The gusts blow across the flight path, at 3
+    % of the trim speed.
     """
     V0 = airframe.speed
     stops = _stops(airframe)
@@ -145,8 +145,8 @@ def _surfaces(airframe: Airframe) -> list[bool]:
 def _stops(airframe: Airframe) -> list[float]:
     """Choose the end stop of every input.
 
-    A surface gets STOP. The stop of any other input is the deflection that gives AUTHORITY on the
-    output that the input drives.
+    A surface gets STOP. For any other input, the stop is the deflection at which the input has the
+    effect AUTHORITY on the output that it drives.
     """
     Omega = np.abs(airframe.matrix_c() @ airframe.matrix_b())
     authorities = np.array(
@@ -221,8 +221,8 @@ def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
 def pairing(airframe: Airframe) -> tuple[int, ...]:
     """Return the index of the input that is paired with each output.
 
-    The pairs are those of the smallest change that makes D = I with a coupling of at most
-    MAX_COUPLING. If there is no such change, the inputs stay in their order.
+    The pairs follow from the smallest change of pairs and signs that makes D = I with a coupling of
+    at most MAX_COUPLING. If there is no such change, the inputs stay in their order.
     """
     best = search(airframe.matrix_c() @ airframe.matrix_b(), MAX_COUPLING)
     if best is None:

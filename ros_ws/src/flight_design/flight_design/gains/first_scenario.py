@@ -89,7 +89,7 @@ class Channel(NamedTuple):
     def frequency(self) -> float:
         """Natural frequency of the reference model, rad/s.
 
-        It is half of the bandwidth, but at most FASTEST.
+        It is half of the bandwidth of the loop, but at most FASTEST.
         """
         return min(FASTEST.get(self.motion, FASTEST_SPEED), OF_BANDWIDTH * self.bandwidth)
 
@@ -126,7 +126,7 @@ class FirstCommands(NamedTuple):
 
     @property
     def gust(self) -> float:
-        """When a gust comes after the last command, s."""
+        """Time at which the gust after the last command comes, s."""
         return self.duration - LAST / 2.0
 
 
@@ -142,9 +142,9 @@ def first_commands(
     """Choose the commands of a first flight: the outputs one after another, the speeds last.
 
     The frequency and height of each command follow from its `Channel`, and `part` multiplies the
-    heights. If the aircraft `banks` to turn, the yaw rate is that of a coordinated turn, g / V0
-    sin(bank). `speed` is V0, m/s, or None in hover. `rate` is that of the reference model, Hz.
-    `wait` is the time before all commands, s.
+    heights. If the aircraft `banks` to turn, the yaw rate is commanded as in a coordinated turn, g
+    / V0 sin(bank). `speed` is V0, m/s, or None in hover. `rate` is the rate of the reference model,
+    Hz. `wait` is the time before all commands, s.
 
     The reference is slower than the loop, and stays within the authority of the input. Source: K.
     J. Astrom, R. M. Murray, "Feedback Systems", 12.2 (two degrees of freedom).
@@ -201,8 +201,8 @@ def unit_gains(lag: Sequence[float], delay: float) -> dict[str, Any]:
 def scenario_to_design(scenario: FilePath | Scenario) -> Scenario:
     """Load a scenario whose section controller may lack the gains.
 
-    Gains that it lacks are set to 1, and are selected later. The section must have the rate,
-    channels, lags, delay and failsafe. Raises ParameterError.
+    Missing gains are set to 1, and are selected later. The section must have the rate, channels,
+    lags, delay and failsafe. Raises ParameterError if one of these is missing.
     """
     if isinstance(scenario, Scenario):
         return find_scenario(scenario)
@@ -233,8 +233,9 @@ def scenario_to_check(scenario: FilePath | Scenario) -> Scenario:
 def airframe_to_check(airframe: FilePath | Airframe, flight: Scenario) -> Airframe:
     """Return the airframe for a check of gains.
 
-    If a JSBSim aircraft is named, this is the linear model of the JSBSim aircraft that the scenario
-    flies. Raises ParameterError if the airframe has other channels than the law of the scenario.
+    If `airframe` names a JSBSim aircraft, the result is the linear model of the JSBSim aircraft
+    that the scenario flies. Raises ParameterError if the airframe has other channels than the law
+    of the scenario.
     """
     flown = flight.aircraft
     law = flight.controller

@@ -119,8 +119,8 @@ class GainCondition(NamedTuple):
     def margin(self) -> float:
         """Factor by which the gain set meets the condition.
 
-        The factor is below 1 if the condition fails, and 0 if no gain can meet it. It is NaN for a
-        lower bound of 0.
+        The factor is below 1 if the condition fails, and 0 if no gain can meet the condition. It is
+        NaN for a lower bound of 0.
         """
         if self.relation is not Relation.AT_MOST:
             return self.value / self.bound if self.bound > 0.0 else math.nan
@@ -150,7 +150,7 @@ def bound_U(Omegas: FloatArray) -> FloatArray:
 
     `Omegas` has shape (N, m, m). The other entries of the result are 0. U comes from the
     decomposition Omega = S D U (11). The result also bounds the off-diagonal entries of D U D,
-    because they have the same magnitudes. Raises DecompositionError if a sample has no such
+    because these have the same magnitudes. Raises DecompositionError if a sample has no such
     decomposition.
     """
     return np.asarray(np.max([np.triu(np.abs(decompose(Omega).U), 1) for Omega in Omegas], axis=0))
@@ -161,8 +161,8 @@ def rho(Omega: FloatArray, CAC: FloatArray, Lambda: FloatArray) -> float:
 
         rho = largest singular value of [I - G Lambda, G],  G = M (C A C^+ + Lambda),  M = S^-1
 
-    Here N~ = G (r - Lambda e) + e. The reference term of (18) is not in this N~, because it counts
-    as a part of N_d. Omega and CAC = C A C^+ have shape (m, m), Lambda has (m,). Raises
+    Here N~ = G (r - Lambda e) + e. The reference term of (18) is not in this N~, because it is
+    taken as a part of N_d. Omega and CAC = C A C^+ have shape (m, m), Lambda has (m,). Raises
     DecompositionError if Omega has no decomposition S D U. Source: (16)-(19) of Tanyer,
     Tatlicioglu, Zergeroglu, with the correction of docs/theory.md.
     """
@@ -195,8 +195,8 @@ def zeta_Phi(i: int, K: FloatArray, U: FloatArray) -> float:
 def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
     """Compute gains that meet (22), (29), (30) and steps 2 and 3 of Theorem 1 for given bounds.
 
-    The shapes are those in `Bounds` and `GainSet`. `least` is the decay rate of e and r. N~ uses up
-    a part of this decay in step 2, and Phi uses up another part in step 3:
+    The shapes are the shapes in `Bounds` and `GainSet`. `least` is the decay rate of e and r. N~
+    uses up a part of this decay in step 2, and Phi uses up another part in step 3:
 
         least = min(Lambda, 1)
         k_g   = 1.5 rho^2 / (4 least)                                     step 2
@@ -223,15 +223,16 @@ def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
 def check_theorem(gains: GainSet, bounds: Bounds) -> tuple[GainCondition, ...]:
     """Evaluate the conditions of Theorem 1 on a gain set.
 
-    The conditions are (29), (30) from the last channel up, and then those of steps 2 and 3:
+    The conditions are (29), (30) from the last channel up, and then the conditions of steps 2 and
+    3:
 
         beta_i >= (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i)
         k_g >= rho^2 / (4 min(Lambda, 1))
         sum_i zeta_Phi,i^2 / (4 k_d,i) <= min(Lambda, 1) - rho^2 / (4 k_g)
 
-    In the first condition, beta_j is that of the gain set. The last condition names the channel
-    with the largest term. Equation (22) needs no condition, because the gain set states k_g and
-    k_d. Raises ParameterError if a gain is not positive.
+    In the first condition, beta_j is the value in the gain set. The last condition names the
+    channel with the largest term. Equation (22) needs no condition, because the gain set states k_g
+    and k_d. Raises ParameterError if a gain is not positive.
     """
     for key in GainSet._fields:
         require(
@@ -312,10 +313,10 @@ def engineering_gains(
         beta_i = min(factor slew_i, 0.7 rate_limit_i) / response_i
 
     The bandwidth of channel i is then K_i response_i. `slew` is the largest rate of the ideal
-    control, and `rate_limit` is that of the actuator (infinite without a limit). Both are rates of
-    inputs that are scaled to unit response, so their units are those of y / s^2. Raises
-    ParameterError for a factor below 1. Source: this project. The formula of beta follows from N_d
-    = -D U v*_dot at e = 0, see `N_d`.
+    control, and `rate_limit` is the rate limit of the actuator (infinite without a limit). Both are
+    rates of inputs that are scaled to unit response, so their units are the units of y / s^2.
+    Raises ParameterError for a factor below 1. Source: this project. The formula of beta follows
+    from N_d = -D U v*_dot at e = 0, see `N_d`.
     """
     require(factor >= 1.0, "factor", factor, "at least 1: beta above the slew of the ideal control")
     K = np.maximum(bandwidth, max(MIN_K, float(bandwidth[-1])))
@@ -332,8 +333,8 @@ def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:
 
     The result has the shape of v_dot, (..., m), and units of y / s^2. The formula follows from
     Omega v*_dot = y_m_ddot - C (A x_dot + f_dot) and N_d = M (C A x_dot + C f_dot - y_m_ddot) with
-    M Omega = D U. Omega, (m, m), is the response to the inputs v. Raises DecompositionError if
-    Omega has no decomposition S D U.
+    M Omega = D U. Omega, (m, m), is the response of y_dot to the inputs v. Raises
+    DecompositionError if Omega has no decomposition S D U.
     """
     factors = decompose(Omega)
     return np.asarray(-v_dot @ (factors.D[:, None] * factors.U).T)
@@ -355,7 +356,7 @@ def check_rules(
     estimate the margins of the loop, so a loop may break a rule if its margins suffice.
 
     response_i is the nominal abs(Omega_ii) in the scaled inputs of the law. slew is the largest
-    rate of the ideal control in the same inputs, units of y / s^2. All have shape (m,).
+    rate of the ideal control in the same inputs, units of y / s^2. All arrays have shape (m,).
     """
     bandwidth = params.K * response
     most = np.full(len(loop.total), MAX_CROSSOVER_LAG_PRODUCT)
@@ -390,7 +391,7 @@ def check_loop(
     rate limit are converted to inputs of unit response. If one of the other conditions fails, the
     implicit sign chatters. response_i is the nominal abs(Omega_ii) in the inputs of the law, and
     `largest` is an upper bound of abs(Omega_ii). rate_limit is in the same inputs, in units of y /
-    s^2, and infinite without a limit. All have shape (m,).
+    s^2, and infinite without a limit. All arrays have shape (m,).
     """
     fastest = MAX_BETA_TO_RATE_LIMIT * rate_limit * response
     conditions = _by_channel("beta below rate", params.beta * response, fastest, Relation.AT_MOST)

@@ -190,7 +190,7 @@ def select_gains(
 
 
 def _beside_observer(required: Requirement, *, as_read: bool) -> Requirement:
-    """Lower a required phase margin to at most the one that suffices with an observer.
+    """Lower a required phase margin to at most the margin that suffices with an observer.
 
     If the gains are taken `as_read` from a file, the loop only needs to be stable.
     """
@@ -202,7 +202,7 @@ def _beside_observer(required: Requirement, *, as_read: bool) -> Requirement:
 def _two_speeds(speeds: ArrayLike, *, observer: bool) -> tuple[float, float] | None:
     """Return the two fractions of the trim speed, or None if `speeds` is empty.
 
-    Raises ParameterError if they are not on both sides of 1, or given without an observer.
+    Raises ParameterError unless one is below 1 and one above, or if there is no observer.
     """
     expected = "two parts of the trim speed, one below 1 and one above: 0.7,1.4"
     ratios = as_numbers(speeds, "speeds", expected)
@@ -283,8 +283,9 @@ def study(
 ) -> Study:
     """Compute the `Study` of an airframe and of uncertain airframes around it.
 
-    Inputs are those of the law, before an allocation. Commands and gusts are those of a scenario.
-    Lags and delay are those of `flown`, or if it is None of the controller. Raises ParameterError.
+    The inputs are the inputs of the law, before an allocation. Commands and gusts come from the
+    scenario. Lags and delay come from `flown` or, if it is None, from the controller. Raises
+    ParameterError.
     """
     timing = loop_of(controller) if flown is None else flown.comparison.timing
     matrices, _ = of_matrices_and_lags(spread, timing, controller.inputs)
@@ -311,11 +312,11 @@ def _loop(
     lag: ArrayLike | None,
     delay: float | None,
 ) -> LoopSetting:
-    """Return the loop of a scenario, with what the arguments change.
+    """Return the loop of a scenario, with the changes that the arguments ask for.
 
     `rate` and `y_rate` are rates of the law and of y, Hz; `lag` and `delay` are in s. The law runs
-    once per sample of y, so sampling lags by 1.5 periods of y. The loop counts only 1.5 periods of
-    the law, so the difference is added to the delay. Raises ParameterError.
+    once per sample of y, so sampling causes a lag of 1.5 periods of y. The loop includes only 1.5
+    periods of the law, so the difference is added to the delay. Raises ParameterError.
     """
     loop = gain_selection.loop_setting(scenario)
     if rate is not None:
@@ -335,10 +336,7 @@ def _loop(
 
 
 def _mixed(loop: LoopSetting, scenario: Scenario, airframe: Airframe, mixing: str) -> LoopSetting:
-    """Add an allocation to the loop if the airframe or the mixing needs it.
-
-    Otherwise the loop gets the limits of the actuators.
-    """
+    """Add an allocation to the loop if it needs one, and limits of the actuators if it does not."""
     if mixing == FULL or len(airframe.inputs) > len(airframe.outputs):
         return _allocated(loop, scenario, airframe)
     return _with_limits(_without_allocation(loop, scenario), scenario, airframe)
@@ -370,9 +368,9 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
 def _pairing(
     inputs: str | Sequence[str], controller: ControllerConfig, airframe: Airframe
 ) -> tuple[str, ...]:
-    """Return the input of each output: from `inputs`, or if that is empty, as in the controller.
+    """Return the input of each output: from `inputs`, or if that is empty, from the controller.
 
-    It is () if the controller, then, has an allocation or other inputs than the airframe.
+    The result is () if the controller is used but has an allocation or other inputs.
     """
     names = as_names(inputs, "inputs", f"the inputs {', '.join(airframe.inputs)} in any order")
     if names:
@@ -397,8 +395,8 @@ def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
 def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> LoopSetting:
     """Add an allocation to the loop, from the airframe's C B.
 
-    The lags are those of the loop, or of the actuators if the loop has none. Raises ParameterError
-    if the actuators have no end stops.
+    A lag that the loop lacks comes from the actuators. Raises ParameterError if the actuators have
+    no end stops.
     """
     actuators = scenario.aircraft.actuators
     names = list(airframe.inputs)
@@ -467,14 +465,14 @@ def selected_observer(
 ) -> SelectedObserver:
     """Add the feedforward and observer of a model to a controller.
 
-    Returns them with a text that says where the gains come from. The search for the least error
+    The result also has a text that says where the gains come from. The search for the least error
     begins at these gain sets:
 
-    - If there is a file `weights`: the gains in it.
+    - If there is a file `weights`: the gains in the file.
     - If `sketched`: gains for a model that is only a rough sketch of the aircraft.
-    - Otherwise: the gains that `rise-di compare --tune` found in the scenario, or in a shipped one
-      with the same airframe and lags. If the model has other states, or at least SLOWER times the
-      total lag of that search, a rule derives gains from the lags.
+    - In other cases: the gains that `rise-di compare --tune` found in the scenario, or in a shipped
+      one with the same airframe and lags. If the model has other states, or at least SLOWER times
+      the total lag of that search, a rule derives gains from the lags.
 
     The gains of a file or for a sketch only change if the margins need lower gains. Channels that
     are not free keep their gains. The other arguments are as for `with_aircraft_observer`.
@@ -524,7 +522,8 @@ def _noise(
 ) -> tuple[FloatArray, dict[str, float]]:
     """Return the noise of the outputs, (m,), and the noise of the vanes by channel, rms per sample.
 
-    Only vanes whose angle is a state of the model count. A perfect sensor gets a small value.
+    A vane is left out if its angle is not a state of the model. A perfect sensor gets a small
+    value.
     """
     channels = scenario.aircraft.channels().outputs
     measured = scenario.aircraft.sensors.noise or (0.0,) * len(channels)
@@ -573,7 +572,7 @@ def _gain_sets(
 
 @lru_cache
 def _shipped(name: str) -> Scenario:
-    """Read a scenario of the library, once, because a learner designs every few seconds."""
+    """Read a scenario of the library, and cache it, because a learner designs every few seconds."""
     return find_scenario(name)
 
 

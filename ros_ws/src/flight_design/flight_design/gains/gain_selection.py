@@ -145,7 +145,7 @@ class GainAssessment(NamedTuple, Generic[Controller]):
     def has_requirement(self) -> bool:
         """Whether the loop must have certain margins.
 
-        A loop with the implicit or the literal sign has no required margins.
+        If the law has the implicit or the literal sign, no margins are required.
         """
         return any(condition.name in REQUIRED for condition in self.loop)
 
@@ -208,13 +208,13 @@ def gain_sets(study: Study, setting: LoopSetting) -> Selection:
     """Derive two gain sets for an airframe: by Theorem 1 and by the engineering procedure.
 
     The set by Theorem 1 has the literal sign. In both sets the fastest channel comes first, so the
-    last has the smallest K. Inputs are scaled by 1 / abs(Omega_ii), and D follows from the minors.
-    The theorem's set is `theorem_gains` with a Lambda of 1 (1/s), which needs the smallest k_g. The
-    other set is `engineering_gains` with the `slew` of the nominal airframe. Behind servos,
-    `within_requirement` searches for the integral gains and bandwidths with the least error. The
-    margins must meet the requirement on the nominal airframe and on every sample. `omega` is the
-    largest abs(Omega_ii) of the samples. Raises ParameterError as `signs_of_pairing` does, and for
-    parameters that the controller does not accept.
+    last has the smallest K. Inputs are scaled by 1 / abs(Omega_ii), and D follows from the leading
+    minors of Omega. The theorem's set is `theorem_gains` with a Lambda of 1 (1/s), which needs the
+    smallest k_g. The other set is `engineering_gains` with the `slew` of the nominal airframe.
+    Behind servos, `within_requirement` searches for the integral gains and bandwidths with the
+    least error. The margins must meet the requirement on the nominal airframe and on every sample.
+    `omega` is the largest abs(Omega_ii) of the samples. Raises ParameterError as `signs_of_pairing`
+    does, and for parameters that the controller does not accept.
     """
     pairs = _paired(study, setting)
     engineering = gain_candidates(study, setting)
@@ -253,7 +253,10 @@ def gain_candidates(
 
 
 class _Paired(NamedTuple):
-    """The channels of a selection, the fastest first: (22) gives the last one the smallest K."""
+    """The channels of a selection, in the order of (22): the fastest one comes first.
+
+    Equation (22) gives the last channel the smallest K.
+    """
 
     channels: ChannelPairing
     rows: list[int]  # indices of the outputs, in the airframe's order
@@ -373,8 +376,8 @@ def assess_scenario(
 ) -> GainAssessment[ControllerConfig]:
     """Evaluate every condition on the gains in a scenario's controller.
 
-    The study must have flown the manoeuvre of the scenario, so the airframe must have its outputs.
-    Raises ParameterError if D or the pairing contradicts the airframe.
+    The study must have the commands and gusts of the scenario, so the airframe must have its
+    outputs. Raises ParameterError if D or the pairing contradicts the airframe.
     """
     return assess_gains(study, scenario.controller, loop_setting(scenario, gamma_2))
 
@@ -408,12 +411,13 @@ def assess_gains(
 
     Rate, lag and delay come from the controller, gamma_2 and rate limits from the setting.
 
-    RISE-DI has the conditions of `_rise_di_conditions`. The linear loop of any law must be stable
-    for every sample, and have the required margins. With an observer, 35 degrees of phase suffice.
-    The delay margin of the nominal loop must be at least one period, so that a tick may be missed.
-    With an observer it must be at least the observer's margin minus the delay. With the implicit
-    sign, the loop is linear only inside the sign's width, dt^2 omega beta, and no margins are
-    required. Its delay margin is then the delay at which chatter begins, at most half a period.
+    If the law is RISE-DI, the conditions of `_rise_di_conditions` are evaluated. The linear loop of
+    any law must be stable for every sample, and have the required margins. With an observer, 35
+    degrees of phase margin suffice. The delay margin of the nominal loop must be at least one
+    period, so that a tick may be missed. With an observer it must be at least the margin that the
+    observer declares, less the delay. With the implicit sign, the loop is linear only inside the
+    sign's width, dt^2 omega beta, and no margins are required. The delay margin is then the delay
+    at which chatter begins, at most half a period.
     """
     rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
@@ -465,12 +469,12 @@ def _rise_di_conditions(
 ) -> tuple[tuple[GainCondition, ...], tuple[GainCondition, ...], tuple[GainCondition, ...], Bounds]:
     """Evaluate the conditions of Theorem 1, `check_rules` and `check_loop`, in this order.
 
-    The last entry has the bounds of the theorem. `check_rules` and `check_loop` apply only without
-    an observer.
+    The last entry of the result has the bounds of the theorem. `check_rules` and `check_loop` apply
+    only without an observer.
 
-    The value of the condition "D" is the fraction of the samples whose Omega has the signs D. That
-    of "zero dynamics" is the fraction whose zeros are stable. The bounds of (29), (30), steps 2 and
-    3 are the largest over the samples that meet both conditions. "V2_dot" is the smallest
+    The value of the condition "D" is the fraction of the samples whose Omega has the signs D. The
+    value of "zero dynamics" is the fraction whose zeros are stable. The bounds of (29), (30), steps
+    2 and 3 are the largest over the samples that meet both conditions. "V2_dot" is the smallest
     eigenvalue of Q in V2_dot = -z'Qz over these samples; steps 2 and 3 are sufficient for Q > 0.
     """
     rows, columns = law_order(study.airframe, controller)
@@ -521,10 +525,10 @@ def response(study: Study, controller: ControllerConfig) -> FloatArray:
 def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
     """Return the largest V / V0 up to which the same gains have a positive delay margin.
 
-    The response to every input grows with V^2, except that to the input of V. Everything else stays
-    as in trim. The result is a multiple of SPEED_STEP, 0 if there is no delay margin in trim,
-    infinite if the linear loop is stable up to MAX_SPEED_RATIO. Raises ParameterError for the
-    literal sign.
+    The response to every input grows with V^2, except the response to the input of V. Everything
+    else stays as in trim. The result is a multiple of SPEED_STEP. It is 0 if there is no delay
+    margin in trim, and infinite if the linear loop is stable up to MAX_SPEED_RATIO. Raises
+    ParameterError for the literal sign.
     """
     timing = study.timing_of(controller)
     loop = linear_loop(controller, study.airframe, study.A[:1], study.B[:1], timing)
@@ -552,7 +556,7 @@ def _bounds(
     """Compute the bounds of Theorem 1 for inputs divided by `scale`, with two masks of samples.
 
     `scale` is (m,). The first mask marks the samples whose Omega has the signs D. The second mask
-    marks those of them that have stable zeros as well.
+    marks the samples of the first mask that also have stable zeros.
     """
     C = study.C[rows]
     Omegas = C @ study.B[:, :, columns] * scale

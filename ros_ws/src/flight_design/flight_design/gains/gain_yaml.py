@@ -190,7 +190,7 @@ def _comments(selection: Selection, controller: RiseDiConfig) -> dict[str, str]:
 
 
 def _within(uncertainty: float) -> str:
-    """Write the words that a value holds for deviations up to `uncertainty`; "" if that is 0."""
+    """Write the words that a value holds for deviations up to `uncertainty`, or "" if it is 0."""
     return f", the largest within +-{100 * uncertainty:g} %" if uncertainty else ""
 
 
@@ -226,7 +226,7 @@ def section_yaml(
 
 
 def below_requirement(unmet: Sequence[GainCondition], outputs: Sequence[str]) -> str:
-    """Write the first line of a file, which says which margins are too small; "" if none is."""
+    """Write the first line of a file, which says which margins are too small; "" without any."""
     lacking = "; ".join(condition.sentence(outputs) for condition in unmet)
     return f"Margins below the requirement: {lacking}." if lacking else ""
 

@@ -67,7 +67,7 @@ class Effected(NamedTuple):
 
 
 class Flown(NamedTuple):
-    """The aircraft that flies in a study, and how it differs from what the controller was told."""
+    """The aircraft that flies in a study, and its differences from the controller's parameters."""
 
     scenario: Scenario
     comparison: Comparison
@@ -98,14 +98,14 @@ class Study(NamedTuple):
     def timing_of(self, controller: ControllerConfig) -> LoopTiming:
         """Return lags, delay and period of the loop.
 
-        They are those of the aircraft that flies. If no aircraft flies yet, they are those that the
-        controller was told.
+        The timing is that of the aircraft that flies. If no aircraft flies yet, the timing comes
+        from the controller's parameters.
         """
         return loop_of(controller) if self.flown is None else self.flown.comparison.timing
 
     @property
     def differences(self) -> list[str]:
-        """Sentences on how the flying aircraft differs from what the controller was told of it."""
+        """Sentences on how the flying aircraft differs from the controller's parameters."""
         flown = self.flown
         return [] if flown is None else [each.sentence for each in flown.comparison.differences]
 
@@ -179,11 +179,11 @@ def study_airframe(
 
     eta is integrated by Runge-Kutta in steps of 0.01 s, and u*_dot is evaluated at the steps. Only
     f_dot and the rate of the commands u_m, which y_m_ddot contains, are central differences over
-    1e-5 s. f is that of the nominal airframe. With `effected`, the entries of its airframe are
-    uncertain, and each B is then multiplied by its T. Raises ParameterError if Omega is singular,
-    or if the nominal airframe has a zero in the right half plane, because Assumption 3 fails then.
-    Raises FlightEnded if the ideal flight of the nominal airframe diverges. An uncertain airframe
-    that diverges counts as unstable.
+    1e-5 s. All airframes have the f of the nominal one. With `effected`, the entries of its
+    airframe are uncertain, and each B is then multiplied by its T. Raises ParameterError if Omega
+    is singular, or if the nominal airframe has a zero in the right half plane, because Assumption 3
+    fails then. Raises FlightEnded if the ideal flight of the nominal airframe diverges. An
+    uncertain airframe that diverges is marked as unstable.
     """
     drawn_airframe = airframe if effected is None else effected.airframe
     A, B = nominal_and_sampled(drawn_airframe, uncertainty, samples, seed, spread)
@@ -311,7 +311,7 @@ def _zero_dynamics(
     """Integrate eta by Runge-Kutta and return it at every step, shape (n - m, steps, N).
 
     `eta` is the value at the first step. `y_m` and `y_m_dot` are given every half step, and
-    `halves` has the numbers of these half steps. Every second one is the beginning of a step.
+    `halves` has the numbers of these half steps. Every second half step is the beginning of a step.
     """
     t = (STEP / 2.0 * halves)[:, None, None]
     held = y_m @ plant.P.T
@@ -341,8 +341,8 @@ def _rates(
 ) -> FloatArray:
     """Compute u*_dot at T instants, shape (T, N, m).
 
-    `halves` has the instants, counted in half steps. Each of the references has shape (m, T), and
-    eta has shape (n - m, T, N).
+    `halves` has the instants, as numbers of half steps. Each of the references has shape (m, T),
+    and eta has shape (n - m, T, N).
     """
     y_m, y_m_dot, y_m_ddot = references
     instants = np.repeat(STEP / 2.0 * halves, eta.shape[-1])

@@ -53,8 +53,8 @@ def discrete_gust(speed: float) -> tuple[float, float]:
 
         U = REFERENCE_GUST (H / 106.7 m)^(1/6),  H = GUST_TIME speed within GUST_LENGTHS
 
-    H is the distance from the entry to the peak. Source: CS 25.341 (a), without the alleviation
-    factor.
+    U is the peak, and H is the distance from the entry to the peak. Source: CS 25.341 (a), without
+    the alleviation factor.
     """
     length = min(max(GUST_TIME * speed, GUST_LENGTHS[0]), GUST_LENGTHS[1])
     peak = REFERENCE_GUST * (length / GUST_LENGTHS[1]) ** (1.0 / 6.0)
@@ -77,7 +77,7 @@ def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air)
         z+ = A z + N n,  P+ = A P A' + N N',  n white with unit variance
 
     z is the state of the loop and P its covariance. P after 2^j periods follows from P after
-    2^(j-1) periods. The noise of the measurements is a part of n. The response to gusts is without
+    2^(j-1) periods. n contains the noise of the measurements. The response to gusts is without
     noise.
     """
     none = np.zeros(len(loop.lag))

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute the paper's Lyapunov functions along a flight of a known plant.
 
-They are evidence for the theorem, not part of the law.
+They are evidence for the theorem, and the law does not use them.
 
 All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), with
 Omega = C B in these inputs. Time derivatives are central differences over the samples of a flight.
-y_dot jumps with u at a sample, and the difference then gives the mean of its values before and
+y_dot jumps with u at a sample, and the difference then gives the mean of the values before and
 after the jump. The differences are exact up to terms that vanish with the sampling period.
 """
 
@@ -66,8 +66,8 @@ class Evidence(NamedTuple):
 def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples]:
     """Read plant and samples at the ticks of the law from the recorded topics of a scenario.
 
-    The channels are in the law's order, in scaled inputs. The tape must be that of a simulation in
-    one process, or of a bag with an exact clock. Raises ValueError if a tick has no sample of
+    The channels are in the law's order, in scaled inputs. The tape must come from a simulation in
+    one process, or from a bag with an exact clock. Raises ValueError if a tick has no sample of
     `truth` or `y_m` with its stamp.
     """
     airframe, aircraft = scenario.aircraft.load()
@@ -138,7 +138,7 @@ def evidence(
 
     C^+ is the pseudo-inverse, and C^+ e_dot is the part of x_dot that appears in e_dot. Lemma 2
     claims that P >= 0 if zeta_b is the constant of `lemma_2`. With the default 0, P and V2 are
-    known up to a constant. The shapes are those of the fields of `Evidence`. Raises
+    known up to a constant. The shapes are given at the fields of `Evidence`. Raises
     DecompositionError if Omega has no decomposition S D U.
     """
     S, D, U = decompose(plant.C @ plant.B)
@@ -184,7 +184,7 @@ def decay_matrix(plant: KnownPlant, params: LawParams) -> FloatArray:
 def lemma_2(plant: KnownPlant, signals: Evidence, params: LawParams) -> float:
     """Compute the constant zeta_b of (47) that Lemma 2 gives for a flight.
 
-    P >= 0 then follows from (29), (30).
+    With this constant, P >= 0 follows from (29), (30).
 
         zeta_i = max_t abs(N_d,i) + sum_(j>i) abs(U_ij) beta_j
         gamma_2,i = Lambda_i (beta_i / zeta_i - 1)

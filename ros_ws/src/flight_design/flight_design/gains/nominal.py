@@ -26,10 +26,11 @@ THRUST_ACTIVITY = 12.0
 
 
 def activity_units(airframe: Airframe) -> FloatArray:
-    """Return which mean abs(u_dot) of each input costs as much as a unit of error, (p,).
+    """Return the unit of activity of each input, (p,).
 
-    Each value has the unit of its input, in SI, per s. If the file has no `no_thrust`, a thrust in
-    newtons has an infinite unit, so that its activity costs nothing.
+    The unit is the mean abs(u_dot) that costs as much as a unit of error. Each value has the unit
+    of its input, in SI, per s. If the file has no `no_thrust`, a thrust in newtons has an infinite
+    unit, so that its activity costs nothing.
     """
     units = []
     channels = zip(airframe.inputs.values(), airframe.no_thrust(), strict=True)
@@ -53,8 +54,8 @@ def airframe_model(
 ) -> NominalModel:
     """Build the model of an airframe without limits, with the channels in the given order.
 
-    D is I until the caller sets it. `noise`, (m,), is the noise of the outputs, rms per sample.
-    `loop` has its channels in the given order too.
+    D is I until the caller sets it. `noise`, (m,), is the noise of the outputs, rms per sample. The
+    channels of `loop` must also be in the given order.
     """
     rows = [airframe.outputs.index(name) for name in outputs]
     columns = [list(airframe.inputs).index(name) for name in inputs]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the gains of a law with an observer, and the weights of the observer.
 
-They follow from a rule, from a rough sketch of the aircraft, or from a search.
+Gains and weights follow from a rule, from a rough sketch of the aircraft, or from a search.
 """
 
 from collections.abc import Mapping
@@ -82,7 +82,7 @@ def gains_beside_sketch(
 ) -> ObserverGains:
     """Derive gains for a model that is only a rough sketch of the aircraft.
 
-    They are those of `gains_by_rule`, multiplied by BESIDE_SKETCH.
+    The results of `gains_by_rule` are multiplied by BESIDE_SKETCH.
     """
     by_rule = gains_by_rule(model, axes, speed)
     airspeed = [name == "V" for name in outputs]
@@ -119,10 +119,10 @@ def read_gains(path: Path, T: FloatArray, axes: int, states: int) -> ObserverGai
 def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> ObserverGains:
     """Convert the gains that `rise-di compare --tune` finds for a law with an observer.
 
-    `gains` has them by name. Gains of rise_observer stay as they are. Gains K and Lambda of
-    pi_observer become gains of RISE-DI that act as the same PI law inside the width of the softened
-    sign. RISE-DI gets the same K, and SHARE times the same Lambda. The slope 1 / (softening T) of
-    the softened sign gives the rest of Lambda. T is the total lag, (m,), s.
+    `gains` has these gains by name. Gains of the law rise_observer stay as they are. Gains K and
+    Lambda of the law pi_observer become gains of RISE-DI that act as the same PI law inside the
+    width of the softened sign. RISE-DI gets the same K, and SHARE times the same Lambda. The slope
+    1 / (softening T) of the softened sign gives the rest of Lambda. T is the total lag, (m,), s.
     """
     values = {name: np.array(row, dtype=np.float64) for name, row in gains.items()}
     weights = Weights(**{name: values[name] for name in Weights._fields})

@@ -95,7 +95,7 @@ class SelectedObserver(NamedTuple):
     def not_counted(self) -> str:
         """Say how many uncertain aircraft were left out of the margins; return "" if none was.
 
-        Those that are left out diverge under any gains while their outputs are held.
+        An aircraft is left out if it diverges under any gains while its outputs are held.
         """
         if not self.left_out:
             return ""
@@ -120,7 +120,7 @@ class AtSpeed(NamedTuple):
         return SpeedConfig(ratio=self.ratio, **nominal, **_matrices(self.design(slower)))
 
     def flown(self, controller: RiseDiConfig, slower: FloatArray) -> RiseDiConfig:
-        """Return the controller with the models of this speed, without checking its parameters."""
+        """Return the controller with the models of this speed. The parameters are not validated."""
         assert controller.observer is not None  # noqa: S101 - it was designed
         values = {
             "observer": controller.observer.model_copy(update=_matrices(self.design(slower))),
@@ -178,10 +178,10 @@ class ObserverSearch(NamedTuple):
     def best(self, progress: Callable[[str], None] = lambda _: None) -> Trial[_Loops]:
         """Find the trial with the least error among those that have the required margins.
 
-        If no trial has them, the result is the trial with the least shortage. The required damping
-        is lowered to about that of the aircraft's zeros if necessary, because no feedback moves a
-        zero. Without `air`, the least relaxed trial is best. `progress` gets a sentence for each
-        loop.
+        If no trial has the margins, the result is the trial with the least shortage. The required
+        damping is lowered to about the damping of the aircraft's zeros if necessary, because no
+        feedback moves a zero. Without `air`, the least relaxed trial is best. `progress` gets a
+        sentence for each loop.
         """
         m = len(self.model.lag)
         free = np.ones((1, m)) if self.is_free is None else np.array([self.is_free])
@@ -208,9 +208,10 @@ class ObserverSearch(NamedTuple):
     def _trial(self, place: Place, requirement: Requirement, least: float) -> Trial[_Loops]:
         """Evaluate the loops at a place in the search.
 
-        `least` is the least cost so far of a trial that meets the margins, infinite if there is
-        none. If `least` is finite, a trial is rejected before its margins are computed if it costs
-        no less, or if a loop is unstable when each input is late by the delay margin that it needs.
+        `least` is the least cost so far of a trial that meets the margins, and is infinite if there
+        is no such trial yet. If `least` is finite, a trial is rejected before its margins are
+        computed in two cases: if it costs no less, or if a loop is unstable when each input is late
+        by the delay margin that it needs.
         """
         loops = self._loops(place)
         if least < math.inf:
@@ -228,7 +229,7 @@ class ObserverSearch(NamedTuple):
     def selected(self, best: Trial[_Loops]) -> SelectedObserver:
         """Return the controller of a trial, with the delay margin of its loop.
 
-        Raises ParameterError if the trial lacks the margins.
+        Raises ParameterError if the trial misses a required margin.
         """
         if best.shortage:
             raise self._refusal(best.content)
@@ -248,8 +249,8 @@ class ObserverSearch(NamedTuple):
     def _loops(self, place: Place) -> _Loops:
         """Build the loops for given exponents of the relaxation.
 
-        At the start of the search they have the controller of the earlier design, if there is one,
-        with the new feedforward.
+        At the start of the search, the loops have the controller of the earlier design, if there is
+        one, with the new feedforward.
         """
         earlier = self.earlier_design
         begin = np.ones(len(place)) if earlier is None else earlier.relaxation
@@ -297,8 +298,8 @@ class ObserverSearch(NamedTuple):
     def _cost(self, loops: _Loops) -> float:
         """Return the cost of a trial, which is the sum of log(error + activity) over the channels.
 
-        Error and activity are those in wind and noise, each divided by its unit. Without `air`, the
-        cost is the sum of log(relaxation).
+        Error and activity come from the response to wind and noise, and each is divided by its
+        unit. Without `air`, the cost is the sum of log(relaxation).
         """
         if self.air is None:
             return float(np.log(loops.relaxation).sum())

@@ -78,7 +78,7 @@ STILL = 1.4  # motion of a vane that counts as rest, as a multiple of its noise
 def model_for(airframe: Airframe, controller: ControllerConfig, noise: FloatArray) -> NominalModel:
     """Build the model of an airframe for a controller, in the law's order.
 
-    `noise`, (m,), is that of the measured outputs, rms per sample.
+    `noise`, (m,), is the noise of the measured outputs, rms per sample.
     """
     model = airframe_model(
         airframe, controller.outputs, controller.inputs, noise, loop_of(controller)
@@ -114,22 +114,22 @@ def with_aircraft_observer(
     """Add the feedforward and the observer of an airframe to a controller, and select its gains.
 
     A search lowers or raises the gains of each channel by a factor, the relaxation. Among the
-    linear loops with the required margins, it takes the one with the least error in moderate
+    linear loops with the required margins, it takes the loop with the least error in moderate
     turbulence with the noise of the sensors. The search is made with each of the gain `sets`, and
     the result with the least error is taken. With `keeps_gains` the gains stay as they are, and are
     only lowered if the margins need it.
 
     `margin` is the least delay margin, s, either one value for all inputs, or one for each, (m,).
-    If the airframe is `uncertain`, the worst of WORST_OF uncertain aircraft must have the phase
-    margin too. Aircraft with a zero in the right half plane are left out, because no gains can hold
-    all of their outputs. `speeds` are two airspeeds, divided by the trim speed. With them the
-    controller gets a schedule, and the loop must have the margins at these speeds too. `vanes` has
+    If the airframe is `uncertain`, the worst of WORST_OF uncertain aircraft must also have the
+    phase margin. Aircraft with a zero in the right half plane are left out, because no gains can
+    hold all of their outputs. `speeds` are two airspeeds, divided by the trim speed. With them the
+    controller gets a schedule, and the loop must also have the margins at these speeds. `vanes` has
     the noise of each vane, rms per sample in rad, by its channel, alpha or beta.
 
-    If there is an `earlier_design`, the search begins at its loop with the new feedforward. It
-    changes the relaxation of free channels only, so this loop stays if no change lowers the error.
-    `activity` is the weight of the activity of u against the error. `progress` gets a sentence for
-    each loop.
+    If there is an `earlier_design`, the search begins at its loop with the new feedforward. The
+    search changes the relaxation of free channels only, so this loop stays if no change lowers the
+    error. `activity` is the weight of the activity of u against the error. `progress` gets a
+    sentence for each loop.
 
     Raises ParameterError for margins that no relaxation reaches. It is also raised for an airframe
     that has another D, has no wind, or cannot be the model of a feedforward.
@@ -175,7 +175,7 @@ def law_activity_unit(airframe: Airframe, controller: ControllerConfig) -> Float
 
         unit_i = min_j unit_j / abs(T_ji),  u = T v
 
-    unit_j is the unit of effector j, by `activity_units`.
+    unit_j is the result of `activity_units` for effector j.
     """
     T = distribution(airframe, controller)
     cost = (np.abs(T) / activity_units(airframe)[:, None]).max(axis=0)
@@ -206,8 +206,8 @@ def _with_schedule(
 def _air(airframe: Airframe, model: NominalModel, vanes: Mapping[str, float]) -> Air:
     """Return moderate turbulence, gusts from below and from the side, and the noise of all sensors.
 
-    The turbulence has a rotary gust in roll if p is a state. Otherwise only noise would move a
-    symmetrical aircraft in roll.
+    The turbulence has a rotary gust in roll if p is a state. Without the rotary gust, only noise
+    would move a symmetrical aircraft in roll.
     """
     speed = airframe.speed
     spectrum = dryden(**MODERATE, sigma=0.0)
@@ -275,9 +275,10 @@ class _AircraftDesigns(NamedTuple):
         return cls(with_feedforward(bare, airframe), airframe, noise, model, names)
 
     def plant(self, count: int, vanes: Iterable[str]) -> LinearPlant:
-        """Return the nominal aircraft and uncertain ones: `count`, less those that no gains hold.
+        """Return the nominal aircraft and up to `count` uncertain ones.
 
-        In C, the rows of the vanes come below those of the outputs.
+        Uncertain aircraft that no gains can hold are left out. In C, the rows of the vanes come
+        below the rows of the outputs.
         """
         spread = Spread(zeros=WORST_ZEROS)
         A, B = nominal_and_sampled(self.airframe, WORST_UNCERTAINTY, count, WORST_SEED, spread)
@@ -325,7 +326,7 @@ class _AircraftDesigns(NamedTuple):
 def _require_no_vanes(vanes: Mapping[str, float], outputs: Sequence[str]) -> None:
     """Check that a design at several speeds has the output V and no vanes, which it cannot use.
 
-    Raises ParameterError if not.
+    Raises ParameterError if V is missing or if there is a vane.
     """
     require(
         not vanes,
@@ -374,11 +375,11 @@ def with_extended_state_observer(
     """Add an observer to a controller that knows Omega and the lags, but no A, f or wind.
 
     The gains of the law stay, unless the margin needs slower gains. The model of the feedforward is
-    y_dot = Omega u, and the model of the observer is y_dot = diag(Omega) u. If the observer had all
-    of Omega, it would use the elevator to correct V, and this would pitch the aircraft. Omega, (m,
-    m), is in the law's order. `noise`, (m,), is the noise of the outputs, rms per sample. `size`,
-    (m,), holds the units of the outputs, 1 m/s or 0.1 rad/s. Raises ParameterError as
-    `with_aircraft_observer` does.
+    y_dot = Omega u, and the model of the observer is y_dot = diag(Omega) u. The observer must not
+    have all of Omega: it would use the elevator to correct V, and this would pitch the aircraft.
+    Omega, (m, m), is in the law's order. `noise`, (m,), is the noise of the outputs, rms per
+    sample. `size`, (m,), holds the units of the outputs, 1 m/s or 0.1 rad/s. Raises ParameterError
+    as `with_aircraft_observer` does.
     """
     m = len(controller.outputs)
     require_same_signs(Omega, controller.D, "Omega")

@@ -16,7 +16,7 @@ from flight_design.gains.requirement import ACCEPTED_PHASE_MARGIN, PHASE_MARGINS
 def binding(selection: Selection) -> GainCondition:
     """Return the condition that limits the engineering gains most.
 
-    Of the conditions that they do not meet, it is the one that they miss by the largest factor.
+    Among the unmet conditions, this is the condition that the gains miss by the largest factor.
     """
     return min(selection.engineering.unmet, key=lambda condition: condition.margin)
 
@@ -25,10 +25,10 @@ def reason_against_gains(selection: Selection, *, options: Sequence[str] = ()) -
     """Say why the best gains of the search do not meet the requirement; None if they do.
 
     The sentences name the condition that limits the gains most, every other unmet condition, and
-    every change of the loop that reaches the margins. Such a change is a smaller goal, half of the
-    lags, no delay, or twice the rate. For each change, gains are searched again. `options` are
-    those of phase_margin, lag, delay and rate that the calling command has. A sentence names a
-    change by its option if the command has this option.
+    every change of the loop that reaches the margins. Such a change is a lower required margin,
+    half of the lags, no delay, or twice the rate. For each change, gains are searched again.
+    `options` says which of phase_margin, lag, delay and rate are options of the calling command. If
+    the command has an option for a change, the sentence names the change by this option.
     """
     assessed = selection.engineering
     if not assessed.unmet:

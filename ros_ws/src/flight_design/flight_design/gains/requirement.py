@@ -157,7 +157,7 @@ def fractions(
 def least_fractions(margins: Margins, requirement: Requirement) -> FloatArray:
     """Return the least of the `fractions` of each loop, (...).
 
-    It is at least 1 if the loop meets the requirement, and 0 for an unstable loop.
+    The result is at least 1 if the loop meets the requirement, and 0 for an unstable loop.
     """
     phase, gain, damping = fractions(margins, requirement)
     least = np.minimum(np.minimum(phase.min(axis=-1), gain.min(axis=-1)), damping)
@@ -170,7 +170,7 @@ def least_fraction(margins: Margins, requirement: Requirement) -> float:
 
 
 def margin_conditions(margins: LoopMargins, requirement: Requirement) -> tuple[GainCondition, ...]:
-    """Return the requirement as conditions, input by input, those on the nominal aircraft first."""
+    """Return the requirement as conditions, input by input, beginning with the nominal aircraft."""
     nominal = nominal_conditions(margins.nominal, requirement)
     if margins.worst is None:
         return nominal
@@ -202,7 +202,7 @@ def nominal_conditions(nominal: Margins, requirement: Requirement) -> tuple[Gain
 def reason_against_margins(
     margins: LoopMargins, requirement: Requirement, outputs: Sequence[str]
 ) -> Refusal | None:
-    """Say which required margins a loop lacks; None if it has them all.
+    """Say which required margins a loop lacks; None if it lacks none.
 
     `outputs` are the names of the law's outputs.
     """
@@ -226,13 +226,13 @@ def within_requirement(
 ) -> Candidate[Controller]:
     """Search for the candidate with the least error among those that meet a requirement.
 
-    If no candidate meets it, the candidate with the least shortage is returned.
+    If no candidate meets the requirement, the candidate with the least shortage is returned.
 
     `build(slower, lower)` makes a controller. It divides the integral gain by both factors, and the
     bandwidth by `lower`. Each factor has a value of 1 or more for each channel, (m,). At 1 the
     gains are those of the engineering procedure, the rule. The error is the product of the
     `linear_error` of all outputs along `u_dot`, (T, m), with inputs in the law's order. The
-    required damping is that of `above_zeros`.
+    required damping is lowered by `above_zeros`.
 
     The search begins with the bandwidths of the rule, and with the largest integral gains with
     which each channel has its margins. If a margin is missing at the end, the search tries other
@@ -341,7 +341,7 @@ class _Loops(Generic[Controller]):
         """Find the trial with the bandwidths of the rule and the largest possible integral gains.
 
         Here every channel alone must have its margins. A channel for which no integral gain
-        suffices gets that of the rule.
+        suffices gets the integral gain of the rule.
 
         The exponents of all channels are doubled and bisected at once, because channels couple
         little. If the result lacks a margin, its channel gets a smaller integral gain, step by

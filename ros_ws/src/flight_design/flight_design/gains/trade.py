@@ -33,7 +33,7 @@ def trade(
 ) -> tuple[TradeRow, ...]:
     """Select the engineering gains for several required phase margins, deg.
 
-    The errors in the rows are those of the nominal aircraft.
+    The rows of the result have the errors of the nominal aircraft.
     """
     nominal = _nominal(selection.study)
     rows = []

@@ -18,7 +18,7 @@ TUNED = Path(__file__).parent / "tuned"  # folder of the tuned gains, one file a
 
 
 class TuningResult(NamedTuple):
-    """Result of a search for tuned gains."""
+    """The tuned gains that a search has found, with their cost."""
 
     gains: dict[str, list[float]]
     cost: float

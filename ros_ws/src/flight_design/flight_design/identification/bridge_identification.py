@@ -75,7 +75,7 @@ def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
 
     An output and an input belong together if the map gives them the same motion. Raises
     ParameterError if two inputs drive the same output, if an output has no input, or if an output
-    of the map has not the sign of the stack, as in `output_signs`.
+    of the map lacks the sign convention of this project, as `output_signs` says.
     """
     drivers: dict[str, tuple[str, int]] = {}
     for name, row in channel_map.inputs.items():
@@ -116,7 +116,7 @@ def has_airspeed(channel_map: ChannelMap) -> bool:
 def require_envelope(channel_map: ChannelMap) -> None:
     """Check that a channel map limits the speeds and the attitude that it measures.
 
-    Nothing else guards an experiment. Raises ParameterError if a limit is missing.
+    These limits are the only guard of an experiment. Raises ParameterError if a limit is missing.
     """
     needed: list[str] = [name for name in ("phi", "theta") if name in channel_map.pose]
     needed += [name for name, motion in motions(channel_map).items() if UNITS[motion] == "m/s"]
@@ -199,9 +199,10 @@ WHOLE = 0.95
 
 
 def reason_against_experiment(engagements: Sequence[Engagement], duration: float) -> Refusal | None:
-    """Say when and why the bridge released the aircraft before an experiment ended, or None.
+    """Say when and why the bridge released the aircraft before an experiment ended.
 
-    `engagements` are those of the log, and `duration` is the planned one, s.
+    Returns None if the bridge released the aircraft at the end. `engagements` are the engagements
+    in the log, and `duration` is the planned duration of the experiment, s.
     """
     lengths = [
         math.inf if part.stop_ns is None else (part.stop_ns - part.start_ns) / NANOSECONDS
@@ -263,7 +264,7 @@ def gravity_along_path(pose: Signal, speed: float) -> Signal | None:
 
 
 class IdentifiedChannels(NamedTuple):
-    """What is known about m channels in which input i drives output i, in SI."""
+    """Identified properties of m channels in which input i drives output i, in SI."""
 
     Omega: FloatArray  # (m, m)
     Omega_deviation: FloatArray  # (m,) standard deviations of the diagonal of Omega
@@ -339,8 +340,8 @@ def join(
 def over_link(channels: IdentifiedChannels, link_delay: float) -> IdentifiedChannels:
     """Add the delay of the link, s, to channels that were identified from a log of the autopilot.
 
-    The autopilot wrote the log on board, but the law flies over the link and meets the longer
-    delay.
+    The autopilot wrote the log on board, but the law flies over the link. So the delay of the law's
+    loop is longer than the delay in the log.
     """
     return channels._replace(delay=channels.delay + link_delay)
 
@@ -350,7 +351,8 @@ def measured_trims(
 ) -> dict[str, float]:
     """Return the command in trim of each input, SI, by the input's name.
 
-    These are the commands that the bridge sent in the pause after an engagement, while u was 0.
+    These are the commands that the bridge sent in the pause after an engagement, while u was 0. The
+    pause begins at `engaged_ns`.
     """
     stamps = (would_send.stamp_ns - engaged_ns) / NANOSECONDS
     still = (stamps > 0.2 * PAUSE) & (stamps < 0.8 * PAUSE)
@@ -408,7 +410,8 @@ def within_range(
 def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -> str:
     """Write a channel map with the measured trims as text.
 
-    A trim that the map captures at the engagement will be measured again at every engagement.
+    If the map captures a trim at the engagement, the bridge will measure this trim again at every
+    engagement.
     """
     values = channel_map.model_dump(exclude_unset=True)
     values["source"] = f"{values['source']}; trims measured in {source}"
@@ -487,7 +490,7 @@ def airframe_yaml(
 
 
 def signs_alone(sign: FloatArray) -> IdentifiedChannels:
-    """Return channels of which nothing is known but the signs of the effects."""
+    """Return channels of which only the signs of the effects are known."""
     none = 0.0 * sign
     return IdentifiedChannels(
         Omega=np.diag(sign),

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Choose units and bounds for the relative errors of the entries of A and B.
 
-An entry with the unit 0 is taken as known.
+If the unit of an entry is 0, the entry is taken as known.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ MAX_FACTOR = 2.5
 
 
 def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:
-    """Return the units in which the errors of the entries of A and B are counted, SI.
+    """Return the units of the errors of the entries of A and B, SI.
 
     The units are the nominal values, except in the rows of angles, where they are 0, because these
     entries are known. If `coupled`, an entry that is 0 gets a unit that follows from its row:

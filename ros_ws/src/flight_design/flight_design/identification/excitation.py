@@ -43,7 +43,7 @@ YAW_RATES = "FW_ACRO_YAW_EN"  # parameter of PX4, see `to_set`
 
 
 class OwnShare(NamedTuple):
-    """The share of an output's variance that its paired input explains."""
+    """The fraction of an output's variance that its paired input explains."""
 
     output: str
     input: str
@@ -52,12 +52,16 @@ class OwnShare(NamedTuple):
 
     @property
     def is_still(self) -> bool:
-        """Whether the share is too small for the log to show what the input does to the output."""
+        """Whether the input moves the output too little to identify its effect from the log.
+
+        This is so if the input explains too small a fraction of the output's variance, or if the
+        output moves too little compared with the noise.
+        """
         return not (self.share >= LEAST_SHARE and self.peak >= LEAST_PEAK)  # NaN shows nothing
 
     @property
     def sentence(self) -> str:
-        """Say what was found and what is expected."""
+        """Sentence that compares the motion in the log with the motion that is needed."""
         if self.share >= LEAST_SHARE:
             return (
                 f"{self.output}: found a peak of {self.peak:.2g} times the noise of the gyro, "
@@ -70,11 +74,11 @@ class OwnShare(NamedTuple):
 
 
 def shares(recorded: FlightData, airframe: Airframe) -> FloatArray:
-    """Return the share of each output's variance that each input explains, (outputs, inputs).
+    """Return the fraction of each output's variance that each input explains, (outputs, inputs).
 
         share_ij = var (C_i x_j) / var y_i,  x_j_dot = (A - FORGETTING) x_j + B_j u_j
 
-    A rough airframe suffices. A share exceeds 1 if two inputs work against each other.
+    A rough airframe suffices. A fraction exceeds 1 if two inputs work against each other.
     """
     A = airframe.matrix_a() - FORGETTING * np.eye(len(airframe.states))
     B = airframe.matrix_b()
@@ -93,7 +97,7 @@ def shares(recorded: FlightData, airframe: Airframe) -> FloatArray:
 def own_shares(
     recorded: FlightData, airframe: Airframe, channels: ChannelPairing
 ) -> list[OwnShare]:
-    """Return the share of each output's variance that its paired input explains.
+    """Return the fraction of each output's variance that its paired input explains.
 
     The outputs are in the law's order.
     """
@@ -127,8 +131,9 @@ def peaks(recorded: FlightData) -> FloatArray:
 def to_set(outputs: Iterable[str], parameters: Mapping[str, float]) -> str:
     """Say which parameter of PX4 must be set so that its controller flies the doublets.
 
-    Without this parameter, PX4 does not control the yaw rate to its setpoint. `parameters` are
-    those of the log. Returns "" if no parameter need be set. Source: PX4 1.16, fw_rate_control.
+    Without this parameter, PX4 does not control the yaw rate to its setpoint. `parameters` has the
+    parameters in the log. Returns "" if no parameter need be set. Source: PX4 1.16,
+    fw_rate_control.
     """
     if "r" not in outputs or parameters.get(YAW_RATES) != 0.0:
         return ""
@@ -161,8 +166,9 @@ def to_fly(
 def gust_warning(part: Part) -> str:
     """Warn that a part of the aircraft was flown in gusts; return "" if the air was calm enough.
 
-    The standard deviations do not include the error that gusts cause. In gusts of 0.5 m/s, the
-    effects on a light airplane came out a fifth too weak.
+    A part is a group of states and inputs that does not couple with the rest. The standard
+    deviations of its entries do not include the error that gusts cause. In gusts of 0.5 m/s, the
+    effects on a light airplane were identified a fifth too weak.
     """
     if part.wind < WINDY:
         return ""
@@ -176,10 +182,9 @@ def gust_warning(part: Part) -> str:
 def factors_of(parts: Iterable[Part]) -> dict[str, float]:
     """Return the outputs that need more motion, each with the factor by which it must grow.
 
-    The standard deviation of every effect on such an output is above MAX_DEVIATION. An output is
-    left out if its effects are uncertain because of a delay, since more motion would not help. It
-    is also left out if two models differ (`rates_model.doubted`), since this does not say how much
-    more motion is needed.
+    An output needs more motion if the standard deviation of every effect on it is above
+    MAX_DEVIATION. There are two exceptions. If the effects are uncertain because of a delay, more
+    motion would not help. If two models differ (`rates_model.doubted`), the factor is unknown.
     """
     factors = {}
     for part in parts:

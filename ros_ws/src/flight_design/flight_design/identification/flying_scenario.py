@@ -143,7 +143,8 @@ class _Identified(NamedTuple):
     def loop(self) -> LoopTiming:
         """Timing of the loop.
 
-        Its delay is the least delay of all channels. What a channel has beyond it counts as lag.
+        The delay of the loop is the least delay of all channels. If the delay of a channel is
+        longer, the difference is added to its lag.
         """
         channels = self.channels
         delay = float(np.min(channels.delay))
@@ -189,8 +190,8 @@ class _Identified(NamedTuple):
     def of_integrators(self, manoeuvre: Manoeuvre) -> Study:
         """Study the ideal control of y_dot = Omega u along the first second of a manoeuvre.
 
-        This suffices for the `slew`. Only the gain set of Theorem 1 would need the rest of the
-        manoeuvre, but it is not used.
+        One second suffices for the `slew`. Only the gain set of Theorem 1 would need the rest of
+        the manoeuvre, and this gain set is not used.
         """
         none = np.zeros_like(self.channels.damping)
         channels = self.channels._replace(damping=none, stiffness=none, zero=none)
@@ -199,7 +200,7 @@ class _Identified(NamedTuple):
         return ideal_control.study_airframe(integrators, short, samples=1)
 
     def setting(self, requirement: Requirement) -> LoopSetting:
-        """Return the loop for which gains are selected. Until then all its gains are 1."""
+        """Return the loop for which gains are selected. All its gains are 1 until the selection."""
         loop = self.loop
         lag = loop.lag.tolist()
         channels = controller_values(self.channel_map, self.pairing)
@@ -249,11 +250,11 @@ def _within_margins(
 
 
 def _without_sideslip(channels: IdentifiedChannels, pairing: ChannelPairing) -> IdentifiedChannels:
-    """Return the channels with the channel r reduced to its damping.
+    """Return the channels with the model of the channel r reduced to its damping.
 
     The stiffness of r is N_beta, which acts in straight flight. In a coordinated turn, beta_dot =
-    -r + g / V phi is 0, so the stiffness does not act. A rudder that worked against it would make
-    the aircraft skid.
+    -r + g / V phi is 0, so the stiffness does not act. A rudder that worked against the stiffness
+    would make the aircraft skid.
     """
     turns = np.array([name == "r" for name in pairing.outputs])
     damping = np.where(turns, channels.damping - channels.zero, channels.damping)
@@ -273,11 +274,11 @@ def _with_integrals(
     """Choose the integral gains of a controller from the models of the channels.
 
     The slope of the softened sign is 1 / (softening total lag). Lambda plus this slope is the
-    integral of the PI law K (s + integral) / s. For a first-order channel the integral is the
-    damping, so that the loop becomes K / s. In a channel with stiffness, y returns to trim under a
-    constant u, so the channel needs a larger integral. The sensitivity must stay below
-    MAX_SENSITIVITY. The crossover is that of y_dot = Omega u. Source: K. J. Astrom, T. Hagglund,
-    "Advanced PID Control", 2006, 6.5 (lambda tuning), 4.6 (largest sensitivity).
+    integral gain of the PI law K (s + integral) / s. For a first-order channel the integral gain is
+    the damping, so that the loop becomes K / s. In a channel with stiffness, y returns to trim
+    under a constant u, so the channel needs a larger integral gain. The sensitivity must stay below
+    MAX_SENSITIVITY. The crossover is that of the loop around y_dot = Omega u. Source: K. J. Astrom,
+    T. Hagglund, "Advanced PID Control", 2006, 6.5 (lambda tuning), 4.6 (largest sensitivity).
     """
     places = [pairing.outputs.index(name) for name in controller.outputs]
     params = controller.law_params()

@@ -109,7 +109,7 @@ def recording(tape: Tape, airframe: Airframe) -> FlightData:
 
     At each instant y is the nearest sample, within half a period, and u is the last sample. Raises
     ParameterError if the log lacks a channel of the airframe, is shorter than ten times TRANSIENT,
-    or has gaps beyond MOST_GAPS.
+    or has more gaps than MOST_GAPS allows.
     """
     y = tape["y"]
     u = tape["u"]
@@ -178,10 +178,10 @@ def delayed(u: FloatArray, periods: float) -> FloatArray:
 def measured_noise(y: FloatArray, size: FloatArray) -> FloatArray:
     """Estimate the noise of each channel from the third differences of y, (T, m), rms per sample.
 
-    The variance of these differences is 20 times that of the noise. They do not show the noise of a
-    y that is rounded to larger steps, because it often stays the same. So the result is at least
-    the rms error of rounding, step / sqrt(12), where the step is the least change of y. It is also
-    at least MIN_NOISE times `size`, the unit of the channel.
+    The variance of the third differences is 20 times the variance of the noise. If y is rounded to
+    steps larger than its noise, y often stays the same, and the differences do not show the noise.
+    So the result is at least the rms error of rounding, step / sqrt(12), where the step is the
+    least change of y. It is also at least MIN_NOISE times `size`, the unit of the channel.
     """
     third = np.diff(y, n=3, axis=0)
     # 0.6745 sigma is the median magnitude of a normal value
@@ -337,7 +337,7 @@ def wind_model(
     The winds approximate Dryden's moderate turbulence: they have its spectrum at low and at high
     frequencies. With T = L / V0, Dryden's spectrum is 2 sigma^2 T / (1 + (T omega)^2) along the
     flight path, and sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across it. The rotary gust
-    in roll, rad/s, is that of `roll_gust`. `speed` is V0 and `span` the wing span, both in SI.
+    in roll, rad/s, comes from `roll_gust`. `speed` is V0 and `span` the wing span, both in SI.
     """
     if not axes:
         # A multicopter hovers at a speed of 0.
@@ -457,11 +457,11 @@ def filter_bank(
         alpha_dot -= shear_1 q_g,  q_dot -= shear_2 A[q, q] q_g
 
     A frozen field of wind has the shear (0, -1). MIL-F-8785C gives q_g the opposite sign, and in
-    other models of the air the slope also moves alpha. The noises of the wind are the rows
-    `levels` of LEVELS, multiplied by `strength`, (N, G). `drift` is as in
+    other models of the air the slope also moves alpha. The noises of the wind are the rows `levels`
+    of LEVELS, multiplied by `strength`, (N, G). `drift` has the meaning that it has in
     `observer_design.Weights`. If the models are `near` the first one, their gains are computed from
-    its gains, exact to first order. With a `lag`, (N,), s, the outputs reach y through a filter,
-    see `behind_filter`.
+    the gains of the first model, exact to first order. With a `lag`, (N,), s, the outputs reach y
+    through a filter, see `behind_filter`.
     """
     air = FilterAir(names, speed, span, shear)
     m = model.B.shape[-1]
@@ -552,14 +552,14 @@ class Block(NamedTuple):
 
 
 def _block(parts: Sequence[NDArray[np.int32]], label: np.int32) -> Block:
-    """Return the states, inputs, outputs and winds that have a label."""
+    """Return the block that has a label: its states, inputs, outputs and winds."""
     return Block(*(np.flatnonzero(part == label) for part in parts))
 
 
 def blocks(model: NominalModel) -> list[Block]:
     """Split an aircraft into the parts that A, gravity, B, C and the wind do not couple.
 
-    If the numbers of inputs and outputs differ in a part, the whole aircraft is one part.
+    If a part has not as many inputs as outputs, the whole aircraft is returned as one part.
     """
     (n, m), G = model.B.shape, model.wind.shape[1]
     coupled = np.zeros((n + 2 * m + G, n + 2 * m + G))

@@ -130,10 +130,10 @@ class IdentifiedAircraft(NamedTuple):
 
     @property
     def failure(self) -> Refusal | None:
-        """Why the aircraft does not fly, or None if it flies.
+        """Reason why the aircraft does not fly, or None if it flies.
 
-        It flies if every flight completes, and if the rms error of each output in calm air is below
-        its largest command.
+        The aircraft flies if every flight completes, and if the rms error of each output in calm
+        air is below the largest command of this output.
         """
         for title, flight in self.flights.items():
             if flight.outcome != str(COMPLETED):
@@ -172,19 +172,19 @@ def identify_jsbsim(
     commands and gusts: `gain_selection.gain_sets`. The beta of V follows from `airspeed_slew`. If
     `observer_margin` is given, the controller gets an extended-state observer for y_dot = Omega u.
     The loop around this model then has the delay margin `observer_margin`, s, and its margins meet
-    `requirement`, except that 35 degrees of phase suffice.
+    `requirement`, except that 35 degrees of phase margin suffice.
 
     4. Simulate the result in calm air, with a gust, and in turbulence.
 
     If `guided`, guidance flies a turn by 90 degrees and a climb by 100 m in place of the pulses.
-    The stall speed of guidance is that of `slowest_trim`. Its sideslip feedback can also fly an
-    aircraft whose `sideslip_zero` is positive.
+    `slowest_trim` gives the stall speed of guidance. The sideslip feedback of guidance can also fly
+    an aircraft whose `sideslip_zero` is positive.
 
     If `learns`, which needs an `observer_margin`, the controller of step 3 gets no observer. The
     scenario in the result then begins with the gains alone, and a model is learned in moderate
-    turbulence. The designs of the learner have the `observer_margin`, and its rough model is the
-    `sketch` of Omega and speed. The flights of step 4 are without learning. `named` has properties
-    that the user names for an input, in place of JSBSim's.
+    turbulence. The designs of the learner have the delay margin `observer_margin`, and the rough
+    model of the learner is the `sketch` of Omega and speed. The flights of step 4 are without
+    learning. `named` has properties that the user names for an input, in place of JSBSim's.
 
     Raises FlightEnded if the aircraft does not trim or does not respond, and ParameterError if its
     outputs and inputs cannot be paired, or if the speed is below guidance's speed floor.
@@ -288,10 +288,11 @@ def with_sideslip_held(airframe: Airframe, zero: float) -> Airframe:
 def airspeed_slew(bandwidth: float, effect: float) -> float:
     """Return the slew of the throttle, 1/s, from which beta of V is chosen.
 
-    `bandwidth` is that of V, rad/s, and `effect` is that of the throttle, m/s^2. The airspeed V
-    contains the wind itself, so the slew is chosen for light turbulence: beta becomes K sigma
-    bandwidth / 4, with sigma = LIGHT_SIGMA. The sign term then moves the throttle at most as fast
-    as a Lambda of bandwidth / 4, which is the Lambda of the engineering procedure.
+    `bandwidth` is the bandwidth of the loop of V, rad/s, and `effect` is the effect of the throttle
+    on V_dot, m/s^2. The airspeed V contains the wind itself, so the slew is chosen for light
+    turbulence: beta becomes K sigma bandwidth / 4, with sigma = LIGHT_SIGMA. The sign term then
+    moves the throttle at most as fast as a Lambda of bandwidth / 4, which is the Lambda of the
+    engineering procedure.
     """
     return bandwidth**2 / 4.0 * LIGHT_SIGMA / (gain_selection.BETA_TO_SLEW * effect)
 
@@ -299,8 +300,8 @@ def airspeed_slew(bandwidth: float, effect: float) -> float:
 def _too_weak(linear: Linearization) -> str:
     """Write a sentence, after a "; ", for each output that its own input hardly moves.
 
-    At full travel, the input that is paired with such an output moves it less than a tenth as much
-    as another input does.
+    At full travel, the input that is paired with such an output moves the output less than a tenth
+    as much as another input does.
     """
     inputs = linear.condition.inputs()
     reach = linear.Omega * linear.travel()
@@ -322,8 +323,8 @@ def slowest_trim(condition: FlightCondition) -> float:
     """Find the slowest airspeed at which an aircraft trims in level flight at an altitude, m/s.
 
     Below this speed lift or thrust is not enough, so guidance takes it as the stall speed. The
-    search is a bisection that begins at 0.2 of the condition's speed. Its error is at most 1 % of
-    the condition's speed.
+    search is a bisection that begins at 0.2 of the condition's speed. The error of the result is at
+    most 1 % of the condition's speed.
     """
     slow = 0.2 * condition.speed
     fast = condition.speed
@@ -419,7 +420,7 @@ def airspeed_bandwidth(authority: float, lag: float) -> float:
 
 
 def _setting(linear: Linearization, V_bandwidth: float) -> LoopSetting:
-    """Return the loop for which gains are selected. Until then all its gains are 1."""
+    """Return the loop for which gains are selected. All its gains are 1 until the selection."""
     inputs = list(linear.condition.inputs())
     trim = linear.trim
     base = RiseDiConfig.validate_mapping(

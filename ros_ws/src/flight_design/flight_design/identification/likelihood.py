@@ -76,9 +76,9 @@ class Models(NamedTuple):
 class Unknown(NamedTuple):
     """Standard deviations, before the flight, of all that is identified; 0 for a known value.
 
-    `drift` is not such a deviation, but the noise of the disturbances in the filter. Hidden states,
-    such as alpha, are states that y does not contain. If y has only the rates, the rows of the
-    hidden states count as known, because mass and lift give them.
+    `drift` is an exception: it is the noise of the disturbances in the filter. Hidden states, such
+    as alpha, are states that y does not contain. If y has only the rates, the rows of the hidden
+    states are taken as known, because mass and lift give them.
     """
 
     delay: float = 0.0  # s, deviation of the delay of u
@@ -145,9 +145,9 @@ class Likelihood:
         """Set up the likelihood, with the priors of the errors of A and B in `unknown`.
 
         `believe` may replace the priors later. `delay` is the delay of u, s. The search starts with
-        means over `factor` periods, by default over the shortest lag. If `coupled`, the entries
-        that are 0 are identified, too. `rates` has the limits of the aircraft's actuators, in units
-        of u / s. They count only if the delay is identified.
+        means over `factor` periods, by default over the shortest lag. If `coupled`, entries that
+        are 0 in the nominal model are identified as well. `rates` has the rate limits of the
+        aircraft's actuators, in units of u / s. They are used only if the delay is identified.
         """
         if factor is None:
             factor = max(int(float(np.min(model.lag)) / recorded.period + 1e-9), 1)
@@ -247,8 +247,9 @@ class Likelihood:
     def relative_errors(self, theta: FloatArray) -> FloatArray:
         """Return the relative errors of the entries for their parameters theta, (..., entries).
 
-        Both are the same, except for entries whose prior deviation is above PRIOR. A rough file
-        errs by a factor, up or down, so the theta of such an entry is the logarithm of the factor.
+        The errors equal theta, except for entries whose prior deviation is above PRIOR. A rough
+        file errs by a factor, up or down, so the theta of such an entry is the logarithm of the
+        factor.
         """
         return np.where(self._by_factor, np.expm1(theta), theta)
 
@@ -325,7 +326,7 @@ class Likelihood:
         """Return the delays of the inputs, s, and their standard deviations, (m,) each.
 
         A delay includes the lag of y, and the time by which the lag of the actuator exceeds the
-        known lag, because a loop is late by all of them.
+        known lag, because all of them make a loop late.
         """
         late = self._period * self._delay
         if self._delay_deviation:
@@ -348,9 +349,9 @@ class Likelihood:
     def by_lag(self, covariance: FloatArray) -> FloatArray:
         """Return which part of each standard deviation of theta is caused by unknown lags, (p,).
 
-        The lags are that of y and those of the actuators, with their inertias. `covariance` is that
-        of theta. If the lags were known, the variances would be smaller by the squares of these
-        parts.
+        The lags are the lag of y and the lags of the actuators, with their inertias. `covariance`
+        is the covariance of theta. If the lags were known, the variances would be smaller by the
+        squares of these parts.
         """
         lags = slice(self._lag.start, self._inertia.stop)
         shared = covariance[:, lags]
@@ -438,7 +439,7 @@ class Likelihood:
     ) -> float:
         """Return the cost that `Search.fit` minimises, for theta, (p,).
 
-        The levels of the wind are `levels`, or if it is None the best ones.
+        The wind has the given `levels`. If `levels` is None, it has the best level in each span.
         """
         levels = self.levels(theta) if levels is None else levels
         (cost,), _, _ = self._costs(self.passed(theta, levels), used, theta[None])
@@ -531,10 +532,10 @@ class Likelihood:
         return centred
 
     def reason_against_air(self, fit: Fit) -> Refusal | None:
-        """Refuse a fit in which the slope of the vertical wind has too strong an effect on a state.
+        """Return a refusal of a fit if the slope of the vertical wind acts too strongly.
 
-        If this effect is at its bound, it stands for errors of the aircraft's model, not for the
-        wind.
+        If the effect of this slope on a state is at its bound, the effect stands for errors of the
+        aircraft's model, not for the wind. Returns None if no effect is at its bound.
         """
         effects = np.abs(fit.theta[self._shear])
         bounds = self._upper[self._shear]
@@ -548,9 +549,9 @@ class Likelihood:
         )
 
     def known(self) -> NDArray[np.bool_]:
-        """Return the mask of the samples that count, (T,).
+        """Return the mask of the samples that can be used, (T,).
 
-        They have a y, and lie after the transient of the filter.
+        These samples have a y, and lie after the transient of the filter.
         """
         return np.isfinite(self._y).all(axis=1) & (
             np.arange(len(self._y)) >= TRANSIENT / self._period - 0.5
@@ -561,11 +562,11 @@ class Likelihood:
         return self.known() & ~held_out(len(self._y), self._spans[0].stop)
 
     def _counted(self, theta: FloatArray, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return the mask of the samples that count in the fit, (T,).
+        """Return the mask of the samples that are used in the fit, (T,).
 
-        A span does not count if no level of the wind explains it. A span with a gust does not count
-        if less than the share FEW of all spans have gusts. After a span that does not count, the
-        next RECOVERY spans do not count either.
+        A span is left out if no level of the wind explains it. A span with a gust is left out if
+        less than the fraction FEW of all spans have gusts. After a span that is left out, the next
+        RECOVERY spans are left out as well.
         """
         _, (e,), _ = self.passed(theta, levels)
         square = np.array(
@@ -585,7 +586,7 @@ class Likelihood:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the costs of N models, their normalised innovations, and sum log det S / 2.
 
-        Only the samples in the mask `used` count. The innovations have shape (N, samples, m).
+        Samples outside the mask `used` are left out. The innovations have shape (N, samples, m).
         """
         e = innovations.e[:, used]
         total = np.sum(innovations.half_log_det[:, used], axis=1)

@@ -52,7 +52,7 @@ class SearchEnd(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """The innovations at a theta, divided by their rms, with their derivatives by theta."""
+    """The innovations at a theta, divided by their rms, and their derivatives by theta."""
 
     cost: float
     e: FloatArray  # (samples, m) innovations divided by their rms
@@ -61,7 +61,10 @@ class Slopes(NamedTuple):
 
 
 class Doubt(NamedTuple):
-    """Two causes of error, beside noise, that the standard deviations of a fit include."""
+    """Two causes of error, besides noise, that widen the standard deviations of a fit.
+
+    They are the uncertain delay of u, and a model that is not right.
+    """
 
     timing: float  # s, standard deviation of the delay of u, which is not identified
     whiteness: FloatArray  # (m,) `whiteness` of the innovations of the held-out samples
@@ -88,7 +91,7 @@ class Search(Likelihood):
         number of samples. The cost has several minima, because a wrong wind can explain a wrong
         model.
 
-        So the search has several starts. They average the flight over the shortest lag:
+        So the search has several starts, at which the flight is averaged over the shortest lag:
 
         - theta = 0;
         - for each level in STARTS, a start with this level in all spans;
@@ -98,10 +101,10 @@ class Search(Likelihood):
         and the strengths of the winds are free. At last, the search goes on from the best end with
         the most frequent level in every span. Turbulence is the same in every span, and levels that
         change with theta could hold the search at a worse minimum. After the starts, spans that no
-        level explains do not count, and a few gusts do not count either.
+        level explains are left out, and so are spans with gusts if there are few of them.
 
-        If `begin`, (p,), is given, it is the only start. Otherwise `flown`, the theta of the model
-        in flight, is one more start.
+        If `begin`, (p,), is given, it is the only start. If it is not given, `flown`, the theta of
+        the model in flight, is one more start.
         """
         if begin is None:
             ends = self._ends(flown, used)
@@ -114,7 +117,7 @@ class Search(Likelihood):
         return self._fit_at(min(best, steady, key=lambda end: end.cost), same, used, flown)
 
     def fit_about(self, fit: Fit, used: NDArray[np.bool_], flown: FloatArray | None = None) -> Fit:
-        """Search again from an earlier fit, with its errors as the means of the prior."""
+        """Search again from an earlier fit, whose errors become the means of the prior."""
         deviation = self.prior[self._errors]
         self.believe(deviation, fit.theta[self._errors])
         return self.fit(used, fit.theta, flown)
@@ -123,8 +126,8 @@ class Search(Likelihood):
         """Search from one start only, with the same level of the wind in every span.
 
         The start is in moderate turbulence, at the model in flight, whose theta is `flown`. If
-        there is none, it is at the nominal model. Returns None if less than the share ALIKE of the
-        spans have the same level.
+        `flown` is None, the start is at the nominal model. Returns None if less than the fraction
+        ALIKE of the spans have the same level.
         """
         coarse = self.coarse
         begin = self._lagging(np.zeros(len(self.prior)) if flown is None else flown)
@@ -200,8 +203,9 @@ class Search(Likelihood):
     def _lagging(self, theta: FloatArray) -> FloatArray:
         """Return theta, (p,), clipped to the bounds, with a lag of y and inertias of the actuators.
 
-        Each of them is one standard deviation. From 0 the search would explain a filter of y or a
-        slow servo by a delay of u, and end there, although a lag or an inertia predicts better.
+        The lag and each inertia are one standard deviation. If they started from 0, the search
+        would explain a filter of y or a slow servo by a delay of u, and end there, although a lag
+        or an inertia predicts better.
         """
         begin = self._within(theta)
         begin[self._lag] = begin[self._inertia] = 1.0
@@ -218,8 +222,8 @@ class Search(Likelihood):
 
         These steps use the flight averaged over the shortest lag. `levels` gives the level of each
         span. If it is None, theta decides the levels. `winds` says whether the strengths of the
-        winds are free. The lags of the actuators are not: beside free delays and inertias, the
-        first long steps would set them to anything.
+        winds are free. The lags of the actuators are not free: beside free delays and inertias, the
+        first long steps would set the lags to arbitrary values.
         """
         free = np.ones(len(theta), dtype=bool)
         free[self._winds] = winds
@@ -245,7 +249,7 @@ class Search(Likelihood):
         """Search from one start, and return the end of the search.
 
         `levels` gives the level of each span. If it is None, theta decides the levels. In the first
-        step and in the next `unsettled` steps every span counts, and the search does not end.
+        step and in the next `unsettled` steps every span is used, and the search does not end.
         """
         for iteration in range(STEPS):
             self.progress()
@@ -330,10 +334,10 @@ class Search(Likelihood):
         H is the Hessian. J has the derivatives by theta of the innovations e, divided by their rms.
         If the model were right, M would be J J'. Here two matrices take its place, and each
         parameter gets the larger of its two standard deviations. The first matrix sums the outer
-        products of J e over blocks of the log. With `leaves_out`, the J e of block k is
-        (I - J_k J_k' H^-1)^-1 J_k e_k. H^-1 times this is the change of theta if the block is left
-        out. This matters if a few blocks with gusts decide theta: the fit then follows the errors
-        in these blocks, and their e is too small to show them. The second matrix is J J' times the
+        products of J e over blocks of the log. With `leaves_out`, the J e of block k is (I - J_k
+        J_k' H^-1)^-1 J_k e_k. H^-1 times this is the change of theta if the block is left out. This
+        matters if a few blocks with gusts decide theta: the fit then follows the errors in these
+        blocks, so that their e is too small to show the errors. The second matrix is J J' times the
         whiteness of each output, as in Birge's ratio.
 
         s is the change of theta with the delay of u, and j is the derivative of e by this delay.
@@ -396,7 +400,8 @@ class Search(Likelihood):
     def flying(self, flown: FloatArray, parts: Iterable[tuple[Likelihood, Fit]]) -> Innovations:
         """Return the innovations of the model that flies, whose theta is `flown`, (p,).
 
-        Winds, angles and delays are those that were fitted for each of the `parts`.
+        Winds, angles and delays come from the fits of the `parts` (groups of states that do not
+        couple).
         """
         theta = np.where(self._errors, flown, self.joined(parts))
         return self.predicted(theta, self.levels(theta))
@@ -404,8 +409,9 @@ class Search(Likelihood):
     def joined(self, parts: Iterable[tuple[Likelihood, Fit]]) -> FloatArray:
         """Return one theta, (p,), with the mean winds, angles and delays of all parts.
 
-        The errors of A and B in it are 0, and so are the lags and inertias of the actuators. Those
-        that were found for a part are wrong if the part couples with another one.
+        In this theta the errors of A and B are 0, and so are the lags and inertias of the
+        actuators. The values that were found for a part are wrong if the part couples with another
+        one.
         """
         values: dict[str, list[float]] = {}
         for part, fit in parts:

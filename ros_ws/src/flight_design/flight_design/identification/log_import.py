@@ -105,9 +105,9 @@ def imported(
 ) -> Imported:
     """Return y, u, `commands` and the pose of a log, as the bridge would have published them.
 
-    The map's `instant` names an output. y has the newest value of each output at the stamps of this
-    one. The pose has the newest values at the stamps of its first channel. u is the command minus
-    its median. The command is
+    The map's `instant` names an output. y has the newest value of each output at the stamps of the
+    output `instant`. The pose has the newest values at the stamps of its first channel. u is the
+    command minus its median. The command is
 
     - with PX4: the setpoint that the map names;
     - with ArduCopter: the output of the rate controllers;
@@ -269,7 +269,7 @@ def _measured(log: VehicleLog, quantity: str, key: str) -> LogField:
 
 
 def _messages(log: VehicleLog, quantity: str) -> str:
-    """Name the messages of this log format that can have a quantity, for an error sentence."""
+    """Name the messages in this format of log that can have a quantity, for an error sentence."""
     sources = ULOG_SOURCES if log.format is None else log.format.sources
     return (
         " or ".join(dict.fromkeys(source.message for source in sources.get(quantity, ())))
@@ -390,8 +390,8 @@ def _flight(
 ) -> tuple[tuple[int, int], str | None]:
     """Return the first and the last instant to import, and a sentence on other flights.
 
-    The longest stretch in the window is imported, or without a window the longest one in the air.
-    If `needs_manual`, only stretches in MANUAL count.
+    The longest stretch in the window is imported, or without a window the longest stretch in the
+    air. If `needs_manual`, stretches outside the mode MANUAL are ignored.
     """
     start_ns = int(stamps[0])
     keep = np.ones(len(stamps), dtype=bool)
@@ -486,8 +486,8 @@ def _complete(stamp_ns: Stamps, values: FloatArray, is_damaged: bool) -> tuple[S
     """Return the samples in which every channel has a value.
 
     Bytes that are lost within a message leave wrong values. In a damaged log, the running medians
-    over AROUND samples span a range, from the lowest to the highest median. A value counts as wrong
-    if it lies farther outside this range than the range is wide.
+    over AROUND samples span a range, from the lowest to the highest median. A value is taken as
+    wrong if it lies farther outside this range than the range is wide.
     """
     is_known = np.isfinite(values).all(axis=1)
     stamp_ns, values = stamp_ns[is_known], values[is_known]
@@ -515,7 +515,7 @@ def gap_sentence(name: str, stamp_ns: Stamps, start_ns: int) -> str | None:
 
 
 def lost_share(stamp_ns: Stamps) -> float:
-    """Return the share of the samples that a topic lacks, judged by its usual period."""
+    """Return the fraction of the samples that a topic lacks, judged by its usual period."""
     return max(1.0 - len(stamp_ns) / _expected(stamp_ns), 0.0)
 
 
@@ -538,9 +538,9 @@ def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Si
 
 
 def require_map_of_import(channel_map: ChannelMap, recorded: RecordedRun) -> None:
-    """Check that the rows by which the u of a log was imported are also in this channel map.
+    """Check that a channel map still has the rows with which the u of a log was imported.
 
-    Raises ParameterError if the log was imported by other rows.
+    Raises ParameterError if the log was imported with other rows.
     """
     source = recorded.metadata.get(IMPORTED)
     if source is None:

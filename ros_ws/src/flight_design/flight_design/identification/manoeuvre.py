@@ -31,8 +31,8 @@ CLIMB_START = 30.0
 def moderate_turbulence(altitude: float) -> dict[str, Any]:
     """Return the parameters of moderate turbulence at an altitude, m.
 
-    At low altitude the turbulence follows from the wind near the ground. At high altitude its rms
-    is 10 ft/s.
+    At low altitude the turbulence follows from the wind near the ground. At high altitude the rms
+    of the turbulence is 10 ft/s.
     """
     values: dict[str, Any] = {"altitude": max(altitude, LOWEST), "seed": 1}
     if altitude < HIGH:
@@ -70,7 +70,7 @@ class ManoeuvreResult(NamedTuple):
 def fly_all(
     scenario: Scenario, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, ManoeuvreResult]:
-    """Fly a scenario of `identify` three times.
+    """Fly a scenario that `identify` has written three times.
 
     The flights are in "calm" air, with the "gust" of the scenario, and in moderate "turbulence"
     without the gust.

@@ -4,9 +4,10 @@
 
 The estimate maximises the posterior probability, given the innovations of the observer's filter.
 
-It uses only y, and u after its limits. Two of three seconds fit the model, and every third second
-is held out to validate it. y does not show the scale of alpha or beta, so entries that depend on
-this scale stay near their nominal values. No number in this module is specific to an aircraft.
+It uses y, and u after the limits of u, and no other signal. Two of three seconds fit the model, and
+every third second is held out to validate it. y does not show the scale of alpha or beta, so
+entries that depend on this scale stay near their nominal values. No number in this module is
+specific to an aircraft.
 """
 
 import math
@@ -127,7 +128,7 @@ class Identification(NamedTuple):
 
     @property
     def refusal(self) -> Refusal | None:
-        """Why this model must not be used, one sentence for each part."""
+        """Reason why this model must not be used, with one sentence for each refused part."""
         return joined(part.refusal for part in self.parts)
 
 
@@ -164,7 +165,7 @@ class _Study(NamedTuple):
         return search
 
     def part(self, search: Search, fit: Fit) -> Part:
-        """Return the model of a block, with the reason why it must not be used, if there is one."""
+        """Return the model of a block, with the reason why it must not be used, if there is any."""
         outputs = search.names.outputs
         before = prediction(fit.before, self.validating)
         after = prediction(fit.after, self.validating)
@@ -235,10 +236,10 @@ class _Study(NamedTuple):
     ) -> Fit:
         """Search again around a fit in which too many entries are at a bound.
 
-        They may be there because the airframe file is rough. There is no further search if the
-        effect of an input is at a bound, for two reasons. No law designed from the file can fly an
-        aircraft beyond these bounds. Besides, the part of the aircraft may couple with another
-        part.
+        The entries may be at their bounds because the airframe file is rough. There is no further
+        search if the effect of an input is at a bound, for two reasons. No law designed from the
+        file can fly an aircraft beyond these bounds. Besides, the block may couple with another
+        block of the aircraft.
         """
         for _ in range(AGAIN * self.searches_again):
             entries = search.about_centre(search.entries(fit))
@@ -251,7 +252,7 @@ class _Study(NamedTuple):
         return fit
 
     def reason_against_airframe(self, entries: Sequence[Entry]) -> Refusal | None:
-        """Refuse the airframe if too many entries are at a bound."""
+        """Return a refusal of the airframe if too many entries are at a bound, else None."""
         return reason_against_airframe(
             entries, self.airframe.name, self.bound_count, self.unknown.factor
         )
@@ -288,9 +289,10 @@ class _Study(NamedTuple):
     ) -> tuple[Fit, Part] | Refusal:
         """Fit the whole aircraft as one part, with entries that couple its parts.
 
-        Returns a refusal unless the innovations of this fit are white, its model may be used, and
-        it predicts better than the parts that were fitted separately. `apart` are the innovations
-        of these parts. The fit also has the innovations of the model in flight, `flown`.
+        Returns a refusal unless three conditions hold: the innovations of this fit are white, its
+        model may be used, and the model predicts better than the parts that were fitted separately.
+        `apart` has the innovations of the separate parts. The fit also has the innovations of the
+        model in flight, `flown`.
         """
         search = self.search(model, whole_aircraft(model), coupled=True)
         also = None if flown is None else search.model_errors(flown)
@@ -315,7 +317,7 @@ class _Study(NamedTuple):
     def advantage(self, flown: Innovations, nominal: Innovations) -> float:
         """Return how much better the model in flight predicts the samples in the mask `later`.
 
-        It is the `advantage` over the nominal model, in standard deviations.
+        The result is the `advantage` over the nominal model, in standard deviations.
         """
         return advantage(flown, nominal, span_length(self.recorded), self.later)
 
@@ -345,20 +347,21 @@ def identify_model(
         channels: Channels in the law's order, whose D the model must keep; by default they are in
             the airframe's order.
         progress: Takes the steps `completed` and their largest number `total`.
-        bound_count: How many entries of a part may lie at their bound.
+        bound_count: How many entries of a part may lie at their bound. A part is a group of states
+            and inputs that does not couple with the rest.
         unknown: Prior standard deviations of all that is identified, such as delays.
         flown: The model in flight. It is one more start of the search, and its advantage over the
             nominal model is computed.
-        after: The advantage counts only samples after this flight time, s.
+        after: The advantage is computed from samples after this flight time, s.
         quick: Whether a single start is tried first. Its result is kept if the air is alike in the
-            spans, and if the model that is found may be used. Otherwise more starts follow.
+            spans, and if the model that is found may be used. If not, more starts follow.
         searches_again: Whether a part with too many entries of A at their bounds is searched again,
             around the result of the first search.
         timing: Standard deviation of the delay in `actuation`, s. If it is given, even as 0, the
             standard deviations of the result also hold for a model that is not right
             (`Search.with_doubt`).
         is_doubted: Whether the stated deviations also hold for a model that is not right. The
-            refusals do not use these deviations, while they do use those of `timing`.
+            refusals do not use these deviations, but they use those that `timing` widens.
 
     Raises:
         ParameterError: An output does not move.
@@ -412,7 +415,7 @@ def identify_model(
 def _counter(
     progress: Callable[..., None], parts: int, *, starts_at_flown: bool
 ) -> Callable[[], None]:
-    """Return a function that counts the steps of all searches and tells `progress`.
+    """Return a function that counts the steps of all searches and reports them to `progress`.
 
     `starts_at_flown` says whether the model in flight is one more start.
     """
@@ -434,9 +437,9 @@ def _follows(
     u: FloatArray,
     known: NDArray[np.bool_],
 ) -> float:
-    """Return how strongly the innovations of a part follow the u of another part, u (T, m).
+    """Return how strongly the innovations of a block follow the u of another block, u (T, m).
 
-    The result is the largest `correlation` of all pairs of parts.
+    The result is the largest `correlation` of all pairs of blocks.
     """
     largest = 0.0
     for (_, fit), block in zip(fits, every, strict=True):
@@ -448,7 +451,7 @@ def _follows(
 def _couples(flown: Airframe, nominal: Airframe) -> bool:
     """Return whether a model couples states that do not couple in the nominal model.
 
-    It does if an entry is not zero where the nominal entry is zero.
+    This is so if an entry of A or B is not zero where the nominal entry is zero.
     """
     new, old = (np.hstack([model.matrix_a(), model.matrix_b()]) for model in (flown, nominal))
     return bool(np.any((new != 0.0) & (old == 0.0)))

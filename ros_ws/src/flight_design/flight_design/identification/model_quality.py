@@ -41,7 +41,7 @@ def whiteness(e: FloatArray, held_out: NDArray[np.bool_]) -> FloatArray:
     The value is the mean of n_k rho_k^2 over the lags k = 1 .. LAGS. rho_k is the autocorrelation
     of n_k pairs of held-out samples. For white noise the mean is 1, with a standard deviation of
     sqrt(2 / LAGS). e has shape (T, m), held_out (T,). Source: G. M. Ljung, G. E. P. Box, Biometrika
-    65(2), 1978, here for the pairs within the held-out spans.
+    65(2), 1978. Here both samples of a pair lie in the same held-out span.
     """
     return np.diag(correlation(e, e, held_out))
 
@@ -70,11 +70,11 @@ def advantage(
         t = sum d_k / sqrt(K var d),  d_k the difference of log-likelihood of span k of K
         z = Phi^-1(F_(K-1)(t)),  F of Student's distribution, Phi of the normal one
 
-    If both models are equally far from the aircraft, z has a standard normal distribution. This
-    holds whichever model is simpler, and even if both models are wrong. Source: Q. H. Vuong,
-    Econometrica 57(2), 1989, here with spans of `span` samples, whose d_k are nearly independent.
-    Student's t is used because K is small. Only the samples in the mask `counts`, (T,), count. With
-    fewer than two spans z is 0.
+    The result is z. If both models are equally far from the aircraft, z has a standard normal
+    distribution. This holds whichever model is simpler, and even if both models are wrong. Source:
+    Q. H. Vuong, Econometrica 57(2), 1989, here with spans of `span` samples, whose d_k are nearly
+    independent. Student's t is used because K is small. Samples outside the mask `counts`, (T,),
+    are left out. With fewer than two spans z is 0.
     """
     end = len(counts) // span * span
     d = np.where(counts, first.log_likelihood - second.log_likelihood, 0.0)[:end]
@@ -88,16 +88,16 @@ def advantage(
 
 @dataclass(frozen=True)
 class NoBetter(Refusal):
-    """The refusal of a model only because it predicts no better than the nominal model."""
+    """A refusal of a model for the sole reason that the nominal model predicts as well."""
 
 
 def reason_against_prediction(
     before: Prediction, after: Prediction, outputs: Sequence[str]
 ) -> NoBetter | None:
-    """Refuse a model that predicts the held-out samples no better than the nominal model.
+    """Return a refusal of a model that predicts held-out samples no better than the nominal one.
 
     A model is also refused if the innovations of an output are not white, and no whiter than those
-    of the nominal model.
+    of the nominal model. Returns None if the model is not refused.
     """
     if after.log_likelihood <= before.log_likelihood:
         return NoBetter(

@@ -35,7 +35,7 @@ def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
 
 
 def reason_against_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> Refusal | None:
-    """Refuse a model if even the best known effect on some output is uncertain.
+    """Return a refusal if even the best known effect on some output is uncertain, else None.
 
     An effect is uncertain if its relative standard deviation is above MAX_DEVIATION. The refusal
     names the output whose effects are known worst.
@@ -77,10 +77,11 @@ def at_bound(entries: Iterable[Entry], factor: float = MAX_FACTOR) -> list[Entry
 def reason_against_airframe(
     entries: Iterable[Entry], name: str, allowed: int = 0, factor: float = MAX_FACTOR
 ) -> Refusal | None:
-    """Refuse the airframe `name` if more than `allowed` entries ended at a bound of the search.
+    """Return a refusal of the airframe `name` if too many entries ended at a bound of the search.
 
-    A single entry is too many if the record shows it clearly, with less than half of the prior
-    standard deviation. The aircraft then lies beyond the bound.
+    At most `allowed` entries may be at a bound. But a single entry is too many if the record shows
+    it clearly, with less than half of the prior standard deviation. The aircraft then lies beyond
+    the bound. Returns None if the airframe is not refused.
     """
     found = at_bound(entries, factor)
     is_shown = any(entry.deviation < PRIOR / 2.0 for entry in found)
@@ -101,7 +102,7 @@ def _minor_signs(Omega: FloatArray) -> list[float]:
 def reason_against_signs(
     nominal: Airframe, identified: Airframe, channels: ChannelPairing
 ) -> Refusal | None:
-    """Refuse an identified model that gives the law another D.
+    """Return a refusal of an identified model that gives the law another D, else None.
 
     D follows from the signs of the leading minors of C B.
     """
@@ -119,8 +120,8 @@ def reason_against_signs(
 def in_time(entries: Iterable[Entry], by_timing: Iterable[float]) -> list[Entry]:
     """Return entries with the standard deviations that they would have without one cause of error.
 
-    `by_timing` is the part of each standard deviation that this cause makes. If the cause is an
-    uncertain delay of u, the result has the standard deviations for a known delay.
+    The cause is, for example, an uncertain delay of u. The result then has the standard deviations
+    for a known delay. `by_timing` has the part of each standard deviation that the cause makes.
     """
     return [
         entry._replace(deviation=float(np.sqrt(max(entry.deviation**2 - late**2, 0.0))))
@@ -131,9 +132,10 @@ def in_time(entries: Iterable[Entry], by_timing: Iterable[float]) -> list[Entry]
 def reason_against_timing(
     entries: Sequence[Entry], by_timing: Sequence[float], outputs: Iterable[str]
 ) -> Refusal | None:
-    """Refuse a part of the aircraft if its best known effects depend too much on the delay of u.
+    """Return a refusal if the best known effects depend too much on the delay of u, else None.
 
-    `by_timing` is the part of each entry's standard deviation that an uncertain delay of u causes.
+    The entries belong to one part of the aircraft. `by_timing` is the part of each entry's standard
+    deviation that an uncertain delay of u causes.
     """
     late = dict(zip((entry.name for entry in entries), by_timing, strict=False))
     worst = max(best_known(entries, outputs), key=lambda effect: late.get(effect.name, 0.0))

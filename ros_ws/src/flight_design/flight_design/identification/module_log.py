@@ -36,8 +36,8 @@ class ModuleChange(NamedTuple):
 class ModuleFlight(NamedTuple):
     """What a controller exported into PX4 logged at its ticks: y, y_m, u and `internals`.
 
-    `equal` is the number of ticks whose u has the same bits in Python. `lost` is the number of
-    ticks after a gap of the log, which Python cannot compute.
+    `equal` is the number of ticks whose u has the same bits when Python computes it. `lost` is the
+    number of ticks after a gap of the log, which Python cannot compute.
     """
 
     tape: Tape
@@ -50,11 +50,12 @@ def module_flight(log: VehicleLog, controller: ControllerConfig) -> ModuleFlight
     """Compute the ticks of a controller that was exported into PX4 again in Python.
 
     A stretch is the ticks from an engagement to the first gap or to the next engagement. Python
-    starts each stretch with the u of its first tick in the log. In `internals`, e and u come from
-    the log, and the states of the law come from Python. At low airspeed the largest torque, 1, may
-    limit u more than the parameters do. Then the limits of u count as changed parameters. Raises
-    ParameterError if the log has no ticks, or if the flight had other parameters than `controller`.
-    It is also raised if the export computes in single precision, or if the law refuses a tick.
+    starts each stretch with the u of its first tick in the log. In the signal `internals`, e and u
+    come from the log, and the states of the law come from Python. At low airspeed the largest
+    torque, 1, may limit u more than the parameters do. Such limits of u are treated as changed
+    parameters. Raises ParameterError if the log has no ticks, or if the flight had other parameters
+    than `controller`. It is also raised if the export computes in single precision, or if the law
+    refuses a tick.
     """
     require(STATUS in log.tables, "the log", f"no {STATUS}", EXPECTED)
     table = log.tables[STATUS]
@@ -176,8 +177,8 @@ class _Ticks:
     def _limits(self, k: int) -> dict[str, tuple[float, ...]]:
         """Return the limits of u in the tick k.
 
-        For each input, they are the narrower of the limits in the scenario and those of a torque of
-        1.
+        For each input, the narrower limits are taken: those in the scenario, or those of a torque
+        of 1.
         """
         end = self._values["u_end"][k]
         exported = self._controller.guard().limits

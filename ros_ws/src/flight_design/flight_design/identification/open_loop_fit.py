@@ -81,9 +81,10 @@ class ChannelModel(NamedTuple):
 
     @property
     def is_usable(self) -> bool:
-        """Whether gain and phase of the loop are certain, and a feedforward can follow the zero.
+        """Whether the model can be used to select gains and to design a feedforward.
 
-        A model can be usable even if the noise is as large as y.
+        Gain and phase of the loop must be certain, and a feedforward must be able to follow the
+        zero. A model can be usable even if the noise is as large as y.
         """
         gain, phase = self.at_loop_frequency()
         is_certain = gain.is_certain and phase.deviation <= 1.0 / MIN_CERTAINTY
@@ -182,7 +183,7 @@ def fit_channel(
 
 
 def _settled(t: FloatArray) -> NDArray[np.bool_]:
-    """Return the mask (N,) of the samples that come at least SETTLED after each long gap."""
+    """Return the mask (N,) of the samples that come at least SETTLED s after each long gap."""
     if len(t) < 2:
         return np.ones(len(t), dtype=bool)
     gaps = np.diff(t)
@@ -193,14 +194,18 @@ def _settled(t: FloatArray) -> NDArray[np.bool_]:
 def _decay(t: FloatArray, damping: float) -> FloatArray:
     """Return a function of time that is fitted in addition to a constant and t.
 
-    It shows the decay of an initial value, exp(-damping t). If the damping is 0, it is t^2 / 2.
+    The function describes the decay of an initial value, exp(-damping t). If the damping is 0, the
+    function is t^2 / 2.
     """
     x = damping * t
     return np.where(x > 1e-4, (np.expm1(-x) + x) / max(damping, 1e-9) ** 2, 0.5 * t**2)
 
 
 def _has_zero_of_its_own(theta: FloatArray) -> bool:
-    """Return whether the zero of a second-order model is stable, and too slow to cancel the lag."""
+    """Return whether the zero of a second-order model is stable and does not cancel the lag.
+
+    The zero cancels the lag if it is about as fast as the lag.
+    """
     _, lag, Omega, _, _, slow = theta
     return bool(0.0 <= slow * Omega * lag <= MAX_ZERO_LAG * Omega**2)
 

@@ -11,7 +11,8 @@ from flight_core.vectors import FloatArray
 def kept_share(lag: FloatArray, period: float) -> FloatArray:
     """Return `keep` of `behind_filter` for N lags, s, as (N, 1, 1, 1).
 
-    At low frequencies the filter is then late by its lag. With a lag of 0 it changes nothing.
+    With this `keep`, the filter is late by its lag at low frequencies. With a lag of 0 it changes
+    nothing.
     """
     return (lag / (lag + period))[:, None, None, None]
 
@@ -21,7 +22,7 @@ def behind_filter(sampled: ObserverModel, keep: FloatArray) -> ObserverModel:
 
         f+ = keep f + (1 - keep) H z+,   y = f
 
-    In the result, the states f come after those of z.
+    In the state of the result, f comes after z.
     """
     m, s = sampled.H.shape
     reach = _reach(sampled.H, keep)

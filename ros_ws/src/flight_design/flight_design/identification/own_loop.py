@@ -110,7 +110,7 @@ class OwnLoop(NamedTuple):
 
 
 def _ends(scenario: Scenario) -> FloatArray:
-    """Return which u a torque of 1 stands for, for each input of the law, with the sign of D."""
+    """Return the u that a torque of 1 stands for, for each input of the law, with the sign of D."""
     controller = scenario.rise_di()
     inputs = scenario.aircraft.channels().inputs
     upper = dict(zip(inputs, scenario.aircraft.actuators.upper or (), strict=False))

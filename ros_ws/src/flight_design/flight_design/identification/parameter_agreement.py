@@ -136,7 +136,7 @@ class Servo(NamedTuple):
     is_reversed: bool
 
     def deflection(self, pulse: FloatArray, stick: Stick) -> FloatArray:
-        """Return at which fraction of full deflection the servo is, given its pulse, us.
+        """Return the deflection of the servo for a pulse, us, as a fraction of full deflection.
 
         The fraction is -1 to 1, and for a throttle 0 to 1.
         """
@@ -151,7 +151,7 @@ def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
     """Return the servo that an input's stick moves: the first servo with the stick's function.
 
     `values` has the parameters at the time of the samples. Raises ParameterError if there is no
-    such servo, or if one of its parameters is missing.
+    servo with this function, or if one of its parameters is missing.
     """
     function = FUNCTIONS[stick.axis]
     outputs = [
@@ -189,7 +189,7 @@ def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
 
 
 class Agreement(NamedTuple):
-    """A parameter as a log has it, compared with what a channel map says."""
+    """A parameter in a log, compared with what a channel map says."""
 
     what: str  # the parameter, or the quantity that is taken from the log
     logged: str  # the value in the log; "" if the log has no record
@@ -225,7 +225,7 @@ def compared(
 
 
 def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> None:
-    """Raise ParameterError if a parameter in the log differs from that of the map."""
+    """Raise ParameterError if a parameter in the log differs from what the map says."""
     differing = [row for row in rows if row.is_different]
     if differing:
         logged = ", ".join(f"{row.what} {row.logged}" for row in differing)
@@ -250,10 +250,11 @@ def absence_sentence(rows: Iterable[Agreement]) -> str | None:
 
 
 def change_sentences(recorded: Parameters, start_ns: int, first_ns: int, last_ns: int) -> list[str]:
-    """Say which of the parameters that matter change before or after the samples.
+    """Say which decisive parameters change before or after the samples.
 
-    `first_ns` and `last_ns` are the first and the last sample, and `start_ns` is the beginning of
-    the log. Raises ParameterError if a parameter changes between the samples.
+    A parameter is decisive if the signs or effects in the samples depend on it. `first_ns` and
+    `last_ns` are the first and the last sample, and `start_ns` is the beginning of the log. Raises
+    ParameterError if a decisive parameter changes between the samples.
     """
     between = []
     outside = []

@@ -101,9 +101,9 @@ def rates_of_log(
 
         u = sign(D) end torque (V / V0)^2
 
-    `end` is the upper end stop of an input. V / V0 is clipped as in the exported module. For
-    ArduPlane, the position of the servo takes the place of the torque. Raises ParameterError as
-    `rates_map`, `log_import.imported` and `innovation_filters.recording` do.
+    `end` is the upper end stop of an input. V / V0 is clipped as in the exported module. If the
+    autopilot is ArduPlane, the position of the servo takes the place of the torque. Raises
+    ParameterError as `rates_map`, `log_import.imported` and `innovation_filters.recording` do.
     """
     channel_map = rates_map(scenario, autopilot)
     taken = imported(channel_map, log, window, show, servos=autopilot == "ardupilot")
@@ -179,7 +179,7 @@ def broadened(recorded: FlightData, cutoff: float) -> tuple[FlightData, float]:
     Returns the flight with the new y, and the time, s, by which the new y is ahead of the old one.
 
     Behind a narrow filter the noise of y is coloured, and so are the innovations. The zeros of the
-    two filters at z = -1 cancel. A sample counts as lost if it depends on a lost sample.
+    two filters at z = -1 cancel. A sample that depends on a lost sample becomes a lost sample.
     """
     rate = 1.0 / recorded.period
     narrow = signal.butter(2, cutoff, fs=rate)

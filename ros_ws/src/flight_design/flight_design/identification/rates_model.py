@@ -55,9 +55,9 @@ def identify_rates(
     """Identify the rows of A and B for the body rates from a log, around the nominal airframe.
 
     The rows of states that are no outputs are known: mass and lift give them. The airframe of the
-    result has the bank angle among its states if the nominal one can bank. `timing` is the standard
-    deviation of the instant at which u acts, s. A second model is fitted behind a faster high-pass.
-    Its differences from the first one widen the standard deviations of the result.
+    result has the bank angle among its states if the nominal airframe can bank. `timing` is the
+    standard deviation of the instant at which u acts, s. A second model is fitted behind a faster
+    high-pass. The differences between the two models widen the standard deviations of the result.
     """
     searches = [(without_trim(recorded), timing), (without_trim(recorded, FAST), None)]
     found, steady = (
@@ -133,11 +133,11 @@ def doubted(found: Identification, steady: Identification) -> Identification:
 
         new sigma^2 = sigma^2 + (error of the entry - its error in `steady`)^2
 
-    An entry that `steady` lacks has the error 0 there. A part is refused if the best known effect
-    on one of its outputs differs by more than MOST_APART between the models. A part that is already
-    refused for another reason keeps this reason. The exception is a part that is refused as no
-    better than the nominal model, but has the higher likelihood: such a part may be used, so it is
-    tested too.
+    If `steady` lacks an entry, the error in `steady` is taken as 0. A part (a group of states and
+    inputs that does not couple with the rest) is refused if the best known effect on one of its
+    outputs differs by more than MOST_APART between the models. A part that is already refused for
+    another reason keeps this reason. The exception is a part that is refused as no better than the
+    nominal model, but has the higher likelihood: such a part may be used, so it is also tested.
     """
     errors = {entry.name: entry.error for entry in steady.entries}
     return found._replace(parts=tuple(_doubted(part, errors) for part in found.parts))
@@ -158,7 +158,10 @@ def _doubted(part: Part, steady: Mapping[str, float]) -> Part:
 
 
 def _reason_against_motion(part: Part, steady: Mapping[str, float]) -> Refusal | None:
-    """Refuse a part whose best known effects differ between the two models."""
+    """Return a refusal of a part whose best known effects differ between the two models.
+
+    Returns None if they differ by at most MOST_APART.
+    """
 
     def apart(effect: Entry) -> float:
         return abs(effect.error - steady.get(effect.name, 0.0))

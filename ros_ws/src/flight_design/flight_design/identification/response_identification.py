@@ -143,7 +143,7 @@ def identify_response(
         engaged: The spans in ns in which u acts on the aircraft; by default the whole log.
 
     Raises:
-        ParameterError: A channel is missing, or there are too few samples for any result.
+        ParameterError: A channel is missing, or there are too few samples for any channel.
     """
     for topic, signal, names in (("y", y, outputs), ("u", u, inputs)):
         missing = [name for name in names if name not in signal.names]
@@ -312,8 +312,9 @@ class _Predictor(NamedTuple):
     def step_responses(self) -> FloatArray:
         """Return the responses of every output to a step of every input, (1 + DRAWS, K, m, m).
 
-        The step has size 1. The first response is that of the estimate, and those of the draws
-        follow. The K instants are whole periods after the step, up to HORIZON.
+        The step has size 1. The first response comes from the estimate, and the others come from
+        random draws of the coefficients. The K instants are whole periods after the step, up to
+        HORIZON.
         """
         m = self.coefficients.shape[1]
         layout = self.layout
@@ -377,12 +378,12 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
 
 
 def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: Spans) -> FloatArray:
-    """Return the share of each channel's variance that the excitation explains, (k,).
+    """Return the fraction of each channel's variance that the excitation explains, (k,).
 
-    Without disturbances the share is 1. The regressors of a channel at an instant are means of the
-    excitation over windows before this instant, up to LOOP_MEMORY. Each span is divided into FOLDS
-    parts, and each part is predicted with coefficients that were fitted to the other parts. Source
-    of the cross-validation: M. Stone, J. Royal Statistical Society B 36, 1974.
+    Without disturbances the fraction is 1. The regressors of a channel at an instant are means of
+    the excitation over windows before this instant, up to LOOP_MEMORY. Each span is divided into
+    FOLDS parts, and each part is predicted with coefficients that were fitted to the other parts.
+    Source of the cross-validation: M. Stone, J. Royal Statistical Society B 36, 1974.
     """
     residual = np.zeros((len(RIDGES), len(names)))
     total = np.zeros(len(names))
@@ -443,7 +444,7 @@ def _fitted_response(
 ) -> Response:
     """Fit the response of each channel to the step responses of the predictor.
 
-    `responses` are those of `_Predictor.step_responses`. `share` is the share of each channel's
+    `responses` comes from `_Predictor.step_responses`. `share` is the fraction of each channel's
     motion that the excitation explains, (m,). A channel that does not move in `rows`, or whose step
     response is not finite, has no fit.
     """
@@ -512,7 +513,7 @@ def _reason_against_channel(
 def _too_little_share(output: str, name: str, share: float) -> str:
     """Say that the excitation explains too little of a channel's motion, and how to get more.
 
-    The share is P / (P + Q), with the power P of the excitation and Q of the disturbances.
+    `share` is P / (P + Q), with the power P of the excitation and the power Q of the disturbances.
     """
     factor = math.sqrt((1.0 - share) / max(share, 0.05) / (1.0 / MIN_SHARE - 1.0))
     excited = (
@@ -524,7 +525,7 @@ def _too_little_share(output: str, name: str, share: float) -> str:
 
 
 def _more_excitation(name: str, ratio: float) -> str:
-    """Say how much more excitation is needed for a certain result.
+    """Say how much more excitation is needed to identify a channel with certainty.
 
     The standard errors fall in proportion to the size of the excitation, and to the square root of
     its duration.

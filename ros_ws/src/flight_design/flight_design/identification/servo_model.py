@@ -3,8 +3,8 @@
 """Convert u so that actuators with a lag of first order move as other servos would.
 
 The servos may be late, of second order, and limited in rate. An actuator has no noise, so its
-position follows from u alone. The filters can therefore keep the actuators of first order. They get
-the u with which these actuators have the position of the servo at each tick.
+position follows from u alone. The filters can therefore keep the actuators of first order. Their
+input is a u with which these actuators have the position of the servo at each tick.
 """
 
 import numpy as np
@@ -30,8 +30,9 @@ def behind_servos(
 ) -> FloatArray:
     """Delay the commanded u, (T, m), and apply `behind_servo`, for each of N models, (N, T, m).
 
-    `late`, (N, m), are the delays of the inputs in periods. `lag`, (m,), s, is that of the filters.
-    `servo_lag` and `inertia`, (N, m), and `rate_limit`, (m,), are those of `behind_servo`.
+    `late`, (N, m), are the delays of the inputs in periods. `lag`, (m,), s, has the lags of the
+    actuators in the filters. `servo_lag` and `inertia`, (N, m), and `rate_limit`, (m,), have the
+    meaning that they have in `behind_servo`.
     """
     acting = np.empty((len(late), *u.shape))
     limits = np.full(u.shape[1], np.inf) if rate_limit is None else rate_limit
@@ -61,8 +62,9 @@ def behind_servo(
 
         inertia lag^2 p_ddot + servo_lag p_dot + p = u,   abs(p_dot) <= rate_limit
 
-    `lag` is that of the first-order actuator, s. The servo is at rest at the first u. Without an
-    inertia it is of first order. An actuator without a lag has no inertia either, and no limit.
+    p is the position of the servo, and `lag` is the lag of the first-order actuator, s. The servo
+    is at rest at the first u. Without an inertia the servo is of first order. If the actuator has
+    no lag, the servo has no inertia and no rate limit.
     """
     if lag == 0.0:
         return u

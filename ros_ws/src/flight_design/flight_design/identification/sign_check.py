@@ -124,7 +124,7 @@ def recorded_response(
     law, y_m excites the loop. Without y_m, and under the law `excitation`, u itself is the
     excitation. Raises ParameterError if the log has no y and u, or if its bridge was never engaged.
     It is also raised for a flight under guidance, because its y_m follows y, and for a log that was
-    imported by other rows than those of `channel_map`.
+    imported with other rows than those of `channel_map`.
     """
     recorded = read_run(bag, namespace)
     tape = recorded.tape
@@ -241,8 +241,8 @@ def check_effectors(
     """Check the signs of the effectors against the `effect` of an allocation, (m, p).
 
     An effector is checked at the output that it moves most, relative to the largest effect on this
-    output. `Omega`, (m, p), is that of `check_signs`, with a column for each effector. In the
-    result, the D of an effector's channel is the sign of its effect.
+    output. `Omega`, (m, p), has a column for each effector, and is in the map's order as in
+    `check_signs`. In the result, the D of an effector's channel is the sign of its effect.
     """
     mapped = _omega_of_law(channel_map, Omega, outputs, effectors)
     largest = np.argmax(np.abs(effect) / np.abs(effect).max(axis=1, keepdims=True), axis=0).tolist()
@@ -275,7 +275,7 @@ def check_effectors(
 def _omega_of_law(
     channel_map: ChannelMap, Omega: FloatArray, outputs: Sequence[str], inputs: Sequence[str]
 ) -> FloatArray:
-    """Return Omega `through` the map, in the law's order: that of `outputs` and `inputs`."""
+    """Return Omega `through` the map, with the rows `outputs` and the columns `inputs`."""
     rows = _places(outputs, channel_map.outputs)
     columns = _places(inputs, channel_map.inputs)
     return through(channel_map, Omega)[np.ix_(rows, columns)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Build a rough model of an aircraft that has no airframe file: a sketch.
+"""Build a rough model of an aircraft that has no airframe file. The model is called a sketch.
 
 A sketch follows from Omega and the trim speed alone. A learner begins with it.
 """
@@ -36,7 +36,7 @@ JSBSim in moderate turbulence these are 0.03 to 0.1 rad/s^2 rms over some second
 def sketch(
     name: str, Omega: FloatArray, outputs: Sequence[str], inputs: Sequence[str], speed: float
 ) -> Airframe:
-    """Sketch a rough airframe that has the zeros of a rigid symmetric aircraft.
+    """Build a rough airframe, a sketch, that has the zeros of a rigid symmetric aircraft.
 
     The sketch needs only Omega = C B and the trim speed V0, m/s.
 
@@ -48,12 +48,12 @@ def sketch(
         r_dot     = 6 |Omega_r| beta - 0.05 P p - R r + Omega_r u,  R = 0.95 sqrt(11 n |Omega_r|)
 
     In these equations, 11 is the lift slope divided by the lift coefficient, 0.17 is in 1/s, and
-    0.05 is the angle of attack in trim, rad. V depends on no other state, since y hardly shows what
-    alpha and theta do to V beside the wind in the airspeed. The factors are geometric means over
-    the twelve aircraft of `benchmarks.jsbsim_gains`, from differences of their accelerations in
-    trim. The entries of a single aircraft differ from them by a factor of 1.3 to 3. Omega (m, m)
-    has rows `outputs` and columns `inputs`; input i drives output i. Raises ParameterError for
-    other outputs than q, V, p, r.
+    0.05 is the angle of attack in trim, rad. V depends on no other state, because the effects of
+    alpha and theta on V hardly show in y beside the wind in the airspeed. The factors are geometric
+    means over the twelve aircraft of `benchmarks.jsbsim_gains`, from differences of their
+    accelerations in trim. The entries of a single aircraft differ from these means by a factor of
+    1.3 to 3. Omega (m, m) has rows `outputs` and columns `inputs`; input i drives output i. Raises
+    ParameterError for other outputs than q, V, p, r.
     """
     require(
         sorted(outputs) == ["V", "p", "q", "r"],
@@ -94,11 +94,11 @@ def sketch(
 
 
 def sketched(name: str, controller: ControllerConfig, speed: float) -> Airframe:
-    """Return the airframe of a controller's feedforward, which came from a sketch.
+    """Return the airframe of a controller's feedforward, which came from a sketch (a rough model).
 
     `speed` is the trim speed V0, m/s. The wind acts on the states through the columns V, alpha and
-    beta of A. Raises ParameterError if the controller has no feedforward, or if its states are not
-    those of a sketch.
+    beta of A. Raises ParameterError if the controller has no feedforward, or if the feedforward has
+    other states than a sketch.
     """
     model = controller.feedforward
     require(
@@ -140,9 +140,9 @@ def with_sketch(
     noise: FloatArray,
     margin: float,
 ) -> RiseDiConfig:
-    """Add the feedforward and the observer of a sketch to a controller, without letting them act.
+    """Add feedforward and observer of a sketch (a rough model) to a controller, not yet acting.
 
-    They do not act yet because `observer.part` is 0. Omega (m, m) and `noise`, (m,), the rms per
+    They do not act because `observer.part` is 0. Omega (m, m) and `noise`, (m,), the rms per
     sample, are in the law's order. `margin` is the least delay margin, s. Raises ParameterError as
     `sketch` and `with_aircraft_observer` do.
     """

@@ -68,8 +68,8 @@ def second_order_response(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the step responses of two second-order systems behind a lag and a delay, (N,) each.
 
-    The first is that of y'' + damping y' + stiffness y = v', and the second has v in place of v'.
-    In both, lag v' = u(t - delay) - v, and the system is at rest before the step.
+    The first system is y'' + damping y' + stiffness y = v', and the second has v in place of v'. In
+    both, lag v' = u(t - delay) - v, and the system is at rest before the step.
     """
     begin = np.maximum(t - delay, 0.0)
     # the state z, z', v; the output is z' for the first response, z for the second
@@ -136,9 +136,9 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
 def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
     """Return whether a fitted response begins in the direction of Omega.
 
-    The direction is the sign of the sum of the response until EARLY after delay and lag. If this is
-    not the sign of Omega, the slow term makes up the whole response. The two fitted poles then
-    stand for a pole and a lag, and Omega is about 0.
+    The direction is the sign of the sum of the response, up to the time EARLY after the delay and
+    the lag. If this is not the sign of Omega, the slow term makes up the whole response. The two
+    fitted poles then stand for a pole and a lag, and Omega is about 0.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     first, second = second_order_response(
@@ -150,8 +150,8 @@ def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 -
 def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size: float) -> float:
     """Return by how much a fitted response lowers chi squared, minus its number of parameters.
 
-    Only the time up to EARLY after delay and lag counts. A negative result becomes 0, and so does
-    the result of a response that does not begin with the sign of Omega.
+    The response is examined up to the time EARLY after the delay and the lag. A negative result
+    becomes 0. The result is also 0 if the response does not begin with the sign of Omega.
     """
     early = t <= theta[0] + theta[1] + EARLY
     first, second = second_order_response(t[early], *theta[[0, 1, 3, 4]])
@@ -168,7 +168,7 @@ def _whitener(responses: FloatArray) -> FloatArray:
     """Return W, (N, N), with which the error W (s - true s) of a response s has covariance I.
 
     The covariance follows from responses, (1 + DRAWS, N). An error of FLOOR times the largest value
-    is added to it. W is 0 for the responses of a constant output.
+    is added to the covariance. W is 0 for the responses of a constant output.
     """
     values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(responses[1:].T)))
     floor = (FLOOR * np.max(np.abs(responses[0]))) ** 2 + RANK * values[-1]

@@ -65,7 +65,10 @@ DEAD_WITHIN = 4.0
 
 
 class Change(NamedTuple):
-    """The result of testing one part of the aircraft, which does not couple with the rest."""
+    """Result of a test for changes of one part of the aircraft.
+
+    A part is a group of states and inputs that does not couple with the rest.
+    """
 
     outputs: tuple[str, ...]
     gain: float  # log-likelihood that is gained if effects may fall by more than LOSS
@@ -93,10 +96,10 @@ def change_test(
         G = min J(kappa_j >= -LOSS) - min J(kappa_j >= -2)
 
     with the normalised innovations e and their covariance S, as in `Search.fit`. A fault of an
-    effector multiplies its column of B by a factor, so a part has as many unknown factors as
-    inputs. A is known. The winds and the angles at the beginning are free too. Each minimum is also
-    sought with the levels of the wind of the other one, so that no difference in the wind passes
-    for a loss.
+    effector multiplies its column of B by a factor, so a part (a group of states and inputs that
+    does not couple with the rest) has as many unknown factors as inputs. A is known. The winds and
+    the angles at the beginning are also free. Each minimum is also sought with the levels of the
+    wind that belong to the other minimum, so that no difference in the wind passes for a loss.
 
     G is 0 while the losses are within LOSS. If a loss is z standard deviations larger than LOSS, 2
     G = z^2, by S. S. Wilks (Ann. Math. Statist. 9(1), 1938). In one test a single input with a loss
@@ -105,8 +108,9 @@ def change_test(
 
     The input j is dead if the minimum of J for -OFF_CENTRE <= kappa_j + 1 <= NONE meets two
     conditions. It is lower than the first minimum in G by more than MAX_GAIN, and at most
-    DEAD_WITHIN above the second one. `delays` has the delays of u, s, by the outputs of a part. The
-    default is the delay of `actuation`. `drift` is the noise of the disturbances, as in `Unknown`.
+    DEAD_WITHIN above the second minimum in G. `delays` has the delays of u, s, by the outputs of a
+    part. The default is the delay of `actuation`. `drift` is the noise of the disturbances, as in
+    `Unknown`.
     """
     changes = []
     flown = in_rolling_air(flown)
@@ -156,7 +160,7 @@ class Effects(Search):
         delay: float | FloatArray,
         drift: float = DRIFT,
     ) -> None:
-        """Set up the search; `delay` is that of u, s, and `drift` the noise of the disturbances."""
+        """Set up the search. `delay` is the delay of u, s, `drift` the noise of disturbances."""
         model = filter_model(flown, actuation, recorded)
         unknown = Unknown(angle=ANGLE, drift=drift)
         super().__init__(recorded, model, block, flown, delay, unknown, factor=1)
@@ -195,8 +199,9 @@ class Effects(Search):
         """Find the least J if every kappa is at least `lower`.
 
         With the winds that fit the flown model, a loss of effect may pass for gusts. Therefore the
-        search has several starts: these winds, the same wind in every span, and each input dead. A
-        start with a dead input counts only if its J exceeds the least J by less than CLOSE.
+        search has several starts: these winds, the same wind in every span, and each input dead.
+        The end of a start with a dead input is ignored if its J exceeds the least J by CLOSE or
+        more.
         """
         same = self.least(lower=lower, levels=np.full(len(self._spans), TURBULENT))
         best = least_of(self.least(lower=lower), self.least(same.theta, lower))

@@ -39,7 +39,7 @@ ROUNDED = 1.001  # factor on the required margins of a loop, so that it has them
 
 
 class Goal(NamedTuple):
-    """What the design for a learned model must meet."""
+    """Margins and further conditions that the design for a learned model must meet."""
 
     margin: FloatArray  # (m,) delay margin of each input, s
     needed: Requirement
@@ -56,7 +56,7 @@ ParameterError."""
 
 
 class Known(NamedTuple):
-    """What a learned model says of a part of the aircraft: delays of its inputs, and deviations."""
+    """Properties of one part of a learned model: delays of its inputs, and standard deviations."""
 
     deviation: Mapping[str, float]  # relative deviation of each entry, by name
     latest: Mapping[str, float]  # delay of each input plus two standard deviations, s
@@ -75,8 +75,8 @@ class LearnedLoop(NamedTuple):
         """Return the linear loop around the model, with a box of uncertain aircraft.
 
         In the box, each entry deviates by up to DEVIATIONS standard deviations. The loop has no
-        limits. Every u is late by the longest delay in `known`, or by the delay that the controller
-        was told if this is longer.
+        limits. Every u is late by the longest delay in `known`, or by the delay in the controller's
+        parameters if this is longer.
         """
         model = self.model
         deviation = chain.from_iterable(part.deviation.items() for part in self.known)
@@ -115,7 +115,8 @@ def margin_of(controller: RiseDiConfig) -> float:
 def asked_margin(start: RiseDiConfig) -> float:
     """Return the delay margin that a learned design should keep, s.
 
-    It is `learn.margin`, or if that is not set, the delay margin of the controller at the start.
+    This is `learn.margin`. If it is not set, it is the delay margin of the controller with which
+    the flight started.
     """
     asked = None if start.learn is None else start.learn.margin
     return margin_of(start) if asked is None else asked
@@ -124,8 +125,8 @@ def asked_margin(start: RiseDiConfig) -> float:
 def is_late(start: RiseDiConfig, latest: Mapping[str, float]) -> bool:
     """Return whether an input needs a larger delay margin than `asked_margin`.
 
-    `latest` has the latest delay of each input, s, by name. An input needs a margin of this delay
-    and DELAY_LEFT.
+    `latest` has the latest delay of each input, s, by name. The margin that an input needs is its
+    latest delay plus DELAY_LEFT.
     """
     return max(latest.values(), default=0.0) + DELAY_LEFT > asked_margin(start)
 
@@ -153,19 +154,20 @@ def goal(
 ) -> Goal:
     """Return the goal of a design for a model of which some parts are learned.
 
-    Each part needs a delay margin:
+    A part is a group of states and inputs that does not couple with the rest. Each part needs a
+    delay margin:
 
     - If `learn.margin` is set, it is this margin.
-    - Otherwise, with no design for the airframe file, it is the margin of the controller at the
-      start.
+    - If there is no `learn.margin` and no design for the airframe file, it is the margin of the
+      controller with which the flight started.
     - With a design for the airframe file (`file`), it is the margin that the loop with this design
-      has around the learned model, but at most the margin of the start. A learned part needs at
-      least LEAST_MARGIN, or the margin of the start if this is smaller.
+      has around the learned model, but at most the margin at the start of the flight. A learned
+      part needs at least LEAST_MARGIN, or the margin at the start if this is smaller.
 
     A `dead` output flies without this design, so it needs no margin. In any case an input must
     tolerate DELAY_LEFT, s, beyond its `latest` delay, s. With a design for the file, the
-    sensitivity must be at most 2, or that of the loop with this design if it is larger. This bounds
-    the phase and gain margins (Astrom, Murray, "Feedback Systems", 10.5).
+    sensitivity must be at most 2, or the sensitivity of the loop with this design if it is larger.
+    This bounds the phase and gain margins (Astrom, Murray, "Feedback Systems", 10.5).
     """
     outputs = start.outputs
     margin = np.full(len(outputs), margin_of(start))
@@ -211,13 +213,19 @@ def by_law_of_start(
 ) -> set[str]:
     """Return the outputs that fly by the law with which the flight started.
 
-    `left` has the parts of the aircraft that are left to this law, each with its dead input. The
-    dead input is None if the controller gave up the model of the part. Then all outputs of the part
-    fly by the law. If a part has a dead input, all of its outputs fly by the law, too, unless the
-    design for the file flies (`has_file`). In that case only the output of the dead input flies by
-    the law, and V if it is in the part. In flights without an elevator, the observer of V erred
-    four times as much as the law. The other outputs keep the design, because their inputs work. In
-    flights without a rudder, the error of p was half of that under the law.
+    `left` has the parts of the aircraft that are left to this law, each with its dead input. A part
+    is a group of states and inputs that does not couple with the rest.
+
+    - If the dead input is None, the controller no longer uses a model of the part. All outputs of
+      the part then fly by the law.
+    - If a part has a dead input and no design for the airframe file flies, all outputs of the part
+      fly by the law.
+    - If a part has a dead input and the design for the file flies (`has_file`), only the output of
+      the dead input flies by the law, and V if it is in the part.
+
+    In flights without an elevator, the observer of V erred four times as much as the law. The other
+    outputs keep the design, because their inputs work. In flights without a rudder, the error of p
+    with the design was half of the error under the law.
     """
     driven = dict(zip(start.inputs, start.outputs, strict=True))
     return {
@@ -235,7 +243,7 @@ def with_flown_channels(
     flying: Collection[str],
     left: Mapping[tuple[str, ...], str | None],
 ) -> RiseDiConfig:
-    """Combine a design for the outputs `flying` with the law of the start for all others.
+    """Combine a design for the outputs `flying` with the first law of the flight for all others.
 
     `left` has the parts of the aircraft that are left to this law, as in `by_law_of_start`. The law
     does not move their dead inputs. If any part is left and there is an observer, the margin in the
@@ -250,7 +258,7 @@ def with_flown_channels(
 
 
 def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> RiseDiConfig:
-    """Set the delay margin in a controller to what its loop around a model has, at most `most`."""
+    """Set the delay margin in a controller to that of its loop around a model, at most `most`."""
     linear = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
     undelayed = linear.loop._replace(delay=0.0)
     kept = delay_margin(linear.nominal, linear.law, undelayed) - RESOLUTION
@@ -263,7 +271,7 @@ def with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> R
     """Put the standard deviations of B into the model of a controller's feedforward.
 
     `deviation` has the relative standard deviation of each entry, by the entry's name. An entry
-    that no flight has shown gets PRIOR.
+    that is not in `deviation` gets PRIOR.
     """
     model = designed.feedforward
     assert model is not None  # noqa: S101 - a design has one

@@ -3,8 +3,8 @@
 """Test the deviations that an airframe file states, and widen them if the record contradicts them.
 
 A deviation is information: an entry that the record hardly shows stays at the value of the file,
-with the deviation of the file. So if this deviation is too small, the stated deviations of the
-model are too small as well.
+with the deviation of the file. So if the deviation in the file is too small, the stated deviation
+of the entry in the model is too small as well.
 """
 
 from collections.abc import Callable
@@ -41,8 +41,8 @@ def identified_within(
     """Identify a model, and return it with deviations of the file that the record allows.
 
     If `tests`, the deviations `believed` are tested. If the record contradicts them, they are
-    doubled, the model is identified again, and a remark says so. `identify` is called with the
-    deviations as `unknown`, and with `searches_again`.
+    doubled, the model is identified again, and a remark says so. The function `identify` gets the
+    deviations as its argument `unknown`, and also an argument `searches_again`.
     """
 
     def found_with(deviations: Unknown) -> Identification:
@@ -70,14 +70,15 @@ def is_contradicted(found: Identification, believed: Unknown) -> bool:
 
         sum (theta_i / s_i)^2,   its mean nu = sum (1 - d_i^2 / s_i^2)
 
-    theta_i are the errors that were found, d_i their deviations, and s_i those of the file. If the
-    s_i are right, the variance of the sum is at most that of a chi-squared distribution with nu
-    degrees of freedom. The file is contradicted if this distribution exceeds the sum with a
-    probability below CONTRADICTED. Entries at the bounds of the search contradict the file too.
+    theta_i are the errors that were found, d_i their deviations, and s_i the deviations of the
+    file. If the s_i are right, the variance of the sum is at most that of a chi-squared
+    distribution with nu degrees of freedom. The file is contradicted if this distribution exceeds
+    the sum with a probability below CONTRADICTED. Entries at the bounds of the search also
+    contradict the file.
 
-    Only parts whose model explains the record count. A model whose innovations are not white, or
-    whose best known effect on an output is at its bound, is wrong for another reason, such as parts
-    that couple.
+    Only parts whose model explains the record are used in the sum. A model whose innovations are
+    not white, or whose best known effect on an output is at its bound, is wrong for another reason,
+    such as parts that couple.
     """
     parts = [part for part in found.parts if _counts(part, believed.factor)]
     name = found.airframe.name

@@ -93,7 +93,7 @@ class FlightRecord:
         return FlightData(self.period, t, padded_y[:, self._rows], held[:, self._columns])
 
     def has_fallen_back(self, after_ns: int, proposals: Collection[int]) -> bool:
-        """Return whether the law fell back after an instant.
+        """Return whether the law fell back after an instant, because a proposal failed.
 
         This is so if the parameters changed, and the new parameters are no proposal. `proposals`
         has the digests of the proposals.
@@ -114,7 +114,7 @@ def steady_end(recorded: FlightData, airframe: Airframe) -> tuple[FlightData, fl
     """Return the longest end of a record with a steady airspeed, and this airspeed over V0.
 
     The airspeed is steady if its rms deviation from the mean is at most SPREAD of the mean. The
-    effects of the surfaces vary twice as much, and a linear model still holds.
+    relative change of the surfaces' effects is then twice as large, and a linear model still holds.
     """
     V = recorded.y[:, airframe.outputs.index("V")] / airframe.speed
     known = np.isfinite(V)[::-1]

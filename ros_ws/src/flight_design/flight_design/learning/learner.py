@@ -92,7 +92,7 @@ PartName = tuple[str, ...]
 
 
 class Verdict(NamedTuple):
-    """Which model flies after an identification, and sentences about its parts."""
+    """The model that flies after an identification, and sentences about the parts of this model."""
 
     model: Airframe  # the model in flight if no part has a new model
     known: dict[PartName, Known]
@@ -104,8 +104,9 @@ class Verdict(NamedTuple):
 class Learner:
     """The record of y and u over a window, and the designs that are proposed from it.
 
-    The parts of the aircraft, which do not couple, are learned one by one. Without a learned model
-    a part flies the design for the airframe file, which allows for errors, or the law of the start.
+    The parts of the aircraft (outputs that couple with no other part) are learned one by one. A
+    part without a learned model flies the design for the airframe file, which allows for errors, or
+    the first law of the flight.
     """
 
     def __init__(
@@ -121,14 +122,14 @@ class Learner:
     ) -> None:
         """Make a learner with an empty record.
 
-        `airframe` is the rough model, the prior. The delay in `actuation` is that of the loop
+        `airframe` is the rough model, the prior. The delay in `actuation` is the delay of the loop
         beyond sampling and lags. `design_of_rough` makes a design for the rough model that allows
         for its errors. This design flies from the start, and later in the parts without a learned
-        model. If `design_of_rough` is None, these parts fly by the law of the start.
+        model. If `design_of_rough` is None, these parts fly by the first law of the flight.
 
         `rough` has the standard deviations of A and B in the rough model. It also has the noise of
-        the disturbances, which a test for a change uses too. With `quick`, an identification begins
-        with a single start (`identify_model`), and no guarantee is proved.
+        the disturbances, which a test for a change uses as well. With `quick`, an identification
+        begins with a single start (`identify_model`), and no guarantee is proved.
         """
         settings = controller.learn
         assert settings is not None  # noqa: S101 - `scenario_learner.learner` makes no other
@@ -190,21 +191,21 @@ class Learner:
 
         The first proposal needs no record. It is a design for the rough airframe that allows for
         errors. Parts whose models are refused later also fly by this design. If this proposal does
-        not fly, or if the law falls back, those parts fly the law of the start.
+        not fly, or if the law falls back, those parts fly by the first law of the flight.
 
         The last RECORD seconds are tested for a loss of effect. If an input has no effect any more,
-        its part flies the law of the start without this input. After a loss of effect, older
-        samples are left out, and the flown model becomes the prior. If nothing is due, nothing is
-        proposed. The result then has a sentence only if a single test has found that an input may
-        have no effect.
+        its part flies by the first law without this input. After a loss of effect, older samples
+        are left out, and the flown model becomes the prior. If nothing is due, nothing is proposed.
+        The result then has a sentence only if a single test has found that an input may have no
+        effect.
 
         While the rough model flies, the first model of a part is only on trial. The next
         identification proposes it if the samples since then show its advantage over the rough one.
 
-        `flown` is the digest of the parameters that fly. If it still differs from that of the last
-        proposal after the latency, the controller refused the proposal or fell back. Then an
-        identification is due. Outputs that the controller has `given_up` are not proposed again. If
-        no part is left to learn, a sentence says so once.
+        `flown` is the digest of the parameters that fly. If it still differs from the digest of the
+        last proposal after the latency, the controller refused the proposal or fell back. Then an
+        identification is due. `given_up` has the outputs whose models the controller stopped using.
+        They are not proposed again. If no part is left to learn, a sentence says so once.
         """
         is_first = not self._has_proposed_rough
         self._has_proposed_rough = True
@@ -270,8 +271,8 @@ class Learner:
     def _damaged(self, changes: Sequence[Change], end_ns: int) -> LearnerResult:
         """Decide on parts that have changed; a part with a dead input flies without it at once.
 
-        Any other part is identified again, from the record since the change and around the flown
-        model.
+        A changed part without a dead input is identified again, from the record since the change
+        and around the flown model.
         """
         self._record.forget_before(end_ns - nanoseconds(RECORD))
         self._prior = self._model
@@ -293,7 +294,7 @@ class Learner:
         return LearnerResult(self._last, told)
 
     def _verdict(self, identified: Identification, *, lost: bool) -> Verdict:
-        """Decide which parts fly new models. If `lost`, the last proposal does not fly."""
+        """Decide which parts fly new models. `lost` says that the last proposal does not fly."""
         known = dict(self._known)
         model = self._model
         told = list[str]()
@@ -352,7 +353,8 @@ class Learner:
     ) -> str | None:
         """Design a controller for a model, and note it as the last proposal. Raises ParameterError.
 
-        Returns a sentence on what `learn.margin` costs, or None if it costs nothing.
+        Returns a sentence on the tracking error that `learn.margin` costs, or None if it costs
+        none.
         """
         proposed, price_text = self._designed(model, known, dead)
         new = [part for part, value in known.items() if value is not self._known.get(part)]
@@ -392,10 +394,10 @@ class Learner:
         return LearnerResult(proposed, f"the airframe {name} as it is, {UNVERIFIED}")
 
     def _note_given_up(self, flown: int, outputs: Sequence[str]) -> None:
-        """Note that the controller uses no learned model in some outputs any more.
+        """Note that the controller no longer uses a learned model in some outputs.
 
-        The last proposal flies if the flown parameters differ from it only in these outputs.
-        Otherwise it was refused.
+        If the flown parameters differ from the last proposal only in these outputs, the proposal
+        flies. If they also differ elsewhere, the proposal was refused.
         """
         if set(outputs) <= set(outputs_without(self._start)):
             return
@@ -406,7 +408,7 @@ class Learner:
             self._proposed = flown
 
     def _give_up(self, outputs: Sequence[str]) -> None:
-        """Leave some outputs to the law of the start from now on, by adding to `learn.without`."""
+        """Leave some outputs to the flight's first law from now on: extend `learn.without`."""
         self._start = without_models(self._controller, self._controller, outputs)
         if outputs:
             part = outputs_without(self._start)
@@ -419,7 +421,8 @@ class Learner:
         """Return whether an identification is due: at `learn.updates`, then once in every window.
 
         If the last proposal does not fly (`lost`), or if a part has changed, an identification is
-        also due RETRY after the last one, unless the law fell back less than AFTER_FALLBACK ago.
+        also due at RETRY after the last identification, unless the law fell back in the last
+        AFTER_FALLBACK seconds.
         """
         is_planned = False
         elapsed_ns = -1 if self._first_ns is None else end_ns - self._first_ns
@@ -494,10 +497,9 @@ class Learner:
     def _changes(self, end_ns: int) -> list[Change]:
         """Find changes in the last RECORD seconds, in the parts that have a learned model.
 
-        An input counts as dead only in the second test in a row, unless the law fell back. No
-        change is found if the speed was not steady, or if an output stood still. There is none
-        either if an output oscillated over RETRY, because no model with a stable loop explains such
-        an oscillation.
+        An input is taken as dead only in the second test in a row, unless the law fell back. No
+        change is found if the speed was not steady, if an output stood still, or if an output
+        oscillated over RETRY, because no model with a stable loop explains such an oscillation.
         """
         suspected, self._suspected = self._suspected, {}
         begin_ns = end_ns - nanoseconds(RECORD)
@@ -530,16 +532,16 @@ class Learner:
         return found
 
     def _by_law(self, dead: Mapping[PartName, str | None]) -> set[str]:
-        """Return the outputs that fly by the law of the start, given the dead inputs."""
+        """Return the outputs that fly by the flight's first law, given the dead inputs."""
         return by_law_of_start(self._controller, dead, has_file=self._design_of_rough is not None)
 
     def _designed(
         self, model: Airframe, known: Mapping[PartName, Known], dead: Mapping[PartName, str | None]
     ) -> tuple[RiseDiConfig, str | None]:
-        """Design the controller for a model, and say what `learn.margin` costs.
+        """Design the controller for a model, and say what `learn.margin` costs in error.
 
-        Parts without a learned model fly by the law of the start, or by the rough model as long as
-        it is in use. Raises ParameterError.
+        Parts without a learned model fly by the first law of the flight, or by the rough model as
+        long as it is in use. Raises ParameterError.
         """
         start = self._controller
         without_learning = start.model_copy(update={"learn": None})
@@ -582,7 +584,7 @@ class Learner:
         latest: Mapping[str, float],
         dead: Collection[str],
     ) -> str | None:
-        """Write what `learn.margin` costs in error; None if there is no design to compare."""
+        """Write what `learn.margin` costs in tracking error; None if no design can be compared."""
         start = self._controller
         settings = start.learn
         if settings is None or settings.margin is None or self._design_of_rough is None:

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run a learner as a node, which proposes feedforward and observer from the controller's ticks.
 
-The search runs in a thread of low priority. In real time the loop does not wait for it.
+The search runs in a thread of low priority. If the flight is in real time, the loop does not wait
+for the search.
 """
 
 import os
@@ -43,11 +44,12 @@ NICE = 10  # nice value of a search in real time, which must not delay the loop
 class LearnerNode(FlightNode[LearnerConfig]):
     """Takes y and u of each tick from `internals`, and publishes the proposals that are due.
 
-    After a search, the guarantee of its proposal is proved. The proposal does not wait for this.
-    While a search or a proof runs, the samples wait in the queue of the subscription, so the record
-    of a search does not change. In lockstep the proposals therefore equal those of the loop in one
-    process. In real time a search begins with the newest sample. If several identifications became
-    due during a search, only the last of them is made.
+    After a search, the guarantee of its proposal is proved. The proposal does not wait for this
+    proof. While a search or a proof runs, the samples wait in the queue of the subscription, so the
+    record of a search does not change. If the flight is in lockstep, the proposals therefore equal
+    the proposals of a simulation in one process. If it is in real time, a search begins with the
+    newest sample. If several identifications became due during a search, only the last of them is
+    made.
     """
 
     def __init__(self) -> None:
@@ -111,7 +113,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
     def _advance(self, now_ns: int) -> bool:
         """Publish what a finished search or proof found, and take samples until the next search.
 
-        Return whether there was a sample, a proposal or a proof.
+        Returns whether there was a sample, a proposal or a proof.
         """
         advanced = False
         if self._search is not None and not self._search.is_alive():
@@ -147,7 +149,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
             self.get_logger().info(self._said)
 
     def _publish_found(self) -> None:
-        """Publish what was identified, with the guarantee of its proposal, if there is any."""
+        """Publish what was identified, with the guarantee of its proposal if there is one."""
         if self._found is not None:
             encoder = self.encoder(self._found.names)
             self._publish_learned(encoder.encode(self._end_ns, self._found.values))
@@ -203,9 +205,10 @@ class LearnerNode(FlightNode[LearnerConfig]):
             self.get_logger().error(f"unexpected exception: {traceback.format_exc()}")
 
     def close(self) -> None:
-        """Complete the searches that are due, in lockstep.
+        """Complete the searches that are due, if the flight is in lockstep.
 
-        The log then has their entries, as the log of a simulation in one process has.
+        The log then has the results of these searches, as the log of a simulation in one process
+        has.
         """
         if self.parameters.lockstep:
             self._advance(0)

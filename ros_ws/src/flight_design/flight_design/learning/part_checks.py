@@ -48,10 +48,10 @@ def change_sentence(change: Change) -> str:
 
 
 def reason_against_innovations(part: Part) -> Refusal | None:
-    """Refuse a part if the innovations of an output are too far from white noise.
+    """Return a refusal of a part if innovations are too far from white noise, else None.
 
-    The worst output counts. Its `whiteness` is 1 for white noise, and must be at most
-    MAX_WHITENESS.
+    The output with the largest `whiteness` decides. The whiteness is 1 for white noise, and must be
+    at most MAX_WHITENESS.
     """
     worst = int(np.argmax(part.after.whiteness))
     white = float(part.after.whiteness[worst])
@@ -65,7 +65,7 @@ def reason_against_innovations(part: Part) -> Refusal | None:
 
 
 def reason_against_delays(part: Part, delay: float) -> Refusal | None:
-    """Refuse a part if the delay of an input is at the bound of the search.
+    """Return a refusal of a part if the delay of an input is at the bound of the search, else None.
 
     `delay` is the known delay of the loop, s, from which the search starts.
     """
@@ -94,10 +94,11 @@ def is_file_better(part: Part) -> bool:
 def reason_against_first_model(part: Part, name: str, *, flies: bool) -> Refusal | None:
     """Refuse the first model of a part until it has proved itself against the airframe `name`.
 
-    The model was chosen by the record, so only later samples count. Let a difference be clear if
-    two equally good models show it with a probability of at most 5 %. If the airframe `flies`, as
-    one from a file does, the model must be clearly better than the airframe. If the airframe does
-    not fly, as a sketch does not, the model is refused only if it is clearly worse.
+    The model was chosen by the record, so only later samples can prove it. Let a difference be
+    clear if two equally good models show it with a probability of at most 5 %. If the airframe
+    `flies`, as one from a file does, the model must be clearly better than the airframe. If the
+    airframe does not fly, as a sketch (a rough model) does not, the model is refused only if it is
+    clearly worse. Returns None if the model is not refused.
     """
     limit = LIKELIER if flies else -LIKELIER
     if part.advantage == 0.0:
@@ -116,8 +117,8 @@ def reason_against_first_model(part: Part, name: str, *, flies: bool) -> Refusal
 def return_to_file(part: Part, name: str | None) -> str:
     """Say by which model or law a part flies now, because the model in flight predicted worse.
 
-    The model of the airframe file has predicted better. The part flies by the airframe `name`, or
-    by the law of the start if `name` is None.
+    The model of the airframe file has predicted better. The part flies by the airframe `name`. If
+    `name` is None, it flies by the law with which the flight started.
     """
     flies = "the law of the start" if name is None else f"the airframe {name} as it is"
     return f"{' and '.join(part.outputs)} by {flies}: {_file_advantage(part)}"
@@ -133,7 +134,10 @@ def entries_of_file(part: Part) -> tuple[Entry, ...]:
 
 
 def reason_against_part_alone(part: Part, known: Iterable[tuple[str, ...]]) -> Refusal | None:
-    """Refuse a separate model of a part that the model in flight couples with another part."""
+    """Return a refusal of a separate model of a part that is coupled in the model in flight.
+
+    Returns None if the model in flight does not couple the part with another one.
+    """
     if not any(is_within(part.outputs, outputs) for outputs in known if outputs != part.outputs):
         return None
     return Refusal(
@@ -148,10 +152,11 @@ def forgotten_coupling(part: Part) -> str:
 
 
 def reason_against_effects(part: Part, flown: Airframe | None) -> Refusal | None:
-    """Refuse an effect that gusts make weaker than in the flown model by more than MAX_DEVIATION.
+    """Return a refusal if gusts have made an identified effect too weak, else None.
 
-    Gusts hide the effects of the inputs. The identified effects are then too weak, and the gains of
-    a design with these effects would be too high.
+    An effect is too weak if it is below the effect in the flown model by more than the fraction
+    MAX_DEVIATION. Gusts hide the effects of the inputs. The gains of a design with too weak effects
+    would be too high.
     """
     if flown is None or not part.has_gusts:
         return None
@@ -171,7 +176,8 @@ def reason_against_effects(part: Part, flown: Airframe | None) -> Refusal | None
 def effect_sentence(part: Part) -> str:
     """Say which effects of the inputs on the outputs the flight has shown.
 
-    Each effect is given relative to that of the rough airframe, with its standard deviation.
+    Each effect is given relative to the same effect in the rough airframe, with its standard
+    deviation.
     """
     effects = (entry for entry in part.entries if entry.matrix == "B" and entry.row in part.outputs)
     known = (entry for entry in effects if entry.nominal and entry.deviation < PRIOR / 2.0)
@@ -184,9 +190,9 @@ def effect_sentence(part: Part) -> str:
 def without_effect(
     left: Mapping[tuple[str, ...], str | None], by_law: Collection[str]
 ) -> list[str]:
-    """Say which parts fly without an input, and which of their outputs fly the law of the start.
+    """Say which parts fly without an input, and which outputs fly by the flight's first law.
 
-    `left` is as in `designs.by_law_of_start`, and `by_law` has the outputs that fly this law.
+    `left` is as in `designs.by_law_of_start`, and `by_law` has the outputs that fly by this law.
     """
     told = []
     for part, dead in left.items():

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make the learner of a scenario.
 
-Its rough model is the airframe file or a sketch. The observers of its designs have the gains of
-`rise-di gains`.
+The rough model of the learner is the airframe file or a sketch, which is a model from the effects
+of the inputs and the trim speed alone. The observers of its designs have the gains of `rise-di
+gains`.
 """
 
 from pathlib import Path
@@ -46,9 +47,9 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
     """Return the function that `simulate` and `fly_and_report` take as `learn`, or None.
 
     The rough model is the published airframe, not the aircraft in flight. For an aircraft of
-    JSBSim, and with `learn.prior.sketch`, it is the feedforward of the controller instead. A file
-    in `learn.prior.file` replaces either. In real time the loop has the delay of the section
-    controller. In one process and in lockstep u acts at once.
+    JSBSim, and with `learn.prior.sketch`, the feedforward of the controller is the rough model. A
+    file in `learn.prior.file` replaces either. If the flight is in real time, the loop has the
+    delay of the section controller. If it is in one process or in lockstep, u acts at once.
 
     Args:
         scenario: The flight.
@@ -132,9 +133,9 @@ def that_learns(scenario: Scenario) -> Scenario:
 
         Omega = diag(D omega / input_scale),   V0 the trim speed
 
-    The parameters of the law give the signs and sizes of Omega. The rough model is the sketch of
-    Omega and V0. Raises ParameterError if the controller has an observer, or if the sketch lacks an
-    output.
+    The parameters of the law give the signs and sizes of Omega. The rough model is built from Omega
+    and V0 by `sketch`. Raises ParameterError if the controller has an observer, or if the rough
+    model lacks an output.
     """
     start = scenario.rise_di()
     expected = "none: a scenario of the law alone, whose signs and sizes are the rough model"
@@ -202,7 +203,7 @@ def _prior(path: str, flown: Airframe) -> Airframe:
 
 
 class LearnStep(NamedTuple):
-    """What the learner found at a time of the flight."""
+    """What the learner found at one time of the flight."""
 
     t: float  # s
     is_proposed: bool
@@ -234,7 +235,7 @@ class _Ticks(NamedTuple):
     given_up: Signal
 
     def left(self, k: int) -> tuple[str, ...]:
-        """Return the outputs that the controller had given up at the tick k."""
+        """Return the outputs whose learned models the controller no longer used at the tick k."""
         names = self.given_up.names
         return tuple(name for name in names if self.flown is not None and self.given_up[name][k])
 
@@ -265,12 +266,12 @@ def _ticks(tape: Tape, controller: RiseDiConfig) -> _Ticks:
 
 
 def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
-    """Let the learner of a scenario work on the ticks of a log, with their y and u.
+    """Run the learner of a scenario on the ticks of a log, with their y and u.
 
-    Only ticks in which the law was engaged count. As in flight, the record ends if the law is
+    Ticks in which the law was not engaged are left out. As in flight, the record ends if the law is
     deactivated. If the flight in the log was without a learner, or its learner had other settings
-    than the scenario, each proposal counts as flown. Raises ParameterError if nothing can be
-    learned from the log.
+    than the scenario, each proposal is treated as if it had flown. Raises ParameterError if nothing
+    can be learned from the log.
     """
     # Simulated time begins at 0.
     make = learner(scenario, real_time=tape.start_ns > 0)
