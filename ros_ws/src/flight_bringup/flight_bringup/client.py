@@ -60,7 +60,8 @@ class NetworkClient(Client):
         """Exchange clock readings until this host has one of every other host.
 
         This takes at most `timeout` s. Returns the hosts whose messages arrive at this host. Also
-        returns the clock of each of them that receives the messages of this host.
+        returns, for each of these hosts that receives the messages of this host, the reading of its
+        clock.
         """
         heard_hosts: set[str] = set()
         clocks: dict[str, ClockOfPeer] = {}

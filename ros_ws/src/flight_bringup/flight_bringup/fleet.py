@@ -75,7 +75,7 @@ class AircraftOfFleet(Config):
 
 
 class FleetConfig(Config):
-    """The content of a fleet file. Its paths are relative to the folder of this file."""
+    """The content of a fleet file. Paths in the file are relative to the folder of the file."""
 
     scenario: str = Field(
         default="osprey_route", description="scenario of the aircraft that name none"
@@ -144,7 +144,7 @@ def read_fleet(
     """Read a fleet file.
 
     `duration`, s, replaces the duration in the file. If `use_sim_time` is True, the fleet flies by
-    the topic /clock. Raises ParameterError.
+    the topic /clock. Raises ParameterError if the file is invalid.
     """
     path = as_path(file, "fleet", A_FLEET)
     content = read_yaml(path, str(path), A_FLEET)
@@ -219,7 +219,7 @@ def _scenario(
 def _nested(
     scenario: Scenario, changes: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """Return the changes of a scenario, completed so that each replaces a whole group.
+    """Return the changes of a scenario, completed so that each change replaces a whole group.
 
     A change that is a mapping gives new values only to some parameters of a group. The other
     parameters of the group are added, with their values in the scenario.
@@ -254,7 +254,7 @@ class _Flight:
     stopping: threading.Thread | None = None
 
     def start(self, fleet: Fleet, pause: Callable[[float], None]) -> None:
-        """Start the processes, and in real time wait until they are ready.
+        """Start the processes. In a real-time flight, also wait until the processes are ready.
 
         `pause` sleeps for a duration, s, between two checks. The flights of a fleet are started one
         after the other, because a host should not start many processes at once.
@@ -282,8 +282,8 @@ class _Flight:
     def begin(self, start: tuple[float, float]) -> None:
         """Begin the flight, given t = 0 of the fleet in `start`.
 
-        `start` has t = 0 by the system clock and by the monotonic clock, s. In lockstep nothing
-        more happens here, because the flight has begun already.
+        `start` has t = 0 by the system clock and by the monotonic clock, s. If the flight is in
+        lockstep, nothing happens here, because the flight has begun already.
         """
         if self.processes is None or self.stopping is not None:
             return
@@ -347,9 +347,10 @@ def fly_fleet(
 
     `progress` is called with the name of an aircraft, its flight time, s, and a text.
 
-    In real time the aircraft share t = 0, which is set when every node is ready. An aircraft with a
-    delay begins later by its delay. If an aircraft ends early, or never begins, the others fly on.
-    Ctrl-C ends all flights. Raises ParameterError if no aircraft can begin.
+    If the fleet flies in real time, its aircraft share t = 0, which is set when every node is
+    ready. An aircraft with a delay begins later by its delay. If an aircraft ends early, or never
+    begins, the others fly on. Ctrl-C ends all flights. Raises ParameterError if no aircraft can
+    begin.
     """
     require_ros_environment()
     from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
@@ -391,7 +392,7 @@ def fly_fleet(
 
 
 def _begin(flights: Sequence[_Flight], fleet: Fleet) -> None:
-    """Begin all flights with a common t = 0, except in lockstep, where they have begun already."""
+    """Begin all flights with a common t = 0. Lockstep flights have begun already."""
     if not fleet.lockstep:
         start = start_instants(LEAD + BEGIN_TIME * len(flights), flights[0].monitor)
         for flight in flights:

@@ -80,8 +80,8 @@ def fly_over_topics(
 
     The nodes are separate processes, or share one if `one_process` is True. By default they fly in
     real time. With `lockstep` they fly as fast as the machine allows, and with `use_sim_time` by
-    the topic /clock. All nodes are in the `namespace`, such as "/uav1". An `autopilot` takes the
-    place of the simulated aircraft, in real time only.
+    the topic /clock. All nodes are in the `namespace`, such as "/uav1". In real time, an
+    `autopilot` can take the place of the simulated aircraft.
 
     `announce` is called with a line when the phase of an engagement or its reason changes, except
     if only a number in the reason changes. It also gets a line on what became of a learner's
@@ -147,7 +147,7 @@ def follow(
 ) -> Steps:
     """Return the steps by which a flight that has begun is followed, one every POLL_PERIOD.
 
-    Each step checks the flight once. The arguments are those of `fly_over_topics`.
+    Each step checks the flight once. The arguments have the same meaning as for `fly_over_topics`.
     """
     if processes.lockstep:
         return _follow_lockstep(processes, progress, announce)
@@ -285,9 +285,10 @@ def _announce_learned(
     start_time: float,
     announce: Callable[[str], None],
 ) -> None:
-    """Announce what became of the learner's proposals since the last call, and its end.
+    """Announce what became of the learner's proposals since the last call.
 
-    The end of the learner's process is announced because the flight goes on without it.
+    If the learner's process has ended, its end is announced as well, because the flight goes on
+    without a learner.
     """
     for instant, sentence in processes.monitor.learned():
         announce(f"t = {instant - start_time:.2f} s: {sentence}")
@@ -302,8 +303,8 @@ def _follow_lockstep(
 ) -> Steps:
     """Follow a lockstep flight from its first instant to its last.
 
-    The text of `progress` has the real-time factor, which counts from the first instant in the log.
-    The flight ends when the aircraft has taken the last u and the log is complete.
+    The text of `progress` has the real-time factor since the first instant in the log. The flight
+    ends when the aircraft has taken the last u and the log is complete.
     """
     scenario = processes.scenario
     # The last instant is the beginning of the aircraft's last whole period.
@@ -431,8 +432,8 @@ def _is_its_file(scenario: Scenario) -> bool:
 def as_file(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
     """Return the scenario with a parameter file that the nodes in the namespace can read.
 
-    If the scenario equals its own file, the result is that of `as_flown`. Otherwise it is written
-    to a new file in the folder of the run. Raises ParameterError.
+    If the scenario equals its own file, the result is that of `as_flown`. If it does not, it is
+    written to a new file in the folder of the run. Raises ParameterError.
     """
     if _is_its_file(scenario):
         return as_flown(scenario, run, namespace)

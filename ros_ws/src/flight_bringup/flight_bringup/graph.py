@@ -76,7 +76,7 @@ class Autopilot(NamedTuple):
 
     @property
     def topics(self) -> list[str]:
-        """The topics to record: those of the channel map, and those of the bridge."""
+        """The topics to record: the topics of the channel map and the topics of the bridge."""
         return [*self.channel_map.recorded_topics, *topics.recorded_with("bridge")]
 
 
@@ -88,10 +88,11 @@ def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:
 def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
     """Check that the bridge can send all that the controller may command.
 
-    Otherwise the bridge would clip u, and the anti-windup of the law would not know of it. The
-    limits of the scenario are not narrowed, because the log must hold the parameters that flew. A
-    dry run sends nothing, so it passes. The check also fails for a controller that holds u while it
-    is inactive, because the bridge engages only if u is near trim. Raises ParameterError.
+    If the bridge could not, it would clip u, and the anti-windup of the law would not know of it.
+    The limits of the scenario are not narrowed, because the log must hold the parameters that flew.
+    A dry run sends nothing, so it passes the check. The check fails for a controller that holds u
+    while it is inactive, because the bridge engages only if u is near trim. Raises ParameterError
+    if the check fails.
     """
     if autopilot.dry_run:
         return
@@ -133,7 +134,7 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
 def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec, ...]:
     """Return the nodes that start second, when the recorder and the controller are ready.
 
-    They are the aircraft or the bridge, the reference model, and guidance and a learner if the
+    The nodes are the aircraft or the bridge, the reference model, and guidance and a learner if the
     scenario has them. Raises ParameterError if guidance cannot fly the simulated aircraft, or if a
     learner is to fly with a bridge.
     """
@@ -160,18 +161,19 @@ LEAD = 0.5  # s from the message of t = 0 on `start` to t = 0, within which a bu
 
 
 def start_lead(startup: float) -> float:
-    """Return how long after the start of the second stage t = 0 is, s.
+    """Return the time from the start of the second stage of nodes to t = 0, s.
 
-    `startup` is the time, s, from the start of the first stage until it was ready. The second stage
-    gets 1.5 times this time, and half a second in which the nodes discover each other.
+    `startup` is the time, s, from the start of the first stage until its nodes were ready. The
+    second stage gets 1.5 times this time, and half a second in which the nodes discover each other.
     """
     return 0.5 + 1.5 * startup
 
 
 def start_instant(lead: float, now: float) -> float:
-    """Return the time of t = 0, s, which is `lead` after `now`.
+    """Return the time of t = 0, s, which is about `lead` after `now`.
 
-    It is a whole multiple of 0.01 s, so that nodes with and without `start_time` tick together.
+    The result is a whole multiple of 0.01 s, so that nodes with and without `start_time` tick
+    together.
     """
     return round(now + lead, 2)
 
@@ -199,10 +201,10 @@ def parameter_overrides(
 ) -> ParameterOverrides:
     """Return the parameters that a process needs beside its section of the scenario file.
 
-    For several nodes in one process the keys are "node:name". Each parameter goes to the nodes that
-    need it:
+    If several nodes share a process, the keys are "node:name". Each parameter goes to the nodes
+    that need it:
 
-    - In real time the nodes that begin at t = 0 get its instant, or ON_START.
+    - In real time the nodes that begin at t = 0 get the instant of t = 0, or ON_START.
     - In lockstep the aircraft gets the rate of u and the duration, controller and guidance get the
       rate of y, and the reference model gets the rate of u_m.
     - Guidance gets the parameters of `guidance_by_rule`. The learner gets the scenario.
@@ -212,7 +214,7 @@ def parameter_overrides(
       and the controller starts inactive.
     - With `use_sim_time` every node ticks by /clock.
 
-    `replaced` has the nodes in whose place nodes of the user fly.
+    `replaced` has the nodes that nodes of the user replace.
     """
     clock: ParameterOverrides = {"use_sim_time": True} if use_sim_time else {}
     if spec is BRIDGE:
@@ -330,8 +332,8 @@ def replayed_topics(
 ) -> list[str]:
     """Return the topics of a log that none of the nodes publishes, with full names, in order.
 
-    `namespace` is the namespace of the nodes. A bridge among them also publishes the messages of
-    its channel map.
+    `namespace` is the namespace of the nodes. If a bridge is among the nodes, it also publishes the
+    messages of its channel map.
     """
     prefix = f"/{namespace.strip('/')}/".replace("//", "/")
     names = {name for node in nodes for name in topics.published_by(node.executable)}

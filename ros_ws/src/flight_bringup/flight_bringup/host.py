@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure whether this host is fast enough to fly in real time.
 
-For half a second, as many processes compute as the flight will have, and each reports which share
-of a core it got. Two other measures are of no use: the load of the host, and the delay with which a
-sleeping process wakes. They look alike on a host that can fly and on one that cannot.
+For half a second, as many processes compute as the flight will have, and each process reports the
+fraction of a core that it got. Two other measures are of no use: the load of the host, and the
+delay with which a sleeping process wakes. Both look alike on a host that can fly and on one that
+cannot.
 """
 
 import subprocess
@@ -47,7 +48,7 @@ CoresGiven = Callable[[int], float]
 def processes_of(scenario: Scenario, *, composed: bool) -> int:
     """Return the number of processes of a flight that compute all the time.
 
-    The learner does not count, because it searches only now and then, and a late model harms no
+    The learner is not included, because it searches only now and then, and a late model harms no
     flight.
     """
     if composed:

@@ -76,7 +76,7 @@ class DeferredInterrupt:
         self._interrupt_if_pending()
 
     def pause(self, duration: float) -> None:
-        """Sleep for a duration, s. Raises KeyboardInterrupt if a signal comes before its end."""
+        """Sleep for a duration, s. Raises KeyboardInterrupt if a signal comes during this time."""
         time.sleep(duration)
         self._interrupt_if_pending()
 

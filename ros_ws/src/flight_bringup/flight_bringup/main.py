@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run the nodes of a flight in one process, over the same topics as separate processes.
 
-Guidance and the learner run too if the arguments name them.
+Guidance and the learner also run if the arguments name them.
 """
 
 import sys

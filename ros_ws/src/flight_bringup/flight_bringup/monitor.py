@@ -46,7 +46,8 @@ MODES = {float(mode): mode.name for mode in Mode}
 class FlightMonitor(Client):
     """Follows a flight by the states of its nodes and the progress of its log.
 
-    In real time it also follows the topic `internals` of the controller and a bridge's engagement.
+    If the flight is in real time, the monitor also follows the topic `internals` of the controller
+    and a bridge's engagement.
     """
 
     def __init__(
@@ -84,12 +85,15 @@ class FlightMonitor(Client):
     def has_time(self) -> bool:
         """Return whether the time of the flight is known.
 
-        In simulated time it is known once the first /clock has arrived.
+        If the time is simulated, it is known once the first /clock has arrived.
         """
         return self._simulated is None or self._simulated.is_known()
 
     def ahead(self, lead: float) -> float:
-        """Return how much flight time, s, passes while at least `lead` s pass on the host."""
+        """Return the flight time, s, that may pass while `lead` s pass on the host.
+
+        It is longer than `lead` if a simulator runs faster than real time.
+        """
         return lead if self._simulated is None else lead * max(self._simulated.speed(), 1.0)
 
     def end_of_clock(self) -> Outcome | None:
@@ -108,7 +112,7 @@ class FlightMonitor(Client):
     def is_ready(self, node: str, pid: int) -> bool:
         """Return whether the event loop of a node runs.
 
-        The process id tells the node from a node of the same name in another flight.
+        The process id distinguishes the node from a node of the same name in another flight.
         """
         return self._state(node, pid) in {*NodeState}
 
@@ -161,8 +165,8 @@ class FlightMonitor(Client):
     def recorded(self) -> float | None:
         """Return the instant up to which the log is complete, s.
 
-        In lockstep it is a flight time, and in real time a time by the clock of the stamps. Returns
-        None if nothing has changed since the last call.
+        If the flight is in lockstep, this is a flight time. If it is in real time, it is a time by
+        the clock of the stamps. Returns None if nothing has changed since the last call.
         """
         stamps = self._decoded(self._recorded, stamp_of)
         return seconds(stamps[-1]) if stamps else None
@@ -170,8 +174,9 @@ class FlightMonitor(Client):
     def require_free_domain(self) -> None:
         """Check that the namespace has no aircraft and no reference model yet.
 
-        Raises ParameterError if it has one. Only this ROS domain is checked. The check waits until
-        DISCOVERY_TIME after the monitor was made, because publishers are not known earlier.
+        Raises ParameterError if it has one of them. Only this ROS domain is checked. The check
+        waits until DISCOVERY_TIME after the monitor was made, because publishers are not known
+        earlier.
         """
         remaining = self._created + DISCOVERY_TIME - time.monotonic()
         require_no_publishers(self._node, LOOP_INPUTS, FREE_DOMAIN, remaining)

@@ -111,7 +111,7 @@ def _sleep_until(deadline_ns: int) -> None:
 def unsendable(types: Mapping[str, str]) -> dict[str, str]:
     """Return the topics that cannot be published, each with its type.
 
-    Either their message type is not installed, or ROS does not permit their name.
+    Either the message type of such a topic is not installed, or ROS does not permit its name.
     """
     lacking = {}
     for topic, name in types.items():

@@ -74,16 +74,17 @@ POLL_PERIOD = 0.005  # s, time between two checks while nodes start
 
 
 def end_with_parent() -> list[str]:
-    """Return the beginning of a command, by which it gets SIGTERM when this process dies.
+    """Return the beginning of a command that must end when this process dies.
 
-    The result is empty if the host has no setpriv of util-linux.
+    The words are put before the command, which then gets SIGTERM when this process dies. The result
+    is empty if the host has no setpriv of util-linux.
     """
     setpriv = shutil.which("setpriv")
     return [setpriv, "--pdeathsig", "TERM"] if setpriv else []
 
 
 def start_instants(lead: float, monitor: "FlightMonitor") -> tuple[float, float]:
-    """Return t = 0 by the clock of the stamps and by the clock of the ticks, s.
+    """Return the instant of t = 0 by the clock of the stamps and by the clock of the ticks, s.
 
     t = 0 is `lead` s from now by the host's clock.
     """
@@ -108,7 +109,7 @@ CAUSE = re.compile(r"\[FATAL\]|error: ")
 
 
 class NotReadyError(ParameterError):
-    """Raised if a node is not ready in time, or ends before, although its parameters are valid."""
+    """Raised if a node is not ready in time, or ends before it is ready, with valid parameters."""
 
 
 class NodeProcess:
@@ -193,10 +194,10 @@ class FlightProcesses:
     """All processes of one flight, as a context manager that stops them when it exits.
 
     `monitor` reports which nodes are ready, and must be in the same `namespace`. With an autopilot,
-    the bridge starts in place of the simulated aircraft. In real time with a simulated aircraft,
-    `match` waits until the flight is ready, and `begin` then sets t = 0. `announce` gets a line if
-    processes had to be killed. `pause` sleeps for a duration, s, between two checks of nodes that
-    start.
+    the bridge starts in place of the simulated aircraft. If a simulated aircraft flies in real
+    time, `match` waits until the flight is ready, and `begin` then sets t = 0. `announce` gets a
+    line if processes had to be killed. `pause` sleeps for a duration, s, between two checks of
+    nodes that start.
     """
 
     def __init__(
@@ -280,7 +281,7 @@ class FlightProcesses:
         """Set t = 0 after `match`. Returns an outcome if the flight cannot begin, else None.
 
         `start` has t = 0 by the system clock and by the monotonic clock, s. It is given if several
-        flights share t = 0. By default t = 0 is LEAD from now.
+        flights share t = 0. If it is None, t = 0 is LEAD from now.
         """
         leave_real_time_priority()  # the nodes have this priority
         outcome = self.match()
@@ -301,7 +302,7 @@ class FlightProcesses:
         return nodes
 
     def _unmatched(self) -> list[str]:
-        """Say of each node for which the flight still waits what it lacks."""
+        """Say what each node lacks for which the flight still waits."""
         names = self._nodes()
         ready = {name: self.monitor.is_ready(name, pid) for name, pid in names}
         unmatched = [name for name, pid in names if not self.monitor.is_matched(name, pid)]
@@ -358,9 +359,10 @@ class FlightProcesses:
     def ended(self) -> Outcome | None:
         """Return the outcome if a process or the simulated time has ended, else None.
 
-        In real time the end of a learner is no outcome, because the law flies on. On a busy host
-        several processes may have ended since the last call. In this case a landing is taken as the
-        cause, and a process that only lost contact with another process is not.
+        If a flight is in real time, the end of a learner is no outcome, because the law flies on.
+        On a busy host several processes may have ended since the last call. In this case a landing
+        is taken as the cause of the end. A process that only lost contact with another process is
+        not.
         """
         processes = [
             process for process in self.processes if self.lockstep or process.node is not LEARNER
@@ -373,7 +375,7 @@ class FlightProcesses:
         return self.monitor.end_of_clock()
 
     def pop_end_of_learner(self) -> Outcome | None:
-        """Return how the learner has ended, but only once. Otherwise return None."""
+        """Return how the learner has ended, at the first call after its end, else None."""
         for process in self.processes:
             if process.node is LEARNER and process.popen.poll() is not None:
                 self.processes.remove(process)

@@ -4,10 +4,10 @@
 
 ros2 launch flight_bringup bridge.launch.py map:=ardupilot
 
-The nodes are those of fly.launch.py, with the bridge in place of the aircraft. The bridge sends to
-the autopilot only if dry_run:=false is given, and only while it is engaged (docs/autopilots.md). A
-map whose signs contradict the controller's signs is refused. The flight ends with Ctrl-C or after
-`duration`. If a node ends earlier, the exit status is 1.
+The launch starts the nodes of fly.launch.py, with the bridge in place of the aircraft. The bridge
+sends to the autopilot only if dry_run:=false is given, and only while it is engaged
+(docs/autopilots.md). A map whose signs contradict the controller's signs is refused. The flight
+ends with Ctrl-C or after `duration`. If a node ends earlier, the exit status is 1.
 """
 
 import math

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a fleet on a full ROS 2: ros2 launch flight_bringup fleet.launch.py fleet:=fleet.yaml.
 
-It runs `rise-di fly`, which starts, follows and ends the flight of every aircraft. The launch ends
-when this command does. The exit status is 1 if an aircraft did not complete its flight.
+The launch runs the command `rise-di fly`, which starts, follows and ends the flight of every
+aircraft. The launch ends when this command does. The exit status is 1 if an aircraft did not
+complete its flight.
 """
 
 from pathlib import Path

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a scenario on a full ROS 2: ros2 launch flight_bringup fly.launch.py scenario:=osprey_servo.
 
-The nodes and the scenario file are those of `rise-di fly`. The flight begins when each node is
-ready and each of its inputs has a publisher. It ends when the log holds the duration of the
+The launch uses the same nodes and scenario file as `rise-di fly`. The flight begins when each node
+is ready and each of its inputs has a publisher. It ends when the log holds the duration of the
 scenario, or in lockstep when the aircraft has completed this duration. It ends early with exit
 status 1 if a node ends or is not ready, or if no u reaches the aircraft. If another launch file
-includes this one, the end of the flight ends only its own nodes.
+includes this one, the end of the flight ends only the nodes of this flight.
 """
 
 from collections.abc import Sequence

@@ -4,10 +4,10 @@
 
 ros2 launch flight_bringup replay.launch.py run:=runs/latest
 
-Like `rise-di play`, it publishes the topics of the log with their timing, and /clock with the time
-of the log. It plays only topics that none of the nodes publishes, so that a controller answers the
-recorded y and y_m with a new u. The playback begins when all nodes are ready, and ends with the
-log. If a node ends earlier, the exit status is 1.
+Like `rise-di play`, the launch publishes the topics of the log with their timing, and /clock with
+the time of the log. Topics that one of the nodes publishes are not played, so that a controller
+answers the recorded y and y_m with a new u. The playback begins when all nodes are ready, and ends
+with the log. If a node ends earlier, the exit status is 1.
 """
 
 from collections.abc import Sequence

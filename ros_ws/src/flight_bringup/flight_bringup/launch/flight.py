@@ -75,7 +75,7 @@ class Flight:
         """List what the launch file gives to all nodes of the flight, such as "SetRemap y".
 
         `use_sim_time` is left out. SetParameter, SetParametersFromFile and SetRemap reach only the
-        nodes that the launch starts, and no nodes of another process.
+        nodes that the launch starts itself. They reach no node of a command that the launch runs.
         """
         names = []
         for each in self._given_parameters():
@@ -172,7 +172,7 @@ class _Restore(Action):
     def execute(self, context: LaunchContext) -> None:
         """Replace the launch configurations by the stored ones.
 
-        `Flight.in_scope` saves the present ones before, and brings them back afterwards.
+        `Flight.in_scope` saves the present configurations before, and brings them back afterwards.
         """
         context.launch_configurations.clear()
         context.launch_configurations.update(self.configurations)

@@ -97,7 +97,10 @@ class FlownEvent(Event):
 
 
 def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgument:
-    """Declare the launch argument `scenario`. `otherwise` says what an empty value means."""
+    """Declare the launch argument `scenario`.
+
+    `otherwise` ends the description, and says what an empty value means.
+    """
     description = (
         f"name of a scenario ({', '.join(scenarios())}), or path of a scenario file "
         f"(.yaml){otherwise}"
@@ -177,8 +180,8 @@ def by_rise_di(flight: Flight, file: str, *, has_own_time: bool = False) -> list
     """Run the command `rise-di fly` for a scenario or fleet file, with the launch's arguments.
 
     The command flies in real time, because a launch file flies beside other nodes. If
-    `has_own_time` is True, the fleet file says whether it does. If the command ends with an error,
-    because a flight was not completed, the launch ends with exit status 1.
+    `has_own_time` is True, the fleet file says whether the fleet flies in real time. If the command
+    ends with an error, because a flight was not completed, the launch ends with exit status 1.
 
     Raises ParameterError if the launch file gives parameters or names to its nodes, because they
     would not reach the nodes of the command.
@@ -233,11 +236,11 @@ def flight_node(
 
 
 def rosbag2(flight: Flight, scenario: Scenario, overrides: ParameterOverrides) -> ExecuteProcess:
-    """Return the process `ros2 bag record`, which takes the place of the stack's recorder.
+    """Return the process `ros2 bag record`, which takes the place of this package's recorder.
 
-    It records the same topics. `overrides` are the parameters that the stack's recorder would get.
-    The files that this recorder would attach to its log are written to a separate log in the folder
-    of the run.
+    It records the same topics. `overrides` are the parameters that the replaced recorder would get.
+    The files that the replaced recorder would attach to its log are written to a separate log in
+    the folder of the run.
     """
     run = Path(overrides["directory"])
     with BagWriter(run) as bag:
@@ -296,8 +299,8 @@ def on_state(
 ) -> Action:
     """Return an action that waits until a node has reached a state, and then runs `then` once.
 
-    If this node has already reached the state or a later one, `then` runs immediately. This happens
-    if nodes of the user publish the inputs of the node before it starts.
+    If the node has already reached the state or a later one, `then` runs immediately. This happens
+    if nodes of the user publish the inputs of the node before the node starts.
     """
     node = f"{flight.namespace}/{spec.executable}"
     states = [*NodeState]
@@ -377,12 +380,12 @@ def start_in_stages(
 def begin_when_matched(
     flight: Flight, nodes: Sequence[NodeSpec], duration: float, *, by_rosbag2: bool, flies: bool
 ) -> list[Action]:
-    """Begin the flight when each node is ready and each of its inputs has a publisher.
+    """Begin the flight when each node is ready and each input of a node has a publisher.
 
     t = 0 is published on the topic `start`. The flight ends when the log holds y, y_m and u up to
     `duration`, s. With rosbag2 it ends when u has the stamp of this instant. The flight ends early
-    if a node is not ready, or lacks a publisher, for too long. If `flies` is True, the aircraft is
-    a node of the stack, and the flight also ends early if the aircraft takes no u.
+    if a node is not ready, or lacks a publisher, for too long. If `flies` is True, the simulated
+    aircraft is one of the nodes, and the flight also ends early if this aircraft takes no u.
     """
     begin = _Begin(flight, nodes, duration, flies=flies)
     return [
@@ -459,8 +462,8 @@ def end_with_log(
     """End a flight when the log holds y, y_m and u up to the system time `end_time`, s.
 
     If the log lacks one of these topics, for example u while a bridge is not engaged, the flight
-    ends `lead` plus `duration` s from now. If the log is still growing then, the flight ends
-    LOG_TIMEOUT later.
+    ends `lead` plus `duration` s from now. If the log is still growing at this time, the flight
+    ends LOG_TIMEOUT later.
     """
     last = [-math.inf]  # monotonic time of the log's last change, s
 
@@ -484,7 +487,7 @@ def _complete_at(
 ) -> RegisterEventHandler:
     """Complete the flight when `held` is True for the stamp up to which the log is complete.
 
-    Up to this stamp the log holds y, y_m and u. With rosbag2 it is the stamp of the newest u.
+    Up to this stamp the log holds y, y_m and u. With rosbag2 the stamp of the newest u is taken.
     """
     context = flight.context
 
@@ -540,7 +543,7 @@ def _subscribe_states(flight: Flight) -> None:
 def _is_descendant(pid: int) -> bool:
     """Return whether this launch has started a process, directly or behind a launch prefix.
 
-    It has not started the processes of another flight in the same namespace.
+    The processes of another flight in the same namespace were not started by this launch.
     """
     with suppress(psutil.Error):
         return os.getpid() in {parent.pid for parent in psutil.Process(pid).parents()}
