@@ -17,10 +17,10 @@ CLOCK_TOLERANCE_NS = NANOSECONDS
 class AutopilotLock:
     """Admits one autopilot: the first one until it is silent, and then the next one.
 
-    Two autopilots behind the same address are told apart by the time since boot in their messages.
-    In the messages of one autopilot this time never goes back. It advances no faster than the clock
-    of this host, except after a message that was late. An autopilot that starts again counts as a
-    second sender at first. Once it has sent no message of its earlier run for the time of a
+    Two autopilots behind the same address are distinguished by the time since boot in their
+    messages. In the messages of one autopilot this time never goes back. It advances no faster than
+    the clock of this host, except after a message that was late. An autopilot that starts again is
+    taken as a second sender at first. Once no message of its earlier run has come for the time of a
     silence, the lock admits the new run.
     """
 
@@ -44,15 +44,15 @@ class AutopilotLock:
         return self._addresses.publisher
 
     def overran(self, duration_ns: int) -> None:
-        """Do not count as silence a time, ns, in which the receiver itself did not run."""
+        """Exclude from the silence of a sender a time, ns, in which this receiver did not run."""
         self._addresses.overran(duration_ns)
         self._starts.overran(duration_ns)
 
     def check(self, address: str, since_boot_ns: int | None, now_ns: int) -> None:
         """Refuse a message of a second sender as long as the first one is not silent.
 
-        Raises ChannelError with the reason "sender". `since_boot_ns` is None for a message without
-        the time since boot.
+        If the message is refused, raises ChannelError with the reason "sender". `since_boot_ns` is
+        None for a message without the time since boot.
         """
         try:
             self._addresses.check(address, now_ns)
@@ -99,8 +99,8 @@ class AutopilotLock:
         """Return a name for the run in which the autopilot sent a message.
 
         A run lasts from one boot to the next. If the time since boot continues that of the locked
-        run, the result is the name of the locked run. Otherwise it is a new name, made from the
-        instant of boot.
+        run, the result is the name of the locked run. If it does not, the result is a new name,
+        made from the instant of boot.
         """
         boot_ns = now_ns - since_boot_ns
         is_same_run = (

@@ -146,8 +146,8 @@ class Bridge:
     def max_u_age_ns(self) -> int:
         """Return the age limit of a u, ns.
 
-        The age counts from the stamp of u, which is the instant of its y. This limit prevents the
-        playback of a log from flying the autopilot.
+        The age is measured from the stamp of u, which is the instant of its y. This limit prevents
+        the playback of a log from flying the autopilot.
         """
         return self._max_age_ns + self._max_y_age_ns
 
@@ -157,7 +157,7 @@ class Bridge:
         self._u = sample.value
 
     def take_effects(self, sample: StampedVector, now_ns: int) -> None:
-        """Take how much effect each input has, (m,), as the controller's probe has found.
+        """Take the effect of each input, (m,), as the controller's probe has found it.
 
         The inputs are in the order of the map. If an input has no effect, an engagement ends.
         """
@@ -196,7 +196,7 @@ class Bridge:
         return {name: reason for name in watched if (reason := self._staleness(name, now_ns))}
 
     def _staleness(self, name: str, now_ns: int) -> Stale | None:
-        """Return the fault of a channel that is too old, or None if it is not.
+        """Return the fault of a channel that is too old, or None if the channel is fresh.
 
         A channel with `held` in the map is never too old, because y repeats its last value.
         """
@@ -225,7 +225,7 @@ class Bridge:
         """Say which inputs have stayed at a limit for longer than their rows allow, or return None.
 
         The aircraft does not answer to such an input any more. The limits of the law may be
-        narrower than those of the map, so a large u that does not change also counts as being at a
+        narrower than those of the map, so a large u that does not change is also taken to be at a
         limit.
         """
         reasons = []
@@ -258,10 +258,10 @@ class Bridge:
         return self.conditions.is_active(name, now_ns, engaged=is_engaged)
 
     def _lack(self, now_ns: int) -> Refusal | None:
-        """Return the warning of an engaged bridge, or None.
+        """Return the warning of an engaged bridge, or None if there is nothing to warn of.
 
-        It warns of the coming end by `max_engaged`, of `problem`, and of overrides without
-        messages. It also warns if it cannot notice the loss of the transmitter.
+        The bridge warns if `max_engaged` will soon end the engagement, if there is a `problem`, and
+        if overrides get no messages. It also warns if it cannot notice the loss of the transmitter.
         """
         warning = None
         if self._end_ns is not None and now_ns >= self._end_ns - END_WARNING_NS:
@@ -287,8 +287,9 @@ class Bridge:
     def reason_against_engagement(self, now_ns: int) -> Refusal | None:
         """Say why `engage` would be refused now, or return None.
 
-        Conditions for which an engagement waits do not count. A dry run says first that it sends
-        nothing, and then the reason that would remain with `dry_run: false`.
+        Conditions for which an engagement waits are no such reason. If the bridge makes a dry run,
+        the text says first that nothing is sent, and then the reason that would remain with
+        `dry_run: false`.
         """
         checks: tuple[Callable[[], Refusal | None], ...] = (
             lambda: self.conflict,
@@ -338,8 +339,8 @@ class Bridge:
     def _stale_inputs(self, now_ns: int) -> Refusal | None:
         """Say which of the values that an engagement needs are stale, or return None.
 
-        They are y, the envelope, the conditions of `engage_if`, the trims that the autopilot sends,
-        and u.
+        An engagement needs y, the envelope, the conditions of `engage_if`, the trims that the
+        autopilot sends, and u.
         """
         keys = (*map(trim_key, self.channel_map.trims), *self.channel_map.engage_if)
         sources = {key: stale for key in keys if (stale := self._staleness(key, now_ns))}
@@ -359,7 +360,7 @@ class Bridge:
     def _reason_against_trim(self, name: str) -> Refusal | None:
         """Say why the trim of an input that the autopilot sends is refused, or return None.
 
-        It is refused if the trim plus a limit of u lies outside the range of the field.
+        The trim is refused if the trim plus a limit of u lies outside the range of the field.
         """
         row = self.channel_map.inputs[name]
         trim = self.trim(name)
@@ -374,9 +375,9 @@ class Bridge:
     def engage(self, now_ns: int, *, blind: bool = False) -> Refusal | None:
         """Engage or begin to engage, or return the reason why not.
 
-        The phase says whether the bridge is engaged already or still begins to engage. If `blind`
-        is True, the engagement ignores a loss of the transmitter, and has no time limit. A request
-        while the bridge is engaged starts the time of `max_engaged` again.
+        The attribute `phase` shows whether the bridge is engaged already or still begins to engage.
+        If `blind` is True, the engagement ignores a loss of the transmitter, and has no time limit.
+        A request while the bridge is engaged starts the time of `max_engaged` again.
         """
         if self.phase is Phase.ENGAGED:
             self.conditions.blind |= blind
@@ -399,7 +400,8 @@ class Bridge:
     def _continue_engagement(self, now_ns: int) -> None:
         """Engage as soon as the conditions hold for which an engagement waits.
 
-        The bridge gives up when the time to wait is over, or if there is another reason against it.
+        The bridge stops waiting when the time to wait is over, or if there is another reason
+        against an engagement.
         """
         self.reason = self.conditions.violation(now_ns, awaited=True)
         timed_out = now_ns - self._phase_ns > nanoseconds(self.channel_map.engage_timeout)
@@ -496,7 +498,7 @@ class Bridge:
         return value - self._zero[name] if self._is_captured() else 0.0
 
     def _is_captured(self) -> bool:
-        """Return whether the trims have the values at the engagement.
+        """Return whether the trims are held at their values at the engagement.
 
         In other phases the trims follow the values that the autopilot sends.
         """
@@ -519,8 +521,8 @@ class Bridge:
     def pose(self, now_ns: int) -> tuple[tuple[str, ...], StampedVector] | None:
         """Return the names and the values of the pose's fresh channels.
 
-        Their stamp is that of the first row of the pose in the map. Returns None if this stamp is
-        not new. psi is in -pi..pi. A channel is left out if it is stale or has not been received
+        Their stamp is the stamp of the first row of the pose in the map. Returns None if this stamp
+        is not new. psi is in -pi..pi. A channel is left out if it is stale or has not been received
         yet.
         """
         first = next(iter(self.channel_map.pose), None)
@@ -537,7 +539,7 @@ class Bridge:
     def raw_u(self) -> FloatArray:
         """Return the newest u, limited and converted to the raw values of the fields, (m,).
 
-        They are the raw values of trim + min(max(u, lower), upper).
+        Before the conversion, the values are trim + min(max(u, lower), upper).
         """
         u = np.minimum(np.maximum(self._u, self._lower), self._upper)
         return np.array(

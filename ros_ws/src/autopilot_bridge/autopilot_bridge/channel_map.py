@@ -255,7 +255,7 @@ def version_fault(topic: str, message_class: Any) -> Refusal | None:
 def version_faults(
     topics: Iterable[tuple[str, str]], load: Callable[[str], Any] = importlib.import_module
 ) -> list[Refusal]:
-    """Return the `version_fault` of each topic that has one.
+    """Return the faults of the topics whose name has the wrong version, as in `version_fault`.
 
     Topics whose message package is not installed cannot be checked, so they are left out.
     """

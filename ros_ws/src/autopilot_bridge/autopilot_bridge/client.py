@@ -39,11 +39,12 @@ class EngagementClient(Client):
     def engage(self, progress: Callable[[str], None], *, blind: bool = False) -> Refusal | None:
         """Wait until u is at trim, and engage the bridge, which then activates the controller.
 
-        Returns the reason of a refusal. A bridge that is engaged takes the request immediately, and
-        starts the time of `max_engaged` again. If `blind` is True, the engagement ignores a loss of
-        the transmitter. `progress` is called with sentences on what the bridge waits for, and on
-        what it warns of once it is engaged. If the caller stops waiting, for example after Ctrl-C,
-        the request is withdrawn, so that the autopilot does not change its mode later.
+        Returns the reason if the bridge refuses. If the bridge is engaged already, it takes the
+        request immediately, and starts the time of `max_engaged` again. If `blind` is True, the
+        engagement ignores a loss of the transmitter. `progress` is called with sentences on what
+        the bridge waits for, and on what the bridge warns of once it is engaged. If the caller
+        stops waiting, for example after Ctrl-C, the request is withdrawn, so that the autopilot
+        does not change its mode later.
         """
         self._spin_until(
             lambda: bool(self._received_phases()),
@@ -80,7 +81,7 @@ class EngagementClient(Client):
         return _refusal_in(self._call(Trigger, ENGAGE_BLIND, request, "a flight with a bridge"))
 
     def disengage(self) -> Refusal | None:
-        """Disengage the bridge, or return the reason if it refuses."""
+        """Disengage the bridge, or return the reason if the bridge refuses."""
         return self._set_engaged(engaged=False)
 
     def _set_engaged(self, *, engaged: bool) -> Refusal | None:
@@ -90,7 +91,7 @@ class EngagementClient(Client):
     def _withdraw(self) -> None:
         """Ask the bridge to disengage, and wait at most WITHDRAW_TIMEOUT for an answer.
 
-        A bridge whose process is suspended answers later.
+        If the process of the bridge is suspended (SIGSTOP), the answer comes after it is resumed.
         """
         client = self._node.create_client(SetBool, ENGAGE)
         if client.wait_for_service(WITHDRAW_TIMEOUT):
@@ -112,9 +113,9 @@ class EngagementClient(Client):
         return self._phases
 
     def _is_settled(self, progress: Callable[[str], None]) -> bool:
-        """Return whether the bridge has engaged, or has given up after it began to engage.
+        """Return whether the bridge has engaged, or has stopped trying after it began to engage.
 
-        Phases that the bridge reported before the request do not count.
+        Phases that the bridge reported before the request are ignored.
         """
         phases = [phase for phase, _ in self._received_phases()]
         while phases and phases[0] not in {"ENGAGING", "ENGAGED"}:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the conditions and the pilot overrides of a channel map.
 
-With them the autopilot and the pilot can refuse or end an engagement.
+By conditions and overrides the autopilot and the pilot can refuse or end an engagement.
 """
 
 from collections.abc import Mapping
@@ -65,8 +65,8 @@ class Conditions:
     def violation(self, now_ns: int, *, awaited: bool) -> Refusal | None:
         """Say which conditions do not hold, or return None.
 
-        If `awaited` is True, only the conditions for which an engagement waits are checked.
-        Otherwise only the other conditions are checked.
+        If `awaited` is True, the conditions for which an engagement waits are checked. If it is
+        False, all other conditions are checked.
         """
         rows = (
             (name, row)
@@ -86,9 +86,9 @@ class Conditions:
     def is_contradicted(self) -> bool:
         """Return whether the last received value contradicts a condition.
 
-        If it does, the pilot or the autopilot chose another mode, or the aircraft has landed. A
-        condition that shows the loss of the transmitter does not count, because then the pilot
-        cannot take over.
+        A contradiction means that the pilot or the autopilot chose another mode, or that the
+        aircraft has landed. A condition that shows the loss of the transmitter is ignored, because
+        after this loss the pilot cannot take over.
         """
         rows = self._map.conditions.items()
         readings = ((row, self._conditions.get(name)) for name, row in rows if not row.transmitter)
@@ -126,8 +126,8 @@ class Conditions:
     def blindness(self, *, bounded: bool) -> Refusal | None:
         """Return a warning if an engagement does not notice the loss of the transmitter, else None.
 
-        The sentence also says what can still end the engagement. `bounded` says whether
-        `max_engaged` ends it.
+        The warning also says what can still end the engagement. `bounded` says whether
+        `max_engaged` ends the engagement.
         """
         if self.watches_transmitter and not self.blind:
             return None
@@ -165,7 +165,7 @@ def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) 
 
 
 def joined_faults(faults: Mapping[str, Stale]) -> Refusal | None:
-    """Join the faults of several channels, by name, to one sentence, or return None without any.
+    """Join the faults of several channels, by name, to one sentence; None if there is no fault.
 
     Channels with the same fault are named together.
     """

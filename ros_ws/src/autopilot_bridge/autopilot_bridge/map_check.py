@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check which rows of a channel map are right for a release of an autopilot.
 
-A row is right if the message definition has its field, with the components that its function needs.
-For PX4, the topic must also have the version of the definition. If the source of a condition names
-a constant, the value of this constant must be one of the values of the condition.
+A row is right if the message definition has the field of the row, with the components that the
+row's function needs. For PX4, the topic must also have the version of the definition. If the source
+of a condition names a constant, the value of this constant must be one of the values of the
+condition.
 """
 
 import re
@@ -52,7 +53,7 @@ class CheckedRow(NamedTuple):
 def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
     """Return the definitions of the message types `kinds`, read from packages below a folder.
 
-    The result also has all types that these types contain. Types that no package has are left out.
+    The result also has all types that the `kinds` contain. Types that no package has are left out.
     Raises ParameterError if there is no package.
     """
     expected = (
@@ -86,7 +87,7 @@ def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
 def installed_definitions(kinds: Iterable[str]) -> Types:
     """Return the definitions of the message types `kinds`, as they are installed.
 
-    The result also has all types that these types contain. The definitions come from the installed
+    The result also has all types that the `kinds` contain. The definitions come from the installed
     message packages and, for MAVLink, from pymavlink. Types that are not installed are left out.
     Raises ParameterError for a type of MAVLink if pymavlink is not installed.
     """

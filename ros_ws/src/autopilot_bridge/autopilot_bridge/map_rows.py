@@ -92,10 +92,11 @@ class MovingRow(Row):
 
     @property
     def motion(self) -> tuple[str, int]:
-        """The output that changes as the channel grows, a key of UNITS, and the sign of the change.
+        """The motion that shows the sign of this channel: an output, and the sign of its change.
 
-        The sign is +1 if the output grows, and -1 if it falls. `positive` describes the motion for
-        a growing raw value, so `sign` is applied to it.
+        The output is a key of UNITS. As the channel grows, the output grows if the sign is +1, and
+        falls if the sign is -1. `positive` describes the motion for a growing raw value, so `sign`
+        is applied to it.
         """
         output, sign = MOTIONS[self.positive]
         return output, sign * self.sign
@@ -197,7 +198,7 @@ class InputRow(MovingRow):
 class MessageRow(Config):
     """A message to the autopilot, or a request of a service.
 
-    A message without a field of an input is a heartbeat.
+    A message that carries no input is a heartbeat.
     """
 
     topic: TopicName = Field(description="the autopilot's topic or service")
@@ -280,7 +281,7 @@ class ConditionRow(WatchedRow):
 
 
 class OverrideRow(WatchedRow):
-    """A pilot override: the bridge disengages immediately if the field exceeds the threshold."""
+    """A pilot override: the bridge disengages at once when the field exceeds the threshold."""
 
     above: Number | None = Field(
         default=None, description="the override is active if the field is above this"
@@ -368,7 +369,7 @@ class LinkConfig(Config):
 class SilenceConfig(Config):
     """The failsafe that acts if u times out while the bridge is engaged.
 
-    The bridge then sends neutral values, then release values, and then nothing.
+    When it acts, the bridge sends neutral values, then release values, and then nothing.
     """
 
     max_age: Positive = Field(description="the age above which u has timed out, s")

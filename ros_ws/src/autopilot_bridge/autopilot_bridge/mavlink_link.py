@@ -3,12 +3,13 @@
 """Connect to an autopilot by MAVLink, to receive and send the messages of a channel map.
 
 A thread receives messages, sends a heartbeat each second, requests the rates of messages and reads
-parameters. It sends as a companion computer of the autopilot. Only the messages of the map have the
-system number of the ground station, because ArduPilot takes RC overrides from no other system. Its
-failsafe FS_GCS_ENABL counts these overrides as heartbeats of the station, but does not count the
-heartbeats of a companion. Sources: MAVLink guide (heartbeat and parameter protocols,
-SET_MESSAGE_INTERVAL); common.xml and ardupilotmega.xml of pymavlink; ArduPilot, GCS_Common.cpp,
-handle_rc_channels_override and handle_heartbeat. The link was tried with ArduPlane in SITL.
+parameters. It sends as a companion computer of the autopilot, with one exception: the messages of
+the map have the system number of the ground station, because ArduPilot takes RC overrides from no
+other system. ArduPilot's failsafe FS_GCS_ENABL takes these overrides as heartbeats of the station,
+but ignores the heartbeats of a companion. Sources: MAVLink guide (heartbeat and parameter
+protocols, SET_MESSAGE_INTERVAL); common.xml and ardupilotmega.xml of pymavlink; ArduPilot,
+GCS_Common.cpp, handle_rc_channels_override and handle_heartbeat. The link was tried with ArduPlane
+in SITL.
 """
 
 import hashlib
@@ -81,8 +82,8 @@ class MavlinkMessage(NamedTuple):
 def mavlink_type(name: str) -> Any:
     """Return a class for a MAVLink message, whose numeric fields are all zero.
 
-    Its attribute `fields` has the names of these fields. Raises ParameterError if there is no such
-    message.
+    The attribute `fields` of the class has the names of the numeric fields. Raises ParameterError
+    if there is no message with this name.
     """
     require_package("pymavlink")
     from pymavlink.dialects.v20 import ardupilotmega as dialect  # noqa: PLC0415 - an extra
@@ -148,11 +149,11 @@ def _connection(config: LinkConfig) -> Any:
 class Link:
     """A MAVLink connection, which receives messages after `start` is called.
 
-    It only takes messages of the sender that `AutopilotLock` admits, and over UDP it sends to no
-    other address. `parameters` names parameters of the autopilot that the link reads. `further`
-    names more of them, which some releases lack. If there is a passphrase, each message is signed,
-    and messages without a valid signature are refused. Source: MAVLink guide, message signing. The
-    key is derived from the passphrase as MAVProxy and Mission Planner do.
+    The link only takes messages of the sender that `AutopilotLock` admits, and over UDP it sends to
+    no other address. `parameters` names parameters of the autopilot that the link reads. `further`
+    names more parameters, which some releases lack. If there is a passphrase, each message is
+    signed, and messages without a valid signature are refused. Source: MAVLink guide, message
+    signing. The key is derived from the passphrase as MAVProxy and Mission Planner do.
     """
 
     def __init__(
@@ -194,8 +195,8 @@ class Link:
     def conflict(self) -> Refusal | None:
         """A reason that prevents an engagement or ends it, or None.
 
-        It names who else sends as the autopilot or as the bridge, or a setting of the autopilot
-        that prevents every engagement.
+        The reason names who else sends as the autopilot or as the bridge, or a setting of the
+        autopilot that prevents every engagement.
         """
         second = self._second if time.monotonic() - self._second_at <= SILENCE else None
         return joined((self._clash, second))
@@ -254,8 +255,8 @@ class Link:
     def _station_numbers(self) -> range:
         """Return the numbers of the systems whose RC overrides the autopilot takes.
 
-        They come from the autopilot's parameters, or from the map if these parameters are not
-        known.
+        The numbers come from the autopilot's parameters, or from the map if these parameters are
+        not known.
         """
         first = self.parameters.get(STATION, self.parameters.get(OLD_STATION))
         if first is None:
@@ -278,7 +279,10 @@ class Link:
         )
 
     def end_reason(self) -> Refusal | None:
-        """Say why an engagement must end: slow messages, or a silent ground station."""
+        """Say why an engagement must end: slow messages, or a silent ground station.
+
+        Returns None if there is no such reason.
+        """
         now = time.monotonic()
         limit = self._config.station_silence
         silence = None
@@ -346,9 +350,10 @@ class Link:
                 self._take(message, address, received_ns)
 
     def _packet(self) -> tuple[bytes, Address]:
-        """Receive bytes, and return them with their sender. After a silence of POLL there are none.
+        """Receive bytes, and return them with their sender.
 
-        For TCP and for a serial line, the sender is the URL.
+        If no bytes come for the time POLL, the bytes are empty. For TCP and for a serial line, the
+        sender is the URL.
         """
         if not self._connection.select(POLL):
             return b"", ()
@@ -360,7 +365,7 @@ class Link:
     def _parsed(self, data: bytes, address: Address) -> Sequence[Any]:
         """Return the messages in received bytes.
 
-        Only for the sender that the lock admits, a message may span several packets.
+        A message may span several packets only if its sender is the one that the lock admits.
         """
         if not self._is_udp or _text(address) == self._lock.address:
             return self._parser.parse_buffer(data) or ()

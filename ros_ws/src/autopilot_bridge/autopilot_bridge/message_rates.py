@@ -26,7 +26,7 @@ GAPS = 3  # number of gaps between the newest messages, whose mean gives the pre
 
 
 class MessageRates:
-    """Counts the messages of each name, and compares their rates with the `requested` ones, Hz."""
+    """Counts the messages of each name, and compares their rates with the `requested` rates, Hz."""
 
     def __init__(self, requested: Mapping[str, float], now: float) -> None:
         self._requested = dict(requested)
@@ -62,14 +62,14 @@ class MessageRates:
     def slow(self, now: float) -> dict[str, Refusal]:
         """Say how slow each slow message is, by name.
 
-        A message counts as slow if its rate is slow now. A message that has once reached the
-        requested rate also counts as slow if its rate was slow less than REMEMBERED ago.
+        A message is slow if its rate is slow now. After a message has once reached the requested
+        rate, it stays slow for the time REMEMBERED after its rate was last slow.
         """
         reasons = {name: rate.slowness(name, now) for name, rate in self._rates.items()}
         return {name: reason for name, reason in reasons.items() if reason is not None}
 
     def lasting(self, now: float) -> Refusal | None:
-        """Say which messages have been slow for SLOW_ENDS or longer, or return None."""
+        """Say which messages have been slow for at least SLOW_ENDS s, or return None."""
         reasons = joined(
             rate.slowness(name, now) for name, rate in self._rates.items() if rate.lasts(now)
         )

@@ -257,9 +257,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._bridge.take_effects(sample, now_ns)
 
     def _pause_ns(self) -> int:
-        """Return the time since the previous tick began.
+        """Return the time since the previous tick began, ns.
 
-        A time in which the host was suspended counts, although the clock of the ticks stops in it.
+        A time in which the host was suspended is included, although the clock of the ticks stops in
+        it.
         """
         return self._boot_ns() - self._began_ns
 
@@ -281,7 +282,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _disengage_after_pause(self, now_ns: int) -> None:
         """Disengage if the bridge did not run for a while.
 
-        In this time the autopilot or its pilot may have flown without it.
+        During such a pause the autopilot or its pilot may have flown without the bridge.
         """
         pause_ns = self._pause_ns()
         self._began_ns += pause_ns
@@ -298,7 +299,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         now_ns: int,
         step_ns: int,
     ) -> None:
-        """Give the fields of a message to the bridge.
+        """Pass the fields of a message to the bridge.
 
         The message's stamps are by the system clock, which is ahead of the ticks' time by
         `step_ns`.
@@ -386,7 +387,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._activation, self._activation_ns = (future, self.now_ns()) if active else (None, 0)
 
     def _check_activation(self, now_ns: int) -> None:
-        """Disengage if the controller did not activate, because its u would stay at trim."""
+        """Disengage if the controller did not activate, because u would then stay at trim."""
         if self._activation is None:
             return
         if self._activation.done():
@@ -505,7 +506,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return str((*faults, *refusals, "no sample of its publisher arrives")[0])
 
     def graph_checks(self) -> list[Callable[[], None]]:
-        """Return checks of the ROS graph, also of the topics that the autopilot must receive.
+        """Return checks of the ROS graph, which include the topics that the autopilot must receive.
 
         The autopilot cannot receive a topic if it subscribes with another type or an incompatible
         quality of service. A second publisher of a topic ends the engagement.
@@ -518,11 +519,11 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return [*super().graph_checks(), *outgoing, self._find_conflicts]
 
     def _find_conflicts(self) -> None:
-        """Tell the bridge which topics have a second publisher.
+        """Inform the bridge which topics have a second publisher.
 
         With two autopilots, y would be mixed, and both autopilots would be flown. So the topics
-        that the bridge reads, and those of setpoints, are checked. Overrides and requests of a mode
-        may have several publishers.
+        that the bridge reads and the topics of setpoints are checked. Overrides and requests of a
+        mode may have several publishers.
         """
         read_topics = set()
         for subscription, rows in self._readers:
@@ -552,7 +553,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._watch_link()
 
     def _watch_link(self) -> None:
-        """Tell the bridge what is wrong with topics, link and parameters of the autopilot."""
+        """Inform the bridge what is wrong with topics, link and parameters of the autopilot."""
         bridge = self._bridge
         link = self._link
         bridge.conflict = self._conflict

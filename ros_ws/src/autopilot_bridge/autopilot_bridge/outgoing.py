@@ -44,7 +44,7 @@ class OutgoingMessage:
         self._sent_ns = 0
 
     def is_due(self, now_ns: int, slack_ns: int) -> bool:
-        """Return whether the message's period has passed since it was last sent.
+        """Return whether the message's period has passed since the message was last sent.
 
         `slack_ns` is the tolerance of the period.
         """
@@ -104,7 +104,7 @@ def field_type(name: str) -> Any:
 def require_field(empty: Any, name: str, row: MeasuredRow | WatchedRow) -> None:
     """Check that a message has the fields of a row. Raises ParameterError if one is missing.
 
-    A field inside a sequence is checked only when the first message comes.
+    A field inside a sequence cannot be checked before the first message comes.
     """
     if "[" in row.field:
         return

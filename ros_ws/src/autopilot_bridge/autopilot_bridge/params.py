@@ -331,7 +331,8 @@ class ChannelMap(Config):
     def recorded_topics(self) -> list[str]:
         """List the topics that the log records.
 
-        They are the topics with a quality of service, and the topics of MAVLink messages.
+        These are the topics for which the map gives a quality of service, and the topics of MAVLink
+        messages.
         """
         rows = chain.from_iterable(
             rows_by_name.values() for rows_by_name in self._readers().values()
