@@ -187,7 +187,8 @@ def write_module(
 
     The outputs y are body rates. If u is at the upper end stop of its actuator, the autopilot gets
     a torque of 1 with the sign of D. In ArduPlane this torque is a deflection of 45 degrees. While
-    RISE-DI does not fly, PX4 flies by its fw_rate_control, or by mc_rate_control for a multicopter.
+    the exported controller (RISE-DI) does not fly, PX4 flies by its fw_rate_control, or by
+    mc_rate_control for a multicopter.
     """
     shell = SHELLS[autopilot]
     controller = exportable(scenario.controller)
@@ -218,10 +219,11 @@ def write_module(
 
 
 def _words_of_vehicle(shell: Shell, scenario: Scenario) -> Mapping[str, str]:
-    """Return the words of the shell that a multicopter needs replaced, with their replacements.
+    """Return the words of the shell that must be replaced for a multicopter, with the new words.
 
-    The result is {} for a fixed wing. A fixed wing has a trim speed. A multicopter has none, and
-    its inputs are torques about the axes. Raises ParameterError if the aircraft is neither.
+    The shell is the code that connects the controller to the autopilot. The result is {} for a
+    fixed wing. A fixed wing has a trim speed. A multicopter has none, and its inputs are torques
+    about the axes. Raises ParameterError if the aircraft is neither.
     """
     channels = scenario.aircraft.channels()
     has_torques = set(scenario.controller.inputs) <= TORQUES

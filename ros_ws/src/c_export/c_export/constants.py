@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write the parameters of the controller and the reference model for the C code.
 
-They are written as rise_di_parameters.h, or as the bytes of struct rise_di_parameters.
+The parameters are written as the text of rise_di_parameters.h, or as the bytes of struct
+rise_di_parameters.
 """
 
 import math
@@ -86,8 +87,8 @@ REALS: Mapping[str, float] = MappingProxyType(
 class Constant:
     """A member of struct rise_di_parameters, or of the struct for the reference model.
 
-    Its value is one or several integers (int, tuple), or reals (array). A matrix is stored row by
-    row.
+    The value of the member is one or several integers (int, tuple), or reals (array). A matrix is
+    stored row by row.
     """
 
     name: str
@@ -136,11 +137,11 @@ IDLE_IN_C = frozenset(
 
 
 def exportable(controller: ControllerConfig) -> RiseDiConfig:
-    """Return the controller if it can be exported, or else raise ParameterError.
+    """Return the controller if it can be exported. Raises ParameterError if it cannot.
 
-    It cannot be exported if its law is not RISE-DI, or if its model can be replaced in flight (the
-    section `learn`). Any other key that the C code lacks must be at its default, and an observer
-    must not be switched off by a `part` of 0.
+    A controller cannot be exported if its law is not RISE-DI, or if its model can be replaced in
+    flight (the section `learn`). Any other key that the C code lacks must be at its default, and an
+    observer must not be switched off by a `part` of 0.
     """
     require(
         isinstance(controller, RiseDiConfig),
@@ -283,9 +284,10 @@ def header(
     float32: bool,
     samples: int = SAMPLE_BUFFER_SIZE,
 ) -> str:
-    """Return the text of rise_di_parameters.h. If `reference` is None, it has no reference model.
+    """Return the text of rise_di_parameters.h.
 
-    The C code stores the last `samples` samples of y, and as many of y_m.
+    If `reference` is None, the header has no reference model. The C code stores the last `samples`
+    samples of y, and as many of y_m.
     """
     r = 0 if reference is None else len(reference.model().A_m)
     suffix = "F" if float32 else ""
@@ -424,6 +426,6 @@ def _octal(character: str) -> str:
 def _comment(names: tuple[str, ...]) -> str:
     """Return names for a C comment, separated by commas.
 
-    They have the escapes of `_strings`, so that no name can end the comment early.
+    The names have the escapes of `_strings`, so that no name can end the comment early.
     """
     return ", ".join("".join(map(_octal, name)) for name in names)

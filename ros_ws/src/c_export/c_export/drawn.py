@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draw random inputs with which C and Python are compared.
 
-They are calls of a controller with any timing, and single steps from any state.
+The inputs are calls of a controller with any timing, and single steps from any state.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -109,10 +109,10 @@ def drawn_calls(
 
 
 def _interval_ns(kind: float, size: float, period_ns: int) -> int:
-    """Return a drawn time from one tick to the next, ns.
+    """Return a random time from one tick to the next, ns.
 
     The time is a period with jitter, or far from a period, or a long pause. It follows from `kind`
-    and `size`, which are drawn from 0 to 1.
+    and `size`, which the caller has drawn from 0 to 1.
     """
     if kind < 0.9:
         return round(period_ns * (1.0 + 0.2 * (size - 0.5)))
@@ -398,8 +398,8 @@ def _effector_values(
 ) -> tuple[FloatArray, FloatArray | None]:
     """Allocate u to the effectors for many steps, one in each column.
 
-    Returns the u that the effectors can give, and their commands. Without an allocation, these are
-    `u` and None.
+    Returns the u that the effectors can give, and the commands of the effectors. Without an
+    allocation, the results are `u` and None.
     """
     if params is None or before is None:
         return u, None
@@ -417,7 +417,10 @@ def _columns(params: Any) -> Any:
 
 
 def _where(mask: NDArray[np.bool_], here: Any, otherwise: Any) -> Any:
-    """Return, for each step, the state `here` if the mask is True, else the state `otherwise`."""
+    """Return, for each step, the state `here` if the mask is True, else the other state.
+
+    The other state is the argument `otherwise`.
+    """
     if hasattr(here, "_asdict"):
         return type(here)(*(_where(mask, *pair) for pair in zip(here, otherwise, strict=True)))
     return np.where(mask, here, otherwise)

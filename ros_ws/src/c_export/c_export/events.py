@@ -123,7 +123,7 @@ class Recorder(Controller):
     """A controller that records its calls as events, and its state after each tick.
 
     `sets` are the parameter sets from which `retune_to` chooses. The recorder starts with the first
-    of them. `before_tick` is called before each tick with the recorder and the instant. It returns
+    set. `before_tick` is called before each tick with the recorder and the instant. It returns
     whether the controller is active. The controller keeps the last `samples` samples of y, and as
     many of y_m.
     """
@@ -172,14 +172,14 @@ class Recorder(Controller):
         self._add(START)
 
     def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """Give a sample of y to the controller. If `silent` contains y, the sample is lost."""
+        """Pass a sample of y to the controller. If `silent` contains y, the sample is lost."""
         if "y" in self.silent:
             return None
         self._add(TAKE_Y, now_ns, sample.stamp_ns, y=sample.value)
         return self._note_refusal(super().take_y, sample, now_ns)
 
     def take_y_m(self, sample: StampedVector, now_ns: int) -> Refusal | None:
-        """Give a sample of y_m to the controller. If `silent` contains y_m, the sample is lost."""
+        """Pass a sample of y_m to the controller. If `silent` contains y_m, the sample is lost."""
         if "y_m" in self.silent:
             return None
         self._add(TAKE_Y_M, now_ns, sample.stamp_ns, y_m=sample.value)
@@ -219,9 +219,10 @@ class Recorder(Controller):
         return output
 
     def guard_tick(self, now_ns: int, sample: GuardSample | None, *, active: bool) -> None:
-        """Compute a tick of the guard with a given sample, and record it.
+        """Compute a tick of the guard with a given sample, and record the tick.
 
-        `sample` is None if the tick has no sample of y and y_m.
+        The guard is the part of the controller around the law, with checks of samples, engagement
+        and failsafe. `sample` is None if the tick has no sample of y and y_m.
         """
         y = None
         y_m = []
@@ -326,7 +327,7 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
 def flight_recordings(
     scenario: Scenario, sets: Sequence[RiseDiConfig], samples: int = SAMPLE_BUFFER_SIZE
 ) -> Iterator[Recording]:
-    """Yield recordings of three flights: undisturbed, with a tenth of y lost, and with faults.
+    """Yield recordings of three flights: undisturbed, with a tenth of the y lost, and with faults.
 
     The flights are simulated in one process. The faults are new parameters, deactivation,
     engagement, tight limits, and losses of y or y_m. A loss ends while the failsafe holds u, while
@@ -383,9 +384,9 @@ def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder
 def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]:
     """Read the parameter sets and the ticks from a log, and compute the ticks again.
 
-    Returns the sets, the recording, and the number of ticks whose u equals that of the log. The
-    sets are the parameters of the start and those after each change in flight. Raises
-    ParameterError if the changes in the log do not lead to the parameters that flew.
+    Returns the sets, the recording, and the number of ticks whose u equals the u in the log. The
+    sets are the parameters at the start of the flight, and the parameters after each change in
+    flight. Raises ParameterError if the changes in the log do not lead to the parameters that flew.
     """
     sets = [exportable(recorded_parameters(run.scenario_file()))]
     changes = [*recorded_changes(run, sets[0])]

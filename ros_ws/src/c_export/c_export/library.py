@@ -253,8 +253,8 @@ DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 def model_description(controller: RiseDiConfig, scenario: str, units: Units) -> str:
     """Return the text of modelDescription.xml.
 
-    The inputs of the unit are y, y_m, active, y_new and y_m_new. Its outputs are u and mode, and
-    its parameters are those in TUNABLE. A step of the unit is a tick of the controller.
+    The inputs of the FMI unit are y, y_m, active, y_new and y_m_new. Its outputs are u and mode,
+    and its parameters are listed in TUNABLE. A step of the unit is a tick of the controller.
     """
     variables = _channels(controller, units)
     begin = 2 * len(controller.outputs) + 1

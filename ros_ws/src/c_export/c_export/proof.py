@@ -108,8 +108,8 @@ def write_code(
 def compilers(names: Sequence[str] = ()) -> list[list[str]]:
     """Return the commands of the C compilers to use.
 
-    They are `names` or, if this is empty, those of COMPILERS that are on the PATH. Raises
-    ParameterError if there is no compiler.
+    The result is `names` or, if this is empty, each command of COMPILERS that is on the PATH.
+    Raises ParameterError if there is no compiler.
     """
     commands = [words(command) for command in names] or [
         [name] for name in COMPILERS if shutil.which(name)
@@ -176,7 +176,7 @@ class Program:
     def take(self, sets: Sequence[RiseDiConfig]) -> None:
         """Replace the parameter sets to which the program can change.
 
-        The program ignores the first set, because it starts with the parameters of the exported
+        The program ignores the first set, because it starts with the parameters in the exported
         header.
         """
         self._sets = sets
