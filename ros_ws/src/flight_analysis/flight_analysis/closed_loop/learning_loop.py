@@ -52,7 +52,7 @@ class LearnerResult(NamedTuple):
 class Learner(Protocol):
     """Interface of a learner, which identifies A and B during a flight and proposes parameters.
 
-    Its channels are in the order of the control law.
+    The channels of y and u are in the order of the control law.
     """
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
@@ -106,7 +106,7 @@ class Learned(NamedTuple):
 
     The first channel, `proposed`, is 1 if parameters were proposed, else 0. Then follow the values
     of the entries of A and B that act on the outputs, and after them the standard deviations of
-    these values. The last three channels are those of GUARANTEE.
+    these values. The last three channels are named in GUARANTEE.
     """
 
     names: tuple[str, ...]

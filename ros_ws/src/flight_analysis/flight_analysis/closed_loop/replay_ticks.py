@@ -204,8 +204,8 @@ class Ticks:
     ) -> tuple[ControllerState, FloatArray]:
         """Compute tick k, and return the state after it and the values of its channels.
 
-        The channels are those of the attribute `names`. If the tick has no output, all values are
-        NaN.
+        The attribute `names` has the names of these channels. If the tick has no output, all values
+        are NaN.
         """
         stamp_ns = int(self.stamp_ns[k])
         y = None

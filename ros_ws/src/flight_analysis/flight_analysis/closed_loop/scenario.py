@@ -155,8 +155,8 @@ class Scenario:
     def _values(self, name: str, changes: Mapping[str, Any]) -> dict[str, Any]:
         """Return the parameters of a section, to which the caller then adds `changes`.
 
-        If `changes` has another law, the gains of the present law are left out. If there is no
-        section of guidance, its parameters are those of `guidance_by_rule`.
+        If `changes` has another law, the gains of the present law are left out. If guidance is
+        asked for and the scenario has no such section, `guidance_by_rule` gives the parameters.
         """
         section: Config | None = getattr(self, name)
         if section is None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Find the scenarios that ship with the stack, give them a route, and save them."""
+"""Find the scenarios that ship with this package, give them a route, and save them."""
 
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
@@ -117,7 +117,7 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
 
 
 def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
-    """Return the scenario with values replaced by those of a ROS parameter file.
+    """Return the scenario with the values of a ROS parameter file in place of its own.
 
     Sections of the file for nodes outside `namespace` are ignored. Raises ParameterError if a value
     is invalid. The message names the parameter file, because the scenario was valid before.

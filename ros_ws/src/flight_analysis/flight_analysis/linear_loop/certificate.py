@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Write a guarantee to a file that can be checked without this stack, and keep guarantees.
+"""Write a guarantee to a file that can be checked without this package, and keep guarantees.
 
 A certificate contains the sampled loop in numbers, the box of its uncertain entries, and the steps
 of the proof. The script examples/check_certificate.py checks it. The script computes the motion
 over a period again, and bounds the error of the Legendre coefficients that are left out.
 
 Guarantees are also kept in the folder rise-di/guarantees in $XDG_CACHE_HOME, or in ~/.cache, under
-the digest of their loop. The report of a flight computes no guarantee. It shows the one that was
-kept for its loop.
+the digest of their loop. The report of a flight computes no guarantee. It shows the guarantee that
+was kept for the flown loop.
 """
 
 import hashlib

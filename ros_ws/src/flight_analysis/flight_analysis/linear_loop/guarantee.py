@@ -356,11 +356,11 @@ def _proved(
 ) -> tuple[float, list[dict[str, Any]]]:
     """Find the largest size below `least` that can be proved, and return it with its proof.
 
-    The size is a factor on the deviations of the box. If `disks` is True, the size is that of the
-    disks, and the deviations cover the whole box. The result is 0 if no size is proved. `least` is
-    a size that a search has found too large. If `exact` is True, the search has found no such size,
-    so `least` itself may be provable and is tried first. Without `finer_gaps` the first size that
-    is proved is the result. `show` gets each size before its proof is tried.
+    The size is a factor on the deviations of the box. If `disks` is True, the size is the size of
+    the disks, and the deviations cover the whole box. The result is 0 if no size is proved. `least`
+    is a size that a search has found too large. If `exact` is True, the search has found no such
+    size, so `least` itself may be provable and is tried first. Without `finer_gaps` the first size
+    that is proved is the result. `show` gets each size before its proof is tried.
     """
 
     def proof_at(gap: float, most: int) -> list[dict[str, Any]] | None:

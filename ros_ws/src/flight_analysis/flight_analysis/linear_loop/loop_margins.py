@@ -143,7 +143,7 @@ def margins(
 
     The least margins lie at corners of the box of these deviations, where no drawn sample falls. A
     search therefore finds them, and the drawn samples only serve to count the stable aircraft. Lags
-    and delay are those of the aircraft that flies, even if the controller was told others.
+    and delay come from the aircraft that flies, even if the controller was designed for others.
 
     Args:
         scenario: Scenario with the aircraft and the controller.
@@ -260,7 +260,7 @@ def scenario_loop(
 ) -> LinearLoop:
     """Build the loop of a controller around the nominal and uncertain aircraft of a scenario.
 
-    Lags and delay are those of the aircraft that flies. They come from the scenario or from
+    Lags and delay of the aircraft that flies are used. They come from the scenario or from
     `flight`. Raises ParameterError as `margins` does.
     """
     airframe = scenario_model(scenario, controller)
@@ -312,8 +312,8 @@ def linear_loop(
 ) -> LinearLoop:
     """Build the loop of a controller around N aircraft, A (N, n, n) and B (N, n, m).
 
-    The airframe gives the states and channels. If `timing` is None, the loop has the timing that
-    the controller was told. Raises ParameterError for the literal sign.
+    The airframe gives the states and channels. If `timing` is None, the loop has the timing in the
+    controller's parameters. Raises ParameterError for the literal sign.
     """
     rows, columns = law_order(airframe, controller)
     loop = loop_of(controller) if timing is None else timing

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compare what the controller was told of its aircraft with the aircraft that flies.
+"""Compare what a controller's parameters say of its aircraft with the aircraft that flies.
 
 The section `controller` of a scenario states lags and a delay, for which the controller was
 designed. The section `aircraft` has the lags and the delay of the simulated aircraft, and a log
@@ -91,7 +91,7 @@ MEANING = {
 
 
 class Difference(NamedTuple):
-    """A fact about the aircraft that differs from what the controller was told."""
+    """A fact about the aircraft that differs from the controller's parameters."""
 
     fact: str  # the key, with its value in the aircraft and its value in the controller
     standing: Standing
@@ -119,7 +119,7 @@ PLANNED = FlightFacts()
 
 
 class Comparison(NamedTuple):
-    """The timing of the loop that flies, and how it differs from what the controller was told."""
+    """The timing of the loop that flies, and its differences from the controller's parameters."""
 
     timing: LoopTiming
     differences: tuple[Difference, ...]

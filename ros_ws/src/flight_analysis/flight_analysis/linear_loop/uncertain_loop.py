@@ -11,15 +11,15 @@ Their error is of the order of (T p)^4, for a period T and an eigenvalue p. Sour
 loop: T. Chen, B. Francis, "Optimal Sampled-Data Control Systems", chapter 10.
 
 u can be late by an unknown time from 0 to `late`, s, which differs from tick to tick and from input
-to input. At each instant the newest u that has arrived acts. Where the period of a u begins at
-s = 0, the input then changes by
+to input. At each instant the newest u that has arrived acts. With s = 0 at the beginning of the
+period of a u, the input then changes by
 
     -sum_j (1 + e_j(s)) / 2 v_j,  v_j = u_(k-j) - u_(k-j-1)
 
 over the first p_j of the period, p_j = min(late / T - j, 1). e_j is 1 until u_(k-j) arrives, and -1
-from then on. The middle, e_j = 0, belongs to the loop. e_j v_j is a function over p_j. Its root
-mean square is abs(v_j) whatever e_j is, so all its Legendre coefficients together form a full block
-of size 1 that reads v_j. The block can change from tick to tick, so it has one X for all
+from then on. The middle, e_j = 0, belongs to the loop. e_j v_j is a function over p_j. The root
+mean square of e_j v_j is abs(v_j) whatever e_j is, so all its Legendre coefficients together form a
+full block of size 1 that reads v_j. The block can change from tick to tick, so it has one X for all
 frequencies, and G = 0.
 """
 
@@ -300,8 +300,9 @@ def sensitivity_slopes(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Compute S and its slopes along d at the frequencies w, rad/s.
 
-    Both refer to the aircraft with the deviations d, (k,). w has the shape (F,), S has (F, m, m),
-    and the slopes have (F, k, m, m). The loop must have disks in all inputs, and no late u.
+    S and the slopes refer to the aircraft with the deviations d, (k,). w has the shape (F,), S has
+    (F, m, m), and the slopes have (F, k, m, m). The loop must have disks in all inputs, and no late
+    u.
     """
     around = loop.at(d)
     p, k = loop.uncertain, len(d)

@@ -48,9 +48,9 @@ def best_pose(tape: Tape) -> Signal | None:
 def tracking_error(tape: Tape) -> Signal:
     """Return the measured error e = y - y_m, (N, m).
 
-    It has a row for each sample of y within the time of y_m. Channels that y_m lacks are left out.
-    y_m is interpolated linearly. The law controls this error, which contains the noise of the
-    sensors.
+    The result has a row for each sample of y within the time of y_m. Channels that y_m lacks are
+    left out. y_m is interpolated linearly. The law controls this error, which contains the noise of
+    the sensors.
     """
     names = _controlled(tape)
     return _minus_reference(
@@ -73,10 +73,10 @@ def _controlled(tape: Tape) -> tuple[str, ...]:
 def true_error(tape: Tape) -> Signal | None:
     """Return the true error C x - y_m, (N, m), which only a simulation logs.
 
-    It has a row for each sample of the topic `truth` within the time of y_m. The channels are those
-    of `tracking_error`. The noise and bias of the sensors do not enter this error, except through
-    their effect on the flight. Returns None if `truth` lacks the state x.CHANNEL of one of the
-    channels.
+    The result has a row for each sample of the topic `truth` within the time of y_m. It has the
+    same channels as `tracking_error`. The noise and bias of the sensors do not enter this error,
+    except through their effect on the flight. Returns None if `truth` lacks the state x.CHANNEL of
+    one of the channels.
     """
     if "truth" not in tape:
         return None

@@ -223,8 +223,9 @@ def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bo
 def _processes(tape: Tape) -> dict[str, ProcessAccount]:
     """Return when each process of a flight began and sent its messages, by name of the process.
 
-    In lockstep the stamps are no times of day, so it is unknown when a process was ready. A process
-    is left out if nothing is known of it, such as a recorder in lockstep.
+    If the flight was in lockstep, its stamps are no times of day, so it is unknown when a process
+    was ready. A process of which nothing is known, such as the recorder of a lockstep flight, is
+    left out.
     """
 
     def flight_time(stamp_ns: int | None) -> float | None:

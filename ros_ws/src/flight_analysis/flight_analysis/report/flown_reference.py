@@ -181,8 +181,9 @@ def _is_whole(tape: Tape) -> bool:
 def _has_known_start(tape: Tape) -> bool:
     """Return whether t = 0 of the tape is known to be t = 0 of the reference model.
 
-    It is known for a flight in one process, whose tape has the scenario. It is also known for a
-    flight whose nodes were started together, because its log states the duration.
+    t = 0 is known for a flight in one process, whose tape has the scenario. It is also known for a
+    flight whose nodes were started together. You can tell such a flight by its log, which states
+    the duration.
     """
     return tape.scenario is not None or tape.duration is not None
 

@@ -341,7 +341,7 @@ def _outside(tape: Tape, pose: Signal, inside: FloatArray) -> Outside:
     """Return how long and how far the aircraft was outside its limits.
 
     `inside` has, for each pose, the distance by which the aircraft is inside the limits, (N,), m.
-    It is negative outside.
+    The distance is negative outside.
     """
     t = (pose.stamp_ns - tape.start_ns) / NANOSECONDS
     lasted = float(np.sum(np.diff(t)[inside[:-1] < 0.0]))
@@ -427,7 +427,7 @@ def control_errors(tape: Tape) -> dict[str, FloatArray]:
 def distance(tape: Tape) -> float | None:
     """Return the length of the path over ground, m, or None if the log has no speed over ground.
 
-    It is the integral of the speed over ground.
+    The length is the integral of the speed over ground.
     """
     pose = tape.signals.get("pose")
     if pose is None or not {"v_north", "v_east"} <= set(pose.names):

@@ -54,7 +54,7 @@ Bounds = Mapping[str, tuple[float, float]]
 def guided_context(context: PlotContext) -> PlotContext:
     """Add what figures of guidance need to a context: units, and the times of a stale pose.
 
-    The units are those of the quantities that guidance holds.
+    The units belong to the quantities that guidance holds, such as altitude.
     """
     t = context.tape.time("guidance")
     mode = context.tape["guidance"]["mode"]

@@ -426,7 +426,7 @@ def _moving_mean(values: FloatArray, count: int) -> FloatArray:
 def _declared_noise(aircraft: AircraftConfig) -> list[float]:
     """Return the largest noise of each output that the sensor's parameters declare, SI.
 
-    It is DECLARED sqrt(noise^2 + drift^2 rate NOISE_TIME) + quantisation.
+    The result is DECLARED sqrt(noise^2 + drift^2 rate NOISE_TIME) + quantisation.
     """
     sensors = aircraft.sensor_arrays()
     steps = aircraft.rate * NOISE_TIME

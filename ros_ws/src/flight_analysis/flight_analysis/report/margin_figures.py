@@ -49,8 +49,8 @@ def decibels(factor: FloatArray | float) -> FloatArray:
 def margin_rows(margins: LoopMargins) -> list[list[str]]:
     """Return a row of cells for each input, and a last row for ALL_INPUTS.
 
-    The cells are those of MARGIN_COLUMNS. A cell has the value of the nominal aircraft, and in
-    parentheses the value of the worst uncertain aircraft.
+    A row has the cells that MARGIN_COLUMNS names. A cell has the value of the nominal aircraft, and
+    in parentheses the value of the worst uncertain aircraft.
     """
     columns = _values(margins.nominal, (*margins.channel_delay, margins.delay))
     uncertain = columns
@@ -158,7 +158,7 @@ def margin_table(
 ) -> MetricTable:
     """Return the table of the margins of a flight's loop, with the guarantee for this loop.
 
-    `differences` are sentences on how the aircraft differs from what the controller was told.
+    `differences` are sentences on how the aircraft differs from the controller's parameters.
     """
     sentences = [*differences, modes_text(margins)]
     sentences += [] if guarantee is None else guarantee_text(guarantee)

@@ -3,7 +3,7 @@
 """Describe a report page as records, and write it as HTML that needs no network.
 
 A page begins with its head, which has the title, the verdicts and the tiles. The blocks follow in
-their order. They are figures, a replay, cards, messages and tables. The line of contents links to
+their order. A block has figures, a replay, cards, messages or tables. The line of contents links to
 the blocks that have a short name.
 """
 
@@ -296,7 +296,7 @@ def page_parts(page: Page) -> Iterator[str]:
 
 @cache
 def _template() -> Template:
-    """Return the template of a page. It is compiled only once, because this takes long."""
+    """Return the template of a page. Compile it only once, because this takes long."""
     environment = Environment(
         loader=FileSystemLoader(HERE),
         autoescape=True,

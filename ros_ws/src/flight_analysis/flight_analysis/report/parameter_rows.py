@@ -16,7 +16,7 @@ LEFT_OUT = ("recorder.", "flight.")  # sections about the log and the run, not t
 def parameter_rows(scenario: Scenario) -> list[tuple[str, str, str]]:
     """Return name, flown value and default of each parameter that differs from its default, SI.
 
-    Parameters without a default come last. They have NONE in place of a default.
+    Parameters without a default come last. Their rows have the text NONE in place of a default.
     """
     rows: list[tuple[str, str, str]] = []
     for section in SCHEMAS:

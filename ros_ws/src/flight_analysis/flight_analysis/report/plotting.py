@@ -117,7 +117,7 @@ class SampleStore:
 
         Values are rounded because noise does not compress, and a pixel shows fewer digits. The bits
         of a value are taken as an integer. The array has the first integer, and then the difference
-        of each from the one before, modulo 2^32, because successive samples hardly differ.
+        of each integer from the one before, modulo 2^32, because successive samples hardly differ.
         """
         spare = 24 - MANTISSA
         bits = values.astype("<f4").view("<u4")
@@ -141,8 +141,8 @@ def _digest(array: NDArray[Any]) -> str:
 def pack(content: bytes | NDArray[Any], width: int = 1) -> str:
     """Shuffle the bytes of items of `width` bytes, compress them by zlib, and encode as base64.
 
-    The shuffle puts the first bytes of all items first, then the second bytes, and so on. This
-    helps because the high bytes of small steps are all equal.
+    The shuffle puts the first bytes of all items first, then the second bytes, and so on. The
+    shuffled bytes compress better, because the high bytes of small steps are all equal.
     """
     shuffled = np.frombuffer(content, dtype=np.uint8).reshape(-1, width).T.tobytes()
     return base64.b64encode(zlib.compress(shuffled, LEVEL)).decode()

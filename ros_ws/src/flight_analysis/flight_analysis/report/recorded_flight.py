@@ -139,7 +139,7 @@ def log_account(recorded: RecordedRun) -> Account | None:
 
 
 def scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
-    """Return the scenario that is stored in a log. Its path is beside the log.
+    """Return the scenario that is stored in a log. The path of the scenario is beside the log.
 
     Raises ParameterError if the log has no valid scenario.
     """

@@ -65,10 +65,10 @@ def rewrite_report(
     """Write scenario, summary.json and report.html of an earlier flight.
 
     The files are written beside the log, or into the new folder `output`. The link runs/latest does
-    not change. A `scenario` that replaces the one in the log is not written. Raises ParameterError
-    as `read_flight` does, before any file is written, and UnwrittenReportError if a file cannot be
-    written. If the run lacks y or y_m, only summary.json is written, with the outcome alone, and
-    UnflownError is raised.
+    not change. If `scenario` replaces the scenario in the log, no scenario is written. Raises
+    ParameterError as `read_flight` does, before any file is written, and UnwrittenReportError if a
+    file cannot be written. If the run lacks y or y_m, only summary.json is written, with the
+    outcome alone, and UnflownError is raised.
     """
     recorded = read_run(run, namespace, scenario, remaps)
     folder = output or folder_of(run)

@@ -18,10 +18,10 @@ MAX_WINDOW = 8192
 def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Return the frequencies, Hz, and each channel's amplitude spectral density, unit / sqrt(Hz).
 
-    The method is that of Welch (1967). The Hann windows overlap by half, and each has its mean
-    removed. A window spans a tenth of the flight, but at most MAX_WINDOW. If a sample is missing,
-    the last one is repeated, but for at most LONGEST_INTERVAL, because a gap of the log can have
-    any length. The integral of the squared density over the frequencies is the variance.
+    The method is Welch's (1967). The Hann windows overlap by half, and each has its mean removed. A
+    window spans a tenth of the flight, but at most MAX_WINDOW. If a sample is missing, the last one
+    is repeated, but for at most LONGEST_INTERVAL, because a gap of the log can have any length. The
+    integral of the squared density over the frequencies is the variance.
     """
     places = np.round((signal.stamp_ns - signal.stamp_ns[0]) / period_ns).astype(np.int64)
     longest = max(round(LONGEST_INTERVAL * NANOSECONDS / period_ns), 1)

@@ -44,8 +44,8 @@ class LatencyMetrics(NamedTuple):
 def tick_periods(tape: Tape) -> NDArray[np.int64]:
     """Return the time between successive ticks of the controller, ns, shape (N - 1,).
 
-    The instant of a tick is the stamp of its sample plus the channel "age". It is also the deadline
-    of the tick plus the channel "late".
+    The instant of a tick is the stamp of its sample plus the channel "age". The same instant is the
+    deadline of the tick plus the channel "late".
     """
     internals = tape["internals"]
     return np.diff(internals.stamp_ns + np.round(internals["age"] * 1e9).astype(np.int64))
