@@ -16,7 +16,7 @@ Controller = TypeVar("Controller", bound=ControllerConfig)
 
 
 def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
-    """Return the controller with a feedforward, whose nominal model is that of the airframe.
+    """Return the controller with a feedforward whose nominal model is the airframe.
 
     The lead is lag + delay + half a period of the controller. Raises ParameterError if the airframe
     cannot be the model, for example because it has a zero in the right half plane.

@@ -325,7 +325,7 @@ def scenario_text(heading: Iterable[str], sections: Sections) -> str:
     """Write the text of a scenario file: a heading as comments, and then the sections.
 
     A section may be a text, such as `gain_yaml.selection_yaml` writes, or a mapping. Empty lines of
-    the heading are left out. Keys whose value is None or {} are left out too.
+    the heading are left out. Keys whose value is None or {} are also left out.
     """
     rows = {name: _with_values(section) for name, section in sections.items()}
     lines = LICENCE + "#\n" + comment(filter(None, heading))

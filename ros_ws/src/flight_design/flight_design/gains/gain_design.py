@@ -232,8 +232,8 @@ def check_gains(
 ) -> GainAssessment[ControllerConfig]:
     """Evaluate all conditions on the gains of a scenario, and the margins of its loop.
 
-    The law need not be RISE-DI. Lags and delay are those of the aircraft in the scenario, even if
-    the controller was told others.
+    The law need not be RISE-DI. Lags and delay come from the scenario's aircraft, even if the
+    controller was designed for others.
 
     Args:
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe. If the
@@ -382,7 +382,7 @@ def _pairing(
 
 
 def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
-    """Return a loop without its allocation, with the inputs and lags of the actuators instead."""
+    """Return a loop without its allocation. Its inputs and lags are those of the actuators."""
     if loop.base.allocation is None:
         return loop
     names = tuple(scenario.aircraft.channels().inputs)

@@ -385,7 +385,7 @@ def assess_scenario(
 def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
     """Return the loop of a scenario.
 
-    The rate limit of an input is that of the controller or of the actuator, whichever is lower.
+    The rate limit of an input is the lower one of two limits: the controller's and the actuator's.
     """
     controller = scenario.controller
     rates = scenario.aircraft.actuators.rate

@@ -234,8 +234,8 @@ def below_requirement(unmet: Sequence[GainCondition], outputs: Sequence[str]) ->
 def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) -> str:
     """Write the nominal and the worst phase margins of a loop in a sentence.
 
-    With the implicit sign the sentence is that of `chatter_sentence`. Returns "" if the loop has
-    the literal sign or is unstable.
+    With the implicit sign, `chatter_sentence` gives the sentence. Returns "" if the loop has the
+    literal sign or is unstable.
     """
     if margins is None or not margins.nominal.stable:
         return ""

@@ -98,7 +98,7 @@ class Study(NamedTuple):
     def timing_of(self, controller: ControllerConfig) -> LoopTiming:
         """Return lags, delay and period of the loop.
 
-        The timing is that of the aircraft that flies. If no aircraft flies yet, the timing comes
+        The timing comes from the aircraft that flies. If no aircraft flies yet, the timing comes
         from the controller's parameters.
         """
         return loop_of(controller) if self.flown is None else self.flown.comparison.timing

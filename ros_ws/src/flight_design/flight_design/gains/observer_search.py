@@ -4,8 +4,9 @@
 
 The loop must have the required margins. The factor of a channel is its relaxation. It divides K and
 the integral gain, and multiplies the observer's weight `effort`. A relaxation above 1 makes the
-loop slower, and one below 1 makes it faster. Both may be needed, because the inputs of an aircraft
-may act less or more than those of the aircraft for which the gains were found.
+loop slower, and one below 1 makes it faster. A relaxation above or below 1 may be needed, because
+the inputs of an aircraft may act less or more than the inputs of the aircraft for which the gains
+were found.
 """
 
 import math

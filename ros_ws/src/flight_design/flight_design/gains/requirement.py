@@ -5,7 +5,7 @@
 Every required margin gives a `GainCondition`. The search computes the margins of every loop that it
 tries.
 
-The margins are those of the sampled loop with actuators, delay and hold
+The margins are computed for the sampled loop with actuators, delay and hold
 (`flight_analysis.linear_loop.input_margins`). The values of 45 degrees and 6 dB come from
 MIL-F-9490D, 3.1.3.6.1, for an aerodynamic surface. A sensitivity of at most 2 comes from K. J.
 Astrom, R. M. Murray, "Feedback Systems", 12.3.
@@ -229,10 +229,10 @@ def within_requirement(
     If no candidate meets the requirement, the candidate with the least shortage is returned.
 
     `build(slower, lower)` makes a controller. It divides the integral gain by both factors, and the
-    bandwidth by `lower`. Each factor has a value of 1 or more for each channel, (m,). At 1 the
-    gains are those of the engineering procedure, the rule. The error is the product of the
-    `linear_error` of all outputs along `u_dot`, (T, m), with inputs in the law's order. The
-    required damping is lowered by `above_zeros`.
+    bandwidth by `lower`. Each factor has a value of 1 or more for each channel, (m,). If both
+    factors are 1, the gains follow from the engineering procedure, the rule. The error is the
+    product of the `linear_error` of all outputs along `u_dot`, (T, m), with inputs in the law's
+    order. The required damping is lowered by `above_zeros`.
 
     The search begins with the bandwidths of the rule, and with the largest integral gains with
     which each channel has its margins. If a margin is missing at the end, the search tries other

@@ -119,8 +119,8 @@ def own_shares(
 def peaks(recorded: FlightData) -> FloatArray:
     """Return how far each output moves from trim, (m,), as a multiple of its noise.
 
-    The motion is the largest magnitude of the means over intervals of PEAK. The noise is that of a
-    single sample.
+    The motion is the largest magnitude of the means over intervals of PEAK. The noise is the rms
+    noise of a single sample.
     """
     y = without_trim(recorded).y
     length = max(1, round(PEAK / recorded.period))

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identify an aircraft of JSBSim: its linear airframe, its gains and a scenario.
 
-The airframe is the linearisation of JSBSim about the trim. The gains are those that `rise-di gains`
-would select for this airframe. No number in this module is specific to an aircraft.
+The airframe is the linearisation of JSBSim about the trim. The gains are the same as `rise-di
+gains` would select for this airframe. No number in this module is specific to an aircraft.
 """
 
 from collections.abc import Callable
@@ -408,10 +408,10 @@ def _integrators(linear: Linearization) -> Airframe:
 def airspeed_bandwidth(authority: float, lag: float) -> float:
     """Return the bandwidth of V, rad/s, for a throttle with an authority, m/s^2, and a lag, s.
 
-    It is min(0.46 / total, authority / sigma), where total is the total lag. V contains the wind
-    along the path itself. So in moderate turbulence, sigma = 3.05 m/s rms, the throttle moves with
-    an rms of up to its authority. With more bandwidth it would go from stop to stop, and the error
-    of V would be twice the wind. This happened on the 737.
+    The bandwidth is min(0.46 / total, authority / sigma), where total is the total lag. V contains
+    the wind along the path itself. So in moderate turbulence, sigma = 3.05 m/s rms, the throttle
+    moves with an rms of up to its authority. With more bandwidth it would go from stop to stop, and
+    the error of V would be twice the wind. This happened on the 737.
     """
     return min(
         FASTEST_V / float(total_lag(np.array(lag), DELAY, 1.0 / CONTROL_RATE)),

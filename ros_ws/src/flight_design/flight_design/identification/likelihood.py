@@ -280,8 +280,8 @@ class Likelihood:
     ) -> Models:
         """Design the filters of N models, with parameters theta (N, p), at some levels of the wind.
 
-        With `near`, the gains of all models are computed from those of the first model, to first
-        order.
+        With `near`, the gains of all models are computed from the gains of the first model, to
+        first order.
         """
         levels = np.unique(levels)
         airframe = self._airframe

@@ -151,7 +151,7 @@ class Search(Likelihood):
 
         The fit also has the innovations of the nominal model, and of the model `flown` if there is
         one. For each of these two models, the wind has the best level in each span, or the levels
-        `same` if those have a lower cost.
+        `same` if the cost with `same` is lower.
         """
         theta = best.theta
         covariance: FloatArray = np.asarray(np.linalg.inv(best.hessian), float)

@@ -80,8 +80,8 @@ class Window(NamedTuple):
 class Imported:
     """The tape of a log, and what is known of its autopilot.
 
-    The parameters of the autopilot are those at the first sample. The notes are sentences on what
-    stays unknown.
+    The parameters of the autopilot have their values at the first sample. The notes are sentences
+    on what stays unknown.
     """
 
     tape: Tape

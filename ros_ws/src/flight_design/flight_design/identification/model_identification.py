@@ -478,7 +478,7 @@ def with_entries(airframe: Airframe, entries: Iterable[Entry]) -> Airframe:
 
 
 def join_innovations(parts: Sequence[Innovations], blocks: Sequence[Block]) -> Innovations:
-    """Join the innovations of the blocks to those of all outputs."""
+    """Join the innovations of the blocks to the innovations of all outputs."""
     order = np.argsort(np.concatenate([block.outputs for block in blocks]))
     r = np.concatenate([part.r for part in parts], axis=1)[:, order]
     normalised = np.concatenate([part.normalised for part in parts], axis=1)[:, order]

@@ -122,7 +122,7 @@ def own_loop(parameters: Mapping[str, float], scenario: Scenario, autopilot: str
     """Read the rate loop of an autopilot from its log, or return None if a parameter is missing.
 
     PX4 and ArduPlane multiply FF by a reference speed over the airspeed, and P and I by the square
-    of this ratio. Here the gains are those at the trim speed.
+    of this ratio. The result has the gains at the trim speed.
     """
     speed = scenario.aircraft.channels().speed
     names = ARDUPLANE if autopilot == "ardupilot" else FIXED_WING if speed > 0.0 else MULTICOPTER

@@ -4,10 +4,11 @@
 
 The results are Omega, lags and delays with standard errors.
 
-A predictor gives every sample of y from earlier samples of y and from u. It is fitted by least
-squares, and it goes back far enough to predict the effect of earlier disturbances too. Its step
-response is the step response of the aircraft. A second-order response with a delay and a lag is
-fitted to the beginning of this step response, and yields Omega, the lag and the delay.
+A predictor gives every sample of y from earlier samples of y and from u. The predictor is fitted by
+least squares, and it goes back far enough to predict the effect of earlier disturbances as well.
+The step response of the predictor is the step response of the aircraft. A second-order response
+with a delay and a lag is fitted to the beginning of this step response, and yields Omega, the lag
+and the delay.
 
 Sources: L. Ljung, "System Identification", 1999, 7.3 and 13.4 (direct identification in closed
 loop); U. Forssell, L. Ljung, Automatica 35, 1999; Y. Zhu, "Multivariable System Identification for
@@ -179,7 +180,8 @@ def identify_response(
 class Layout(NamedTuple):
     """The regressors that predict y(k): recent samples of y, and means of y and u over windows.
 
-    The windows lie before the sample k. Their ends are given in sample periods before k.
+    The windows lie before the sample k. The ends of the windows are given in sample periods before
+    k.
     """
 
     period: float  # s, period of y

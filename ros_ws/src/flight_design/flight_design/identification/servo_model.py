@@ -89,8 +89,8 @@ def _within_rate(
 ) -> FloatArray:
     """Return the positions of a servo with limited rate after each tick, (T,).
 
-    The servo is at rest at 0. Without the limit its position and rate would be Phi times those
-    before, plus Gamma u.
+    The servo is at rest at 0. Without the limit, position and rate after a tick would be Phi times
+    position and rate before the tick, plus Gamma u.
     """
     (by_position, by_rate), (rate_by_position, rate_by_rate) = Phi.tolist()
     by_u, rate_by_u = Gamma.tolist()

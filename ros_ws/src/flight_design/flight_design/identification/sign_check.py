@@ -58,7 +58,7 @@ class SignCheck(NamedTuple):
 def require_signs(channel_map: ChannelMap, scenario: Scenario) -> None:
     """Check that a channel map agrees with the D of a scenario's controller.
 
-    The effects of the inputs on the outputs are those of the scenario's airframe. Raises
+    The effects of the inputs on the outputs come from the scenario's airframe. Raises
     ParameterError if the map contradicts D.
     """
     contradictions = check_scenario(
@@ -177,9 +177,9 @@ def check_signs(
 ) -> SignCheck:
     """Compare D of diag(output signs) Omega diag(input signs) with the controller's D.
 
-    With a recorded flight, its signs are compared too. Omega = C B of the airframe, (m, m), has its
-    channels in the map's order. `outputs`, `inputs` and `D` are in the controller's order. Raises
-    ParameterError if the map does not fit the airframe, or if Omega has no D.
+    If there is a recorded flight, its signs are also compared. Omega = C B of the airframe, (m, m),
+    has its channels in the map's order. `outputs`, `inputs` and `D` are in the controller's order.
+    Raises ParameterError if the map does not fit the airframe, or if Omega has no D.
     """
     mapped = _omega_of_law(channel_map, Omega, outputs, inputs)
     D_mapped = [int(sign) for sign in signs(mapped)]

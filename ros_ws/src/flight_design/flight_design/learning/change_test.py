@@ -107,7 +107,7 @@ def change_test(
     probability is 2e-6, and for smaller losses it is smaller.
 
     The input j is dead if the minimum of J for -OFF_CENTRE <= kappa_j + 1 <= NONE meets two
-    conditions. It is lower than the first minimum in G by more than MAX_GAIN, and at most
+    conditions. This minimum is lower than the first minimum in G by more than MAX_GAIN, and at most
     DEAD_WITHIN above the second minimum in G. `delays` has the delays of u, s, by the outputs of a
     part. The default is the delay of `actuation`. `drift` is the noise of the disturbances, as in
     `Unknown`.

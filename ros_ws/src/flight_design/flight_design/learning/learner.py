@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learn in the air: identify A and B from the last seconds of a flight, check them, and design.
 
-The function `model_identification.identify_model` identifies A and B, as it does for a log. It
-begins with a rough airframe. The design is an observer and a feedforward. If a check
+The function `model_identification.identify_model` identifies A and B, as it does for a log. The
+identification begins with a rough airframe. The design is an observer and a feedforward. If a check
 fails, a sentence says why the model is refused. The controller checks the parameters again when it
 loads them, and may refuse them.
 """

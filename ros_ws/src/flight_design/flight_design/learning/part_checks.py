@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the model of a part of the aircraft, and write sentences about the part.
 
-A part is a group of states and inputs that does not couple with the rest. Its model is checked
-against the model in flight.
+A part is a group of states and inputs that does not couple with the rest. The new model of a part
+is checked against the model in flight.
 """
 
 from collections.abc import Collection, Iterable, Mapping

@@ -108,7 +108,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
     def design_of_rough(start: RiseDiConfig) -> SelectedObserver:
         """Return the design for the rough model, which allows for its errors.
 
-        It is made only once, also for the learners of many aircraft.
+        The design is made only once, also for the learners of many aircraft.
         """
         if start not in of_rough:
             margin = asked_margin(controller)
