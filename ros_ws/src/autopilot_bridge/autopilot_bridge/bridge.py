@@ -225,8 +225,8 @@ class Bridge:
         """Say which inputs have stayed at a limit for longer than their rows allow, or return None.
 
         The aircraft does not answer to such an input any more. The limits of the law may be
-        narrower than those of the map, so a large u that does not change is also taken to be at a
-        limit.
+        narrower than the limits in the map, so a large u that does not change is also taken to be
+        at a limit.
         """
         reasons = []
         inside, small = (

@@ -392,8 +392,8 @@ def _rows(members: list[Constant], numbers: Callable[[FloatArray], str]) -> list
 def _initialiser(member: Constant, numbers: Callable[[FloatArray], str]) -> str:
     """Return the C initialiser of a member: a number, or a list in braces.
 
-    The limits are a nested struct. Its braces open before the list of `lower`, its first member,
-    and close after the list of `rate`, its last member.
+    The limits are a nested struct. The braces of this struct open before the list of `lower`, the
+    first member, and close after the list of `rate`, the last member.
     """
     value = member.value
     if isinstance(value, int):

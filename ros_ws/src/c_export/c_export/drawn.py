@@ -167,7 +167,7 @@ def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int)
     """Draw single steps of an engaged controller from any state, and compute them all at once.
 
     The controller has the parameters sets[index]. Errors are 0.001 to 300 widths of the softened
-    sign. dt is 0.2 to 10 periods, so that up to 9 samples are missing. It is always short enough
+    sign. dt is 0.2 to 10 periods, so that up to 9 samples are missing. dt is always short enough
     that the law does not engage again.
     """
     rng = np.random.default_rng(seed)

@@ -212,7 +212,7 @@ class Program:
         return states[:, :integers], reals, json.loads(process.stdout)
 
     def compare(self, recording: Recording) -> Comparison:
-        """Run the program with a recording, and compare its states with those of Python."""
+        """Run the program with a recording, and compare its states with the states in Python."""
         integers, reals, _ = self.run(recording)
         m = len(self._sets[0].outputs)
         if len(integers) != recording.ticks:
@@ -369,10 +369,10 @@ def version(compiler: Sequence[str]) -> str:
 def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, int]:
     """Measure the memory of the exported code, in bytes.
 
-    The result has the bytes of machine code with its constants, of global variables, and of the
-    stack, under the names of FIGURES. The bytes of the stack are the sum of the frames of all
-    functions. No function calls itself, so no chain of calls needs more than this sum. An unknown
-    number is left out.
+    Under the names in FIGURES, the result has three numbers of bytes: of machine code with its
+    constants, of global variables, and of the stack. The bytes of the stack are the sum of the
+    frames of all functions. No function calls itself, so no chain of calls needs more than this
+    sum. An unknown number is left out.
     """
     for name in (*CODE, PARAMETERS):
         shutil.copyfile(code / name, folder / name)

@@ -162,7 +162,7 @@ def follow(
 
 
 class _Phase(Enum):
-    """How far a flight in real time has come."""
+    """Phase of a flight in real time, from its start until the aircraft takes u."""
 
     OPEN = auto()  # the flight need not begin: there may never be a u
     WAITING = auto()  # the controller has not published
@@ -179,8 +179,8 @@ class _Span:
     """Tells when a flight in real time has begun, and when it is over.
 
     A flight has begun when the aircraft takes u. It is over when the log holds y, y_m and u up to
-    its end. With an autopilot, or with a controller that a user activates, there may never be a u.
-    In these cases `begins` is False, and the phase is OPEN to the end.
+    the end of the flight. With an autopilot, or with a controller that a user activates, there may
+    never be a u. In these cases `begins` is False, and the phase is OPEN to the end.
     """
 
     def __init__(
@@ -432,8 +432,8 @@ def _is_its_file(scenario: Scenario) -> bool:
 def as_file(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
     """Return the scenario with a parameter file that the nodes in the namespace can read.
 
-    If the scenario equals its own file, the result is that of `as_flown`. If it does not, it is
-    written to a new file in the folder of the run. Raises ParameterError.
+    If the scenario equals its own file, `as_flown` gives the result. If it does not, the scenario
+    is written to a new file in the folder of the run. Raises ParameterError.
     """
     if _is_its_file(scenario):
         return as_flown(scenario, run, namespace)

@@ -288,7 +288,7 @@ def _recording(scenario: Scenario, run: Path, autopilot: Autopilot | None) -> Pa
 
 
 def _lockstep_rates(scenario: Scenario) -> dict[NodeSpec, ParameterOverrides]:
-    """Return, for each node, the rates of the inputs for which it waits in lockstep.
+    """Return, for each node of a lockstep flight, the rates of the inputs for which it waits.
 
     The aircraft also gets the duration of the flight.
     """

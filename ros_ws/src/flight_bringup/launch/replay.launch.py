@@ -148,7 +148,7 @@ def _play(context: LaunchContext) -> list[Action]:
 
 
 def _player(flight: Flight, topics: str) -> ExecuteProcess:
-    """Return the process `rise-di play` with the launch's arguments. Its end ends the launch."""
+    """Return the process `rise-di play` with the launch's arguments. The launch ends with it."""
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action] | None:
         if event.returncode != 0:

@@ -2,5 +2,5 @@
 # SPDX-License-Identifier: Apache-2.0
 """Code that the launch files share.
 
-It needs `launch` and `launch_ros`, which only a full ROS 2 has.
+The code needs the packages `launch` and `launch_ros`, which only a full ROS 2 has.
 """
