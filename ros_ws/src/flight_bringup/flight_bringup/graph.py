@@ -19,7 +19,7 @@ from rise_di_controller.learning.proposals import AUTHORITY_TICKS
 
 
 class NodeSpec(NamedTuple):
-    """A node of a flight, or all nodes in one process, by package and executable."""
+    """Package and executable of a node of a flight, or of a process with all nodes."""
 
     package: str
     executable: str  # also the name of the node, and of its section in a scenario

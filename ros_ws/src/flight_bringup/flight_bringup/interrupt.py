@@ -59,7 +59,7 @@ class DeferredInterrupt:
         self._pending: tuple[int, FrameType | None] | None = None
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Interrupt, or remember the signal while interrupts are deferred."""
+        """Interrupt at once, or remember the signal while interrupts are deferred."""
         if self._is_deferred:
             self._pending = number, frame
         else:

@@ -212,7 +212,7 @@ class ProposalStation:
         topics.advertise("authority", authority_names(controller.parameters.outputs))
 
     def step(self, t_ns: int) -> None:
-        """Let a proposal take effect if it is due. Publish `authority` if this is due."""
+        """Let a proposal take effect if it is due, and publish `authority` if this topic is due."""
         self._learning.step(self._controller, t_ns)
         if t_ns % (AUTHORITY_TICKS * self.period_ns) == 0:
             self._topics.publish(

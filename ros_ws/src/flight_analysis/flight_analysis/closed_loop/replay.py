@@ -81,7 +81,10 @@ class ReplayResult(NamedTuple):
 
     @property
     def compared(self) -> NDArray[np.bool_]:
-        """Mask of the ticks that are compared with y, state and published u, shape (N,)."""
+        """Mask of the ticks that are compared with the log, shape (N,).
+
+        The state before such a tick is known, and the log has its y and u.
+        """
         return self.checked if self.published is None else self.checked & self.published
 
     def different(self) -> NDArray[np.bool_]:

@@ -75,9 +75,9 @@ class ParametersInForce:
     ) -> ControllerState | None:
         """Apply the next changes until the parameters have the digest that the log has for a tick.
 
-        `digest` is this digest, and `number` is the number of the tick. Returns the state, adapted
-        to the new parameters. If the parameters reach this digest after none of the changes, no
-        change is applied, and the state is returned as it is.
+        `digest` is the digest in the log, and `number` is the number of the tick. Returns the
+        state, adapted to the new parameters. If none of the changes leads to the digest in the log,
+        no change is applied, and the state is returned as it is.
         """
         if digest == self.digest or digest in self._unmatched:
             return state

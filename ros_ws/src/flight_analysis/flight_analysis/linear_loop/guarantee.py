@@ -440,7 +440,7 @@ def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:
 
 
 def _as_unstable(box: Box, d: FloatArray, frequency: float) -> Unstable:
-    """Describe the aircraft with deviations d, whose unstable mode has this frequency, rad/s."""
+    """Describe the aircraft with deviations d and an unstable mode at `frequency`, rad/s."""
     entries = {
         name: float(part) for name, part in zip(box.names, d * box.part, strict=True) if part
     }

@@ -51,7 +51,7 @@ class Ticks(NamedTuple):
 
 
 class Attack(NamedTuple):
-    """A periodic sequence of delays, and the growth of its fastest mode."""
+    """A periodic sequence of delays, and the growth of the loop's fastest mode under it."""
 
     growth: float  # factor over the whole sequence
     frequency: float  # rad a tick

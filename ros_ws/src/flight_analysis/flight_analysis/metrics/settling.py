@@ -65,7 +65,7 @@ def settling_time(
 
 
 class Settling(NamedTuple):
-    """How long each channel that a transient excites takes to settle."""
+    """Settling times after one transient, for each channel that the transient excites."""
 
     transient: Transient
     until: dict[str, float]  # start of the next transient of the channel, or end of the flight, s

@@ -81,7 +81,7 @@ class LegResult(StrEnum):
 
 
 class FlownLeg(NamedTuple):
-    """When and with which result a leg of a route was flown."""
+    """A leg of a route that guidance flew: the times of the leg and its result."""
 
     leg: int  # number of the leg, from 0 as in `target`
     start: float  # when the aircraft begins to fly to the leg, s

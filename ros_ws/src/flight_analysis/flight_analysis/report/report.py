@@ -27,7 +27,7 @@ COMPARISON = "comparison.html"
 
 
 class File(NamedTuple):
-    """A file beside the page: its name in errors, its path, and the function that writes it."""
+    """A file beside the page: its name in error messages, its path, and its writing function."""
 
     key: str
     path: Path

@@ -96,7 +96,7 @@ class Span(NamedTuple):
 
 
 class Leeway(NamedTuple):
-    """How late the first sample of a topic may come, and how early its last one, s."""
+    """Times at the beginning and at the end of a span in which a topic need not have samples."""
 
     begin: float = 0.0  # time from the beginning of the span to the first sample
     # time from the last sample to the end of the span; None if it may be any time
@@ -403,7 +403,7 @@ def _ticks(tape: Tape, scenario: Scenario, span: Span) -> tuple[int, float]:
 def _instants_with_y(tape: Tape, internals: Signal, step_ns: int) -> int:
     """Return the number of ticks that have a new y or are in a failsafe.
 
-    The controller publishes u only in these ticks. They are counted if an aircraft outside this
+    The controller publishes u only in these ticks. The number is needed if an aircraft outside this
     package has another rate of y, or if a sensor is declared to drop samples. A y that only the log
     lost is included, because the controller received it.
     """

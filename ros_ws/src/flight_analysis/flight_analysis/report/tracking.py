@@ -281,7 +281,7 @@ def _sums(values: FloatArray, count: int) -> FloatArray:
 
 
 def _shortfall(excess: Excess, pair: ErrorPair, i: int, unit: DisplayUnit) -> Shortfall:
-    """Return a shortfall for an error that is too large. If it oscillates, its cycle is stated."""
+    """Return a shortfall for an error that is too large. It states the cycle of an oscillation."""
     rms, allowed = unlike_numbers(excess.rms * unit.factor, excess.allowed * unit.factor)
     brief = f"{excess.output} off by {rms} {unit.unit} rms, {allowed} allowed"
     sentence = f"{brief}, from t = {excess.start:.1f} to {excess.stop:.1f} s"

@@ -123,7 +123,7 @@ def runs_argument() -> DeclareLaunchArgument:
 
 
 def recorder_argument(*further: str) -> DeclareLaunchArgument:
-    """Declare the launch argument `recorder`. `further` has values that it may also have."""
+    """Declare the launch argument `recorder`. `further` has additional values that it permits."""
     description = (
         "true: the stack's recorder; rosbag2: `ros2 bag record` into the folder rosbag2 of the run"
     )

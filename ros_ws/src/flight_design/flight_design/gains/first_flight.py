@@ -111,7 +111,7 @@ def first_flight(
 
 
 def _channels(airframe: Airframe, lag: Sequence[float]) -> dict[str, Channel]:
-    """Return the properties of each channel from which its commands follow, by output."""
+    """Return, by output, the properties of each channel that determine its commands."""
     outputs = list(airframe.outputs)
     if len(airframe.inputs) > len(outputs):
         _, law = _distributed(airframe, lag)
@@ -181,7 +181,7 @@ def _distributed(airframe: Airframe, lag: Sequence[float]) -> tuple[AllocationCo
 
 
 def default_lags(airframe: Airframe) -> tuple[float, ...]:
-    """Choose the lag of each input, s: that of a servo for an angle, else that of an engine."""
+    """Choose the lag of each input, s: a servo's lag for an angle, else an engine's lag."""
     return tuple(SURFACE_LAG if surface else ENGINE_LAG for surface in _surfaces(airframe))
 
 

@@ -72,7 +72,7 @@ def sensor_noise(output: str) -> float:
 
 
 class Channel(NamedTuple):
-    """The properties of an output from which its commands follow, in SI."""
+    """Properties of an output, in SI, that determine the commands for this output."""
 
     motion: str  # q, p, r, V or climb; any other output has no size of its own
     authority: float  # largest y_dot that the input causes before it reaches its nearer end stop
@@ -220,9 +220,9 @@ def scenario_to_design(scenario: FilePath | Scenario) -> Scenario:
 def scenario_to_check(scenario: FilePath | Scenario) -> Scenario:
     """Load a scenario to check its gains; a file with only the section controller is enough.
 
-    A controller that is alone gets the commands, gusts and rate limits of the scenario COMMANDED.
-    The aircraft in COMMANDED may differ from the aircraft that the controller is for. Raises
-    ParameterError.
+    If the file has only this section, the commands, gusts and rate limits come from the scenario
+    COMMANDED. The aircraft in COMMANDED may differ from the aircraft that the controller is for.
+    Raises ParameterError.
     """
     controller = controller_alone(scenario)
     if controller is None:

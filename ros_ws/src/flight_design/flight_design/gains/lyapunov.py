@@ -222,7 +222,7 @@ def integral(signal: FloatArray, t: FloatArray) -> FloatArray:
 
 
 class Example(NamedTuple):
-    """A flight for `fly_known_plant`."""
+    """An example flight: the plant and the other arguments of `fly_known_plant`."""
 
     plant: KnownPlant
     y_m: FloatArray  # (N, m) at the ticks

@@ -171,7 +171,9 @@ def with_aircraft_observer(
 
 
 def law_activity_unit(airframe: Airframe, controller: ControllerConfig) -> FloatArray:
-    """Return which mean abs(v_dot) of each input v costs as much as a unit of error, (m,).
+    """Return the unit of activity of each input v of the law, (m,).
+
+    The unit is the mean abs(v_dot) that costs as much as a unit of error.
 
         unit_i = min_j unit_j / abs(T_ji),  u = T v
 

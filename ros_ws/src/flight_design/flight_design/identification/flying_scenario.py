@@ -294,8 +294,8 @@ def _with_integrals(
 def _integral(channels: IdentifiedChannels, i: int, crossover: float, total_lag: float) -> float:
     """Return the integral gain of a channel, 1/s, for a loop with `crossover`, rad/s.
 
-    The wanted gain is multiplied by INTEGRALS, one after another, until the sensitivity is below
-    MAX_SENSITIVITY.
+    The wanted gain is multiplied by the factors in INTEGRALS, one after another, until the
+    sensitivity is below MAX_SENSITIVITY.
     """
     omega = np.geomspace(0.1, 1e3, 400) * crossover
 

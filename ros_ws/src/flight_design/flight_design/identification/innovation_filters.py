@@ -519,7 +519,7 @@ class Block(NamedTuple):
     winds: NDArray[np.int64]
 
     def named(self, airframe: Airframe) -> Names:
-        """Return the names that belong to the indices."""
+        """Return the names of the states, channels and winds in this block."""
         every: tuple[Iterable[str], ...] = (
             airframe.states,
             airframe.inputs,

@@ -63,7 +63,7 @@ class Estimate(NamedTuple):
 
     @property
     def is_certain(self) -> bool:
-        """Whether the value is at least MIN_CERTAINTY standard errors."""
+        """Whether the value is at least MIN_CERTAINTY times its standard error."""
         return self.value >= MIN_CERTAINTY * self.deviation
 
 

@@ -243,7 +243,7 @@ def with_flown_channels(
     flying: Collection[str],
     left: Mapping[tuple[str, ...], str | None],
 ) -> RiseDiConfig:
-    """Combine a design for the outputs `flying` with the first law of the flight for all others.
+    """Combine a design for the outputs `flying` with the initial law of the flight for all others.
 
     `left` has the parts of the aircraft that are left to this law, as in `by_law_of_start`. The law
     does not move their dead inputs. If any part is left and there is an observer, the margin in the

@@ -106,7 +106,7 @@ class Learner:
 
     The parts of the aircraft (outputs that couple with no other part) are learned one by one. A
     part without a learned model flies the design for the airframe file, which allows for errors, or
-    the first law of the flight.
+    the initial law of the flight.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class Learner:
         `airframe` is the rough model, the prior. The delay in `actuation` is the delay of the loop
         beyond sampling and lags. `design_of_rough` makes a design for the rough model that allows
         for its errors. This design flies from the start, and later in the parts without a learned
-        model. If `design_of_rough` is None, these parts fly by the first law of the flight.
+        model. If `design_of_rough` is None, these parts fly by the initial law of the flight.
 
         `rough` has the standard deviations of A and B in the rough model. It also has the noise of
         the disturbances, which a test for a change uses as well. With `quick`, an identification
@@ -191,10 +191,10 @@ class Learner:
 
         The first proposal needs no record. It is a design for the rough airframe that allows for
         errors. Parts whose models are refused later also fly by this design. If this proposal does
-        not fly, or if the law falls back, those parts fly by the first law of the flight.
+        not fly, or if the law falls back, those parts fly by the initial law of the flight.
 
         The last RECORD seconds are tested for a loss of effect. If an input has no effect any more,
-        its part flies by the first law without this input. After a loss of effect, older samples
+        its part flies by the initial law without this input. After a loss of effect, older samples
         are left out, and the flown model becomes the prior. If nothing is due, nothing is proposed.
         The result then has a sentence only if a single test has found that an input may have no
         effect.
@@ -377,7 +377,7 @@ class Learner:
         self._proposals.add(self._proposed)
 
     def _distrust(self, *, lost: bool) -> None:
-        """Use the rough model no longer if its design was refused or the law fell back from it."""
+        """Stop using the rough model if its design was refused, or if the law fell back from it."""
         is_rough_alone = not self._known and not self._dead
         if lost and (is_rough_alone or self._record.has_fallen_back(-1, self._proposals)):
             self._design_of_rough = None
@@ -408,7 +408,7 @@ class Learner:
             self._proposed = flown
 
     def _give_up(self, outputs: Sequence[str]) -> None:
-        """Leave some outputs to the flight's first law from now on: extend `learn.without`."""
+        """Leave some outputs to the flight's initial law from now on: extend `learn.without`."""
         self._start = without_models(self._controller, self._controller, outputs)
         if outputs:
             part = outputs_without(self._start)
@@ -532,7 +532,7 @@ class Learner:
         return found
 
     def _by_law(self, dead: Mapping[PartName, str | None]) -> set[str]:
-        """Return the outputs that fly by the flight's first law, given the dead inputs."""
+        """Return the outputs that fly by the flight's initial law, given the dead inputs."""
         return by_law_of_start(self._controller, dead, has_file=self._design_of_rough is not None)
 
     def _designed(
@@ -540,7 +540,7 @@ class Learner:
     ) -> tuple[RiseDiConfig, str | None]:
         """Design the controller for a model, and say what `learn.margin` costs in error.
 
-        Parts without a learned model fly by the first law of the flight, or by the rough model as
+        Parts without a learned model fly by the initial law of the flight, or by the rough model as
         long as it is in use. Raises ParameterError.
         """
         start = self._controller

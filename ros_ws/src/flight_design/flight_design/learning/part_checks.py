@@ -190,7 +190,7 @@ def effect_sentence(part: Part) -> str:
 def without_effect(
     left: Mapping[tuple[str, ...], str | None], by_law: Collection[str]
 ) -> list[str]:
-    """Say which parts fly without an input, and which outputs fly by the flight's first law.
+    """Say which parts fly without an input, and which outputs fly by the flight's initial law.
 
     `left` is as in `designs.by_law_of_start`, and `by_law` has the outputs that fly by this law.
     """
