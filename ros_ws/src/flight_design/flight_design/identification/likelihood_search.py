@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_core.vectors import FloatArray
+from flight_design.identification.block_changes import between, blocks_of, few_blocks, left_out
 from flight_design.identification.likelihood import Fit, Innovations, Likelihood
 
 DIFFERENCE = 1e-4  # step of a parameter in the finite differences of the derivatives
@@ -278,9 +279,8 @@ class Search(Likelihood):
         "System Identification", 7.4 and 10.2.
         """
         slopes = self._slopes(theta, levels, used, free)
-        hessian = slopes.J @ slopes.J.T + np.diag(self.prior**-2)
-        slope = slopes.J @ slopes.e.ravel() + (theta - self.centre) / self.prior**2
-        slope += slopes.half_log_det
+        hessian = self._hessian(slopes)
+        slope = self._slope(slopes, theta)
         trials = np.clip(
             theta + damped_steps(theta, slope, hessian, self._lower, self._upper, free),
             self._lower,
@@ -333,17 +333,14 @@ class Search(Likelihood):
 
         H is the Hessian. J has the derivatives by theta of the innovations e, divided by their rms.
         If the model were right, M would be J J'. Here two matrices take its place, and each
-        parameter gets the larger of its two standard deviations. The first matrix sums the outer
-        products of J e over blocks of the log. With `leaves_out`, the J e of block k is (I - J_k
-        J_k' H^-1)^-1 J_k e_k. H^-1 times this is the change of theta if the block is left out. This
-        matters if a few blocks with gusts decide theta: the fit then follows the errors in these
-        blocks, so that their e is too small to show the errors. The second matrix is J J' times the
-        whiteness of each output, as in Birge's ratio.
+        parameter gets the largest of its standard deviations. The first matrix sums the outer
+        products of J e over blocks of the log. The second matrix is J J' times the whiteness of
+        each output, as in Birge's ratio. With `leaves_out`, `left_out` and `few_blocks` take the
+        place of the sum over blocks.
 
         s is the change of theta with the delay of u, and j is the derivative of e by this delay.
-        Sources: H. White, Econometrica 50(1), 1982; J. G. MacKinnon, H. White, J. Econometrics
-        29(3), 1985, for a block left out; R. T. Birge, Phys. Rev. 40(2), 1932; S. F. Schmidt,
-        Advances in Control Systems 3, 1966, for a delay that is not estimated.
+        Sources: H. White, Econometrica 50(1), 1982; R. T. Birge, Phys. Rev. 40(2), 1932; S. F.
+        Schmidt, Advances in Control Systems 3, 1966, for a delay that is not estimated.
 
         Returns the fit, and the part of each entry's standard deviation that the delay causes,
         (entries,).
@@ -351,16 +348,19 @@ class Search(Likelihood):
         theta, used = fit.theta, self.fitted()
         slopes = self._slopes(theta, fit.levels, used, np.ones(len(theta), dtype=bool))
         before = np.diag(self.prior**-2)
-        inverse: FloatArray = np.asarray(np.linalg.inv(slopes.J @ slopes.J.T + before), float)
+        inverse: FloatArray = np.asarray(np.linalg.inv(self._hessian(slopes)), float)
         by_output = slopes.J.reshape(len(theta), *slopes.e.shape)
         coloured = (by_output * np.sqrt(np.maximum(doubt.whiteness, 1.0))).reshape(slopes.J.shape)
         places = np.flatnonzero(used) // round(BLOCK / self._period)
-        of_blocks = self._block_scores(by_output, slopes.e, places)
+        blocks = blocks_of(by_output, slopes.e, places)
+        by_prior = np.diag(inverse @ before @ inverse)
+        variances = [np.diag(inverse @ coloured @ coloured.T @ inverse) + by_prior]
         if doubt.leaves_out:
-            of_blocks = self._scores_left_out(by_output, of_blocks, places, inverse)
-        sums = of_blocks - of_blocks.mean(axis=0)
-        middles = (coloured @ coloured.T, sums.T @ sums * len(sums) / max(len(sums) - 1, 1))
-        spread = [np.diag(inverse @ (middle + before) @ inverse) for middle in middles]
+            by_noise = np.diag(inverse) - by_prior
+            variances.append(left_out(blocks, inverse) + by_prior)
+            variances.append(few_blocks(blocks, inverse, by_noise) + by_prior)
+        else:
+            variances.append(between(blocks.scores @ inverse) + by_prior)
         models = self.models(theta[None], fit.levels)
         later = models._replace(u=self._delayed(self._delay + LATER / self._period))
         (e,), (e_later,) = (
@@ -369,33 +369,17 @@ class Search(Likelihood):
         )
         j = (e_later - e) / np.sqrt(np.mean(e**2, axis=0)) / LATER
         late = np.abs(doubt.timing * inverse @ (slopes.J @ j.ravel()))
-        return fit._replace(deviation=np.sqrt(np.maximum(*spread) + late**2)), late[: self.count]
+        square = np.maximum.reduce(variances) + late**2
+        return fit._replace(deviation=np.sqrt(square)), late[: self.count]
 
-    @staticmethod
-    def _block_scores(
-        by_output: FloatArray, e: FloatArray, places: NDArray[np.int64]
-    ) -> FloatArray:
-        """Return J_k e_k of each block k, (blocks, p). `places` has the block of each sample."""
-        return np.array(
-            [
-                by_output[:, places == k].reshape(len(by_output), -1) @ e[places == k].ravel()
-                for k in np.unique(places)
-            ]
-        )
+    def _hessian(self, slopes: Slopes) -> FloatArray:
+        """Return the Hessian of Gauss-Newton, J J' + prior^-2, (p, p)."""
+        return np.asarray(slopes.J @ slopes.J.T + np.diag(self.prior**-2))
 
-    @staticmethod
-    def _scores_left_out(
-        by_output: FloatArray, scores: FloatArray, places: NDArray[np.int64], inverse: FloatArray
-    ) -> FloatArray:
-        """Return (I - J_k J_k' H^-1)^-1 J_k e_k of each block k, (blocks, p).
-
-        `scores` has J_k e_k, and `inverse` is H^-1.
-        """
-        left_out = np.empty_like(scores)
-        for row, k in enumerate(np.unique(places)):
-            J = by_output[:, places == k].reshape(len(inverse), -1)
-            left_out[row] = np.linalg.solve(np.eye(len(inverse)) - J @ J.T @ inverse, scores[row])
-        return left_out
+    def _slope(self, slopes: Slopes, theta: FloatArray) -> FloatArray:
+        """Return the derivative of the cost by theta, (p,)."""
+        by_prior = (theta - self.centre) / self.prior**2
+        return np.asarray(slopes.J @ slopes.e.ravel() + by_prior + slopes.half_log_det)
 
     def flying(self, flown: FloatArray, parts: Iterable[tuple[Likelihood, Fit]]) -> Innovations:
         """Return the innovations of the model that flies, whose theta is `flown`, (p,).
