@@ -2,9 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Deviations from the blocks of a log, beside sums by hand and regressions whose truth is known."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from numpy.typing import NDArray
 from pytest import approx
 
 from flight_core.vectors import FloatArray
@@ -15,6 +19,8 @@ from flight_design.identification.block_changes import (
     few_blocks,
     left_out,
 )
+from flight_design.identification.innovation_filters import LEVELS
+from flight_design.identification.likelihood_search import Search, Slopes
 
 PLACES = np.repeat(np.arange(4), 10)  # blocks of 40 samples
 
@@ -88,3 +94,45 @@ def test_few_blocks_cover_a_true_value_as_often_as_deviations_should(
     by_sum, by_t = np.mean(beyond, axis=(0, 2))
     assert by_t == approx(share, abs=0.02)
     assert by_sum > 0.25
+
+
+class Line(Search):
+    """A search whose innovations are linear in theta. They differ with the level of the wind."""
+
+    def __init__(self, J: FloatArray, e: FloatArray) -> None:
+        self.prior = np.array([0.3, 0.3])
+        self.centre = np.zeros(2)
+        self.asked: list[NDArray[np.int64]] = []
+        self._line = J, e
+
+    def _slopes(
+        self, theta: FloatArray, levels: NDArray[np.int64], *masks: Any, **others: Any
+    ) -> Slopes:
+        self.asked.append(levels)
+        J, e = self._line
+        return Slopes(0.0, (e + theta @ J)[:, None], J, np.zeros(2))
+
+
+def test_change_with_gusts_in_every_span_is_that_of_a_fit_with_them() -> None:
+    """The level of the gusts is that of most spans with gusts: 12, not the calm 0."""
+    J, e, _ = regression(3, colour=0.5)
+    e += 0.3 * J[1]
+    theta = np.array([0.1, -0.2])
+    line = Line(J, e)
+    levels = np.array([0, 0, 0, 0, 12, 12, 13])
+    assert (LEVELS[[12, 13], 1] > 0.0).all()
+    fit: Any = SimpleNamespace(theta=theta, levels=levels)
+    variance, change = line._in_lasting_gusts(fit, np.ones(40, dtype=bool))
+    hessian = J @ J.T + np.eye(2) / 0.09
+    assert_allclose(theta + change, -np.linalg.solve(hessian, J @ e))
+    assert_allclose(variance, np.diag(inverted(hessian)))
+    assert [asked.tolist() for asked in line.asked] == [[12] * 7]
+
+
+def test_air_without_gusts_changes_nothing() -> None:
+    fit: Any = SimpleNamespace(theta=np.ones(2), levels=np.array([0, 3, 4]))
+    line = Line(np.ones((2, 40)), np.zeros(40))
+    variance, change = line._in_lasting_gusts(fit, np.ones(40, dtype=bool))
+    assert not variance.any()
+    assert not change.any()
+    assert not line.asked

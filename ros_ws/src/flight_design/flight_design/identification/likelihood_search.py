@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from flight_core.vectors import FloatArray
 from flight_design.identification.block_changes import between, blocks_of, few_blocks, left_out
+from flight_design.identification.innovation_filters import LEVELS
 from flight_design.identification.likelihood import Fit, Innovations, Likelihood
 
 DIFFERENCE = 1e-4  # step of a parameter in the finite differences of the derivatives
@@ -336,7 +337,7 @@ class Search(Likelihood):
         parameter gets the largest of its standard deviations. The first matrix sums the outer
         products of J e over blocks of the log. The second matrix is J J' times the whiteness of
         each output, as in Birge's ratio. With `leaves_out`, `left_out` and `few_blocks` take the
-        place of the sum over blocks.
+        place of the sum over blocks, and the gusts of the fit count as in `_in_lasting_gusts`.
 
         s is the change of theta with the delay of u, and j is the derivative of e by this delay.
         Sources: H. White, Econometrica 50(1), 1982; R. T. Birge, Phys. Rev. 40(2), 1932; S. F.
@@ -359,7 +360,10 @@ class Search(Likelihood):
             by_noise = np.diag(inverse) - by_prior
             variances.append(left_out(blocks, inverse) + by_prior)
             variances.append(few_blocks(blocks, inverse, by_noise) + by_prior)
+            variance, change = self._in_lasting_gusts(fit, used)
+            variances.append(variance)
         else:
+            change = np.zeros(len(theta))
             variances.append(between(blocks.scores @ inverse) + by_prior)
         models = self.models(theta[None], fit.levels)
         later = models._replace(u=self._delayed(self._delay + LATER / self._period))
@@ -369,8 +373,27 @@ class Search(Likelihood):
         )
         j = (e_later - e) / np.sqrt(np.mean(e**2, axis=0)) / LATER
         late = np.abs(doubt.timing * inverse @ (slopes.J @ j.ravel()))
-        square = np.maximum.reduce(variances) + late**2
+        square = np.maximum.reduce(variances) + change**2 + late**2
         return fit._replace(deviation=np.sqrt(square)), late[: self.count]
+
+    def _in_lasting_gusts(self, fit: Fit, used: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+        """Return the variance of theta with gusts in every span, and how theta changes, (p,) each.
+
+        A span counts as a gust if the model of theta cannot explain it by calmer air. So the levels
+        of the wind favour the theta that they were found with, and the effects of inputs that
+        answer the gusts come out too weak. Here every span has the most frequent level of the
+        gusts, which needs no choice of spans. The change is a step of Gauss-Newton. Both are 0 if
+        the fit has no gusts. Source: J. A. Hausman, Econometrica 46(6), 1978, for a model that is
+        tested by the change of its estimate under a weaker assumption.
+        """
+        theta = fit.theta
+        gusts = fit.levels[LEVELS[fit.levels, 1] > 0.0]
+        if not len(gusts):
+            return np.zeros(len(theta)), np.zeros(len(theta))
+        lasting = np.full_like(fit.levels, np.bincount(gusts).argmax())
+        slopes = self._slopes(theta, lasting, used, np.ones(len(theta), dtype=bool))
+        inverse = np.linalg.inv(self._hessian(slopes))
+        return np.diag(inverse), np.asarray(-inverse @ self._slope(slopes, theta))
 
     def _hessian(self, slopes: Slopes) -> FloatArray:
         """Return the Hessian of Gauss-Newton, J J' + prior^-2, (p, p)."""
