@@ -28,7 +28,8 @@ def end_of(code: str) -> tuple[int, str, str]:
 def test_process_ends_with_the_status_and_its_output_while_a_call_holds_the_interpreter(
     status: int,
 ) -> None:
-    code = f"print('last line')\nDeadline(0.3, {status})\n{HOLDS_THE_INTERPRETER}\n"
+    # 2 s: what holds the interpreter is told at nine tenths of it, and a busy host may be late
+    code = f"print('last line')\nDeadline(2.0, {status})\n{HOLDS_THE_INTERPRETER}\n"
     found, output, stacks = end_of(code)
     assert (found, output) == (status, "last line\n")
     assert "Timeout" in stacks, "what held it is told"
