@@ -13,7 +13,7 @@ from tests.joint_states import JOINT_STATE, STORE, vector
 
 from flight_core.outcome import Refusal
 from flight_core.publisher_lock import LockstepLock, PublisherLock
-from flight_core.vectors import ChannelError, StampedVector
+from flight_core.vectors import ChannelError, SampleFault, StampedVector
 from flight_ros import messages
 from flight_ros.messages import MAX_SIZE, Decoder, Encoder, NamedDecoder, require_size
 from flight_ros.receiver import Receiver, Refusals
@@ -90,7 +90,7 @@ class Setup:
     def take(self, sample: StampedVector, now_ns: int) -> None:
         """Take a sample with q of at most 1."""
         if sample.value[0] > 1.0:
-            raise ChannelError("bounds", "beyond")
+            raise ChannelError(SampleFault.BOUNDS, "beyond")
         self.taken.append(sample)
 
     def poll(self, *messages: bytes, now_ns: int = 0, limit: int | None = None) -> list[bool]:

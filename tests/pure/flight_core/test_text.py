@@ -12,7 +12,7 @@ from flight_core.files import display_path
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import Config, ParameterError
 from flight_core.text import MAX_LENGTH
-from flight_core.vectors import ChannelError
+from flight_core.vectors import ChannelError, SampleFault
 from flight_log.bag import BagWriter
 from flight_log.tape_reader import read_run
 
@@ -24,7 +24,7 @@ ESCAPES = "\x1b[2J\x1b]0;PWNED\x07\nall is well"
     [
         ParameterError(ESCAPES + 9000 * "x"),
         FlightEnded(ESCAPES + 9000 * "x"),
-        ChannelError("name", ESCAPES + 9000 * "x"),
+        ChannelError(SampleFault.NAME, ESCAPES + 9000 * "x"),
     ],
 )
 def test_exceptions_are_printable_and_bounded(error: Exception) -> None:

@@ -6,9 +6,9 @@ An autopilot is identified by the address of its packets, and by the time since 
 messages.
 """
 
-from flight_core.publisher_lock import SENDER, PublisherLock
+from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS
-from flight_core.vectors import ChannelError
+from flight_core.vectors import ChannelError, SampleFault
 
 # autopilots that were switched on within this time cannot be distinguished
 CLOCK_TOLERANCE_NS = NANOSECONDS
@@ -61,7 +61,7 @@ class AutopilotLock:
                 f"a second sender, {address}, sends as the autopilot: {self.address} was "
                 "first and is taken alone"
             )
-            raise ChannelError(SENDER, sentence) from None
+            raise ChannelError(SampleFault.SENDER, sentence) from None
         if since_boot_ns is None or address != self.address:
             return
         try:
@@ -71,7 +71,7 @@ class AutopilotLock:
                 f"the time since boot from {address} jumps: a second autopilot sends "
                 "there, or it has started again"
             )
-            raise ChannelError(SENDER, sentence) from None
+            raise ChannelError(SampleFault.SENDER, sentence) from None
 
     def refresh(self, address: str, since_boot_ns: int | None, now_ns: int) -> bool:
         """Note a message that `check` has admitted, and lock to its sender.

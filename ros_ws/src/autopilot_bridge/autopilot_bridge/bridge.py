@@ -21,7 +21,7 @@ from flight_core.channels import reason_against_inputs
 from flight_core.outcome import Refusal, joined
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
-from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer
+from flight_core.vectors import ChannelError, FloatArray, SampleFault, StampedVector, require_newer
 
 UNBOUNDED = Refusal(
     "the loss of the transmitter cannot be seen over this link: set max_engaged in the "
@@ -120,7 +120,7 @@ class Bridge:
                 hint = "; set stamp: arrival in the map if the autopilot has another clock"
             side = "before" if stamp_ns < now_ns else "after"
             raise ChannelError(
-                "stamp",
+                SampleFault.STAMP,
                 f"{name} is stamped {seconds(abs(now_ns - stamp_ns)):.3f} s {side} now{hint}",
             )
         last = self._readings.get(name)

@@ -20,7 +20,7 @@ from flight_core.environment import PROFILE_VARIABLE
 from flight_core.installation import missing
 from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError
-from flight_core.vectors import ChannelError
+from flight_core.vectors import ChannelError, SampleFault
 
 # The path of a field: names separated by dots. Each name may have an index in brackets.
 PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
@@ -63,7 +63,9 @@ def get_field(message: Any, path: str) -> Any:
             if place:
                 value = value[int(place)]
         except (AttributeError, IndexError, TypeError):
-            raise ChannelError("field", f"{type(message).__name__} has no {path}") from None
+            raise ChannelError(
+                SampleFault.FIELD, f"{type(message).__name__} has no {path}"
+            ) from None
     return value
 
 
@@ -76,7 +78,7 @@ def set_field(message: Any, path: str, value: Any) -> None:
     current = get_field(message, path)
     if isinstance(current, int | np.integer) and isinstance(value, float):
         if not math.isfinite(value):
-            raise ChannelError("range", f"{path} takes integers, not {value:g}")
+            raise ChannelError(SampleFault.RANGE, f"{path} takes integers, not {value:g}")
         value = round(value)
     # NumPy 1.26 would wrap a value beyond the range.
     if (
@@ -84,7 +86,7 @@ def set_field(message: Any, path: str, value: Any) -> None:
         and not np.iinfo(current).min <= value <= np.iinfo(current).max
     ):
         raise ChannelError(
-            "range", f"{path} cannot be {value!r}, which {current.dtype} does not hold"
+            SampleFault.RANGE, f"{path} cannot be {value!r}, which {current.dtype} does not hold"
         )
     parents, _, last = path.rpartition(".")
     parent, ((name, place),) = get_field(message, parents), STEP.findall(last)
@@ -94,7 +96,7 @@ def set_field(message: Any, path: str, value: Any) -> None:
         else:
             setattr(parent, name, value)
     except (AssertionError, OverflowError, TypeError, ValueError) as error:
-        raise ChannelError("range", f"{path} cannot be {value!r} ({error})") from None
+        raise ChannelError(SampleFault.RANGE, f"{path} cannot be {value!r} ({error})") from None
 
 
 def _norm(vector: Any) -> float:
@@ -200,10 +202,10 @@ def read_raw(message: Any, path: str, function: str, turned_by: str | None = Non
     except (AttributeError, TypeError, ValueError):
         what = f"function {function}" if turned_by is None else turned_by
         raise ChannelError(
-            "field", f"{what} cannot convert {path} of {type(message).__name__}"
+            SampleFault.FIELD, f"{what} cannot convert {path} of {type(message).__name__}"
         ) from None
     if not math.isfinite(raw):
-        raise ChannelError("finite", f"{path} = {raw} is not finite")
+        raise ChannelError(SampleFault.FINITE, f"{path} = {raw} is not finite")
     return raw
 
 

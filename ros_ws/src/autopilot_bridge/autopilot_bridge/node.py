@@ -49,7 +49,7 @@ from flight_core.parameters import require
 from flight_core.publisher_lock import require_sender
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.text import bounded
-from flight_core.vectors import ChannelError, StampedVector
+from flight_core.vectors import ChannelError, SampleFault, StampedVector
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder, Encoder
 from flight_ros.rclpy_private import DeserializationError
@@ -319,7 +319,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             try:
                 message = deserialize_message(raw, subscription.topic.type)
             except DeserializationError as error:
-                self.refusals.add(subscription, "malformed", " ".join(str(error).split()))
+                self.refusals.add(subscription, SampleFault.MALFORMED, " ".join(str(error).split()))
                 return
         for name, row in rows:
             try:

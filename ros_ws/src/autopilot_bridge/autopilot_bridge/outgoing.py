@@ -10,7 +10,7 @@ from autopilot_bridge.map_rows import MAVLINK, InputRow, MeasuredRow, MessageRow
 from autopilot_bridge.params import ChannelMap
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds
-from flight_core.vectors import ChannelError
+from flight_core.vectors import ChannelError, SampleFault
 
 
 class ServiceCaller:
@@ -26,7 +26,7 @@ class ServiceCaller:
         Raises ChannelError if the service is not there.
         """
         if not self._client.service_is_ready():
-            raise ChannelError("service", f"{self.topic_name}: no such service")
+            raise ChannelError(SampleFault.SERVICE, f"{self.topic_name}: no such service")
         self._client.call_async(request)
 
 

@@ -8,20 +8,19 @@ A message names its publisher in `frame_id`, for example "/controller#4711".
 from collections.abc import Callable
 
 from flight_core.rates import NANOSECONDS
-from flight_core.vectors import ChannelError
+from flight_core.vectors import ChannelError, SampleFault
 
 SHARED_NS = NANOSECONDS
 """If the numbers of a publisher go back, two publishers share its name, and no sample under this
 name is taken for this time. The time exceeds the age limits of y and u, so that the failsafe
 begins."""
 FOREVER_NS = 2**63  # longer than any flight
-SENDER = "sender"  # the reason of a ChannelError for a sample of a conflicting publisher
 
 
 def require_sender(sender: str, expected: str) -> None:
     """Raise ChannelError, reason "sender", for a sample of an unexpected publisher."""
     if sender != expected:
-        raise ChannelError(SENDER, f"{sender} ignored: expected {expected}")
+        raise ChannelError(SampleFault.SENDER, f"{sender} ignored: expected {expected}")
 
 
 class PublisherLock:
@@ -83,7 +82,7 @@ class PublisherLock:
             now_ns - self._overrun_ns, max_age_ns if is_restarted else takeover_ns
         ):
             raise ChannelError(
-                SENDER,
+                SampleFault.SENDER,
                 f"conflicting publisher {sender} ignored: already receiving from {self.publisher}",
             )
 
@@ -117,7 +116,7 @@ class PublisherLock:
                 is_shared = True
         if is_shared:
             raise ChannelError(
-                SENDER, f"two publishers send under the name {sender}: none is taken"
+                SampleFault.SENDER, f"two publishers send under the name {sender}: none is taken"
             )
 
 
@@ -141,7 +140,7 @@ class LockstepLock(PublisherLock):
             self._sequence = 0
         elif self._sequence and sequence not in {0, expected}:
             raise ChannelError(
-                SENDER,
+                SampleFault.SENDER,
                 f"message {sequence} under the name {sender or 'of the flight'} ignored: expected "
                 f"message {expected}, so a second publisher sends",
             )

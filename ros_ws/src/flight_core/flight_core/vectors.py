@@ -7,6 +7,7 @@ Channels are matched by name, never by position.
 
 import math
 from collections.abc import Sequence
+from enum import StrEnum
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -22,7 +23,6 @@ FloatArray = NDArray[np.float64]
 Array = Any
 """An array of NumPy or of JAX."""
 Scalar = Any  # a Python float, or an array with a value for each aircraft of a fleet
-FUTURE = "future"  # the reason of a ChannelError for a stamp ahead of the clock
 
 
 class _NumPy1:
@@ -116,14 +116,37 @@ class StampedVector(NamedTuple):
     sender: str = ""  # empty if the sample was not received
 
 
+class SampleFault(StrEnum):
+    """Why a sample or a message is refused. Counters of refusals group by it."""
+
+    BOUNDS = "bounds"  # a value outside its limits
+    FIELD = "field"  # the message has no such field, or it holds no number
+    FINITE = "finite"  # NaN or infinity
+    FROZEN = "frozen"  # no value has changed since the last sample
+    FUTURE = "future"  # a stamp ahead of the clock
+    IMPLAUSIBLE = "implausible"  # y changes faster than an aircraft can
+    LENGTH = "length"  # not as many names as values
+    MALFORMED = "malformed"  # bytes that cannot be decoded
+    MODE = "mode"  # a command that the flight mode does not take
+    NAME = "name"  # a channel is missing, unknown or there twice
+    OLD = "old"  # a stamp beyond the age limit
+    ORDER = "order"  # a stamp that is not newer than the last one
+    RANGE = "range"  # a number that the type of a field cannot hold
+    RATE = "rate"  # more messages than a tick takes
+    ROUTE = "route"  # a route that cannot be flown
+    SENDER = "sender"  # a conflicting publisher
+    SERVICE = "service"  # no such service
+    SIZE = "size"  # a message above the size limit
+    STAMP = "stamp"  # a stamp too far from the clock
+
+
 class ChannelError(ValueError):
     """An invalid sample.
 
-    `reason` is a short word by which counters group such samples. The message is a sentence,
-    printable and of limited length.
+    `reason` is its fault. The message is a sentence, printable and of limited length.
     """
 
-    def __init__(self, reason: str, sentence: str) -> None:
+    def __init__(self, reason: SampleFault, sentence: str) -> None:
         super().__init__(bounded(sentence))
         self.reason = reason
 
@@ -135,7 +158,8 @@ def require_newer(stamp_ns: int, last_ns: int, what: str = "sample") -> None:
     """
     if stamp_ns <= last_ns:
         raise ChannelError(
-            "order", f"{what}: stamp {seconds(last_ns - stamp_ns):g} s before the last one"
+            SampleFault.ORDER,
+            f"{what}: stamp {seconds(last_ns - stamp_ns):g} s before the last one",
         )
 
 
@@ -145,7 +169,9 @@ def require_not_future(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
     A stamp is too far ahead if it leads by more than the age limit.
     """
     if stamp_ns > now_ns + max_age_ns:
-        raise ChannelError(FUTURE, f"stamp {seconds(stamp_ns - now_ns):g} s ahead of the clock")
+        raise ChannelError(
+            SampleFault.FUTURE, f"stamp {seconds(stamp_ns - now_ns):g} s ahead of the clock"
+        )
 
 
 def require_not_old(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
@@ -156,7 +182,7 @@ def require_not_old(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
             if stamp_ns
             else "no stamp, expected the instant of the sample"
         )
-        raise ChannelError("old", age)
+        raise ChannelError(SampleFault.OLD, age)
 
 
 def select(
@@ -169,10 +195,12 @@ def select(
     the channels is NaN or infinite.
     """
     if len(names) != len(values):
-        raise ChannelError("length", f"{len(names)} names for {len(values)} values")
+        raise ChannelError(SampleFault.LENGTH, f"{len(names)} names for {len(values)} values")
     vector = np.asarray(values, dtype=np.float64)[_places(tuple(channels), tuple(names))]
     if not is_finite(vector):
-        raise ChannelError("finite", f"{', '.join(channels)} = {vector.tolist()} is not finite")
+        raise ChannelError(
+            SampleFault.FINITE, f"{', '.join(channels)} = {vector.tolist()} is not finite"
+        )
     return vector
 
 
@@ -198,6 +226,7 @@ def _places(channels: tuple[str, ...], names: tuple[str, ...]) -> NDArray[np.int
     for name in channels:
         if names.count(name) != 1:
             raise ChannelError(
-                "name", f"channel {name} expected once among {', '.join(names) or 'no names'}"
+                SampleFault.NAME,
+                f"channel {name} expected once among {', '.join(names) or 'no names'}",
             )
     return np.array([names.index(name) for name in channels], dtype=np.intp)

@@ -19,6 +19,7 @@ from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import (
     ChannelError,
     FloatArray,
+    SampleFault,
     StampedVector,
     is_finite,
     require_newer,
@@ -139,7 +140,8 @@ class Guidance:
         newest = self._newest(self._pose, sample, now_ns)
         if last is not None and np.array_equal(last.value, newest.value):
             raise ChannelError(
-                "frozen", "pose: found every value as before, expected an aircraft that moves"
+                SampleFault.FROZEN,
+                "pose: found every value as before, expected an aircraft that moves",
             )
         self._pose = newest
 
@@ -165,7 +167,7 @@ class Guidance:
             require_newer(sample.stamp_ns, last.stamp_ns)
         if not (largest := float(np.max(np.abs(sample.value)))) <= guidance_state.LARGEST:
             raise ChannelError(
-                "bounds",
+                SampleFault.BOUNDS,
                 f"found a value of {largest:g}, expected at most {guidance_state.LARGEST:g} in SI",
             )
         return sample

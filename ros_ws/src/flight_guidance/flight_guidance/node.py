@@ -28,7 +28,7 @@ from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError, require
 from flight_core.publisher_lock import LockstepLock, require_sender
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
-from flight_core.vectors import ChannelError, StampedVector, select
+from flight_core.vectors import ChannelError, SampleFault, StampedVector, select
 from flight_guidance.guidance import Guidance, GuidanceOutput
 from flight_guidance.guidance_state import GuidanceMode
 from flight_guidance.modes.modes import yaw_rate
@@ -332,7 +332,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             except ChannelError as error:
                 self.refusals.add(self._route_subscription, error.reason, str(error))
             except (ParameterError, DeserializationError) as error:
-                self.refusals.add(self._route_subscription, "route", " ".join(str(error).split()))
+                self.refusals.add(
+                    self._route_subscription, SampleFault.ROUTE, " ".join(str(error).split())
+                )
             else:
                 self.get_logger().info(f"route of {len(points)} waypoints")
                 self._guidance.take_route(route)
@@ -391,7 +393,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         require_sender(sample.sender, controller)
         if np.any(sample.value < 0.0):
             raise ChannelError(
-                "bounds",
+                SampleFault.BOUNDS,
                 "authority: found a value below 0, expected what an input can do either way",
             )
         self._waiting_authority.append(sample)
@@ -406,7 +408,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         try:
             mode = Mode(int(sample.value[0]))
         except ValueError as error:
-            raise ChannelError("mode", str(error)) from None
+            raise ChannelError(SampleFault.MODE, str(error)) from None
         if mode is not self._controller_mode:
             self._controller_mode = mode
             self._guidance.pause(paused=mode is not Mode.ENGAGED, forget=mode is Mode.INACTIVE)

@@ -21,7 +21,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
 from flight_core.rates import NANOSECONDS
-from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
+from flight_core.vectors import ChannelError, FloatArray, SampleFault, StampedVector, select
 from flight_ros.rclpy_private import DeserializationError
 
 # plain CDR, little-endian (DDS Interoperability Wire Protocol 2.2, 10.2)
@@ -133,7 +133,7 @@ class Decoder:
         # the sum of finite values may overflow
         if not math.isfinite(value.sum()) and not np.isfinite(value).all():
             raise ChannelError(
-                "finite", f"{', '.join(self._channels)} = {value.tolist()} is not finite"
+                SampleFault.FINITE, f"{', '.join(self._channels)} = {value.tolist()} is not finite"
             )
         return StampedVector(seconds * NANOSECONDS + nanoseconds, value, self._sender)
 
@@ -177,7 +177,9 @@ class NamedDecoder:
         sample = from_message(message, message.name)
         names = list(message.name)
         if len(set(names)) < len(names):
-            raise ChannelError("name", f"each channel expected once among {', '.join(names)}")
+            raise ChannelError(
+                SampleFault.NAME, f"each channel expected once among {', '.join(names)}"
+            )
         return NamedSample(
             sample.stamp_ns, dict(zip(names, sample.value.tolist(), strict=True)), sample.sender
         )
@@ -199,7 +201,7 @@ def stamp_of(raw: bytes) -> int:
     order = BYTE_ORDERS.get(raw[:2])
     if order is None or len(raw) < LENGTH_PLACE:
         raise ChannelError(
-            "malformed", f"a message of {len(raw)} bytes, expected a stamp in plain CDR"
+            SampleFault.MALFORMED, f"a message of {len(raw)} bytes, expected a stamp in plain CDR"
         )
     place = STAMP_PLACE + STAMP.size // 2
     seconds = int.from_bytes(raw[STAMP_PLACE:place], order, signed=True)
@@ -214,7 +216,9 @@ def instant(stamp_ns: int) -> bytes:
 def require_size(raw: bytes, limit: int = MAX_SIZE) -> None:
     """Raise ChannelError, reason "size", for a message of more than `limit` bytes."""
     if len(raw) > limit:
-        raise ChannelError("size", f"a message of {len(raw)} bytes, expected at most {limit}")
+        raise ChannelError(
+            SampleFault.SIZE, f"a message of {len(raw)} bytes, expected at most {limit}"
+        )
 
 
 def _message(raw: bytes) -> JointState:
@@ -222,4 +226,4 @@ def _message(raw: bytes) -> JointState:
     try:
         return deserialize_message(raw, JointState)
     except DeserializationError as error:
-        raise ChannelError("malformed", " ".join(str(error).split())) from None
+        raise ChannelError(SampleFault.MALFORMED, " ".join(str(error).split())) from None

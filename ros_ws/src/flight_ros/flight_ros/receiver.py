@@ -14,9 +14,9 @@ import numpy as np
 from rclpy.node import Node
 
 from flight_core.outcome import Refusal
-from flight_core.publisher_lock import SENDER, LockstepLock, PublisherLock
+from flight_core.publisher_lock import LockstepLock, PublisherLock
 from flight_core.rates import NANOSECONDS
-from flight_core.vectors import ChannelError, require_not_future, require_not_old
+from flight_core.vectors import ChannelError, SampleFault, require_not_future, require_not_old
 from flight_ros.messages import MAX_SIZE, require_size, sender_of, stamp_of
 from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
 from flight_ros.throttle import Throttle
@@ -73,7 +73,7 @@ class Refusals:
         self._throttle = Throttle(LOG_PERIOD_NS)
         self._conflict: Refusal | None = None
 
-    def add(self, subscription: Source, reason: str, sentence: str) -> None:
+    def add(self, subscription: Source, reason: SampleFault, sentence: str) -> None:
         """Count a refused sample, and log at most one in 2 s for each topic and reason.
 
         A conflicting publisher is an ERROR in the log and in the diagnostics.
@@ -81,11 +81,11 @@ class Refusals:
         key = f"{subscription.topic.name}: {reason}"
         self.counts[key] += 1
         self.last[subscription.name] = time.monotonic_ns(), sentence
-        if reason == SENDER:
+        if reason is SampleFault.SENDER:
             self._conflict = Refusal(f"{subscription.name}: {sentence}")
         if not self._throttle.is_due(key):
             return
-        if reason == SENDER:
+        if reason is SampleFault.SENDER:
             self._node.get_logger().error(f"{subscription.name}: sample refused: {sentence}")
         else:
             self._node.get_logger().warning(f"{subscription.name}: sample refused: {sentence}")
@@ -235,7 +235,7 @@ class Receiver(Generic[S]):
         if self.lock is None:
             return ""
         if (sender := sender_of(raw)) is None:
-            raise ChannelError("malformed", "a message without a header in plain CDR")
+            raise ChannelError(SampleFault.MALFORMED, "a message without a header in plain CDR")
         self.lock.check(sender, now_ns)
         if (
             not self._grows

@@ -14,7 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.serialization import deserialize_message, serialize_message
 
 from flight_core.rates import NANOSECONDS
-from flight_core.vectors import ChannelError
+from flight_core.vectors import ChannelError, SampleFault
 from flight_ros.messages import require_size
 from flight_ros.rclpy_private import DeserializationError
 
@@ -59,7 +59,7 @@ def decode(raw: bytes) -> Report:
         ValueError,
         RecursionError,
     ) as error:  # ValueError: json refuses the text, or the message has not exactly one status
-        raise ChannelError("malformed", " ".join(str(error).split())) from None
+        raise ChannelError(SampleFault.MALFORMED, " ".join(str(error).split())) from None
     stamp = message.header.stamp
     sender = message.header.frame_id
     is_warning = status.level != DiagnosticStatus.OK

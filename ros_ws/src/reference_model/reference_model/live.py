@@ -14,7 +14,7 @@ import numpy as np
 from flight_core.failsafe import failsafe_scale
 from flight_core.kinematics import body_rates, euler_rates, tilt, turn_rate
 from flight_core.rates import seconds
-from flight_core.vectors import ChannelError, FloatArray
+from flight_core.vectors import ChannelError, FloatArray, SampleFault
 
 
 class LiveParams(NamedTuple):
@@ -47,7 +47,7 @@ def take(t_ns: int, u_m: FloatArray, attitude: FloatArray | None, params: LivePa
     """
     if (np.abs(u_m) > params.bounds).any():
         raise ChannelError(
-            "bounds", f"{u_m.tolist()} is beyond the bounds {params.bounds.tolist()}"
+            SampleFault.BOUNDS, f"{u_m.tolist()} is beyond the bounds {params.bounds.tolist()}"
         )
     return Live(t_ns, u_m, None if attitude is None else (float(attitude[0]), float(attitude[1])))
 

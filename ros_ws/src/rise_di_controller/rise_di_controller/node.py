@@ -16,7 +16,7 @@ from flight_core.modes import Mode
 from flight_core.outcome import Refusal
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.text import bounded
-from flight_core.vectors import ChannelError, StampedVector
+from flight_core.vectors import ChannelError, SampleFault, StampedVector
 from flight_ros import reports
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
@@ -199,7 +199,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
 
         def taking(sample: StampedVector, now_ns: int) -> None:
             if (refusal := take(sample, now_ns)) is not None:
-                raise ChannelError("implausible", str(refusal))
+                raise ChannelError(SampleFault.IMPLAUSIBLE, str(refusal))
 
         return taking
 
@@ -354,7 +354,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
 
     def _decode_proposal(self, raw: bytes) -> Report:
         if self._decoded and not self.parameters.lockstep:
-            raise ChannelError("rate", "a second proposal in a tick, expected one")
+            raise ChannelError(SampleFault.RATE, "a second proposal in a tick, expected one")
         self._decoded = True
         return reports.decode(raw)
 
@@ -363,7 +363,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         start = change.pop("start", None)
         flown = change.pop("flown", None)
         if not isinstance(start, int) or not isinstance(flown, int):
-            raise ChannelError("malformed", "a proposal without the digests start and flown")
+            raise ChannelError(
+                SampleFault.MALFORMED, "a proposal without the digests start and flown"
+            )
         assert self._learning is not None  # noqa: S101 - created together with the receiver
         self._learning.receive(
             Proposal(

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 
 from flight_core.units import GRAVITY
-from flight_core.vectors import ChannelError, Scalar, array_namespace
+from flight_core.vectors import ChannelError, SampleFault, Scalar, array_namespace
 from flight_guidance import reach
 from flight_guidance.guidance_state import (
     LARGEST,
@@ -126,13 +126,13 @@ def read_target(
     unknown = [name for name in values if name not in channels_of_step]
     if unknown or not values:
         raise ChannelError(
-            "name",
+            SampleFault.NAME,
             f"{what}: found {', '.join(unknown) or 'no channel'}, expected some of "
             f"{', '.join(channels_of_step)}",
         )
     if len(lateral_modes) > 1 or len(vertical_modes) > 1:
         raise ChannelError(
-            "name",
+            SampleFault.NAME,
             f"{what}: found {', '.join(values)}, expected one lateral and one vertical command "
             "at most",
         )
@@ -140,23 +140,26 @@ def read_target(
         *before, last = channels.together[mode]
         if not {*before, last} <= values.keys():
             group = f"{', '.join(before)} and {last} together"
-            raise ChannelError("name", f"{what}: found {', '.join(values)}, expected {group}")
+            raise ChannelError(
+                SampleFault.NAME, f"{what}: found {', '.join(values)}, expected {group}"
+            )
     for name, partner in (("r", "phi"), ("along", "leg")):
         if name in values and partner not in values:
             raise ChannelError(
-                "name", f"{what}: found {name} without {partner}, expected {partner} too"
+                SampleFault.NAME, f"{what}: found {name} without {partner}, expected {partner} too"
             )
     for name, value in values.items():
         if abs(value) > LARGEST:
             raise ChannelError(
-                "bounds", f"{what}.{name}: found {value:g}, expected at most {LARGEST:g} either way"
+                SampleFault.BOUNDS,
+                f"{what}.{name}: found {value:g}, expected at most {LARGEST:g} either way",
             )
     _require_limits(values, params, what, degrees=degrees)
     limits = params.limits
     if "radius" in values and abs(values["radius"]) < limits.radius:
         expected = f"at least {math.ceil(limits.radius)} m either way"
         raise ChannelError(
-            "bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}"
+            SampleFault.BOUNDS, f"{what}.radius: found {values['radius']:g} m, expected {expected}"
         )
     _read_leg(values, route, what)
 
@@ -183,16 +186,20 @@ def _require_limits(
             unit = UNITS.get(name, "deg" if degrees else "rad") + "/s" * (name == "r")
             value_text = f"{values[name] * factor:.6g}"
             expected = f"{least * factor:.6g} to {largest * factor:.6g} {unit}"
-            raise ChannelError("bounds", f"{what}.{name}: found {value_text}, expected {expected}")
+            raise ChannelError(
+                SampleFault.BOUNDS, f"{what}.{name}: found {value_text}, expected {expected}"
+            )
 
 
 def _read_leg(values: Mapping[str, float], route: Route | None, what: str) -> None:
     """Check that the route has the leg in the commands. Raises ChannelError if it does not."""
     if "leg" in values and route is None:
-        raise ChannelError("bounds", f"{what}.leg: found no route, expected one")
+        raise ChannelError(SampleFault.BOUNDS, f"{what}.leg: found no route, expected one")
     if "leg" in values and route is not None and values["leg"] not in range(len(route.legs)):
         expected = f"a whole number from 0 to {len(route.legs) - 1}"
-        raise ChannelError("bounds", f"{what}.leg: found {values['leg']:g}, expected {expected}")
+        raise ChannelError(
+            SampleFault.BOUNDS, f"{what}.leg: found {values['leg']:g}, expected {expected}"
+        )
     if (
         "along" in values
         and route is not None
@@ -200,7 +207,7 @@ def _read_leg(values: Mapping[str, float], route: Route | None, what: str) -> No
     ):
         expected = f"0 to {longest:.6g} m, the length of the leg; 0 for an arc"
         raise ChannelError(
-            "bounds", f"{what}.along: found {values['along']:g} m, expected {expected}"
+            SampleFault.BOUNDS, f"{what}.along: found {values['along']:g} m, expected {expected}"
         )
 
 
