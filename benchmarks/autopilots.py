@@ -54,8 +54,8 @@ from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.metrics.by_part import errors_by_part
 from flight_analysis.metrics.time_spans import in_spans
+from flight_analysis.report.disturbances import transients
 from flight_analysis.report.guided import control_errors
-from flight_analysis.report.summary import transients
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
 from flight_core.units import unit_sizes

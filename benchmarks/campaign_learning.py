@@ -77,7 +77,7 @@ def knowing(scenario: Scenario) -> Learn:
 def score_of(scenario: Scenario, learn: Learn) -> float:
     """Fly an aircraft that learns, and return its score from LEARNED on.
 
-    The score is NaN if the flight falls back to the law of the start, or restarts there.
+    The score is NaN if the flight falls back to the initial law, or restarts there.
     """
     events: list[Event] = []
     tape = simulate(scenario, learn=learn, announce=events.append)

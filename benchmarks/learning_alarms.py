@@ -46,7 +46,7 @@ class Flight(NamedTuple):
     doubts: int  # single tests after which an input might have had no effect
     changed: int  # times that a part was told to have changed
     dead: int  # times that an input was told to have no effect
-    fallbacks: int  # times that the law of the start took over
+    fallbacks: int  # times that the initial law took over
     largest_gain: float  # largest gain of log-likelihood by a loss of effect, over all tests
     second_gain: float  # second largest gain
     sentences: str  # what was told of damage and fallbacks

@@ -336,7 +336,7 @@ def fly(name: str, number: int, chosen: Scenario) -> Learned:
         found_at=dead[0].stamp_ns / 1e9 if dead else math.nan,
         update=float(np.mean(timed[0].steps)),
         longest=max(timed[0].steps),
-        replayed=int(replay(tape).equal()),
+        replayed=int(replay(tape).is_equal()),
         events=" | ".join(f"{event.stamp_ns / 1e9:g} s: {event.sentence}" for event in events),
     )
     return Learned(tape, controller.model_copy(update={"learn": None}), summary)

@@ -19,6 +19,7 @@ import csv
 import math
 import sys
 from collections.abc import Callable, Mapping
+from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,12 +57,22 @@ class Case(NamedTuple):
     turbulent: bool = False
 
 
+class Result(StrEnum):
+    """How the flight of a case ended."""
+
+    FLOWN = "flown"
+    MISSED = "missed"
+    LOST = "lost"
+    REFUSED = "refused"
+
+
 class Row(NamedTuple):
     """The result of a flight."""
 
     aircraft: str
     case: str
-    result: str  # "flown", "missed ...", "lost ...", or "refused: ..."
+    result: Result
+    about: str  # what follows the word of the result: leg, outcome or refusal
     xtrack: float  # largest cross-track error on the legs, s of flight at V0
     limit: float  # largest permitted cross-track error, s of flight at V0
     altitude: float  # largest error of the altitude on the legs, m
@@ -72,10 +83,11 @@ class Row(NamedTuple):
 
         A refusal has no goal. The words of a missed or a lost flight do not meet the goal.
         """
-        goal = None if self.result.startswith("refused") else self.limit
-        value = self.xtrack if self.result == "flown" else self.result
+        is_flown = self.result is Result.FLOWN
+        goal = None if self.result is Result.REFUSED else self.limit
+        value = self.xtrack if is_flown else f"{self.result}{self.about}"
         return evidence.row(
-            f"{self.case}: cross-track", value, "s" * (self.result == "flown"), at_most=goal
+            f"{self.case}: cross-track", value, "s" if is_flown else "", at_most=goal
         )
 
 
@@ -159,23 +171,30 @@ def fly(name: str, title: str, case: Case) -> Row:
     try:
         varied = planned(scenario, name, case)
     except ParameterError as refusal:
-        return Row(name, title, f"refused: {refusal}", 0.0, limit, 0.0)
+        return Row(name, title, Result.REFUSED, f": {refusal}", 0.0, limit, 0.0)
     tape = simulate(varied)
     if tape.outcome != COMPLETED:
-        return Row(name, title, f"lost: {tape.outcome}", math.inf, limit, math.inf)
+        return Row(name, title, Result.LOST, f": {tape.outcome}", math.inf, limit, math.inf)
     if varied.guidance is None:
         raise ValueError(f"{name} has no guidance")
     route = varied.guidance.plan(varied.guidance.waypoints())
-    result = "flown"
+    result, about = Result.FLOWN, ""
     legs = flown_legs(tape)
     misses = [leg for leg in legs if leg.result is LegResult.MISSED]
     if misses:
-        result = f"missed leg {misses[0].leg} by {misses[0].missed:.0f} m"
+        result, about = Result.MISSED, f" leg {misses[0].leg} by {misses[0].missed:.0f} m"
     elif legs[-1].leg < len(route.legs) - 1:
-        result = f"missed: on leg {legs[-1].leg} of {len(route.legs) - 1} at the end"
+        about = f": on leg {legs[-1].leg} of {len(route.legs) - 1} at the end"
+        result = Result.MISSED
     xtrack, altitude = errors(tape, route)
     return Row(
-        name, title, result, round(xtrack / varied.guidance.speed, 3), limit, round(altitude, 2)
+        name,
+        title,
+        result,
+        about,
+        round(xtrack / varied.guidance.speed, 3),
+        limit,
+        round(altitude, 2),
     )
 
 
@@ -245,7 +264,7 @@ def main() -> int:
             rows_flown.append(row := fly(name, title, CASES[title]))
             writer.writerow(row)
             sys.stdout.flush()
-            failed |= row.xtrack > row.limit or row.result.startswith(("missed", "lost"))
+            failed |= row.xtrack > row.limit or row.result in {Result.MISSED, Result.LOST}
         if len(rows_flown) == len(CASES):
             evidence.write(f"guidance-routes-{name}", (row.figure for row in rows_flown), start)
     return int(failed)

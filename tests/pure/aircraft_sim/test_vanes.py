@@ -222,7 +222,7 @@ def test_vanes_lower_errors_in_turbulence_and_flight_replays() -> None:
     # docs/evidence/tables/laws-vanes.csv.
     assert rms(tape)[0] < 0.9 * single[0]
     replayed = replay(tape)
-    assert replayed.equal()
+    assert replayed.is_equal()
     assert replayed.checked.all()
 
 
@@ -236,7 +236,7 @@ def test_frozen_vane_is_left_out_and_told() -> None:
     assert event.name == "vane alpha stands still: left out"
     assert event.start > 4.0
     assert vane_notes(tape)[0].startswith("vane alpha stands still from t = ")
-    assert replay(tape).equal()
+    assert replay(tape).is_equal()
 
 
 # Refusals

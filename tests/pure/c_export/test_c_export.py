@@ -190,7 +190,7 @@ each_line = pytest.mark.parametrize("case", ["observer", "schedule and allocatio
 
 def test_every_bit_is_equal(case: Case) -> None:
     proof = prove(case.code, compilers(), case.sets, case.recordings, float32=False)
-    assert proof.holds, proof_report(proof, "the case")
+    assert proof.is_proved, proof_report(proof, "the case")
     assert proof.figures["data_bytes"] == 0  # no global
     assert proof.figures["multiply"] > 0 or shutil.which("g++") is None
     ticks = [recording for recording in case.recordings if recording.name != "drawn commands"]
@@ -256,7 +256,7 @@ def test_proof_of_another_machine(case: Case) -> None:
     proof = prove(
         case.code, commands, case.sets, case.recordings, float32=False, runner=["qemu-aarch64"]
     )
-    assert proof.holds, proof_report(proof, "the case")
+    assert proof.is_proved, proof_report(proof, "the case")
     assert "aarch64-linux-gnu-gcc" in proof.compilers[0]
     with refusing("runner: found no program 'qemu-of-nothing', expected a command such as"):
         export("osprey_servo", case.code, runner="qemu-of-nothing")
@@ -422,7 +422,7 @@ def test_float32_is_within_its_bound(exported: Callable[[str], Case], tmp_path: 
     write_code(exportable(controller), "observer", tmp_path, float32=True)
     flights = case.recordings[:1]
     proof = prove(tmp_path, [["gcc"]], case.sets, flights, float32=True)
-    assert proof.holds, proof_report(proof, "observer")
+    assert proof.is_proved, proof_report(proof, "observer")
     assert all(0.0 < comparison.deviation < FLOAT32_BOUND for comparison in proof.comparisons)
 
 

@@ -427,7 +427,7 @@ def test_export_at_another_rate_is_the_loop_at_that_rate(tmp_path: Path) -> None
     np.testing.assert_allclose(corrected, again, rtol=1e-9, atol=1e-12)
     exported = export(scenario, tmp_path, rate=125.0, duration=2.0, drawn=200)
     assert exported.proof is not None
-    assert exported.proof.holds, exported.report
+    assert exported.proof.is_proved, exported.report
     assert "125 Hz" in (tmp_path / "rise_di_parameters.h").read_text()
     with refusing("found a spectral radius of"):  # too slow for this observer
         export(str(REPOSITORY / "examples/px4_airplane/rates_observer.yaml"), tmp_path, rate=200.0)

@@ -478,7 +478,7 @@ def test_log_of_the_module_replays_to_the_bit(shell: Shell, folder: Path) -> Non
     assert (limits == Saturation.MAGNITUDE).sum() > 100
     assert len(flight.changes) > 20  # of the airspeed
     replayed = replay(flight.tape, controller, changes=[change.values for change in flight.changes])
-    assert replayed.equal()
+    assert replayed.is_equal()
     assert replayed.checked.sum() == ticks - 2  # the engagements
     keep = np.ones(len(table.stamp_ns), dtype=bool)
     keep[700:710] = False

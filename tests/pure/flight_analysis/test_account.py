@@ -29,13 +29,13 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics.errors import error_metrics
 from flight_analysis.metrics.time_spans import sample_times
 from flight_analysis.report.account import Account, account
+from flight_analysis.report.disturbances import command_edges
 from flight_analysis.report.html import write_page
 from flight_analysis.report.recorded_flight import read_flight
 from flight_analysis.report.sample_counts import TopicAccount
 from flight_analysis.report.shortfalls import judge
 from flight_analysis.report.summary import (
     RecordedFlight,
-    command_edges,
     command_results,
     summarise,
     taken_over,
@@ -242,7 +242,7 @@ def test_replay_covers_no_tick_without_its_sample(topic: str, tape: Tape) -> Non
     signal = tape[topic]
     keep = ~np.isin(signal.stamp_ns, tape["internals"].stamp_ns[10::20])
     result = replay(replace(tape, signals={**tape.signals, topic: signal.where(keep)}))
-    assert result.equal()
+    assert result.is_equal()
     assert result.compared.mean() == pytest.approx(0.95, abs=0.01)
     assert result.checked.mean() > 0.98
     assert any(f"no sample on the topic {topic}" in note for note in result.notes)

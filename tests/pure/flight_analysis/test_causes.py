@@ -335,7 +335,7 @@ def test_leap_of_all_topics_is_told_and_figures_are_over_flight_time(
     assert summary["notes"] == [f"{sentence}: later times are by the clock before the leap"]
     assert figures(summary) == figures(intact)
     result = replay(log)
-    assert result.equal()
+    assert result.is_equal()
     assert result.compared.sum() == len(result.number) == 201
 
 
@@ -458,7 +458,7 @@ def test_ticks_of_another_controller_do_not_count_among_those_of_the_flight(
     )
     assert summary["notes"][0].startswith(sentence)
     result = replay(log)
-    assert result.equal()
+    assert result.is_equal()
     assert len(result.number) == 201
 
 

@@ -33,7 +33,7 @@ def test_section_of_controller_is_enough(name: str, osprey_gust: Scenario, tmp_p
     alone.write_text(yaml.safe_dump({name: sections["/**/controller"]}))
     parameters = recorded_parameters(stored_scenario(alone))
     assert parameters == osprey_gust.controller
-    assert replay(flown.mcap, parameters).equal()
+    assert replay(flown.mcap, parameters).is_equal()
     result = rewrite_report(flown.mcap.parent, output=tmp_path / "out", scenario=alone)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["scenario"] is None  # nothing is judged by a model of the aircraft

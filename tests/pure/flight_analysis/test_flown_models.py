@@ -37,7 +37,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def learns() -> Scenario:
-    """A flight that flies the law of the start up to 4 s, then the file."""
+    """A flight that flies the initial law up to 4 s, then the file."""
     return find_scenario("osprey_learn").vary(
         flight={"duration": 11.0},
         aircraft={"rate": 100.0, "step": 0.005},

@@ -141,7 +141,7 @@ def test_disk_margin_of_integrator_is_that_of_its_worst_gain() -> None:
 
 def test_unstable_nominal_loop_has_no_guarantee() -> None:
     guarantee = loop_guarantee(integrator(250.0, 0.1))
-    assert not guarantee.holds
+    assert not guarantee.is_proved
     assert guarantee.stable == 0.0
     assert not any(guarantee.disk.values())
 
@@ -253,7 +253,7 @@ def test_guarantee_with_a_late_input_is_below_each_constant_delay() -> None:
     linear = integrator(60.0, 0.1)
     in_time = loop_guarantee(linear)
     guarantee = loop_guarantee(linear, 0.01)
-    assert guarantee.holds
+    assert guarantee.is_proved
     assert guarantee.stable < in_time.stable
     assert guarantee.disk_all < in_time.disk_all
     assert guarantee.unstable is not None
@@ -307,7 +307,7 @@ def test_guarantee_with_a_late_input_holds_for_a_delay_that_changes() -> None:
     assert growth > 1.05
     assert loop_guarantee(linear, PERIOD).stable == 0.0
     # a fifth of the gains leaves the box stable
-    assert loop_guarantee(oscillator((0.1089, 0.000062)), PERIOD).holds
+    assert loop_guarantee(oscillator((0.1089, 0.000062)), PERIOD).is_proved
 
 
 def test_size_between_two_gaps_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -469,7 +469,7 @@ def test_frequency_without_proof_leaves_no_guarantee_and_no_error(
     monkeypatch.setattr(guarantee_module, "FEWER_BOXES", 20)
     guarantee = loop_guarantee(integrator(150.0, 0.1))
     assert guarantee.stable == 0.0
-    assert not guarantee.holds
+    assert not guarantee.is_proved
 
 
 def test_command_bounds_the_effectors_behind_an_allocation(

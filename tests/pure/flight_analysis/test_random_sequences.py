@@ -194,7 +194,7 @@ def test_random_sequence_keeps_u_in_its_limits_and_is_replayed_to_the_bit(
     sequence.run(1000)
     result = replay(sequence.tape(), parameters, changes=sequence.changes)
     assert result.first() is None
-    assert result.equal()
+    assert result.is_equal()
     assert len(result.number) > 500
     assert (~result.checked).sum() <= 3  # up to the first engagement
     assert sequence.restarts  # a jump that stays has been among them

@@ -84,7 +84,7 @@ def busy_flown(name: str) -> Tape:
 
 
 def equal(result: ReplayResult) -> bool:
-    return result.equal() and bool(result.checked.all())
+    return result.is_equal() and bool(result.checked.all())
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -236,7 +236,7 @@ def test_one_bit_of_one_gain_is_found(name: str, channel: int) -> None:
         replay(tape, vary(scenario.controller, {"Lambda": gains})),
         replay(tape, scenario.controller, vary(scenario.controller, {"Lambda": gains})),
     ):
-        assert not result.equal()
+        assert not result.is_equal()
         # from the first tick on, even where rounding hides the bit in all of u
         assert result.other_parameters.all()
         first = result.first()
@@ -398,7 +398,7 @@ def test_replay_applies_successive_gain_changes_one_by_one() -> None:
     assert [note.split(": ")[1] for note in result.notes] == ["Lambda, k_g", "slew", "k_g"]
     # A change that is missing in the log is not guessed.
     lost = replay(driven(GUST.controller, ticks), GUST.controller, changes=changes[2:])
-    assert not lost.equal()
+    assert not lost.is_equal()
     assert lost.notes == ()
 
 

@@ -30,10 +30,11 @@ from flight_analysis.report import (
     plotting,
 )
 from flight_analysis.report.display_units import DisplayUnit, display_units, state_units
+from flight_analysis.report.disturbances import transients
 from flight_analysis.report.html import write_page
 from flight_analysis.report.plotting import Figure, PlotContext
 from flight_analysis.report.spectra import spectra
-from flight_analysis.report.summary import RecordedFlight, summarise, transients
+from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_analysis.report.summary_rows import TIMING_COLUMNS, timing_rows
 from flight_analysis.report.tables import events, metric_tables
 from flight_analysis.report.timing import AgeMetrics, LatencyMetrics, TickMetrics

@@ -40,7 +40,7 @@ def certified(name: str, limited: str, uncertainty: float) -> Content:
     linear = linear_loop(name, uncertainty)
     guarantee = guarantee_with_limit(linear, limited)
     assert guarantee is not None
-    assert guarantee.holds
+    assert guarantee.is_proved
     content: Content = json.loads(limit_certificate(linear, guarantee, {}))
     return content
 
@@ -264,7 +264,7 @@ def test_command_says_what_holds_and_what_proves_it(
     assert said[0].startswith(f"guarantee: {sentence}")
     assert said[0].endswith("(certificate 58911e12fa30)")
     assert "examples/check_certificate.py proves the certificate" in said[-1]
-    assert guarantee.holds == (size == 0.3)
+    assert guarantee.is_proved == (size == 0.3)
 
 
 def test_command_says_that_nothing_holds() -> None:

@@ -111,6 +111,6 @@ def test_log_of_another_arithmetic_refused() -> None:
     scenario = find_scenario("osprey_servo", 0.5)
     stored = StoredFile("osprey_servo.yaml", scenario_yaml(scenario).encode())
     tape = simulate(scenario)
-    assert replay(RecordedRun(tape, stored, provenance())).equal()
+    assert replay(RecordedRun(tape, stored, provenance())).is_equal()
     with refusing("arithmetic: found 7, expected 1: a later version recorded the log"):
         replay(RecordedRun(tape, stored, {"rise_di_versions": {"arithmetic": "7"}}))

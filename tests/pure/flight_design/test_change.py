@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The test for a loss of effect in a flight with damage.
 
-Channels of a damaged part keep the law of the start.
+Channels of a damaged part keep the initial law.
 """
 
 from functools import cache

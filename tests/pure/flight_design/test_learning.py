@@ -152,7 +152,7 @@ def found(*parts: Part) -> Any:
 
 
 def record_rest(made: Learner) -> None:
-    """10 s at rest, with the law of the start."""
+    """10 s at rest, with the initial law."""
     for k in range(1001):
         made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
 
@@ -191,7 +191,7 @@ class Fixed:
 
 def test_replay_of_learning_flight_is_equal_to_the_bit(flown: Flown) -> None:
     result = replay(flown.run)
-    assert result.equal()
+    assert result.is_equal()
     assert result.compared.all()
     assert any("observer.part" in note for note in result.notes)
 
@@ -358,7 +358,7 @@ def test_last_model_of_a_run_is_exported_without_learn(flown: Flown, tmp_path: P
     assert last.models() == flown.learner._last.models() != chosen.rise_di().models()
     exported = rise_di.export(chosen, tmp_path, run=flown.run, duration=1.0, drawn=100)
     assert exported.proof is not None
-    assert exported.proof.holds  # C has the bits of Python in flights of the learned model
+    assert exported.proof.is_proved  # C has the bits of Python in flights of the learned model
     with refusing("controller.learn: found a section, expected none: C code replaces"):
         rise_di.export(chosen, tmp_path, proof=False)
     other = chosen.vary(controller={"ramp": 1.0})
@@ -435,12 +435,12 @@ def test_identification_is_due_where_last_proposal_does_not_fly(
     for k in range(1001, 1500):
         made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
     # other parameters fly: the proposal was refused, or the controller fell back
-    assert made.propose(0).sentence == "each part already flies the law of the start"
+    assert made.propose(0).sentence == "each part already flies the initial law"
     identified.assert_called_once()
 
 
 def test_the_rough_model_flies_until_it_fell_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Designed for a model that errs, beside parts that are learned; then the law of the start."""
+    """Designed for a model that errs, beside parts that are learned; then the initial law."""
     made = made_learner(scenario())
     start = scenario().rise_di()
     rough = made.propose(start.digest()).controller
@@ -502,7 +502,7 @@ def test_refused_part_goes_back_to_the_file_that_predicts_better(
     assert "innovations of r: found a whiteness of 9" in str(after.sentence)
     if is_back:
         # this learner's file was refused before, by the digest 0 that flew
-        assert "p and r by the law of the start: the file predicts" in str(after.sentence)
+        assert "p and r by the initial law: the file predicts" in str(after.sentence)
         assert after.controller is not None
         assert after.controller.observer is not None
         assert after.controller.observer.part == 0.0  # no observer flies
@@ -628,7 +628,7 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(
     none_left = without_models(start, fresh, ["p", "r"]).digest()
     sentences = [restarted.propose(none_left, NAMES).sentence for _ in range(2)]
     assert sentences == [
-        "no part is left to learn: each lacks an input or flies the law of the start",
+        "no part is left to learn: each lacks an input or flies the initial law",
         None,
     ]
 
@@ -653,9 +653,7 @@ def test_part_flies_without_a_dead_input_at_once(monkeypatch: pytest.MonkeyPatch
     identified = Mock(side_effect=AssertionError)  # a test tells: 10 s of record would be too late
     monkeypatch.setattr(design_learner, "identify_model", identified)
     proposal = made.propose(flown)
-    assert proposal.sentence == (
-        "rudder has no effect: p and r without it, by the law of the start"
-    )
+    assert proposal.sentence == ("rudder has no effect: p and r without it, by the initial law")
     assert proposal.controller is not None
     names = authority_names(proposal.controller.outputs)
     effects = authority(proposal.controller, scenario().rise_di()).tolist()
@@ -670,9 +668,7 @@ def test_output_with_a_whole_input_keeps_the_design_for_the_file(
     file = find_scenario("osprey_observer").rise_di()
     made._design_of_rough = Mock(return_value=Mock(controller=file))
     proposal = made.propose(flown)
-    assert proposal.sentence == (
-        "rudder has no effect: p and r without it, r by the law of the start"
-    )
+    assert proposal.sentence == ("rudder has no effect: p and r without it, r by the initial law")
     assert proposal.controller is not None
     assert acting_inputs(proposal.controller) == ("elevator", "aileron", "thrust")
 
@@ -690,7 +686,7 @@ def test_part_without_elevator_or_without_the_file_flies_by_the_law() -> None:
 def test_part_without_an_input_states_the_margin_of_its_own_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Output r flies by the law of the start, with another delay margin than the design has."""
+    """Output r flies by the initial law, with another delay margin than the design has."""
     made, flown = learned_part(monkeypatch, DEAD_RUDDER)
     proposed = made.propose(flown).controller
     assert proposed is not None
@@ -1073,4 +1069,4 @@ def test_law_with_wrong_model_falls_back_and_replay_is_equal() -> None:
     assert (error(tape, 6.0, 8.0) > 2.0 * error(tape, 3.0, 6.0)).any()
     # the law alone has up to 0.11 m/s in this turbulence
     assert (error(tape, 10.0, 12.0) < 0.15).all()
-    assert replay(tape).equal()
+    assert replay(tape).is_equal()

@@ -223,7 +223,7 @@ def test_conditions_say_what_is_missing() -> None:
     failing = [
         condition.name
         for condition in margin_conditions(of, Requirement(phase=math.radians(80.0)))
-        if not condition.holds
+        if not condition.is_met
     ]
     assert failing[:1] == ["phase margin (deg)"]
     assert least_fraction(of.nominal, Requirement(phase=math.radians(80.0))) == approx(

@@ -60,7 +60,7 @@ def test_half_the_period_quarters_the_error(
     # Second order in the period: a factor of 4. A first order has 2, a third order 8.
     folder, selected = selection
     monkeypatch.chdir(folder)
-    assert not [condition for condition in selected.theorem.theorem if not condition.holds]
+    assert not [condition for condition in selected.theorem.theorem if not condition.is_met]
     assert "V2_dot" in {condition.name for condition in selected.theorem.theorem}
     ratio = flown(folder, selected, 100.0) / flown(folder, selected, 200.0)
     assert ((ratio > 3.5) & (ratio < 4.5)).all(), ratio

@@ -219,7 +219,7 @@ def test_lost_speed_in_a_fence_ends_with_an_outcome_and_a_report() -> None:
     assert sentence.status == 4, "the airspeed is far below its command"
     assert log["failed"].max() == 0
     replayed = replay_guidance(tape, section)
-    assert replayed.equal()
+    assert replayed.is_equal()
     assert replayed.checked == replayed.steps
 
 
@@ -271,7 +271,7 @@ def test_step_that_fails_leaves_last_u_m_and_next_is_tried(
     assert notices == [f"guidance at t = {t} s: {said}" for t in ("2.0", "26.0")]
     assert summarise(tape)["guidance"]["failed"] == 4
     replayed = replay_guidance(tape, section)
-    assert replayed.equal()
+    assert replayed.is_equal()
     assert replayed.checked == replayed.steps
     assert replayed.notes == ("4 steps of guidance failed: the last u_m went on",)
     # A u_m that did not go on is found.

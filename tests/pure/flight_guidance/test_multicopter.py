@@ -102,7 +102,7 @@ def test_square_at_3_m_per_s_stays_on_its_lines_and_replays_to_the_bit(
     steady = math.atan(DRAG * 3.0 / GRAVITY)
     assert np.mean(log["pose.theta"][first]) == approx(-steady, abs=0.03)
     replayed = replay_guidance(tape, scenario.guidance)
-    assert replayed.equal()
+    assert replayed.is_equal()
     assert replayed.checked == len(log.stamp_ns)
     summary = guidance_summary(tape, scenario.guidance)
     assert summary is not None
@@ -119,7 +119,7 @@ def test_wait_hovers_at_its_waypoint_for_its_time_and_the_flight_goes_on() -> No
     assert np.max(beside[hovers]) < 1.5  # within 0.5 s of flight at 3 m/s, where the time begins
     assert [leg.result for leg in flown_legs(tape)[:2]] == [LegResult.FLOWN] * 2
     assert log["leg"][-1] > 1
-    assert replay_guidance(tape, scenario.guidance).equal()
+    assert replay_guidance(tape, scenario.guidance).is_equal()
 
 
 def test_attitude_heading_and_climb_are_held_apart() -> None:

@@ -88,7 +88,7 @@ def test_rudder_flies_the_bank_where_the_aileron_has_no_effect() -> None:
     state, commands = flown({"phi": 0.3}, Authority(p=0.0), phi=-0.05)
     u_m = dict(zip(OWN.outputs, state.u_m, strict=True))
     assert u_m["p"] == 0.0
-    assert commands.bank_limited
+    assert commands.is_bank_limited
     bank = math.radians(10.0)
     assert u_m["r"] == approx(GRAVITY * math.tan(2.0 * bank) / SPEED)  # at its limit
     # The sideslip of a turn by the rudder rolls until 1.6 times the bank of a coordinated turn.

@@ -82,7 +82,11 @@ def test_whole_flight_is_read_replayed_shown_and_played(
     contents = read_run(whole, scenario=osprey_gust.path)
     assert figures_of(read_flight(whole, scenario=osprey_gust.path).summary) == figures
     result = replay(contents)
-    assert (len(result.number), int(result.checked.sum()), result.equal()) == (TICKS, TICKS, True)
+    assert (len(result.number), int(result.checked.sum()), result.is_equal()) == (
+        TICKS,
+        TICKS,
+        True,
+    )
     flight = Flight(whole, scenario=contents.scenario)
     flight.update()
     assert (flight.state(), flight.faults(), flight.samples["internals"].count) == (

@@ -58,6 +58,6 @@ def test_every_sample_is_that_of_independent_reader(run: Path) -> None:
 def test_every_bit_is_replayed(run: Path) -> None:
     recorded = read_run(run)
     result = replay(recorded)
-    assert result.equal(), result.first()
+    assert result.is_equal(), result.first()
     assert result.checked.all()
     assert len(result.number) == len(recorded.tape["internals"].stamp_ns) > 30

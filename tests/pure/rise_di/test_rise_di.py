@@ -104,7 +104,7 @@ def test_other_gains_on_the_recorded_inputs_are_an_open_loop(run: rise_di.Record
         controller={"Lambda": SOFT.rise_di().Lambda[0] * np.ones(4, dtype=np.float32)}
     )
     again = rise_di.replay(run, others=slower.controller)
-    assert not again.equal()
+    assert not again.is_equal()
     assert again.notes[0].startswith("open loop")
 
 

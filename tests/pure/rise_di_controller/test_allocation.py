@@ -186,7 +186,7 @@ def test_a_flight_with_an_allocation_at_its_stops_tracks_and_replays_to_the_bit(
     assert np.abs(tape["u"]["elevator"]).max() == 0.01
     is_limited = tape["internals"].group("limited")["v_q"] > 0.0
     assert 0.1 < is_limited.mean() < 0.9
-    assert replay(tape).equal()
+    assert replay(tape).is_equal()
     # The command ends at 8 s, and q needs no elevator soon after: with integrals that wind up e
     # would stay large.
     assert np.abs(tape["internals"]["e.q"][tape.time("internals") > 9.5]).max() < 0.01
@@ -230,7 +230,7 @@ def test_a_vehicle_that_is_no_aeroplane_flies_and_replays(monkeypatch: pytest.Mo
     tape = simulate(scenario)
     assert tape.outcome.status == 0
     assert max(np.abs(tape["internals"][f"e.{name}"]).max() for name in "pq") < 0.5 / 6.0
-    assert replay(tape).equal()
+    assert replay(tape).is_equal()
 
 
 @pytest.mark.parametrize(

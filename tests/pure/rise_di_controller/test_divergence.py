@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from flight_core.vectors import FloatArray
 from rise_di_controller.learning import divergence
 
-DT, DURATION, BEFORE = 0.01, 30.0, 0.02  # s, s; rms of the error under the law of the start, rad/s
+DT, DURATION, BEFORE = 0.01, 30.0, 0.02  # s, s; rms of the error under the initial law, rad/s
 T = DT * np.arange(round(DURATION / DT))
 RANDOM = np.random.default_rng(3)
 LEARNED = np.array([True])
@@ -33,7 +33,7 @@ def test_divergence_is_three_times_the_error_before(
     assert divergence.diverging(state, least, np.array([True, True])).tolist() == [expected, False]
     assert not divergence.diverging(
         state, least, np.array([False, True])
-    ).any()  # q flies the law of the start
+    ).any()  # q flies the initial law
 
 
 def test_running_mean_square_reaches_that_of_a_constant_error() -> None:
@@ -56,7 +56,7 @@ def noise(frequency: float, damping: float) -> FloatArray:
 def flown(
     e: FloatArray, learned: NDArray[np.bool_] = LEARNED, before: float = BEFORE
 ) -> divergence.Oscillations:
-    """The error of 20 s of the law of the start, then e under a learned model.
+    """The error of 20 s of the initial law, then e under a learned model.
 
     It ends where an oscillation is found.
     """

@@ -78,7 +78,7 @@ def test_healthy_surfaces_are_not_called_stuck_in_commands_and_gusts() -> None:
 
 def test_flight_with_a_probe_replays_to_the_bit() -> None:
     tape = jammed("elevator")
-    assert replay(tape).equal()
+    assert replay(tape).is_equal()
 
 
 def test_sines_are_orthogonal_over_the_window_and_tell_u_alone() -> None:

@@ -358,7 +358,7 @@ def test_deactivated_law_goes_back_to_start_and_takes_models_of_its_next_engagem
     flight.controller.tick(flight.now_ns, active=False)
     u = flight.controller.state.u
     assert flight.step(1) == 1
-    assert flight.sentences[-1] == "goes back to the law of the start: it was deactivated"
+    assert flight.sentences[-1] == "goes back to the initial law: it was deactivated"
     assert flight.events[-1].kind is EventKind.RESTART
     assert flight.controller.digest == START.digest()
     assert flight.controller.state.u.tobytes() == u.tobytes()
@@ -424,7 +424,7 @@ def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engag
     assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
     assert flight.sentences[1:] == [
         (
-            "falls back to the law of the start in q, V, to the end of the engagement: q "
+            "falls back to the initial law in q, V, to the end of the engagement: q "
             "oscillates at 4 Hz"
         ),
         "flies model, without q, V",
@@ -486,7 +486,7 @@ def test_parameters_that_diverged_are_not_taken_again_in_the_engagement(
     flight.step()
     refusal = "found parameters that diverged in this engagement, expected others"
     assert flight.sentences[1:] == [
-        "falls back to the law of the start: q diverges",
+        "falls back to the initial law: q diverges",
         f"refused: {refusal}; proposed: model",
     ]
     assert [event.kind for event in flight.events] == [
@@ -521,12 +521,9 @@ def test_part_has_no_further_model_after_its_second_fallback(
         flight.now_ns += 10 * NANOSECONDS
     assert flight.sentences == [
         "flies model",
-        "falls back to the law of the start: q diverges",
+        "falls back to the initial law: q diverges",
         "flies model",
-        (
-            "falls back to the law of the start, in q, V to the end of the engagement: q diverges "
-            "again"
-        ),
+        ("falls back to the initial law, in q, V to the end of the engagement: q diverges again"),
         "flies model, without q, V",
         "flies model, without q, V",
     ]

@@ -347,7 +347,7 @@ def test_frozen_y_in_flight_is_told_and_replayed_to_the_bit() -> None:
     values = y.values.copy()
     values[y.stamp_ns >= 5_000 * MS] = values[y.stamp_ns == 5_000 * MS]
     received = replace(tape, signals={**tape.signals, "y": replace(y, values=values)})
-    assert replay(received).equal()
+    assert replay(received).is_equal()
 
 
 @pytest.mark.slow

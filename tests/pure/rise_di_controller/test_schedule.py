@@ -128,7 +128,7 @@ def test_flight_with_schedule_replayed_to_last_bit() -> None:
     scenario = flight(schedule=True, delay=0.03, duration=60.0)
     result = replay(flown(True), scenario.controller)
     assert result.checked.all()
-    assert result.equal()
+    assert result.is_equal()
 
 
 @pytest.mark.parametrize("name", ["osprey_observer"])

@@ -158,7 +158,7 @@ def test_flight_over_speeds_has_no_jump_of_u_and_is_replayed_to_the_bit(
     tape = simulate(scenario)
     scale = tape["internals"]["scale.q"]
     assert scale.min() < 0.75
-    assert replay(tape).equal()
+    assert replay(tape).is_equal()
     step = np.abs(np.diff(tape["u"].values, axis=0)).max(axis=0)
     fixed = np.abs(
         np.diff(simulate(scenario.vary(controller=SHIPPED.rise_di()))["u"].values, axis=0)

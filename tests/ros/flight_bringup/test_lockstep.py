@@ -135,7 +135,7 @@ def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are
     assert recorded["internals"].group("u_ff").values.any()
     for run in runs[1:]:
         result = replay(run)
-        assert result.equal()
+        assert result.is_equal()
         assert result.compared.sum() == len(result.compared) > 100
         assert not result.notes
 
@@ -180,7 +180,7 @@ def test_other_nodes_end_within_three_seconds_of_kill_and_name_it(
         log = read_run(tmp_path / victim)
         assert any("is truncated" in note for note in log.tape.notes) == (victim == "recorder")
         result = replay(log)
-        assert result.equal()
+        assert result.is_equal()
         # the last complete chunk can end between the internals of a tick and its y
         assert result.compared.sum() >= len(result.compared) - 1 > 100
 

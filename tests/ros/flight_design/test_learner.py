@@ -68,10 +68,10 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
     recorded = read_run(run).tape
     require_equal_bits(recorded, tape)
     result = replay(run)
-    assert result.equal()
+    assert result.is_equal()
     assert result.compared.all()
     steps = replay_guidance(recorded, flight_scenario.guidance)
-    assert steps.equal()
+    assert steps.is_equal()
     assert steps.checked == steps.steps
     assert recorded["guidance"]["authority.p"].min() < UNKNOWN  # guidance knows what was learned
 

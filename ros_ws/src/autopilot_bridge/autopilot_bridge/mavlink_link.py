@@ -175,7 +175,7 @@ class Link:
         self.parameters: dict[str, float] = {}  # the last received parameters of the autopilot
         self._to_read = tuple(parameters)
         self._further = tuple(further)
-        self._systems: set[int] = set()  # systems of autopilots other than that of the map
+        self._systems: set[int] = set()  # systems of autopilots that are not the map's
         self._to_request = dict(config.rates)
         # The message whose interval was requested, and the time of the request.
         self._requested: tuple[str, float] | None = None

@@ -45,7 +45,7 @@ class UsedField:
     topic: str
     type: str
     path: str
-    components: str | None = None  # those of `COMPONENTS` if a function reads the field
+    components: str | None = None  # a key of `COMPONENTS` if a function reads the field
 
 
 class ChannelMap(Config):

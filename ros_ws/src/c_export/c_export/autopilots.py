@@ -47,7 +47,7 @@ float64[{m}] y_m         # [rad/s] y_m at the instant of y
 float64[{m}] e           # [rad/s] y - y_m
 float64[{m}] u           # u in the units of the input
 float64[{m}] u_end       # abs(u) at which the torque is 1 at this airspeed
-float64 y_m_offset       # [s] instant of the newest y_m minus that of y
+float64 y_m_offset       # [s] instant of the newest y_m minus instant of y
 float32 rate             # [Hz] measured rate of the samples; 0 if it is not measured yet
 """
 

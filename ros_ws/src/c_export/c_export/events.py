@@ -116,7 +116,7 @@ class GuardSample:
     stamp_ns: int
     y: FloatArray
     y_m: FloatArray  # y_m at the stamp
-    offset_ns: int = 0  # stamp of the newest y_m minus that of the sample
+    offset_ns: int = 0  # stamp of the newest y_m minus stamp of the sample
 
 
 class Recorder(Controller):

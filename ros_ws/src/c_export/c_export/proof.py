@@ -65,7 +65,7 @@ class Comparison(NamedTuple):
     deviation: float  # largest difference of any u, as a fraction of its range
     has_equal_integers: bool  # integers of the states are modes and times
 
-    def holds(self, *, float32: bool) -> bool:
+    def is_met(self, *, float32: bool) -> bool:
         """Return whether C agrees with Python.
 
         In float64, every bit must be equal. In float32, every integer, such as the mode, must be
@@ -259,9 +259,9 @@ class Proof(NamedTuple):
     float32: bool
 
     @property
-    def holds(self) -> bool:
+    def is_proved(self) -> bool:
         """Whether C agrees with Python in every comparison."""
-        return all(comparison.holds(float32=self.float32) for comparison in self.comparisons)
+        return all(comparison.is_met(float32=self.float32) for comparison in self.comparisons)
 
 
 def prove(
@@ -334,7 +334,7 @@ def proof_report(proof: Proof, scenario: str) -> str:
             difference = f"; u within {part_of_range}"
         ticks = f"{comparison.ticks} ticks, {comparison.values} values"
         lines.append(f"{comparison.name}{compiler}: {ticks}{difference}")
-        if comparison.first is not None and not comparison.holds(float32=proof.float32):
+        if comparison.first is not None and not comparison.is_met(float32=proof.float32):
             first = comparison.first
             lines.append(
                 f"    first in tick {first.tick}: {first.channel} is {first.python!r} in Python, "
@@ -348,7 +348,7 @@ def proof_report(proof: Proof, scenario: str) -> str:
         result = f"every mode is equal and u is within {FLOAT32_BOUND:.2g} of its range"
     else:
         result = "every bit is equal"
-    lines += ["", f"PROVED: {result}" if proof.holds else "NOT PROVED"]
+    lines += ["", f"PROVED: {result}" if proof.is_proved else "NOT PROVED"]
     return "\n".join(lines) + "\n"
 
 

@@ -134,7 +134,7 @@ class Fleet:
         scenarios = [member.scenario for member in self.members]
         if self.composed:
             # A learner has a separate process even if the other nodes share one.
-            return 1 + sum(1 + scenario.learns() for scenario in scenarios)
+            return 1 + sum(1 + scenario.has_learner() for scenario in scenarios)
         return 1 + sum(len(FIRST_STAGE) + len(second_stage(scenario)) for scenario in scenarios)
 
 

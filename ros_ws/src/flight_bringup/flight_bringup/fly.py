@@ -103,7 +103,7 @@ def fly_over_topics(
                 scenario.controller.outputs,
                 lockstep=lockstep,
                 use_sim_time=use_sim_time,
-                learns=scenario.learns(),
+                learns=scenario.has_learner(),
                 namespace=namespace,
             ) as monitor,
             FlightProcesses(
@@ -312,7 +312,7 @@ def _follow_lockstep(
     t = 0.0
     last_change = time.monotonic()
     text = "lockstep, starting"
-    timeout = SEARCH_TIMEOUT if scenario.learns() else STALL_TIMEOUT
+    timeout = SEARCH_TIMEOUT if scenario.has_learner() else STALL_TIMEOUT
     # monotonic time and flight time of the first instant, s
     first: tuple[float, float] | None = None
     while t < end or not processes.is_completed():

@@ -140,7 +140,7 @@ def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec,
     """
     if not bridge:
         require_guidable(scenario)
-    learns = scenario.learns()
+    learns = scenario.has_learner()
     expected = "a simulated aircraft: models from flights of autopilots fail the learner's checks"
     require(not (bridge and learns), "controller.learn", "a bridge", expected)
     stage = SECOND_STAGE_WITH_BRIDGE if bridge else SECOND_STAGE
@@ -151,7 +151,10 @@ def _optional(scenario: Scenario) -> tuple[NodeSpec, ...]:
     """Return guidance and the learner if the scenario has them."""
     return tuple(
         node
-        for node, has in ((GUIDANCE, scenario.guidance is not None), (LEARNER, scenario.learns()))
+        for node, has in (
+            (GUIDANCE, scenario.guidance is not None),
+            (LEARNER, scenario.has_learner()),
+        )
         if has
     )
 
@@ -265,9 +268,9 @@ def _stage_overrides(scenario: Scenario, *, lockstep: bool) -> dict[NodeSpec, Pa
             for name, value in scenario.guidance.by_rule()
         }
         # Without a learner no controller publishes `authority`, so guidance must not wait for it.
-        authority_rate = scenario.learns() * scenario.controller.rate / AUTHORITY_TICKS
+        authority_rate = scenario.has_learner() * scenario.controller.rate / AUTHORITY_TICKS
         overrides[GUIDANCE]["authority_rate"] = authority_rate
-    if scenario.learns():
+    if scenario.has_learner():
         overrides[LEARNER]["scenario_file"] = str(scenario.path)
     return overrides
 
@@ -277,7 +280,7 @@ def _recording(scenario: Scenario, run: Path, autopilot: Autopilot | None) -> Pa
     further: list[str] = []
     if scenario.guidance is not None:
         further += topics.recorded_with("guidance")
-    if scenario.learns():
+    if scenario.has_learner():
         further += topics.recorded_with("learner")
     if scenario.controller.probe:
         further += topics.recorded_with("probe")

@@ -423,7 +423,7 @@ class FlightProcesses:
         with handle_signals(signal.SIG_IGN):
             if self.processes:
                 leave_outcome(self._run, self.outcome)
-            searches = self.lockstep and self.outcome == COMPLETED and self.scenario.learns()
+            searches = self.lockstep and self.outcome == COMPLETED and self.scenario.has_learner()
             last = {
                 RECORDER: CLOSE_TIMEOUT,
                 ONE_PROCESS: SEARCH_TIMEOUT if searches else CLOSE_TIMEOUT,

@@ -91,8 +91,8 @@ GUARANTEE_LEGEND = (
 LEARNER_LEGEND = (
     "first model: when it flew; models refused: by the learner, which says why during the flight, "
     "or by the controller; fallbacks:"
-    " to the law of the start, in all outputs or in some. The margins above are those of the "
-    "law of the start"
+    " to the initial law, in all outputs or in some. The margins above are those of the "
+    "initial law"
 )
 
 
@@ -171,7 +171,7 @@ def _influence(campaign: MonteCarlo, case: int, tally: Tally) -> dict[str, Any]:
         ),
     )
     learn = getattr(scenario.controller, "learn", None)
-    # The learner knows the airframe of the scenario, not that of the corner, which flies.
+    # The learner knows the airframe of the scenario, although the aircraft of the corner flies.
     if learn is not None and (learn.prior is None or learn.prior.file is None):
         scenario = scenario.vary(
             controller={"learn": {"prior": {"file": scenario.aircraft.airframe}}}
@@ -221,7 +221,7 @@ def write_page(
     tables = [overview(definition, tallies, margins), _ends(labels, cases)]
     if any(case["guarantee"] for case in cases):
         tables.append(_guarantees(labels, cases))
-    if scenario.learns():
+    if scenario.has_learner():
         tables.append(_without_model(labels, tallies))
     tables += [_figures(label, tally, units) for label, tally in zip(labels, tallies, strict=True)]
     tables.append(_worst(labels, cases))

@@ -47,7 +47,7 @@ class LearningOutcome(NamedTuple):
     # number of identifications that the learner refused, and of proposals that the controller
     # refused
     refused: int
-    # number of times that the law of the start took over, in all or in some channels
+    # number of times that the initial law took over, in all or in some channels
     fallbacks: int
 
 
@@ -69,7 +69,7 @@ def learned(tape: Tape, events: Sequence[Event]) -> LearningOutcome:
 
 def flies_alone(scenario: Scenario) -> bool:
     """Return whether the aircraft fly one by one, because they learn or are guided."""
-    return scenario.learns() or scenario.guidance is not None
+    return scenario.has_learner() or scenario.guidance is not None
 
 
 def require_single_flights(scenario: Scenario) -> None:
@@ -112,7 +112,7 @@ def fly_single(scenario: Scenario, learner: MakeLearner | None = None) -> Single
     if scenario.guidance is not None:
         figures |= mission_figures(tape, scenario.guidance)
     figures |= _tracking_figures(tape, scenario)
-    if scenario.learns():
+    if scenario.has_learner():
         outcome = learned(tape, events)
         figures |= {name: float(value) for name, value in outcome._asdict().items()}
     return SingleFlight(has_diverged, figures)

@@ -75,7 +75,7 @@ class BridgeExperiment:
     """
 
     map_name: str
-    speed: float | None  # trim speed, m/s; if None, that of the map, or hover
+    speed: float | None  # trim speed, m/s; if None, the speed of the map, or hover
     folder: Path
     amplitude: float  # as a fraction of each input's limit
     log: Path | None  # log of an experiment; if None, it is flown

@@ -312,7 +312,7 @@ def _show(
         )
     if (unmodelled := tally.without_model()) is not None:
         console.print(
-            f"without a model: {unmodelled} of {tally.flights}; fallbacks: to the law of the start"
+            f"without a model: {unmodelled} of {tally.flights}; fallbacks: to the initial law"
         )
     for flight in figures["fly_again"]:
         score = "diverged" if flight["score"] is None else f"score {flight['score']:.3g}"

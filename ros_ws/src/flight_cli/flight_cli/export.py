@@ -130,7 +130,7 @@ class Export:
         else:
             print(exported.report, *exported.files, sep="\n")
         if exported.proof is not None:
-            raise typer.Exit(0 if exported.proof.holds else DIFFERS)
+            raise typer.Exit(0 if exported.proof.is_proved else DIFFERS)
 
 
 def _as_json(exported: Exported) -> dict[str, Any]:
@@ -145,7 +145,7 @@ def _as_json(exported: Exported) -> dict[str, Any]:
     ]
     return {
         **files,
-        "proved": proof.holds,
+        "proved": proof.is_proved,
         "compilers": proof.compilers,
         "comparisons": comparisons,
         "figures": proof.figures,

@@ -433,7 +433,7 @@ def _learner(scenario: Scenario) -> Learn | None:
 
     Raises ParameterError if the scenario cannot learn.
     """
-    if not scenario.learns():
+    if not scenario.has_learner():
         return None
     from flight_design.learning.scenario_learner import learner  # noqa: PLC0415 - loads SciPy, which few flights need
 

@@ -277,7 +277,7 @@ class Check(_Gains):
         return check_gains(self.airframe, self.scenario, **words, entries=entries)
 
     def _exit_if_loop_fails(self, sets: GainSets) -> None:
-        if not loop_verdict(sets.first, sets.guarantee).holds:
+        if not loop_verdict(sets.first, sets.guarantee).is_met:
             raise typer.Exit(LOOP_FAILS)
 
 
@@ -351,7 +351,7 @@ class Guarantee(Check):
         sets = GainSets({"scenario": answer}, checked=Path(self.scenario).stem, limited=guarantee)
         self._show(sets, lines, {"certificate": self.certificate})
         self._exit_if_loop_fails(sets)
-        if guarantee is None or not guarantee.holds:
+        if guarantee is None or not guarantee.is_proved:
             raise typer.Exit(LOOP_FAILS)
 
 

@@ -197,7 +197,7 @@ def show_guarantee(
     if {*study.spread.entries.values()} - {study.uncertainty}:
         say(console, "percentages: of the largest deviation, with the others in proportion")
     margins = checked.margins
-    if not guarantee.holds or margins is None or margins.worst is None:
+    if not guarantee.is_proved or margins is None or margins.worst is None:
         return
     heads = ("input", "disk", "phase\ndeg", "gain\ndB", "worst found,\ndisk")
     title = f"\nDisk margins of every aircraft within +-{100 * guarantee.uncertainty:g} %"

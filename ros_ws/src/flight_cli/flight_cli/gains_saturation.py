@@ -71,7 +71,7 @@ def limit_text(name: str, guarantee: LimitGuarantee | None, certificate: str) ->
     sampled = (
         "found at samples of the frequency: examples/check_certificate.py proves the certificate"
     )
-    if guarantee.settles:
+    if guarantee.is_settling:
         settles = f"the loop settles {within}, {limits} around where it settles"
         return [f"guarantee: {settles} (certificate {certificate})", sampled]
     period = 2.0 * math.pi / guarantee.multiplier.slowest

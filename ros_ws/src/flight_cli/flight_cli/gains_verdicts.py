@@ -21,14 +21,14 @@ def milliseconds(margin: float) -> str:
 class Verdict(NamedTuple):
     """The verdict on a group of conditions. Its sentence is empty if there are no conditions."""
 
-    holds: bool
+    is_met: bool
     sentence: str
 
 
 def loop_verdict(answer: GainAssessment[Any], guarantee: Guarantee | None) -> Verdict:
     """Judge whether a loop is stable with the required margins and the required guarantee."""
-    is_guaranteed = guarantee is None or guarantee.holds
-    holds = answer.is_stable and not failing(answer.loop) and is_guaranteed
+    is_guaranteed = guarantee is None or guarantee.is_proved
+    is_met = answer.is_stable and not failing(answer.loop) and is_guaranteed
     margins = answer.margins
     if margins is None:
         return Verdict(False, "the loop is not judged, because the literal sign has no linear loop")
@@ -55,7 +55,7 @@ def loop_verdict(answer: GainAssessment[Any], guarantee: Guarantee | None) -> Ve
             if is_guaranteed
             else f"but an aircraft {within} may be unstable"
         )
-    return Verdict(holds, ", ".join(("the loop is stable", *clauses)))
+    return Verdict(is_met, ", ".join(("the loop is stable", *clauses)))
 
 
 def rules_verdict(answer: GainAssessment[Any], _: Guarantee | None) -> Verdict:
@@ -116,7 +116,7 @@ def condition_cells(condition: GainCondition) -> tuple[str, str]:
     symbol = SYMBOLS[condition.relation]
     return (
         f"{condition.value:.4g} {symbol} {condition.bound:.4g}",
-        margin if condition.holds else f"[red]{margin} ![/red]",
+        margin if condition.is_met else f"[red]{margin} ![/red]",
     )
 
 
@@ -131,6 +131,6 @@ def condition_as_json(
         "found": condition.value,
         condition.relation.replace(" ", "_"): condition.bound,
         "margin": condition.margin,
-        "holds": condition.holds,
+        "holds": condition.is_met,
         "estimate": condition.is_estimate,
     }

@@ -116,7 +116,7 @@ class Guide(RouteWords):
                     "guide V=VALUE"
                 )
             circle = "a circle to the left" if waypoint.left else "a circle round the waypoint"
-            has_none = not (waypoint.loiters or waypoint.left)
+            has_none = not (waypoint.is_loiter or waypoint.left)
             require(has_none, f"route[{k}]", circle, "none in flight")
         return [(waypoint.north, waypoint.east, waypoint.altitude) for waypoint in waypoints]
 

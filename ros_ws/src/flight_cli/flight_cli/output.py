@@ -179,7 +179,7 @@ def _plain(cell: RenderableType) -> str:
     return Text.from_markup(cell).plain if isinstance(cell, str) else str(cell)
 
 
-WIDEST = 10_000  # width in characters, larger than that of any table
+WIDEST = 10_000  # width in characters; every table is narrower
 
 
 NAME_COLUMN = TextColumn("{task.description}")

@@ -101,8 +101,8 @@ class Replay:
             ticks=max(len(result.number), expected_ticks or 0),
             is_open_loop=others is not None,
             guided=guidance_replay,
-            guarantee=guarantee if result.equal() else None,
-            differences=differences if result.equal() else (),
+            guarantee=guarantee if result.is_equal() else None,
+            differences=differences if result.is_equal() else (),
         )
         lacks = () if account is None else account.notes()
         notes = (*recorded_run.tape.notes, *lacks, *answer.notes())
@@ -111,7 +111,7 @@ class Replay:
                 print_json(_as_json(answer, notes, self.settings or []))
             else:
                 _show(answer, notes)
-        equal = result.equal() and (guidance_replay is None or guidance_replay.equal())
+        equal = result.is_equal() and (guidance_replay is None or guidance_replay.is_equal())
         part = STATUS_SHORTFALL if result.compared.sum() < WHOLE * answer.ticks else 0
         raise typer.Exit(part if equal else DIFFERS)
 
@@ -286,7 +286,7 @@ def _as_json(answer: Shown, notes: Sequence[str], settings: list[str]) -> dict[s
         "set": settings,
         "ticks": len(result.number),
         "checked": int(result.compared.sum()),
-        "equal": result.equal(),
+        "equal": result.is_equal(),
         "other_parameters": int(result.other_parameters.sum()),
         "differing": int(result.different().any(axis=1).sum()),
         "differing_by_group": _count_by_group(result),

@@ -142,7 +142,9 @@ class Tune:
         files = {"airframe": folder / "airframe.yaml", "scenario": scenario, "page": page}
         for name, path in files.items():
             say(console, f"{name}: {display_path(path)}")
-        if not tuned.guarantee.holds or (exported.proof is not None and not exported.proof.holds):
+        if not tuned.guarantee.is_proved or (
+            exported.proof is not None and not exported.proof.is_proved
+        ):
             raise typer.Exit(UNPROVED)
 
     def _target(self) -> tuple[str, Path]:

@@ -70,7 +70,7 @@ class Selectors(NamedTuple):
     uncertainty: float  # uncertainty of A and B, for the search of gains
     entries: Mapping[str, float]  # uncertainty of each entry that the log shows, for the margins
     lead: Callable[[RiseDiConfig], RiseDiConfig]  # gives a feedforward the lead of the module
-    calm: bool  # whether calm air counts alone, without an observer
+    calm: bool  # whether only flights in calm air are judged, without an observer
     accept: bool  # whether gains with too small margins are accepted
     weights: Path | None
     report: Report
@@ -98,7 +98,8 @@ def candidates(selectors: Selectors) -> list[Candidate]:
     flight, airframe = selectors.flight, selectors.airframe
     former = flight.rise_di()
     found = {FORMER: (former, "")}
-    # The feedforward knows what that of the scenario knows beyond the airframe, such as the bank.
+    # The feedforward knows what the scenario's feedforward knows beyond the airframe, such as the
+    # bank.
     beyond = airframe
     if former.feedforward is not None:
         beyond = with_states_of(airframe, former.feedforward)

@@ -82,7 +82,7 @@ class Tuned(NamedTuple):
 
     identification: Identification
     best: Candidate
-    candidates: Sequence[Candidate]  # the first is that of the scenario
+    candidates: Sequence[Candidate]  # the first has the gains of the scenario
     guarantee: Guarantee
     margins: LoopMargins  # margins of the best candidate
     own: OwnFlight | None  # None if the log lacks the autopilot's parameters
@@ -124,7 +124,7 @@ def verdict(tuned: Tuned) -> list[str]:
 
 def guaranteed(guarantee: Guarantee) -> str:
     """Return a sentence on how many standard deviations of A and B the guarantee covers."""
-    holds = "every aircraft is stable" if guarantee.holds else "an aircraft may be unstable"
+    holds = "every aircraft is stable" if guarantee.is_proved else "an aircraft may be unstable"
     # Rounded down, because more is not proved.
     covered = math.floor(20.0 * guarantee.stable / guarantee.uncertainty) / 10.0
     return (

@@ -187,7 +187,7 @@ def _serve_with_control(
     require_ros_environment()
     from flight_view.control_client import ControlClient  # noqa: PLC0415 - loads rclpy, which a page without control lacks
 
-    # The aircraft behind a bridge is not that of the scenario.
+    # The aircraft behind a bridge is not the aircraft of the scenario.
     assess = partial(delay_margins, flight=FlightFacts(is_simulated=not real))
     with ControlClient(namespace) as client:
         key = new_key()

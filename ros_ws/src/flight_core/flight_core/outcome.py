@@ -56,7 +56,7 @@ class Aim(StrEnum):
     """
 
     ENGAGEMENT = "engagement"  # the law flies while it should
-    REFERENCE = "reference"  # y_m is that of the scenario
+    REFERENCE = "reference"  # y_m is as the scenario says
     GROUND = "ground"  # the aircraft stays above the ground
     SEPARATION = "separation"  # the aircraft keeps clear of the other aircraft of a fleet
     STALL = "stall"  # the airspeed stays above the stall speed

@@ -31,8 +31,8 @@ ROS_PARAMETERS = (SIM_TIME, "start_type_description_service", "qos_overrides")
 """Parameters that ROS gives every node."""
 
 WILDCARDS: Mapping[str, str] = {"**": "(/[^/]+)*", "*": "/[^/]+"}
-# similarity from which on an unknown section, such as recoder, counts as a missing section that is
-# misspelt
+# similarity from which on an unknown section, such as recoder, is taken as a misspelt name of a
+# missing section
 MISTYPED = 0.8
 
 

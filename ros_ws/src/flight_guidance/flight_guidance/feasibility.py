@@ -145,7 +145,7 @@ def _legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[L
     loiters = {
         k: Loiter(waypoint.turns, waypoint.wait)
         for k, waypoint in enumerate(waypoints)
-        if waypoint.loiters
+        if waypoint.is_loiter
     }
     left = [k for k, waypoint in enumerate(waypoints) if waypoint.left]
     return path.route([waypoint.point for waypoint in waypoints], radius, least, loiters, left)
@@ -170,7 +170,7 @@ def _without_short_legs(
             inner = [
                 k
                 for k in (short.number - 1, short.number)
-                if 0 < k < len(remaining) - 1 and not remaining[k][1].loiters
+                if 0 < k < len(remaining) - 1 and not remaining[k][1].is_loiter
             ]
             if not inner:
                 raise refusal from None

@@ -106,7 +106,7 @@ class Guidance:
         self._failures = Failures()
         # why the last step failed; None if guidance waits for a pose
         self._failure: str | None = None
-        # Instant of the operator's last message; before the first message, that of the first step.
+        # Instant of the operator's last message, or of the first step before the first message.
         self._operated_ns: int | None = None
         self._link_lost = False
         self._authority = Authority()

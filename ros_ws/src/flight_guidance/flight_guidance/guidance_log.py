@@ -97,7 +97,7 @@ def channels(outputs: Sequence[str]) -> tuple[LogChannels, ...]:
         LogChannels(["theta_c"], "commands.theta_c"),
         LogChannels(["climb_c"], "state.climb_c"),
         LogChannels(["V_c"], "state.V_c"),
-        *(LogChannels([f"limited.{name}"], f"commands.{name}_limited") for name in LIMITED),
+        *(LogChannels([f"limited.{name}"], f"commands.is_{name}_limited") for name in LIMITED),
         LogChannels(["age.pose"], "pose_age"),
         LogChannels([LINK_AGE], "link_age"),
         LogChannels([FAILED], "failed"),

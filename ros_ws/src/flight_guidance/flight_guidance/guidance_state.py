@@ -243,11 +243,11 @@ class StepCommands(NamedTuple):
     missed: float = 0.0
     clearance: float = LARGEST  # m, distance from the fence
     predicted: float = LARGEST  # m, least clearance that the better turn away from the fence keeps
-    bank_limited: bool = False
-    theta_limited: bool = False
-    climb_limited: bool = False
-    V_limited: bool = False
-    slew_limited: bool = False
+    is_bank_limited: bool = False
+    is_theta_limited: bool = False
+    is_climb_limited: bool = False
+    is_V_limited: bool = False
+    is_slew_limited: bool = False
 
 
 def bits(names: Collection[str]) -> int:

@@ -442,7 +442,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             setattr(message.twist.twist.linear, key, value)
         speed = self.parameters.speed + y.get("V", 0.0)  # a multicopter has no V, but measures r
         r = yaw_rate(y, pose["phi"], pose["theta"], speed)
-        # axes forward, left, up (REP 103); those of y are forward, right, down
+        # axes forward, left, up (REP 103); the axes of y are forward, right, down
         for key, value in zip("xyz", (y["p"], -y["q"], -r), strict=True):
             setattr(message.twist.twist.angular, key, value)
         return message

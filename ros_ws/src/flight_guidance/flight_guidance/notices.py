@@ -180,7 +180,7 @@ class Notices:
             self._reach_text = self._reach(authority)
             if self._reach_text != earlier:
                 texts.append(f"from now on {self._reach_text or 'own limits again'}")
-        # The conditions that must last are those of the link, the pose, the tilt and the wind.
+        # The conditions on the link, the pose, the tilt and the wind must last.
         if self._link.is_due(t, holds=log[LINK_AGE] > self._link_timeout):
             texts.append(f"no message of an operator for {self._link_timeout:g} s: home")
         if self._stale.is_due(t, holds=log["age.pose"] > self._max_age):

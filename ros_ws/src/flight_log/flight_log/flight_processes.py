@@ -110,7 +110,7 @@ def flight_processes(
     }
 
 
-# If a publisher is silent for this time, the nodes admit another one. The time is that of
+# If a publisher is silent for this time, the nodes admit another one. It is the time of
 # `aircraft.max_age`.
 SILENT_NS = NANOSECONDS // 5
 SILENT_PERIODS = 3  # least silence of a slow publisher that counts, in periods of its samples

@@ -32,12 +32,12 @@ STILL = 0.1
 # Two sensors agree if they differ by at most this fraction of the standard deviation of the
 # quantity.
 UNLIKE = 0.4
-# A flag counts as set if it is set in at least this fraction of the samples. An airspeed counts as
-# that of a flight if it is at least this fraction of the largest one.
+# A flag is taken as set if it is set in at least this fraction of the samples. An airspeed is taken
+# as one of a flight if it is at least this fraction of the largest one.
 MOST = 0.5
 AIRSPEEDS = frozenset({"Airspeed", "true_airspeed_m_s"})
 TYPICAL = 90.0  # percentile that counts as the typical value of an airspeed
-# messages of PX4 whose instance 1 is that of the surfaces of a VTOL
+# messages of PX4 whose instance 1 belongs to the surfaces of a VTOL
 SURFACES = ("vehicle_torque_setpoint", "actuator_controls_0")
 CORES = ("XKF1", "NKF1", "EKF1")
 

@@ -61,7 +61,7 @@ from flight_log.open_log import (
 
 PARAMETERS = "parameters.yaml"  # attachment with every parameter of the flight
 A_FLIGHT = f"a recorded flight: y, y_m and u as {JOINT_STATE}"
-# A namespace that has one of these topics is that of an aircraft.
+# A namespace that has one of these topics belongs to an aircraft.
 AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")
 
 
@@ -224,7 +224,7 @@ def _tape(
     }
     recording = {name: clock for name, clock in recordings.items() if clock.found}
     leaps: list[Leap] = []
-    # An imported log has no leaps, because its message numbers are those of the import. A lost
+    # An imported log has no leaps, because the import numbered its messages. A lost
     # message leaves no gap in them, so a gap in its stamps would look like a step of the clock.
     if IMPORTED not in log.metadata:
         signals, recording, leaps = without_leaps(signals, recording)

@@ -118,7 +118,7 @@ def _read_dataflash(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
                     continue
                 newest_us = stamp_us(message, newest_us)
                 stamp_ns = min(round(1e3 * newest_us), LARGEST)
-                # The number of an instance is that of the sensor or of the core.
+                # The number of an instance is the number of the sensor or of the core.
                 number = int(getattr(message, "I", 0) or getattr(message, "C", 0))
                 if name == PARAMETER:
                     yield SETTING, stamp_ns, (message.Name, float(message.Value))

@@ -198,7 +198,7 @@ class Taken(NamedTuple):
 
     what: str  # name of the message, or "system"
     numbers: tuple[int, ...]  # those that were taken; none if an estimate replaces the sensors
-    among: tuple[int, ...]  # those of the log
+    among: tuple[int, ...]  # the instances in the log
     reason: Reason
     unused: tuple[UnusedSensor, ...] = ()  # the sensors that an estimate replaces
 

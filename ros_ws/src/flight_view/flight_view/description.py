@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.display_units import NO_UNIT, display_units
+from flight_analysis.report.disturbances import command_edges
 from flight_analysis.report.guided import mission_drawing
 from flight_analysis.report.model_spans import ModelSpan, model_names
-from flight_analysis.report.summary import command_edges
 from flight_analysis.report.summary_rows import model_rows
 from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS

@@ -51,7 +51,7 @@ LONGEST = 20.0  # longest flight if no duration is given, s
 class Material(NamedTuple):
     """The parameters and recordings with which a proof compares C and Python."""
 
-    sets: list[RiseDiConfig]  # parameter sets, of which the first is that of the code
+    sets: list[RiseDiConfig]  # parameter sets; the code begins with the first
     recordings: Iterator[Recording]
     line: str  # a line for the report of the proof
 
@@ -116,7 +116,8 @@ def export(
         proof: Whether to compile and prove the code.
 
     Returns:
-        The files, the proof and the text of the report. `proof.holds` says whether the proof holds.
+        The files, the proof and the text of the report. `proof.is_proved` says whether C computed
+        what Python computes in every comparison.
 
     Raises:
         ParameterError: The controller has no C code, no compiler runs, or the folder cannot be
@@ -128,7 +129,7 @@ def export(
         'rise_di.h'
     """
     source = find_scenario(scenario)
-    if run is not None and source.learns():
+    if run is not None and source.has_learner():
         source = with_last_model(source, run if isinstance(run, RecordedRun) else read_run(run))
         run = None  # several models flew in its ticks, but only the last one is exported
     if rate is not None:

@@ -82,7 +82,7 @@ SCALE = np.array([0.1, 0.5, 0.5, 0.5, 0.5, 0.1])  # scales of these unknowns for
 # Bounds of these unknowns.
 LOWEST = (-0.5, 0.0, -1.0, -1.0, -1.0, -0.5)
 HIGHEST = (0.5, 1.0, 1.0, 1.0, 1.0, 0.5)
-# m/s^2, rad/s^2, largest accelerations in trim: those of a tenth of a degree of attitude.
+# m/s^2, rad/s^2, largest accelerations in trim. A tenth of a degree of attitude causes as much.
 TOLERANCE = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])
 
 AXES_OF_RESIDUALS = ("forward", "sideways", "up or down", "in roll", "in pitch", "in yaw")

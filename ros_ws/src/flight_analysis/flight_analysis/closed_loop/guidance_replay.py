@@ -34,7 +34,7 @@ class GuidanceReplay(NamedTuple):
     first: ReplayDifference | None
     notes: tuple[str, ...]
 
-    def equal(self) -> bool:
+    def is_equal(self) -> bool:
         """Return whether all checked steps are equal to the log in every bit."""
         return self.differing == 0
 

@@ -94,7 +94,7 @@ class ReplayResult(NamedTuple):
         )
         return different
 
-    def equal(self) -> bool:
+    def is_equal(self) -> bool:
         """Return whether the computed ticks equal the log, and used the recorded parameters.
 
         Every checked tick must be equal in every bit. Ticks that were not checked do not matter.
@@ -230,7 +230,7 @@ def replay(
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
-        >>> rise_di.replay(tape).equal()
+        >>> rise_di.replay(tape).is_equal()
         True
     """
     if isinstance(run, Tape):

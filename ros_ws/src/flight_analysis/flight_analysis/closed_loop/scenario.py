@@ -66,7 +66,7 @@ class Scenario:
     reference_model: ReferenceModelConfig
     controller: ControllerConfig
     recorder: RecorderConfig
-    guidance: GuidanceConfig | None = None  # if None, the commands are those of reference_model
+    guidance: GuidanceConfig | None = None  # if None, reference_model generates the commands
 
     @classmethod
     def from_parts(cls, name: str, **sections: Mapping[str, Any] | Config) -> "Scenario":
@@ -178,20 +178,9 @@ class Scenario:
             )
         return self.controller
 
-    def learns(self) -> bool:
+    def has_learner(self) -> bool:
         """Return whether the controller learns its models, A and B, in flight."""
         return isinstance(self.controller, RiseDiConfig) and self.controller.learn is not None
-
-    def air(self) -> str:
-        """Return the most violent disturbance of the air, except gusts, as a name in AIRS."""
-        aircraft = self.aircraft
-        if aircraft.microburst is not None:
-            return "microburst"
-        if aircraft.turbulence is not None:
-            return "turbulence"
-        if aircraft.shear is not None:
-            return "shear"
-        return "wind" if any(aircraft.wind) else "calm"
 
     def gust_windows(self) -> dict[str, tuple[float, float]]:
         """Return the times at which each gust starts and ends, s, by the name of the gust.
@@ -530,7 +519,7 @@ def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
         levels,
     )
     require(
-        guidance.drag is None or not scenario.learns(),
+        guidance.drag is None or not scenario.has_learner(),
         "controller.learn",
         "a section beside the guidance of a multicopter",
         "none: its limits do not follow a learned model",

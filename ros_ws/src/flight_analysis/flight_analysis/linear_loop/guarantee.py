@@ -99,7 +99,7 @@ class Guarantee(NamedTuple):
     proof: Sequence[dict[str, Any]] = ()
 
     @property
-    def holds(self) -> bool:
+    def is_proved(self) -> bool:
         """Whether every aircraft of the box is proved stable."""
         return self.stable >= self.uncertainty
 
@@ -110,7 +110,7 @@ class Guarantee(NamedTuple):
 
     def as_json(self) -> dict[str, Any]:
         """Return the guarantee as a dict that JSON can hold, without the proof."""
-        content = self._asdict() | {"holds": self.holds}
+        content = self._asdict() | {"holds": self.is_proved}
         del content["proof"]
         if self.unstable is not None:
             content["unstable"] = self.unstable._asdict()
@@ -163,7 +163,7 @@ def loop_guarantee(
     guarantee = none._replace(
         stable=largest * proved, unstable=first, proof=proof, zeros=box.largest_zero * proved
     )
-    if not guarantee.holds:
+    if not guarantee.is_proved:
         return guarantee
     disks, disk_all = _disks(linear, uncertain, late, report)
     return guarantee._replace(disk=disks, disk_all=disk_all)

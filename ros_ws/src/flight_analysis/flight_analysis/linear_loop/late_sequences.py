@@ -58,7 +58,7 @@ class Attack(NamedTuple):
     choices: IntArray  # index into `Ticks.maps` of each tick
 
     @property
-    def leaves(self) -> bool:
+    def is_unstable(self) -> bool:
         """Whether the loop is unstable if the sequence is repeated."""
         return self.growth > RADIUS ** len(self.choices)
 
@@ -190,14 +190,14 @@ def attacked(ticks: Ticks, known: IntArray | None = None) -> Attack | None:
     choices, parts = len(ticks.maps), loops_of(ticks)
     known_first = [] if known is None else [ascended(part, known) for part in parts]
     for attack in known_first:
-        if attack.leaves:
+        if attack.is_unstable:
             return attack
     for part in parts:
         for length in LENGTHS:
             for _ in range(STARTS):
                 of_two = rng.choice(choices, 2)
                 start = of_two[(rng.random(length) < rng.random()).astype(int)]
-                if (attack := ascended(part, start)).leaves:
+                if (attack := ascended(part, start)).is_unstable:
                     return attack
     return None
 

@@ -54,7 +54,7 @@ BARE = (
 )
 
 
-ROUNDING = 1e-9  # relative deviation of an entry that counts as none
+ROUNDING = 1e-9  # relative deviation of an entry that is taken as 0
 # significant digits of the numbers in a digest: two ways to the same loop differ only by rounding
 DIGITS = 10
 

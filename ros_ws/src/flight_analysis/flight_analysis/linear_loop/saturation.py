@@ -86,12 +86,12 @@ class LimitGuarantee(NamedTuple):
     zeros: float = 0.0  # part of its row up to which an entry that is 0 in the file deviates
 
     @property
-    def settles(self) -> bool:
+    def is_settling(self) -> bool:
         """Whether every motion settles. If not, the guarantee only excludes fast oscillations."""
         return not self.multiplier.slowest
 
     @property
-    def holds(self) -> bool:
+    def is_proved(self) -> bool:
         """Whether the guarantee was found for the whole box."""
         return self.size >= self.uncertainty
 
@@ -102,9 +102,9 @@ class LimitGuarantee(NamedTuple):
             "uncertainty": self.uncertainty,
             "within": self.size,
             "zeros": self.zeros,
-            "settles": self.settles,
+            "settles": self.is_settling,
             "slowest": self.multiplier.slowest,
-            "holds": self.holds,
+            "holds": self.is_proved,
         }
 
 

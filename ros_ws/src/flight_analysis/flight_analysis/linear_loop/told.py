@@ -29,8 +29,8 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import LoopTiming
 from rise_di_controller.params import ControllerConfig
 
-SMALLEST = 1e-6  # difference of two times that counts as none, s: it changes no printed margin
-# Relative difference of two periods that counts as none. The clocks of two hosts differ by only
+SMALLEST = 1e-6  # s, difference of two times that is taken as 0: it changes no printed margin
+# Relative difference of two periods that is taken as 0. The clocks of two hosts differ by only
 # 1e-4, and a missed tick changes a period by much more.
 SAME_PERIOD = 0.01
 # longest wait in periods of the aircraft: y waits up to one period for a tick, and u up to one

@@ -106,9 +106,9 @@ class Channels(NamedTuple):
     D: FloatArray
     entries: tuple[int, ...]  # indices of the entries in the box
     period: float  # s
-    # Places of the channels of a delay among those of the whole loop: the means of e_j v_j, then
-    # their second coefficients, which read nothing because a block has one row. Both groups are
-    # ordered by j, with the m inputs for each j.
+    # Places of the channels of a delay among the channels of the whole loop: the means of e_j v_j,
+    # then their second coefficients, which read nothing because a block has one row. Both groups
+    # are ordered by j, with the m inputs for each j.
     late: tuple[int, ...] = ()
 
     @property

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flight_analysis.metrics.errors import ErrorMetrics, best_error, error_metrics
 from flight_analysis.metrics.time_spans import sample_times
-from flight_analysis.metrics.transients import CALM, SETTLING_DWELL, Transient, part_masks
+from flight_analysis.metrics.transients import SETTLING_DWELL, Air, Transient, part_masks
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 
@@ -29,7 +29,7 @@ def errors_by_part(
     tape: Tape,
     transients: Sequence[Transient],
     settle: float = SETTLING_DWELL,
-    air: str = CALM,
+    air: Air = Air.CALM,
 ) -> dict[str, dict[str, ErrorMetrics]]:
     """Return rms and maximum of `best_error` by channel and part of the flight.
 
@@ -52,7 +52,7 @@ def inputs_by_part(
     transients: Sequence[Transient],
     settle: float = SETTLING_DWELL,
     topic: str = "u",
-    air: str = CALM,
+    air: Air = Air.CALM,
 ) -> dict[str, dict[str, InputMetrics]]:
     """Return the control effort by input and part of the flight.
 

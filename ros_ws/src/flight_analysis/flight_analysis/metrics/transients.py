@@ -29,11 +29,19 @@ TURN_BANK = math.radians(5.0)  # guidance turns if it commands more bank than th
 CAPTURE_ANGLE = math.radians(1.0)
 CAPTURE_TIME = 0.5
 
-CALM = "calm"
-UNKNOWN_AIR = "other"
-AIRS = (CALM, "wind", "shear", "turbulence", "microburst", UNKNOWN_AIR)
-"""The disturbances of the air except gusts. The part of a flight without gust, command and
-engagement is named after this disturbance. UNKNOWN_AIR means that no simulated aircraft flew."""
+
+class Air(StrEnum):
+    """The disturbance of the air, except gusts, from the calmest to the most violent.
+
+    The part of a flight without gust, command and engagement is named after it.
+    """
+
+    CALM = "calm"
+    WIND = "wind"
+    SHEAR = "shear"
+    TURBULENCE = "turbulence"
+    MICROBURST = "microburst"
+    UNKNOWN = "other"  # no simulated aircraft flew
 
 
 class TransientKind(StrEnum):
@@ -145,7 +153,7 @@ def part_masks(
     t: FloatArray,
     transients: Sequence[Transient],
     settle: float = SETTLING_DWELL,
-    air: str = CALM,
+    air: Air = Air.CALM,
 ) -> dict[str, NDArray[np.bool_]]:
     """Return a mask of the instants t, (N,), for each part of the flight.
 

@@ -159,7 +159,7 @@ def _learned_card(flight: RecordedFlight) -> Card:
     if not learned:
         return Card(
             title="Learned models",
-            sentences=["No learned model flew: the law of the start flew to the end."],
+            sentences=["No learned model flew: the initial law flew to the end."],
         )
     changes = []
     for name, before in spans[0]["rms"].items():
@@ -176,7 +176,7 @@ def _learned_card(flight: RecordedFlight) -> Card:
     ]
     if changes:
         sentences.append(
-            f"Rms error under the law of the start, and under the last model: {', '.join(changes)}."
+            f"Rms error under the initial law, and under the last model: {', '.join(changes)}."
             " Commands and wind of the two differ."
         )
     stable = learned[-1].get("stable")
@@ -189,7 +189,7 @@ def _learned_card(flight: RecordedFlight) -> Card:
             f"With the last model, {within if stable else 'no aircraft is proved stable'}, as long "
             f"as no limit acts (loop {learned[-1]['loop']})."
         )
-    return Card(title="Learned models", sentences=sentences, words=("law of the start",))
+    return Card(title="Learned models", sentences=sentences, words=("initial law",))
 
 
 def _replay_card(flight: RecordedFlight) -> Card:

@@ -48,7 +48,7 @@ def meta_lines(flight: RecordedFlight, scenario: Scenario) -> list[str]:
     distance = guided.distance(flight.tape)
     if distance is not None:
         parts.append(f"{distance / 1e3:.2f} km over ground")
-    # The trim speed is that of the aircraft in the scenario.
+    # The aircraft of the scenario has the trim speed.
     speed = guided.top_speed(flight.tape, scenario.aircraft.channels().speed)
     if speed is not None and is_known:
         parts.append(f"at most {speed:.1f} m/s")

@@ -71,7 +71,7 @@ class ReferenceErrors(NamedTuple):
     t: FloatArray  # flight time, s, (N,)
     outputs: tuple[str, ...]
     error: FloatArray  # y_m of the log less y_m of the scenario, (N, m), SI
-    allowed: FloatArray  # largest abs(error) that counts as none, (m,), SI
+    allowed: FloatArray  # largest abs(error) that is taken as 0, (m,), SI
 
 
 class _Command(NamedTuple):

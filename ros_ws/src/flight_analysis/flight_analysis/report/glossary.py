@@ -12,13 +12,11 @@ from types import MappingProxyType
 
 from flight_analysis.metrics.settling import MIN_BAND_NOISE_FLOORS, SETTLING_BAND
 from flight_analysis.metrics.transients import (
-    AIRS,
-    CALM,
     CAPTURE_ANGLE,
     CAPTURE_TIME,
     SETTLING_DWELL,
     TURN_BANK,
-    UNKNOWN_AIR,
+    Air,
 )
 from flight_analysis.report.display_units import QUANTITY_UNITS
 from flight_analysis.report.guided import BANDS
@@ -46,14 +44,14 @@ GLOSSARY = MappingProxyType(
         "rms": "the root of the mean square",
         "max": "the largest absolute value",
         "whole": "over the whole flight",
-        **{air: _REST + ("; the wind is not known" if air == UNKNOWN_AIR else "") for air in AIRS},
+        **{air: _REST + ("; the wind is not known" if air is Air.UNKNOWN else "") for air in Air},
         "command": f"from an edge of a command {_AFTER}",
         "gust": f"from the entry into a gust {_AFTER}",
         "turn": f"while a bank above {math.degrees(TURN_BANK):.0f} deg is commanded, and {_AFTER}",
         "capture": "outside of turns: while a path steeper than "
         f"{math.degrees(CAPTURE_ANGLE):.0f} deg or a change of V is commanded, or the aircraft "
         f"is farther from its path than it flies in {CAPTURE_TIME:g} s, and {_AFTER}",
-        "ultimate bound": f"the largest error in {CALM} air, once the law has settled",
+        "ultimate bound": f"the largest error in {Air.CALM} air, once the law has settled",
         "noise floor": "the rms that noise and rounding leave in y: a smaller measured error "
         "cannot be distinguished from them",
         "switches (1/s)": "how often the sign term of the law changes its direction",
@@ -73,7 +71,7 @@ GLOSSARY = MappingProxyType(
         "overshoot": "the largest error beyond the command, if the segment begins outside of "
         "the settling band",
         # Models
-        "law of the start": "the law with the model of the file, before the first learned model",
+        "initial law": "the law with the model of the file, before the first learned model",
         # Time
         "jitter": "how far the time between two ticks is from a whole number of periods",
         "age of y": "how old the newest y is when the controller uses it",

@@ -254,7 +254,7 @@ def guarantee_text(guarantee: Guarantee) -> list[str]:
             f"entries that are 0, beside exact others: stable within {proved_percent(alone.stable)}"
             f" of their rows (no certificate without --zeros); {_first_found(alone.unstable)}"
         )
-    if not guarantee.holds:
+    if not guarantee.is_proved:
         percent = 100.0 * guarantee.uncertainty
         lines.append(
             f"an aircraft within {percent:g} % may be unstable: no disk margin is guaranteed"

@@ -20,15 +20,7 @@ from flight_analysis.metrics.by_part import errors_by_part, inputs_by_part
 from flight_analysis.metrics.controller_log import saturation_shares, sign_switches
 from flight_analysis.metrics.errors import TRUE_ERROR, best_error, noise_floor, tracking_error
 from flight_analysis.metrics.settling import settling_bands, settling_times
-from flight_analysis.metrics.transients import (
-    CALM,
-    UNKNOWN_AIR,
-    Transient,
-    TransientKind,
-    engagements,
-    guided_transients,
-    live_commands,
-)
+from flight_analysis.metrics.transients import Air, Transient, TransientKind
 from flight_analysis.report.account import (
     Account,
     Commands,
@@ -43,6 +35,7 @@ from flight_analysis.report.display_units import (
     format_seconds,
     in_order,
 )
+from flight_analysis.report.disturbances import air_of, transients
 from flight_analysis.report.flown_models import FlownController
 from flight_analysis.report.flown_reference import reason_not_compared
 from flight_analysis.report.guided import guidance_notices, guidance_summary
@@ -67,45 +60,6 @@ from flight_core.tape import Tape, as_tape, refusal_note
 from flight_log.bag import COMPARED
 from flight_log.clock import SINCE_EPOCH_NS
 from flight_log.log_messages import LogMessage
-
-
-def command_edges(scenario: Scenario) -> list[Transient]:
-    """Return the changes of the scenario's commands as transients, in order of time.
-
-    They are the edges of its pulses, doublets and ramps.
-    """
-    edges = [
-        Transient(kind=TransientKind.COMMAND, name=name, start=edge.start, stop=edge.stop)
-        for name, of_channel in scenario.reference_model.edges().items()
-        for edge in of_channel
-        if edge.change != 0.0
-    ]
-    return sorted(edges, key=lambda edge: edge.start)
-
-
-def transients(scenario: Scenario, tape: Tape, *, follows_scenario: bool = True) -> list[Transient]:
-    """Return the transients of a flight: engagements, commands and gusts.
-
-    From the first live command on, live commands replace the commands of the scenario. In a guided
-    flight, turns and captures replace commands. If `follows_scenario` is False, y_m did not follow
-    the scenario's commands, so these commands are left out.
-    """
-    windows = scenario.gust_windows() if is_simulated(tape) else {}
-    gusts = [
-        Transient(kind=TransientKind.GUST, name=name, start=start, stop=stop)
-        for name, (start, stop) in windows.items()
-    ]
-    if "guidance" in tape:
-        return [*engagements(tape), *guided_transients(tape), *gusts]
-    live = live_commands(tape)
-    until = float(tape.time("u_m")[0]) if live else math.inf
-    edges = command_edges(scenario) if follows_scenario else []
-    return [
-        *engagements(tape),
-        *(edge for edge in edges if edge.start < until),
-        *live,
-        *gusts,
-    ]
 
 
 class RecordedFlight(NamedTuple):
@@ -206,7 +160,7 @@ def summarise(
     flight_account = account(tape, scenario, outcome) if flight_account is None else flight_account
     not_compared = reason_not_compared(tape, scenario)
     events = transients(scenario, tape, follows_scenario=not_compared is None)
-    air = scenario.air() if is_simulated(tape) else UNKNOWN_AIR
+    air = air_of(scenario, tape)
     flight_account = flight_account._replace(commands=_commands(tape, events, flight_account.end))
     ticks = None
     if "internals" in tape:
@@ -554,14 +508,14 @@ def empty_summary(scenario: Scenario | None, outcome: Outcome) -> dict[str, Any]
     }
 
 
-def _errors(tape: Tape, events: Sequence[Transient], air: str) -> dict[str, Any]:
+def _errors(tape: Tape, events: Sequence[Transient], air: Air) -> dict[str, Any]:
     bands = settling_bands(tape)
     floors = noise_floor(tape)
     switches = sign_switches(tape)
     figures = {}
     for channel, parts in errors_by_part(tape, events, air=air).items():
         figures[channel] = {part: asdict(figures_of) for part, figures_of in parts.items()} | {
-            "bound": parts[CALM].max if air == CALM else None,
+            "bound": parts[Air.CALM].max if air is Air.CALM else None,
             "band": bands[channel],
             "floor": floors[channel],
             "sign_switches": switches.get(channel),
@@ -574,7 +528,7 @@ def _in_order(by_channel: Mapping[str, Any], scenario: Scenario) -> dict[str, An
     return {name: by_channel[name] for name in in_order(by_channel, display_units(scenario))}
 
 
-def _inputs(tape: Tape, events: Sequence[Transient], air: str) -> dict[str, Any]:
+def _inputs(tape: Tape, events: Sequence[Transient], air: Air) -> dict[str, Any]:
     saturation = saturation_shares(tape)
     figures: dict[str, Any] = {}
     for name, parts in inputs_by_part(tape, events, air=air).items():

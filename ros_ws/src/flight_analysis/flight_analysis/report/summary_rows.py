@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any
 
-from flight_analysis.metrics.transients import AIRS, CALM, TransientKind
+from flight_analysis.metrics.transients import Air, TransientKind
 from flight_analysis.report.display_units import (
     NO_UNIT,
     NO_VALUE,
@@ -71,14 +71,14 @@ DISTURBED = (
 )
 RMS_COLUMNS = (
     Column(group="rms", head="whole", path=("whole", "rms")),
-    *(Column(group="rms", head=air, path=(air, "rms")) for air in AIRS),
+    *(Column(group="rms", head=air, path=(air, "rms")) for air in Air),
     *(Column(group="rms", head=kind, path=(kind, "rms")) for kind in DISTURBED),
 )
 
 
 ERROR_COLUMNS = (
     *RMS_COLUMNS,
-    *(Column(group="max", head=air, path=(air, "max")) for air in AIRS if air != CALM),
+    *(Column(group="max", head=air, path=(air, "max")) for air in Air if air is not Air.CALM),
     *(Column(group="max", head=kind, path=(kind, "max")) for kind in DISTURBED),
     Column(group="ultimate", head="bound", path=("bound",)),
 )
@@ -95,7 +95,7 @@ INPUT_COLUMNS = (
     *RMS_COLUMNS,
     Column(group="", head="max", path=("whole", "max")),
     Column(group="rate", head="whole", path=("whole", "rate")),
-    *(Column(group="rate", head=air, path=(air, "rate")) for air in AIRS),
+    *(Column(group="rate", head=air, path=(air, "rate")) for air in Air),
 )
 """Columns that a table of inputs can have before SATURATION_COLUMN. `columns_of` chooses the
 columns for a flight."""

@@ -311,7 +311,7 @@ def model_table(
     headings, rows = model_rows(models, units)
     columns = [Column(group="", head=head) for head in headings]
     return MetricTable(
-        f"Rms of the error by model{part}", columns, rows, MODEL_LEGEND, ("law of the start",)
+        f"Rms of the error by model{part}", columns, rows, MODEL_LEGEND, ("initial law",)
     )
 
 

@@ -33,7 +33,7 @@ from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.law.control_law import ControlLaw
 
 DELAY_TICKS = (1, 2, 3, 4, 6)  # delays of u: 10 to 60 ms at 100 Hz
-TURBULENCE_SEED = 3  # seed of a comparison's turbulence, which differs from that of the tuning
+TURBULENCE_SEED = 3  # seed of a comparison's turbulence; the tuning has another seed
 
 
 class Scores(NamedTuple):

@@ -55,7 +55,7 @@ class Objective(NamedTuple):
     title: str
     weights: dict[str, float]  # weight of each wind
     delay: int  # delay of u in the late flights, in multiples of `Benchmark.delay`
-    # whether the late flights are those of all aircraft, and not only of the nominal one
+    # whether all aircraft also fly with late messages, and not only the nominal one
     is_all_late: bool
     # requirement that the nominal loop must meet if the law has margins
     requirement: Requirement | None = None

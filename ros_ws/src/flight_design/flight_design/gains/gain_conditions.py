@@ -106,7 +106,7 @@ class GainCondition(NamedTuple):
     is_estimate: bool = False  # whether it depends on gamma_2, an assumption
 
     @property
-    def holds(self) -> bool:
+    def is_met(self) -> bool:
         """Whether the gain set meets the condition."""
         if self.relation is Relation.ABOVE:
             return self.value > self.bound
@@ -139,7 +139,7 @@ class GainCondition(NamedTuple):
 
 def failing(conditions: Sequence[GainCondition]) -> tuple[GainCondition, ...]:
     """Return the conditions that the gain set does not meet."""
-    return tuple(condition for condition in conditions if not condition.holds)
+    return tuple(condition for condition in conditions if not condition.is_met)
 
 
 # Theorem 1

@@ -165,7 +165,7 @@ class GainAssessment(NamedTuple, Generic[Controller]):
         It is False for the literal sign, which has no linear loop.
         """
         named = (condition for condition in self.loop if condition.name == STABILITY)
-        return self.margins is not None and all(condition.holds for condition in named)
+        return self.margins is not None and all(condition.is_met for condition in named)
 
 
 def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:

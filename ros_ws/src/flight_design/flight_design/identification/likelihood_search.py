@@ -70,7 +70,7 @@ class Doubt(NamedTuple):
 
     timing: float  # s, standard deviation of the delay of u, which is not identified
     whiteness: FloatArray  # (m,) `whiteness` of the innovations of the held-out samples
-    # whether a block of the log counts by how far theta moves without it
+    # whether the deviations come from how far theta moves if one block of the log is left out
     leaves_out: bool = False
 
 

@@ -103,8 +103,8 @@ class Part(NamedTuple):
     by_timing: tuple[float, ...] = ()
     # part of each entry's deviation that is added because the model may be wrong
     by_model: tuple[float, ...] = ()
-    # difference of each entry from that of a second model, by `rates_model.doubted`; () if there is
-    # none
+    # difference of each entry from the same entry of a second model, by `rates_model.doubted`; ()
+    # if there is none
     by_motion: tuple[float, ...] = ()
 
 

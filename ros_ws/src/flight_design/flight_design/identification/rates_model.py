@@ -37,7 +37,7 @@ from flight_design.identification.model_quality import NoBetter
 from flight_design.identification.model_refusals import best_known
 
 SLOW = 2.0  # s, time constant of the high-pass, twice as long as a doublet
-FAST = 1.0  # s, that of the second high-pass, as long as a doublet
+FAST = 1.0  # s, time constant of the second high-pass, as long as a doublet
 # Largest difference of the best known effect on an output, as a fraction of its nominal value. It
 # is as large as what an uncertain delay of u may cause.
 MOST_APART = 0.15

@@ -33,7 +33,7 @@ from flight_design.identification.model_refusals import MAX_DEVIATION
 # s, length of the record that is tested. With 10 s, losses were found up to 4 s later, and halved
 # effects were not found at all.
 RECORD = 4.0
-# Share of an input's effect. A loss of at most this share counts as no change, since an accepted
+# Share of an input's effect. A loss of at most this share is taken as no change, since an accepted
 # model may be wrong by this much: it is twice the largest standard deviation of its effects.
 LOSS = 2.0 * MAX_DEVIATION
 # Gain of log-likelihood above which a change is found. It stands for 4.9 standard deviations, see
@@ -51,10 +51,10 @@ FACTOR = 1.0
 REVERSED = -2.0  # least relative change of an effect: the input acts the other way
 DEAD = -1.0  # relative change of an effect that is lost
 MOST = 2.0  # largest relative change of an effect
-# Largest share of an effect that counts as none. An accepted model may have a standard deviation
+# Largest share of an effect that is taken as none. An accepted model may have a standard deviation
 # as large as this.
 NONE = MAX_DEVIATION
-# A reversed effect of at most this share counts as none. No surface reverses in flight, but a
+# A reversed effect of at most this share is taken as none. No surface reverses in flight, but a
 # surface that is jammed off centre pushes steadily against the u that is to balance it. If it is
 # jammed at 5 deg while u is at its stop of 30 deg, it looks like an effect of -17 %. This effect
 # has a standard deviation of only 1 %, so a limit in standard deviations would not help.

@@ -157,8 +157,8 @@ class Learner:
         self._tried = airframe  # the model that the next identification tests
         self._tried_ns = -nanoseconds(RETRY)  # end of the record of the last identification
         self._known: dict[PartName, Known] = {}
-        # Parts that fly the law of the start for good, each with its dead input, or with None if
-        # the outputs are those of `learn.without`, which the controller has given up.
+        # Parts that fly the initial law for good, each with its dead input, or with None if
+        # the outputs are in `learn.without`, which the controller has given up.
         self._dead: dict[PartName, str | None] = {}
         self._start = controller  # with the `learn.without` of the parameters in flight
         # Inputs that had no effect in the last test. In a single test a gust can hide an effect.
@@ -171,7 +171,7 @@ class Learner:
         self._proposed_ns = -self._latency_ns  # end of the record of the last proposal
         self._proposals = set[int]()  # digests of all proposals
         self.identification: Identification | None = None  # the last identification
-        self.proposed_loop: LearnedLoop | None = None  # that of the last proposal with a model
+        self.proposed_loop: LearnedLoop | None = None  # loop of the last proposal with a model
 
     @property
     def model(self) -> Airframe | None:
@@ -228,9 +228,7 @@ class Learner:
         self._distrust(lost=lost)
         if is_within(self._controller.outputs, chain.from_iterable(self._dead)) and not lost:
             ended, self._has_ended = self._has_ended, True
-            none_left = (
-                "no part is left to learn: each lacks an input or flies the law of the start"
-            )
+            none_left = "no part is left to learn: each lacks an input or flies the initial law"
             return LearnerResult(None, None if ended else none_left)
         if changes := self._changes(end_ns):
             return self._damaged(changes, end_ns)
@@ -254,7 +252,7 @@ class Learner:
         # after a lost proposal, the next proposal has to leave out the dead inputs again
         leaves_out_again = lost and any(self._dead.values())
         if verdict.model is self._model and not leaves_out_again:
-            nothing = Refusal("each part already flies the law of the start")
+            nothing = Refusal("each part already flies the initial law")
             return LearnerResult(None, str(joined(verdict.refusals) or nothing))
         left_out = without_effect(self._dead, self._by_law(self._dead)) if lost else []
         price_text = self._adopt(verdict.model, verdict.known, self._dead)

@@ -169,7 +169,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
     def _take(self, sample: StampedVector, now_ns: int) -> None:
         mode, age, flown = sample.value[:3].tolist()
         y, u, given_up = np.split(sample.value[3:], 3)
-        if mode == Mode.INACTIVE:  # the next engagement begins with the law of the start
+        if mode == Mode.INACTIVE:  # the next engagement begins with the initial law
             if self._has_record:
                 self._begin_record()
             return

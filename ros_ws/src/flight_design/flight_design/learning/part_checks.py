@@ -120,7 +120,7 @@ def return_to_file(part: Part, name: str | None) -> str:
     The model of the airframe file has predicted better. The part flies by the airframe `name`. If
     `name` is None, it flies by the law with which the flight started.
     """
-    flies = "the law of the start" if name is None else f"the airframe {name} as it is"
+    flies = "the initial law" if name is None else f"the airframe {name} as it is"
     return f"{' and '.join(part.outputs)} by {flies}: {_file_advantage(part)}"
 
 
@@ -199,6 +199,6 @@ def without_effect(
         outputs = [output for output in part if output in by_law]
         which = "" if len(outputs) == len(part) else f"{' and '.join(outputs)} "
         if dead is not None:
-            flown = f"{' and '.join(part)} without it, {which}by the law of the start"
+            flown = f"{' and '.join(part)} without it, {which}by the initial law"
             told.append(f"{dead} has no effect: {flown}")
     return told

@@ -30,7 +30,8 @@ class Zone(NamedTuple):
     east: tuple[float, ...]  # m
     radius: float = 0.0  # m, 0 for a polygon
     exclude: bool = False  # whether the aircraft must keep out of the zone
-    # number of the zone's group, if the aircraft must stay in the zone; None for a group of its own
+    # number of the zone's group if the aircraft must stay in a zone of the group; None if the zone
+    # is alone
     group: int | None = None
 
 

@@ -14,7 +14,7 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
 from flight_guidance.fence.fence import Escape, FenceAction
 from flight_guidance.guidance_state import GuidanceMode, GuidanceParams, GuidanceState, Lateral
-from flight_guidance.modes.legs import EXIT, course_and_speed, has_loitered, leaves
+from flight_guidance.modes.legs import EXIT, course_and_speed, has_loitered, is_at_exit
 from flight_guidance.steering import path
 from flight_guidance.steering.lateral import (
     PathError,
@@ -119,11 +119,11 @@ def _along_leg(
     is_entered: Callable[[Point], Any] = partial(path.is_entered, leg, following)
     if following is not None and path.is_orbit(leg) and has_loitered(state, pose, route):
         near = route.near(state.leg)
-        late = leaves(leg, near, pose, position) and not leaves(
+        late = is_at_exit(leg, near, pose, position) and not is_at_exit(
             leg, EXIT * course_and_speed(pose)[1], pose, position
         )
         if not late:
-            is_entered = partial(leaves, leg, near, pose)
+            is_entered = partial(is_at_exit, leg, near, pose)
     bank = follow(error, entry, is_entered, state.slip, pose, speed, params)
     return bank, error, path.to_go(leg, position)
 

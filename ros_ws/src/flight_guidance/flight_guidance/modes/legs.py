@@ -43,7 +43,7 @@ def along_route(
         return state, 0.0
     if isinstance(leg, Arc) and leg.loiter is not None and leg.end is not None:
         state = _loitering(state, leg, leg.loiter, pose, dt)
-        ends = has_loitered(state, pose, route) and leaves(
+        ends = has_loitered(state, pose, route) and is_at_exit(
             leg, EXIT * course_and_speed(pose)[1], pose, position
         )
         return on_leg(state, state.leg + 1, route) if ends else state, 0.0
@@ -81,7 +81,7 @@ def has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) 
     return state.loitered >= 1.0 and abs(pose["altitude"] - route.altitude[state.leg]) <= LEVEL
 
 
-def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
+def is_at_exit(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
     """Return whether an aircraft on a circle may leave the circle.
 
     It may if it is on course, and past the end of the circle by at most `reach`, m.

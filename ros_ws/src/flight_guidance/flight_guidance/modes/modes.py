@@ -215,11 +215,11 @@ def command(
     xp = array_namespace(speed)
     bank = protection.bank_limit(limits.bank, limits.stall_speed, speed)
     phi_c = clip(phi, bank)
-    climb_c, climb_limited = _climb(state, pose, speed, dt, params) if flies else (0.0, False)
+    climb_c, is_climb_limited = _climb(state, pose, speed, dt, params) if flies else (0.0, False)
     theta_wanted = pitch_for(climb_c, speed, state.alpha)
     if flies and state.vertical is Vertical.THETA:
         theta_wanted = _pitch_within(state, pose["altitude"], speed, params)
-        climb_limited = theta_wanted != state.target.theta
+        is_climb_limited = theta_wanted != state.target.theta
     theta_c = xp.minimum(xp.maximum(theta_wanted, limits.least_pitch), limits.largest_pitch)
 
     V_asked = state.target.V
@@ -238,11 +238,11 @@ def command(
     commands = StepCommands(
         phi_c,
         theta_c,
-        bank_limited=(phi_c != phi) | (abs(phi_c) == bank),
-        theta_limited=theta_c != theta_wanted,
-        climb_limited=climb_limited,
-        V_limited=V_wanted != state.target.V,
-        slew_limited=reduce(
+        is_bank_limited=(phi_c != phi) | (abs(phi_c) == bank),
+        is_theta_limited=theta_c != theta_wanted,
+        is_climb_limited=is_climb_limited,
+        is_V_limited=V_wanted != state.target.V,
+        is_slew_limited=reduce(
             or_, (value != reference[name] for name, value in zip(params.outputs, u_m, strict=True))
         ),
     )

@@ -153,7 +153,7 @@ def step(
     if flies and state.lateral is not Lateral.PHI:
         state = state._replace(V_c=min(state.V_c, abs(motion.velocity)))
     phi_c, theta_c, limited = _attitude_for(state, pose, motion, params)
-    state, climb_limited = _with_climb(state, pose, dt, params)
+    state, is_climb_limited = _with_climb(state, pose, dt, params)
     # u_m has the body rates and the climb, within the rates of the reference model.
     rates = _rates(state, phi_c, theta_c, gains)
     name = vertical(params.outputs)
@@ -171,11 +171,11 @@ def step(
         missed=miss,
         clearance=escape.clearance,
         predicted=escape.predicted,
-        bank_limited=limited,
-        theta_limited=limited,
-        climb_limited=climb_limited,
-        V_limited=flies and speed != state.target.V,
-        slew_limited=any(
+        is_bank_limited=limited,
+        is_theta_limited=limited,
+        is_climb_limited=is_climb_limited,
+        is_V_limited=flies and speed != state.target.V,
+        is_slew_limited=any(
             values[channel] != value for channel, value in zip(params.outputs, u_m, strict=True)
         ),
     )

@@ -57,7 +57,7 @@ class Waypoint(NamedTuple):
         return self.north, self.east
 
     @property
-    def loiters(self) -> bool:
+    def is_loiter(self) -> bool:
         """Whether the aircraft flies circles round the waypoint before it flies on."""
         return self.turns > 0.0 or self.wait > 0.0 or self.departure != self.altitude
 
@@ -315,7 +315,7 @@ def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
     changes = {
         k
         for k, (before, after) in enumerate(pairwise(waypoints_with_speed))
-        if before.loiters or before.speed != after.speed
+        if before.is_loiter or before.speed != after.speed
     }
     corner_numbers = {0, len(points) - 1} | changes
     spans = list(pairwise(sorted(corner_numbers)))

@@ -367,7 +367,7 @@ function drawEvents() { // in the order of time; the last one before the cursor 
   node.children[past]?.classList.add("now");
 }
 
-function drawModels() { // the rms of the error under the law of the start and under each model of a learner
+function drawModels() { // the rms of the error under the initial law and under each model of a learner
   const node = $("models"), {headings, rows = []} = flight.head.models, shown = JSON.stringify([headings, rows]);
   node.hidden = rows.length === 0;
   if (node.hidden || node.dataset.shown === shown) return;

@@ -28,8 +28,8 @@ from rise_di_controller.extensions.observer import VaneParams
 from rise_di_controller.law.decomposition import DecompositionError, signs
 from rise_di_controller.law.saturation import Limits
 
-# Largest amount by which an entry of the product of `effect` and T may differ from that of I. If
-# the file has ten digits, the difference is about 1e-9.
+# Largest difference between an entry of the product of `effect` and T and the entry of I. If the
+# file has ten digits, it is about 1e-9.
 MAX_INVERSE_ERROR = 1e-6
 
 

@@ -134,7 +134,7 @@ class TickInputs(NamedTuple):
     Computing the tick again from these inputs gives the same u to the last bit.
     """
 
-    stamp_ns: int  # stamp of u, which is that of its y; without a y it goes on with the clock
+    stamp_ns: int  # stamp of u, the stamp of its y; without a y it goes on with the clock
     y: FloatArray
     y_m: FloatArray  # interpolated to the stamp of y
     y_m_offset: float  # stamp of the newest y_m minus stamp of y, s

@@ -17,7 +17,7 @@ from flight_core.vectors import FloatArray
 # Time constant of the mean square of e, s, which is a few periods of the slowest oscillation that
 # servos allow.
 MEMORY = 1.0
-# An output diverges above this multiple of its largest rms error under the law of the start. Later
+# An output diverges above this multiple of its largest rms error under the initial law. Later
 # gusts can be twice as strong.
 FACTOR = 3.0
 LEAST = {"V": 1.0}  # rms error of V that does not yet count as a divergence, m/s
@@ -33,8 +33,8 @@ TEST = 50  # number of averaged values between two tests for an oscillation, 1 s
 # Correlation of e with e a period later. It is 0.9 in a limit cycle, and at most 0.5 in turbulence
 # and gusts.
 LIKENESS = 0.7
-# Factor on the largest rms error over a WINDOW under the law of the start. If the error has grown
-# by less, the law of the start is not clearly better.
+# Factor on the largest rms error over a WINDOW under the initial law. If the error has grown
+# by less, the initial law is not clearly better.
 GROWN = 1.5
 HARMLESS = 0.2  # fraction of LEAST or LEAST_RATE below which an oscillation does not count
 
@@ -43,7 +43,7 @@ class Errors(NamedTuple):
     """Mean squares of the error e = y - y_m, each with the shape (m,).
 
     `now` is the running mean of e^2. `largest` is the largest value that `now` reached before a
-    model was learned, or while the controller had fallen back to the law of the start.
+    model was learned, or while the controller had fallen back to the initial law.
     """
 
     now: FloatArray

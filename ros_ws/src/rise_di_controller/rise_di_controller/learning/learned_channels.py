@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Combine channels that use a learned model with channels that fly the law of the start.
+"""Combine channels that use a learned model with channels that fly the initial law.
 
-The law of the start is the law with which the flight started.
+The initial law is the law with which the flight started.
 """
 
 from collections.abc import Collection, Sequence
@@ -136,7 +136,7 @@ def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
 def with_fallback(
     start: RiseDiConfig, parameters: RiseDiConfig, bare: Sequence[bool]
 ) -> RiseDiConfig:
-    """Return parameters in which the channels `bare` fly the law of the start again.
+    """Return parameters in which the channels `bare` fly the initial law again.
 
     If no channel keeps a learned model, the result is `start` itself.
     """
@@ -163,7 +163,7 @@ def without_models(
 ) -> RiseDiConfig:
     """Return parameters in which some outputs no longer use their learned model.
 
-    These outputs fly the law of the start until the engagement ends, and their names are added to
+    These outputs fly the initial law until the engagement ends, and their names are added to
     `learn.without`.
     """
     fallen = with_fallback(start, parameters, [name in outputs for name in start.outputs])

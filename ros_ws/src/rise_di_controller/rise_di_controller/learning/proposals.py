@@ -3,7 +3,7 @@
 """Decide in the controller what becomes of models that are learned in flight.
 
 This module decides when identifications begin, which proposed models fly, and when to fall back to
-the law of the start. It has no side effects, so the node and the loop in one process both use it.
+the initial law. It has no side effects, so the node and the loop in one process both use it.
 """
 
 from collections import Counter, deque
@@ -56,8 +56,8 @@ class EventKind(StrEnum):
     FLIES = "flies"  # the controller has taken a proposal
     REFUSED = "refused"  # a proposal fails a check of the controller
     NO_MODEL = "no model"  # the learner has refused what it identified
-    FALLBACK = "fallback"  # all or some parts of the model fall back to the law of the start
-    # the law was deactivated, and begins again with the parameters of the start
+    FALLBACK = "fallback"  # all or some parts of the model fall back to the initial law
+    # the law was deactivated, and begins again with the initial parameters
     RESTART = "restart"
 
 
@@ -186,7 +186,7 @@ class Learning:
     def authority(self, controller: Controller) -> FloatArray:
         """Return the values of the topic `authority` under the parameters in force."""
         parameters = controller.parameters
-        assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - proposals keep the law of the start
+        assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - proposals keep the initial law
         return authority(parameters, self.start)
 
     def ticked(self, controller: Controller, now_ns: int) -> bool:
@@ -221,7 +221,7 @@ class Learning:
         """Certify a part of a proposal, let due proposals act, and fall back if the law diverges.
 
         Returns the parameters that the controller has taken, or None if it keeps the present ones.
-        After a deactivation the law begins again with the parameters of the start, because a
+        After a deactivation the law begins again with the initial parameters, because a
         learned model may have been the reason to deactivate it.
         """
         if controller.mode is Mode.INACTIVE:
@@ -243,11 +243,11 @@ class Learning:
     def _end_divergence(
         self, diverging: Collection[str], controller: Controller, now_ns: int
     ) -> RiseDiConfig:
-        """Fall back to the parameters of the start in all outputs, because some of them diverge.
+        """Fall back to the initial parameters in all outputs, because some of them diverge.
 
         A part of the model is a group of outputs that the model couples. The fallback is counted
         only for the parts in which an output diverges. A part with FALLBACKS fallbacks flies the
-        law of the start until the engagement ends.
+        initial law until the engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -265,7 +265,7 @@ class Learning:
         reason = " and ".join(f"{name} diverges{' again' * bool(ends)}" for name in diverging)
         self._fallback = Fallback(controller.digest, parameters.input_scale, fallen.digest())
         self._diverged.add(controller.digest)
-        what = f"falls back to the law of the start{lasting}: {reason}"
+        what = f"falls back to the initial law{lasting}: {reason}"
         self._take(controller, now_ns, prepared(fallen), EventKind.FALLBACK, what)
         return fallen
 
@@ -274,7 +274,7 @@ class Learning:
     ) -> RiseDiConfig:
         """Fall back in the outputs that oscillate, and in outputs that the model couples with them.
 
-        All of these outputs fly the law of the start until the engagement ends.
+        All of these outputs fly the initial law until the engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -290,17 +290,14 @@ class Learning:
         outputs = ", ".join(
             name for name, is_bare in zip(parameters.outputs, bare, strict=True) if is_bare
         )
-        what = (
-            f"falls back to the law of the start in {outputs}, to the end of the engagement: "
-            f"{rates}"
-        )
+        what = f"falls back to the initial law in {outputs}, to the end of the engagement: {rates}"
         self._take(controller, now_ns, prepared(fallen), EventKind.FALLBACK, what)
         return fallen
 
     def _begin_again(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
         """Forget all proposals and fallbacks.
 
-        Returns the parameters of the start if a model flew, else None.
+        Returns the initial parameters if a model flew, else None.
         """
         self._updates = Updates(self._settings)
         self._certificate = None
@@ -314,7 +311,7 @@ class Learning:
             controller.parameters
         ) == outputs_without(self.start):
             return None
-        what = "goes back to the law of the start: it was deactivated"
+        what = "goes back to the initial law: it was deactivated"
         self._take(controller, now_ns, prepared(self.start), EventKind.RESTART, what)
         return self.start
 
@@ -332,7 +329,7 @@ class Learning:
         if proposal.start != self._digest:
             return Refusal(
                 f"found a proposal for the parameters {proposal.start}, expected "
-                f"{self._digest}, those of the start"
+                f"{self._digest}, those of the initial parameters"
             )
         if self._simulated:
             is_due = proposal.stamp_ns in self._due and proposal.stamp_ns not in self._received
@@ -461,14 +458,14 @@ def _certificate(
         proposed.observer.states == start.observer.states,
         "controller.observer.states",
         ", ".join(proposed.observer.states),
-        f"those of the start: {', '.join(start.observer.states)}",
+        f"those of the initial parameters: {', '.join(start.observer.states)}",
     )
     speeds = _speeds(start)
     require(
         _speeds(proposed) == speeds,
         "controller.schedule",
         _speeds(proposed) or "none",
-        f"that of the start: {speeds or 'none'}",
+        f"that of the initial parameters: {speeds or 'none'}",
     )
     least = start.observer.margin
     if start.learn is not None:
