@@ -31,6 +31,7 @@ from flight_design.identification.model_identification import (
     identify_model,
 )
 from flight_design.identification.model_quality import Prediction
+from flight_design.identification.model_refusals import Coupling
 from flight_design.learning.file_test import (
     AT_BOUND,
     ROUGHEST,
@@ -156,6 +157,12 @@ def test_errors_of_a_rough_file_count_as_logarithms_of_factors() -> None:
 def test_wrong_model_says_nothing_about_the_file(model: Identification) -> None:
     assert is_contradicted(lateral(0.9, 0.9, 0.9, 0.9), KNOWN)
     assert not is_contradicted(model, KNOWN)
+
+
+def test_part_that_lacks_its_coupling_says_nothing_about_the_file() -> None:
+    model = lateral(0.9, 0.9, 0.9, 0.9)
+    part = model.parts[0]._replace(refusal=Coupling("coupling: found none"))
+    assert not is_contradicted(model._replace(parts=(part,)), KNOWN)
 
 
 def test_deviations_are_doubled_up_to_the_roughest_and_the_learner_says_so() -> None:

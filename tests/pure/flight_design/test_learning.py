@@ -47,9 +47,9 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.gain_design import selected_observer
 from flight_design.gains.observer_search import SelectedObserver
 from flight_design.identification.likelihood import Innovations
-from flight_design.identification.model_identification import Part
+from flight_design.identification.model_identification import Part, reason_against_innovations
 from flight_design.identification.model_quality import Prediction, advantage
-from flight_design.identification.model_refusals import reason_against_airframe
+from flight_design.identification.model_refusals import Coupling, reason_against_airframe
 from flight_design.learning import learner as design_learner
 from flight_design.learning import part_checks
 from flight_design.learning.change_test import Change
@@ -578,16 +578,14 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
     assert made.model.matrix_b()[5, 0] == 0.0
 
 
-def test_parts_that_couple_and_fly_by_separate_models_are_told(
+def test_parts_that_couple_do_not_fly_separate_models_and_are_told_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = learner_that_finds(lateral(), monkeypatch)
-    remark = Refusal("coupling: found parts that follow each other's inputs")
-    model = SimpleNamespace(**vars(found(lateral())) | {"remarks": (remark,)})
-    monkeypatch.setattr(design_learner, "identify_model", lambda *_, **__: model)
-    proposal = made.propose(0)
-    assert proposal.controller is not None
-    assert str(proposal.sentence).endswith(f"refused: {remark}")
+    refusal = Coupling("coupling: found innovations of a part that follow another part")
+    parts = [part._replace(refusal=refusal) for part in 2 * [lateral()]]
+    monkeypatch.setattr(design_learner, "identify_model", lambda *_, **__: found(*parts))
+    assert made.propose(0) == LearnerResult(None, str(refusal))
 
 
 def test_part_that_the_controller_took_back_is_not_proposed_again(
@@ -747,7 +745,7 @@ def test_part_with_coloured_innovations_is_refused_from_the_limit_on(
     whiteness: float, refused: bool
 ) -> None:
     """The limit is 3: a factor of 1.2 beyond it is refused as well."""
-    refusal = part_checks.reason_against_innovations(lateral(whiteness=whiteness))
+    refusal = reason_against_innovations(lateral(whiteness=whiteness))
     assert (refusal is not None) is refused
     assert not refused or str(refusal) == (
         f"innovations of r: found a whiteness of {whiteness:g}, expected at most 3, 1 being white"

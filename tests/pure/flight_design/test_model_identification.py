@@ -45,7 +45,7 @@ from flight_design.identification.model_quality import (
     correlation,
     whiteness,
 )
-from flight_design.identification.model_refusals import reason_against_excitation
+from flight_design.identification.model_refusals import Coupling, reason_against_excitation
 from flight_design.learning.change_test import ANGLE
 from flight_design.learning.part_checks import DELAY_DEVIATION, LAG_DEVIATION
 from flight_log.bag import LogAttachments
@@ -384,16 +384,28 @@ def test_coupled_parts_are_identified_together(
     assert "#   B[p, elevator]: " in model_yaml(model, "a flight")
 
 
-def test_parts_that_couple_are_told_where_their_common_model_is_refused(
+def test_parts_that_couple_are_refused_without_a_common_model(
+    coupled_flight: tuple[FlightData, dict[str, float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded, _ = coupled_flight
+    monkeypatch.setattr(model_identification, "MAX_WHITENESS", 0.5)  # no model is as white
+    model = identify_model(recorded, OSPREY, ACTUATORS)
+    assert [part.outputs for part in model.parts] == [("q", "V"), ("p", "r")]
+    assert [type(part.refusal) for part in model.parts] == [Coupling, Coupling]
+    told = str(model.refusal)
+    assert told.startswith("coupling: found innovations of a part that follow the inputs of ")
+    assert told.count("coupling:") == 1
+    assert told.endswith("expected at most 0.5, 1 being white")
+
+
+def test_parts_stay_apart_if_a_model_with_coupling_predicts_no_better(
     coupled_flight: tuple[FlightData, dict[str, float]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorded, _ = coupled_flight
     monkeypatch.setattr(model_identification, "COUPLED_GAIN", 1e9)
     model = identify_model(recorded, OSPREY, ACTUATORS)
     assert [part.outputs for part in model.parts] == [("q", "V"), ("p", "r")]
-    (remark,) = map(str, model.remarks)
-    assert remark.startswith("coupling: found parts that follow each other's inputs, but no common")
-    assert remark.endswith("to the log-likelihood, and 1e+09 are needed")
+    assert not any(isinstance(part.refusal, Coupling) for part in model.parts)
 
 
 def test_lost_samples_are_predicted_over() -> None:

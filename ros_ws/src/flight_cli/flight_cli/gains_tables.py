@@ -309,7 +309,9 @@ def _assessment_as_json(
     verdicts = {part: verdict(answer, guarantee) for part, verdict in VERDICTS.items()}
     return {
         "verdicts": {
-            part: verdict._asdict() for part, verdict in verdicts.items() if verdict.sentence
+            part: {"holds": verdict.is_met, "sentence": verdict.sentence}
+            for part, verdict in verdicts.items()
+            if verdict.sentence
         },
         "controller": answer.controller.model_dump(exclude_none=True),
         "delay_margin": answer.delay_margin,

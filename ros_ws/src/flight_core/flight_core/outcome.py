@@ -101,8 +101,8 @@ class Refusal:
 
 
 def joined(refusals: Iterable[Refusal | None]) -> Refusal | None:
-    """Join all refusals that are not None into one. Returns None if all are None."""
-    found = [str(refusal) for refusal in refusals if refusal is not None]
+    """Join all different refusals that are not None. Returns None if all are None."""
+    found = dict.fromkeys(str(refusal) for refusal in refusals if refusal is not None)
     return Refusal("; ".join(found)) if found else None
 
 

@@ -66,7 +66,7 @@ class Account(NamedTuple):
     topics: dict[str, TopicAccount]
     lacks: tuple[str, ...]
     busy: str = ""  # sentence that is not empty if a busy host left out samples and ticks
-    is_unguided: bool = False  # whether the controller was engaged but guidance took no step
+    unguided: bool = False  # whether the controller was engaged but guidance took no step
     processes: Mapping[str, ProcessAccount] = {}
     commands: Commands | None = None
     # flight time of the first u, s, if the law flew less than half of the flight; else None
@@ -162,7 +162,7 @@ def account(
     topics, leeways = topic_accounts(tape, scenario, span)
     end = seconds(span.end_ns - tape.start_ns)
     guided = [topics[name] for name in GUIDED if name in topics]
-    is_unguided = bool(guided) and all(
+    unguided = bool(guided) and all(
         topic.expected and not topic.found and not topic.unset for topic in guided
     )
     first = _late_first_u(tape, topics, scenario) if span.is_from_start else None
@@ -191,7 +191,7 @@ def account(
         topics=topics,
         lacks=(*parts, *lacks, *_absent(tape, scenario)),
         busy=_too_busy(busy),
-        is_unguided=is_unguided,
+        unguided=unguided,
         processes=_processes(tape),
         late=first if first is not None and first > end / 2.0 else None,
         starved=starved.spans,

@@ -70,7 +70,7 @@ def judge(
         return _never_flown_by_host(starved, account.end)
     if outcome.end is End.COMPLETED and account.late is not None:
         return never_flew(f"the first u came at t = {account.late:.3f} of {account.end:.3f} s")
-    if outcome.end is End.COMPLETED and account.is_unguided:
+    if outcome.end is End.COMPLETED and account.unguided:
         return never_flew(
             "guidance took no step; see the ages of pose and y against guidance.max_age"
         )

@@ -64,6 +64,7 @@ from flight_design.identification.model_quality import (
     reason_against_prediction,
 )
 from flight_design.identification.model_refusals import (
+    Coupling,
     at_bound,
     in_time,
     reason_against_airframe,
@@ -108,6 +109,23 @@ class Part(NamedTuple):
     by_motion: tuple[float, ...] = ()
 
 
+def reason_against_innovations(part: Part) -> Refusal | None:
+    """Return a refusal of a part if innovations are too far from white noise, else None.
+
+    The output with the largest `whiteness` decides. The whiteness is 1 for white noise, and must be
+    at most MAX_WHITENESS.
+    """
+    worst = int(np.argmax(part.after.whiteness))
+    white = float(part.after.whiteness[worst])
+    if white <= MAX_WHITENESS:
+        return None
+    name = part.outputs[worst]
+    return Refusal(
+        f"innovations of {name}: found a whiteness of {white:.3g}, expected at most "
+        f"{MAX_WHITENESS:g}, 1 being white"
+    )
+
+
 class Identification(NamedTuple):
     """The model of an aircraft that was identified from one flight."""
 
@@ -119,7 +137,7 @@ class Identification(NamedTuple):
     before: Prediction
     after: Prediction
     parts: tuple[Part, ...]
-    remarks: tuple[Refusal, ...] = ()  # what else the record contradicts, such as separate parts
+    remarks: tuple[Refusal, ...] = ()  # what else the record contradicts, such as the file
 
     @property
     def entries(self) -> tuple[Entry, ...]:
@@ -217,7 +235,6 @@ class _Study(NamedTuple):
         parts: Sequence[Part],
         first: Innovations,
         last: Innovations,
-        remarks: Iterable[Refusal],
     ) -> Identification:
         """Join the parts to one model, with innovations of the nominal and the identified model."""
         return Identification(
@@ -228,7 +245,6 @@ class _Study(NamedTuple):
             before=prediction(first, self.validating),
             after=prediction(last, self.validating),
             parts=tuple(parts),
-            remarks=tuple(remarks),
         )
 
     def again(
@@ -286,33 +302,26 @@ class _Study(NamedTuple):
         used: NDArray[np.bool_],
         apart: Innovations,
         flown: Airframe | None,
-    ) -> tuple[Fit, Part] | Refusal:
+    ) -> tuple[Fit, Part] | Coupling | None:
         """Fit the whole aircraft as one part, with entries that couple its parts.
 
-        Returns a refusal unless three conditions hold: the innovations of this fit are white, its
-        model may be used, and the model predicts better than the parts that were fitted separately.
-        `apart` has the innovations of the separate parts. The fit also has the innovations of the
-        model in flight, `flown`.
+        Returns a refusal of the separate parts if the innovations of this fit are not white, or if
+        its model must not be used. Returns None if the model with coupling predicts no better than
+        the parts that were fitted separately, whose innovations are `apart`. The fit also has the
+        innovations of the model in flight, `flown`.
         """
         search = self.search(model, whole_aircraft(model), coupled=True)
         also = None if flown is None else search.model_errors(flown)
         fit = search.fit(used, begin=search.joined(fits), flown=also)
         fit = self.again(search, fit, used, flown)
         part = self.part(search, fit)
+        if reason := part.refusal or reason_against_innovations(part):
+            return Coupling(
+                "coupling: found innovations of a part that follow the inputs of another part, "
+                f"expected a common model of both, which was refused: {reason}"
+            )
         gain = part.after.log_likelihood - prediction(apart, self.validating).log_likelihood
-        gain *= float(self.validating.sum())
-        white = float(part.after.whiteness.max())
-        reason = str(part.refusal or "")
-        if not reason and white > MAX_WHITENESS:
-            reason = f"its innovations have a whiteness of {white:.3g}, above {MAX_WHITENESS:g}"
-        if not reason and gain <= COUPLED_GAIN:
-            reason = f"it adds {gain:.3g} to the log-likelihood, and {COUPLED_GAIN:g} are needed"
-        if not reason:
-            return fit, part
-        return Refusal(
-            "coupling: found parts that follow each other's inputs, but no common model for them, "
-            f"so each keeps its own: {reason}"
-        )
+        return (fit, part) if gain * self.validating.sum() > COUPLED_GAIN else None
 
     def advantage(self, flown: Innovations, nominal: Innovations) -> float:
         """Return how much better the model in flight predicts the samples in the mask `later`.
@@ -399,17 +408,16 @@ def identify_model(
         by_flown = search.flying(search.model_errors(coupled), fits)
         z = study.advantage(by_flown, first)
         parts = [part._replace(advantage=z) for part in parts]
-    remarks = list[Refusal]()
     if len(every) > 1 and _follows(fits, every, recorded.u, is_known) > FOLLOWS:
         whole = study.whole(model, fits, used, last, coupled)
-        if isinstance(whole, Refusal):
-            remarks.append(whole)
-        else:
+        if isinstance(whole, Coupling):
+            parts = [part._replace(refusal=whole) for part in parts]
+        elif whole is not None:
             fit, part = whole
             parts = [part]
             first = fit.before
             last = fit.after
-    return study.identification(airframe, parts, first, last, remarks)
+    return study.identification(airframe, parts, first, last)
 
 
 def _counter(

@@ -24,6 +24,10 @@ MAX_BY_TIMING = 0.15
 ROUNDING = 1e-9
 
 
+class Coupling(Refusal):
+    """A refusal of a part whose model lacks the coupling with another part of the aircraft."""
+
+
 def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
     """Return, for each output, the effect of an input on it that is known best."""
     effects = [entry for entry in entries if entry.matrix == "B" and entry.nominal]

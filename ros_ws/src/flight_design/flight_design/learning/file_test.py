@@ -19,6 +19,7 @@ from flight_design.identification.likelihood import PRIOR, Unknown
 from flight_design.identification.model_identification import Identification, Part
 from flight_design.identification.model_quality import MAX_WHITENESS
 from flight_design.identification.model_refusals import (
+    Coupling,
     at_bound,
     best_known,
     in_time,
@@ -98,7 +99,8 @@ def is_contradicted(found: Identification, believed: Unknown) -> bool:
 def _counts(part: Part, factor: float) -> bool:
     """Return whether the model of a part explains the record, and the part does not couple."""
     return (
-        all(entry.nominal for entry in part.entries)
+        not isinstance(part.refusal, Coupling)
+        and all(entry.nominal for entry in part.entries)
         and float(np.max(part.after.whiteness)) <= MAX_WHITENESS
         and not at_bound(best_known(part.entries, part.outputs), factor)
     )

@@ -31,6 +31,7 @@ from flight_design.identification.likelihood import KNOWN, Unknown
 from flight_design.identification.model_identification import (
     Identification,
     identify_model,
+    reason_against_innovations,
     with_entries,
 )
 from flight_design.learning.change_test import RECORD, Change, change_test
@@ -65,7 +66,6 @@ from flight_design.learning.part_checks import (
     reason_against_delays,
     reason_against_effects,
     reason_against_first_model,
-    reason_against_innovations,
     reason_against_part_alone,
     return_to_file,
     without_effect,
@@ -322,7 +322,9 @@ class Learner:
                 tried += part.entries
             late = reason_against_delays(part, self._actuation.delay)
             if refusal := alone or late or reason:
-                refusals.append(refusal)
+                # Parts that couple have the same refusal.
+                if refusal not in refusals:
+                    refusals.append(refusal)
                 if is_learned and is_about_file and is_file_better(part):
                     model = with_entries(model, entries_of_file(part))
                     del known[part.outputs]

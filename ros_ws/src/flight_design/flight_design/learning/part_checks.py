@@ -8,14 +8,11 @@ is checked against the model in flight.
 
 from collections.abc import Collection, Iterable, Mapping
 
-import numpy as np
-
 from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.outcome import Refusal
 from flight_design.identification.likelihood import MAX_DELAY_ERROR, PRIOR
 from flight_design.identification.model_identification import Part
-from flight_design.identification.model_quality import MAX_WHITENESS
 from flight_design.identification.model_refusals import MAX_DEVIATION, best_known
 from flight_design.learning.change_test import Change
 
@@ -45,23 +42,6 @@ def change_sentence(change: Change) -> str:
     name, effectiveness = min(change.left.items(), key=lambda effect: effect[1])
     weakest = f"{name} has {100 * effectiveness:.0f} % of its effect"
     return f"{' and '.join(change.outputs)} changed, log-likelihood {change.gain:.3g}: {weakest}"
-
-
-def reason_against_innovations(part: Part) -> Refusal | None:
-    """Return a refusal of a part if innovations are too far from white noise, else None.
-
-    The output with the largest `whiteness` decides. The whiteness is 1 for white noise, and must be
-    at most MAX_WHITENESS.
-    """
-    worst = int(np.argmax(part.after.whiteness))
-    white = float(part.after.whiteness[worst])
-    if white <= MAX_WHITENESS:
-        return None
-    name = part.outputs[worst]
-    return Refusal(
-        f"innovations of {name}: found a whiteness of {white:.3g}, expected at most "
-        f"{MAX_WHITENESS:g}, 1 being white"
-    )
 
 
 def reason_against_delays(part: Part, delay: float) -> Refusal | None:
