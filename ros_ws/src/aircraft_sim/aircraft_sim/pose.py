@@ -17,6 +17,8 @@ import numpy as np
 from flight_core.channels import POSE
 from flight_core.vectors import FloatArray, Scalar, array_namespace
 
+PSI, NORTH, V_NORTH = (POSE.index(name) for name in ("psi", "north", "v_north"))
+
 RATE = 50.0
 """Highest rate of pose if `pose.rate` is not given, Hz. The aircraft publishes pose at every k-th
 instant, with the least k for which the rate is not higher."""
@@ -75,19 +77,15 @@ def over_ground(pose: FloatArray, t: float, wind: Sequence[float], start: Start)
     at the origin and heads north. The pose is rotated by the heading at the start, and moved to the
     place of the start.
     """
-    pose_over_ground = pose.copy()
+    values = pose.tolist()
     if start.heading:
         sin = math.sin(start.heading)
         cos = math.cos(start.heading)
-        for first in ("north", "v_north"):
-            i = POSE.index(first)
-            north = pose[i]
-            east = pose[i + 1]
-            pose_over_ground[i] = cos * north - sin * east
-            pose_over_ground[i + 1] = sin * north + cos * east
-        psi = POSE.index("psi")
-        pose_over_ground[psi] = wrapped(float(pose[psi]) + start.heading)
+        for i in (NORTH, V_NORTH):
+            north, east = values[i : i + 2]
+            values[i : i + 2] = cos * north - sin * east, sin * north + cos * east
+        values[PSI] = wrapped(values[PSI] + start.heading)
     for i, (speed, place) in enumerate(zip(wind, (start.north, start.east), strict=True)):
-        pose_over_ground[POSE.index("north") + i] += place + speed * t
-        pose_over_ground[POSE.index("v_north") + i] += speed
-    return np.asarray(pose_over_ground)
+        values[NORTH + i] += place + speed * t
+        values[V_NORTH + i] += speed
+    return np.array(values)

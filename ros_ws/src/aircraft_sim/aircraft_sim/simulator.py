@@ -109,6 +109,7 @@ class Simulator:
         self._delay_line: DelayLine = ()
         self._error = np.zeros(len(self.outputs))
         self._number = 0
+        self._pose: FloatArray | None = None  # at the last sample, once it is computed
         late = nanoseconds(parameters.actuators.delay) // self.period_ns
         # values of u on the way to the actuators
         self._commands = deque([np.zeros(len(self.inputs))] * late)
@@ -166,6 +167,7 @@ class Simulator:
         t_ns = number * self.period_ns
         self._advance(number, u)
         self._number = number
+        self._pose = None
         true = self._model.y()
         # The comparison is also false for NaN.
         if self._model.has_diverged() or not (np.abs(true) <= self._largest[: len(true)]).all():
@@ -194,6 +196,7 @@ class Simulator:
         period.
         """
         step = 1 if self._commands else max(number - self._number, 1)
+        self._pose = None
         for k in range(self._number, number, step):
             self._commands.append(u)
             late = self._commands.popleft()
@@ -201,6 +204,7 @@ class Simulator:
                 self._model.advance(k * self.period_ns, late, step * self.period_ns)
             except FlightEnded as ended:
                 self._number = k + step
+                self._pose = None
                 raise self._with_place(ended) from None
         self._require_above_ground(number * self.period_ns)
 
@@ -227,9 +231,10 @@ class Simulator:
 
     def pose(self) -> FloatArray:
         """Return the true pose at the last sample, in the order of `channels.POSE`."""
-        return pose.over_ground(
-            self._model.pose(), seconds(self._number * self.period_ns), self._wind, self._start
-        )
+        if self._pose is None:
+            t = seconds(self._number * self.period_ns)
+            self._pose = pose.over_ground(self._model.pose(), t, self._wind, self._start)
+        return self._pose
 
     def poses(self) -> DelayLine:
         """Return the measured poses that arrive at the last sample, the oldest first.

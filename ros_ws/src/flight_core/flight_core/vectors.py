@@ -58,6 +58,10 @@ class _Floats:
         return x1 if condition else x2
 
 
+_NAMESPACES: dict[type, Any] = {np.ndarray: _NUMPY, np.float64: _NUMPY, float: _Floats}
+"""Namespaces of the most frequent types, which a dict finds faster than `isinstance`."""
+
+
 def array_namespace(array: Scalar) -> Any:
     """Return the array namespace of an array by the array API standard, or `_Floats` for a float.
 
@@ -76,6 +80,8 @@ def array_namespace(array: Scalar) -> Any:
         >>> rise_di.array_namespace(np.ones(2)).sign(-2.0 * np.ones(2)).tolist()
         [-1.0, -1.0]
     """
+    if (namespace := _NAMESPACES.get(type(array))) is not None:
+        return namespace
     if isinstance(array, (np.ndarray, np.generic)):
         return _NUMPY
     if isinstance(array, (float, int)):

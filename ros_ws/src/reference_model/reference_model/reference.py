@@ -116,7 +116,7 @@ class Reference:
             applied = self._u_m[2 * index + 2]
         else:
             applied = self._live_u_m(self._live)
-            u_m = np.tile(applied, 3)
+            u_m = np.concatenate([applied] * 3)
             after = live.dead_reckon(self._live, tracked, self.period_ns, self._live_params)
         with np.errstate(over="ignore", invalid="ignore"):
             x_m = model.step(self._x_m, u_m, self._stepper)
