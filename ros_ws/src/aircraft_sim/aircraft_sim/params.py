@@ -566,7 +566,7 @@ class AircraftConfig(NodeConfig):
         return divide(period_ns(rate, "pose.rate"), period_ns(self.rate, "rate"), "rate", "")
 
     def pose_sensors(self) -> Sensors | None:
-        """Return the errors of pose, in the order of `channels.POSE`, apart from those of y."""
+        """Return the errors of pose, in the order of `channels.POSE`, without the errors of y."""
         pose = self.pose
         if not (
             pose.delay

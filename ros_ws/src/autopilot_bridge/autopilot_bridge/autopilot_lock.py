@@ -98,9 +98,9 @@ class AutopilotLock:
     def _start(self, since_boot_ns: int, now_ns: int) -> str:
         """Return a name for the run in which the autopilot sent a message.
 
-        A run lasts from one boot to the next. If the time since boot continues that of the locked
-        run, the result is the name of the locked run. If it does not, the result is a new name,
-        made from the instant of boot.
+        A run lasts from one boot to the next. If the time since boot continues the time of the
+        locked run, the result is the name of the locked run. If it does not, the result is a new
+        name, made from the instant of boot.
         """
         boot_ns = now_ns - since_boot_ns
         is_same_run = (

@@ -246,7 +246,7 @@ def extended_state_observer(
 ) -> ObserverDesign:
     """Design the observer with the model `extended_state_model`.
 
-    The method is that of `aircraft_observer`.
+    The method is the same as in `aircraft_observer`.
     """
     model_by_tick = extended_state_model(model, names, weights.decay)
     size = model.C @ model.size

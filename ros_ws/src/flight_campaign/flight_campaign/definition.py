@@ -52,7 +52,7 @@ class Sweep(Config):
     def scaled(self, controller: ControllerConfig, factor: float) -> float | tuple[float, ...]:
         """Multiply the swept parameter by a factor, or only its value in a channel that is named.
 
-        If the channel is an input, the value is that of the output with which it is paired. Raises
+        If the channel is an input, the value for the paired output is returned. Raises
         ParameterError if the parameter or the channel cannot be swept.
         """
         swept = swept_parameters(controller)

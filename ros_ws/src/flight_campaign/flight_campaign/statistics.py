@@ -204,7 +204,7 @@ class Tally(Config):
     def share(self, count: int) -> tuple[float, float, float]:
         """Return a count of flights as a share, with its 95 % confidence interval, 0 to 1.
 
-        The interval is the one of Clopper and Pearson, by quantiles of the beta distribution.
+        The interval follows Clopper and Pearson, by quantiles of the beta distribution.
         """
         others = self.flights - count
         low = float(betaincinv(count, others + 1, 0.025)) if count else 0.0

@@ -87,9 +87,9 @@ class EngineName(StrEnum):
 class Campaign:
     """Fly a Monte Carlo campaign: thousands of uncertain aircraft around an airframe.
 
-    The airframe is the one of the scenario, and many aircraft are computed at once. Aircraft with a
-    route or a learner fly one by one: a core needs 7 s for each minute of flight, and up to 20 s if
-    they learn.
+    The scenario names the airframe, and many aircraft are computed at once. Aircraft with a route
+    or a learner fly one by one: a core needs 7 s for each minute of flight, and up to 20 s if they
+    learn.
 
     Exit status: 0 all flown, 2 bad input, 130 interrupted. To continue an interrupted campaign,
     give its folder.

@@ -50,9 +50,9 @@ NOTHING_LEARNED = 1
 class Learn:
     """Run the learner again on the log of a flight.
 
-    The settings are those of the scenario in the log, unless --set controller.learn.* changes them.
-    y and u are those of the log. The flight may have been without a learner, if its controller has
-    an observer. With --write, the model becomes an airframe file, and `controller.learn.prior` lets
+    The settings come from the scenario in the log, unless --set controller.learn.* changes them. y
+    and u come from the log. The flight may have been without a learner, if its controller has an
+    observer. With --write, the model becomes an airframe file, and `controller.learn.prior` lets
     the next flight start from it. With --certificate, the last model that was proposed gets the
     proof of its guarantee. Exit status: 0 a model, 1 none, 2 bad input.
     """

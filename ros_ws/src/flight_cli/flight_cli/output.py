@@ -311,7 +311,7 @@ def require_writable(option: str, path: Path) -> None:
 
 
 def require_yaml(option: str, path: Path) -> None:
-    """Check that a path is that of a .yaml file in an existing folder.
+    """Check that a path ends in .yaml and lies in an existing folder.
 
     Raises ParameterError if not.
     """

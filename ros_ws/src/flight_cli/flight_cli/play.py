@@ -31,10 +31,10 @@ class Stamps(StrEnum):
 class Play:
     """Publish the topics of a recorded flight again with their timing.
 
-    /clock has the time of the log. The bytes are those of the log, with new stamps. The command
-    refuses to play if the domain already has a publisher on one of the topics. A warning names the
-    topics that are skipped, because they are not in CDR or because their message type is not
-    installed. Exit status: 0 played to the end, 2 bad input, 130 interrupted.
+    /clock has the time of the log. The messages have the bytes of the log, with new stamps. The
+    command refuses to play if the domain already has a publisher on one of the topics. A warning
+    names the topics that are skipped, because they are not in CDR or because their message type is
+    not installed. Exit status: 0 played to the end, 2 bad input, 130 interrupted.
     """
 
     run: Path = argument("Folder of a run, or an MCAP file.", default=REQUIRED)

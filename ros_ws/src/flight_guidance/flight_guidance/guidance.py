@@ -133,8 +133,8 @@ class Guidance:
         """Take a pose in the order of `channels.POSE`.
 
         Raises ChannelError if the stamp is not newer than the stamp of the last pose, or is in the
-        future. It is also raised if a value is beyond LARGEST, and if all values equal those of the
-        last pose.
+        future. It is also raised if a value is beyond LARGEST, and if every value is the same as in
+        the last pose.
         """
         last = self._pose
         newest = self._newest(self._pose, sample, now_ns)

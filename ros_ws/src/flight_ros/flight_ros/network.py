@@ -43,7 +43,7 @@ def addresses(text: str) -> tuple[str, ...]:
 
 
 def own_address(peers: Sequence[str], local: Collection[str]) -> str:
-    """Return which of the peers' addresses is that of this host.
+    """Return which of the peers' addresses belongs to this host.
 
     `local` has the addresses of the interfaces of this host. Raises ParameterError unless exactly
     one of the peers is among them.

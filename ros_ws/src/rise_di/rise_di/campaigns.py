@@ -81,7 +81,7 @@ def fly_campaign(
         entries: Largest relative deviations by name, as in {"A[q,alpha]": 0.6, "lag[elevator]":
             0.5, "noise[q]": 0.5}. "lag" and "noise" stand for all lags and noises that are not
             named. {"delay": 0.02} adds a delay of u of up to 0.02 s. Lags, noise and delay without
-            an entry are those of the scenario.
+            an entry are as in the scenario.
         distribution: Distribution of the deviations: "uniform", "normal" with three standard
             deviations at the limit, or "corners".
         score: Units of the rms errors in the score by output, SI, as in {"q": 0.02}.

@@ -99,7 +99,7 @@ class Loop:
         Args:
             t: Instant of the tick, s.
             y: Outputs, shape (m,), SI, as deviations from trim in the order of `outputs`. If the
-                observer has vanes, the order is that of `measured`. None is a lost sample.
+                observer has vanes, they are in the order of `measured`. None is a lost sample.
             y_m: Reference, shape (m,), SI, in the order of `outputs`. None is a lost sample.
 
         Returns:

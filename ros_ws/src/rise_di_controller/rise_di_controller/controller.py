@@ -292,8 +292,8 @@ class Controller:
 
         Raises:
             ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
-                Reason "order": the stamp is not later than that of the last sample, even if that
-                sample was dropped.
+                Reason "order": the stamp is not later than the stamp of the last sample, even if
+                that sample was dropped.
         """
         m = len(self._parameters.outputs)
         outputs = sample._replace(value=sample.value[:m])
@@ -328,7 +328,7 @@ class Controller:
 
         Raises:
             ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
-                Reason "order": the stamp is not later than that of the last sample taken.
+                Reason "order": the stamp is not later than the stamp of the last sample taken.
         """
         last = self._y_m[-1] if self._y_m else None
         if (reason := self._reason_against(sample, last, now_ns)) is not None:

@@ -47,7 +47,7 @@ def import_airframe(
         source: A state space of python-control or SciPy, or the path of a MATLAB file (.mat), of an
             airframe file (.yaml), or of a text of AVL (system matrix, or stability derivatives) or
             XFLR5 (state matrices).
-        name: Name of the airframe; if empty, that of the file.
+        name: Name of the airframe; if empty, the name of the file.
         speed: Trim speed, a number in m/s or with a unit: "176 ft/s".
         states: Names of the states in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s,
             theta: rad".

@@ -84,7 +84,7 @@ def linearize(condition: FlightCondition) -> Linearization:
         B_j = x_dot(t_end) / size,  lag_j = step + integral of 1 - x_dot(t) / x_dot(t_end)
 
     u has the normalised commands as deviations from trim, and w is the wind along AXES in m/s. Each
-    lag is that of the output that the input drives. The integration step of JSBSim is part of the
+    lag belongs to the output that the input drives. The integration step of JSBSim is part of the
     lag, because a command acts one step later. Attitude acts only through gravity, and altitude has
     no effect. Raises FlightEnded if there is no trim, or if an input does not move its output.
     """

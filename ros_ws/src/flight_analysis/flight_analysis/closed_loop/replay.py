@@ -219,7 +219,7 @@ def replay(
             than the flight, the law engages in the first tick, at the recorded u.
         changes: Parameter changes in flight, in order. If None, they come from the log, but there
             are none if `others` is given. Before a tick, changes are applied until the digest of
-            the parameters is that of the channel "parameters".
+            the parameters equals the one in the channel "parameters".
 
     Returns:
         The recorded and the computed values of N ticks in k channels, shape (N, k), SI.

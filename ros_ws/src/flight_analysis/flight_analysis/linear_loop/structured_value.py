@@ -155,8 +155,8 @@ def least_bound_at(
 ) -> tuple[float, Scaling]:
     """Bound a scaled M(w) of a part of the loop, and return the bound with its X and G.
 
-    The search is that of `least_bound` with the target 1. M(w) is scaled to the sizes of its
-    channels. `near` has the X and G of a similar matrix.
+    The search is the same as in `least_bound`, with the target 1. M(w) is scaled to the sizes of
+    its channels. `near` has the X and G of a similar matrix.
 
     To save time, the search first has only the channels of the means over a period. The channels of
     the second Legendre coefficients get the X that balances their rows and columns. If the bound

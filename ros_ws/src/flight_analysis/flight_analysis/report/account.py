@@ -155,7 +155,7 @@ def account(
 
     If the log has both t = 0 and the planned end, the account covers the time between them. If not,
     it covers, for each topic, the time from the first sample of the topic to the last sample of any
-    topic. `simulated` is False if an autopilot flew an aircraft other than that of the scenario.
+    topic. `simulated` is False if an autopilot flew another aircraft than the scenario describes.
     """
     planned_ns = planned_end_ns(tape)
     span = _span(tape, planned_ns, outcome, simulated=simulated)

@@ -127,7 +127,7 @@ class Benchmark(NamedTuple):
 def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE_SEED) -> Benchmark:
     """Build the benchmark of a scenario: its manoeuvre, actuators and noise.
 
-    y, y_m and the law have the same rate, and topics have no delay. One wind is that of the
+    y, y_m and the law have the same rate, and topics have no delay. One wind comes from the
     scenario, and the other is the turbulence of `turbulence_of` with `turbulence_seed`. Raises
     ParameterError if a campaign cannot fly the scenario, or if an output has no unit in the score.
     """

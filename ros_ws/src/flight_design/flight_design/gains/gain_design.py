@@ -106,7 +106,7 @@ def select_gains(
 ) -> Selection:
     """Select gains for an airframe by Theorem 1 and by the engineering procedure.
 
-    Each gain set comes with every condition. Commands, gusts and loop are those of the scenario.
+    Each gain set comes with every condition. Commands, gusts and loop come from the scenario.
     `scenario.vary(controller=selection.chosen)` flies the engineering gains; `gains_yaml` writes
     them as a section of a scenario file.
 
@@ -114,14 +114,15 @@ def select_gains(
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
         scenario: Name, path of a file (.yaml) whose controller may lack the gains, or a Scenario.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
-        rate: Rate of the law in Hz; None for that of the scenario.
+        rate: Rate of the law in Hz. If None, the scenario's rate is used.
         y_rate: Rate of y in Hz. If its period is longer than the law's, the difference counts as
             delay; y is stale after three of its periods.
-        lag: Lags of the actuators in s, one for all or one per input in the airframe's order;
-            None for those of the scenario.
-        delay: Pure delay in s; None for that of the scenario.
+        lag: Lags of the actuators in s, one for all or one per input in the airframe's order. If
+            None, the scenario's lags are used.
+        delay: Pure delay in s. If None, the scenario's delay is used.
         inputs: Input of each output, in the airframe's order: a list, or a text with commas. If
-            empty, the pairs of the scenario, or if its channels differ, those of the airframe.
+            empty, the scenario says the pairs. If its channels differ, they follow from the
+            airframe.
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
@@ -382,7 +383,7 @@ def _pairing(
 
 
 def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
-    """Return a loop without its allocation. Its inputs and lags are those of the actuators."""
+    """Return a loop without its allocation. It has the inputs and lags of the actuators."""
     if loop.base.allocation is None:
         return loop
     names = tuple(scenario.aircraft.channels().inputs)

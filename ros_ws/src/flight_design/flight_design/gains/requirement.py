@@ -125,8 +125,8 @@ def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
 def above_zeros(requirement: Requirement, plant: LinearPlant) -> Requirement:
     """Lower the required damping ratio to what a loop around an aircraft can reach.
 
-    The ratio becomes at most about that of the aircraft's least damped zero. No feedback moves a
-    zero, and a loop with small errors has modes near the zeros.
+    The ratio becomes at most about the damping ratio of the aircraft's least damped zero. No
+    feedback moves a zero, and a loop with small errors has modes near the zeros.
     """
     zeros = invariant_zeros(plant.A, plant.B, plant.C[: plant.B.shape[-1]])  # without vanes
     modes = zeros[(np.abs(zeros.imag) > NO_MOTION) & (np.abs(zeros) > NO_MOTION)]

@@ -66,9 +66,9 @@ def few_blocks(blocks: Blocks, inverse: FloatArray, by_noise: FloatArray) -> Flo
         variance_i = v_i / E(v_i) by_noise_i (t_nu(0.93) / 1.476)^2,   nu = 2 E(v_i)^2 / var(v_i)
 
     E and var are the mean and the variance if the model is right, that is if e is white noise
-    before the fit. Then theta has the variance `by_noise`, (p,), beside that of its prior. The v_i
-    of few blocks may be small by chance. So the deviation is that for which 1.476 deviations have
-    the probability that they have in a normal distribution: t_nu is a quantile of Student's t.
+    before the fit. Then noise alone gives theta the variance `by_noise`, (p,). The v_i of few
+    blocks may be small by chance. So the deviation is widened until 1.476 deviations have the same
+    probability as in a normal distribution: t_nu is a quantile of Student's t.
 
     `inverse` is H^-1. Sources: R. M. Bell, D. F. McCaffrey, Survey Methodology 28(2), 2002, for nu;
     G. W. Imbens, M. Kolesar, Rev. Economics and Statistics 98(4), 2016, for the quantile.

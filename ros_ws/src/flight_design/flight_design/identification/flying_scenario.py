@@ -277,7 +277,7 @@ def _with_integrals(
     integral gain of the PI law K (s + integral) / s. For a first-order channel the integral gain is
     the damping, so that the loop becomes K / s. In a channel with stiffness, y returns to trim
     under a constant u, so the channel needs a larger integral gain. The sensitivity must stay below
-    MAX_SENSITIVITY. The crossover is that of the loop around y_dot = Omega u. Source: K. J. Astrom,
+    MAX_SENSITIVITY. The crossover belongs to the loop around y_dot = Omega u. Source: K. J. Astrom,
     T. Hagglund, "Advanced PID Control", 2006, 6.5 (lambda tuning), 4.6 (largest sensitivity).
     """
     places = [pairing.outputs.index(name) for name in controller.outputs]

@@ -517,7 +517,7 @@ class Likelihood:
         ]
 
     def in_errors(self, fit: Fit, deviation: FloatArray) -> FloatArray:
-        """Convert standard deviations of theta, (p,), to those of the entries' relative errors."""
+        """Convert standard deviations of theta, (p,), to deviations of the relative errors."""
         slope = np.where(self._by_factor, np.exp(fit.theta[: self.count]), 1.0)
         return slope * deviation[: self.count]
 

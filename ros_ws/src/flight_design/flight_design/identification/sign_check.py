@@ -124,7 +124,7 @@ def recorded_response(
     law, y_m excites the loop. Without y_m, and under the law `excitation`, u itself is the
     excitation. Raises ParameterError if the log has no y and u, or if its bridge was never engaged.
     It is also raised for a flight under guidance, because its y_m follows y, and for a log that was
-    imported with other rows than those of `channel_map`.
+    imported with other rows than `channel_map` has.
     """
     recorded = read_run(bag, namespace)
     tape = recorded.tape

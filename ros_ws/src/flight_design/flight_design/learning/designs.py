@@ -258,7 +258,7 @@ def with_flown_channels(
 
 
 def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> RiseDiConfig:
-    """Set the delay margin in a controller to that of its loop around a model, at most `most`."""
+    """Set `observer.margin` to the delay margin of the loop around a model, at most `most`."""
     linear = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
     undelayed = linear.loop._replace(delay=0.0)
     kept = delay_margin(linear.nominal, linear.law, undelayed) - RESOLUTION

@@ -176,8 +176,8 @@ def _actuation(scenario: Scenario, airframe: Airframe, delay: float) -> Actuatio
 def _speeds(controller: RiseDiConfig, airframe: Airframe) -> tuple[float, float] | None:
     """Return the slow and the fast speed of a schedule's models, divided by the trim speed.
 
-    Returns None if there is no schedule. Raises ParameterError if the speed of the schedule is not
-    that of the rough model.
+    Returns None if there is no schedule. Raises ParameterError if the schedule and the rough model
+    have different speeds.
     """
     if controller.schedule is None:
         return None

@@ -67,7 +67,7 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
 def reach_sentence(params: GuidanceParams, authority: Authority) -> str | None:
     """Write a sentence with the limits that follow from a model learned in flight.
 
-    Returns None if these limits are not below those of the parameters.
+    Returns None if these limits are not below the limits in the parameters.
     """
     now = within_reach(params, authority)
     parts = [

@@ -93,9 +93,9 @@ def local(latitude: float, longitude: float, origin: Origin) -> Point:
         [x, y, z] = N(lat) [cos(lat) cos(lon), cos(lat) sin(lon), (1 - e^2) sin(lat)],
             N = a / sqrt(1 - e^2 sin(lat)^2)
 
-    The vector [x, y, z] of the position minus that of the origin is rotated into north and east.
-    Altitude is not used, because the altitude of an aircraft follows the curved Earth. Source: IOGP
-    publication 373-7-2, methods EPSG:9602 and 9836.
+    The difference of the vectors [x, y, z] of the position and of the origin is rotated into north
+    and east. Altitude is not used, because the altitude of an aircraft follows the curved Earth.
+    Source: IOGP publication 373-7-2, methods EPSG:9602 and 9836.
     """
     lat = math.radians(origin.latitude)
     turn = math.radians(longitude - origin.longitude)

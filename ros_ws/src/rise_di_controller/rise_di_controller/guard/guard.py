@@ -510,7 +510,7 @@ def law_within_limits(
     guard: GuardParams,
     effectors: FloatArray | None,
 ) -> tuple[Any, FloatArray, FloatArray, FloatArray | None]:
-    """Step the law inside its own limits and those of the effectors.
+    """Step the law inside its own limits and the limits of the effectors.
 
     Returns the state, u before saturation, u, and the commands of the effectors. The argument
     `effectors`, (p,), has the commands of the last tick, or is None without an allocation.

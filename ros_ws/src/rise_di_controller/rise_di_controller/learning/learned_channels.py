@@ -25,7 +25,7 @@ def with_channels_of(
 
     These channels get no feedforward and no observer. The result is not checked.
 
-    By equation (22), the K of a channel cannot be below that of the last channel. If the K in
+    By equation (22), the K of a channel cannot be below the K of the last channel. If the K in
     `start` is below it, the channel gets the K of the last channel and a smaller input scale, which
     gives the same loop. The inputs that `dead` marks have no effect. They get the least input
     scale, so that the law does not move them.
