@@ -398,6 +398,18 @@ def test_parts_that_couple_are_refused_without_a_common_model(
     assert told.endswith("expected at most 0.5, 1 being white")
 
 
+def test_parts_with_white_innovations_need_no_common_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded = innovation_filters.recording(flight("turbulence", 0.3), OSPREY)
+    monkeypatch.setattr(model_identification, "FOLLOWS", 0.0)
+    refused = Coupling("coupling: found no common model")
+    monkeypatch.setattr(model_identification._Study, "whole", lambda *_: refused)
+    model = identify_model(recorded, OSPREY, ACTUATORS)
+    assert [part.refusal for part in model.parts] == [None, None]
+    monkeypatch.setattr(model_identification, "MAX_WHITENESS", 0.5)
+    model = identify_model(recorded, OSPREY, ACTUATORS)
+    assert [part.refusal for part in model.parts] == [refused, refused]
+
+
 def test_parts_stay_apart_if_a_model_with_coupling_predicts_no_better(
     coupled_flight: tuple[FlightData, dict[str, float]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -411,7 +411,7 @@ def identify_model(
     if len(every) > 1 and _follows(fits, every, recorded.u, is_known) > FOLLOWS:
         whole = study.whole(model, fits, used, last, coupled)
         if isinstance(whole, Coupling):
-            parts = [part._replace(refusal=whole) for part in parts]
+            parts = _unless_white(parts, whole)
         elif whole is not None:
             fit, part = whole
             parts = [part]
@@ -454,6 +454,16 @@ def _follows(
         of_others = np.delete(u, block.inputs, axis=1)
         largest = max(largest, correlation(fit.after.normalised, of_others, known).max())
     return largest
+
+
+def _unless_white(parts: list[Part], refusal: Coupling) -> list[Part]:
+    """Return the parts with a refusal, unless the innovations of all parts are white.
+
+    If they are white, the parts explain the record without a coupling.
+    """
+    if not any(reason_against_innovations(part) for part in parts):
+        return parts
+    return [part._replace(refusal=refusal) for part in parts]
 
 
 def _couples(flown: Airframe, nominal: Airframe) -> bool:
