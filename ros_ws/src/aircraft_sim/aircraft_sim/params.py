@@ -419,7 +419,7 @@ class AircraftConfig(NodeConfig):
         )
 
     def drift_factors(self) -> Drift | None:
-        """Return the drift as factors on the matrices of equation (1); None without a drift."""
+        """Return the drift as factors on the matrices of equation (1), or None without a drift."""
         if self.drift is None:
             return None
         matrices = (
@@ -510,12 +510,12 @@ class AircraftConfig(NodeConfig):
         return WindModel(self.gust_arrays(AXES), turbulence, self.relative_wind())
 
     def ground(self) -> float | None:
-        """Return the altitude of the ground, m, as in `pose`; None if no section states it."""
+        """Return the altitude of the ground, m, as in `pose`, or None if no section states it."""
         section = self.microburst if self.shear is None else self.shear
         return None if section is None else section.ground
 
     def relative_wind(self) -> RelativeWind | None:
-        """Return the wind that varies with the position; None if it is the same everywhere."""
+        """Return the wind that varies with the position, or None if it is the same everywhere."""
         field = wind_field_of(self.wind, self.shear, self.microburst)
         start = Start(**self.start.model_dump())
         return None if field is None else RelativeWind(field, start, self.altitude or 0.0)
@@ -593,7 +593,7 @@ STILL_AIR = Gust(start=0.0, speed=0.0, length=1.0)
 
 
 def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:
-    """Return values as an array; None if there are none, or if all are 0 and `zero_is_none`."""
+    """Return values as an array, or None if there are none, or if all are 0 and `zero_is_none`."""
     if not values or (zero_is_none and not any(values)):
         return None
     return np.array(values, dtype=np.float64)

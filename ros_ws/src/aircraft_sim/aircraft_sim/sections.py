@@ -162,7 +162,7 @@ def require_one_wind(
 def wind_field_of(
     wind: Sequence[float], shear: ShearConfig | None, burst: MicroburstConfig | None
 ) -> wind_field.WindField | None:
-    """Return the wind as a function of place; None if it is the same everywhere."""
+    """Return the wind as a function of place, or None if it is the same everywhere."""
     section = burst if shear is None else shear
     if section is None:
         return None

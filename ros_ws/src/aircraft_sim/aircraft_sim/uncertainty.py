@@ -265,7 +265,7 @@ def row_sizes(airframe: Airframe) -> dict[str, FloatArray]:
 
 
 def input_sizes(airframe: Airframe) -> FloatArray:
-    """Return by how much each input deviates in `row_sizes`, (p,), SI; 0 if it is not known."""
+    """Return by how much each input deviates in `row_sizes`, (p,), SI, or 0 if it is not known."""
     trim = np.abs(np.nan_to_num(airframe.no_thrust()))
     dimensions = [quantity(channel.unit).dimension for channel in airframe.inputs.values()]
     has_range = [dimension in {ANGLE, DIMENSIONLESS} for dimension in dimensions]

@@ -71,7 +71,7 @@ class VaneSensorsConfig(Config):
             require(airframe.speed > 0.0, key, name, f"{has_none} speed")
 
     def arrays(self, seed: int) -> Vanes | None:
-        """Return the vanes as arrays, with random losses from a seed; None without vanes."""
+        """Return the vanes as arrays, with random losses from a seed, or None without vanes."""
         if not self.channels:
             return None
         frozen_at = np.array(self.frozen_at or (np.inf,) * len(self.channels))

@@ -165,7 +165,9 @@ def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) 
 
 
 def joined_faults(faults: Mapping[str, Stale]) -> Refusal | None:
-    """Join the faults of several channels, by name, to one sentence; None if there is no fault.
+    """Join the faults of several channels, by name, to one sentence.
+
+    Returns None if there is no fault.
 
     Channels with the same fault are named together.
     """

@@ -89,7 +89,7 @@ class FigureStatistics(Config):
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of the sample; 0 if it has fewer than two values."""
+        """Standard deviation of the sample, or 0 if it has fewer than two values."""
         return math.sqrt(self.squares / (self.count - 1)) if self.count > 1 else 0.0
 
     def quantile(self, share: float) -> float:

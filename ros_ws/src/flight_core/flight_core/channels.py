@@ -20,7 +20,10 @@ the channel is 1 m/s."""
 
 
 def vertical(names: Sequence[str]) -> str:
-    """Return the name of the vertical speed among `names`; "" for an airplane, which has none."""
+    """Return the name of the vertical speed among `names`.
+
+    Returns "" for an airplane, which has none.
+    """
     return next((name for name in names if name in VERTICAL), "")
 
 

@@ -73,7 +73,7 @@ def step(
 
 
 def digest(route: Route | None) -> int:
-    """Return a number that identifies a route; 0 for no route."""
+    """Return a number that identifies a route, or 0 for no route."""
     return 0 if route is None else zlib.crc32(repr(route).encode())
 
 
@@ -306,11 +306,11 @@ class Guidance:
             }
 
     def pose(self) -> dict[str, float]:
-        """Return the last pose by channel; empty if no pose has come yet."""
+        """Return the last pose by channel, or an empty dict if no pose has come yet."""
         return {} if self._pose is None else dict(zip(POSE, self._pose.value.tolist(), strict=True))
 
     def y(self) -> dict[str, float]:
-        """Return the last y by channel; empty if no y has come yet."""
+        """Return the last y by channel, or an empty dict if no y has come yet."""
         if self._y is None:
             return {}
         return dict(zip(self._params.outputs, self._y.value.tolist(), strict=True))
@@ -350,7 +350,7 @@ class Guidance:
             self._link_lost = self.home()
 
     def _link_age(self, now_ns: int) -> float:
-        """Return the age of the operator's link, s; 0 if the parameters set no limit for it."""
+        """Return the age of the operator's link, s, or 0 if the parameters set no limit for it."""
         return 0.0 if self._operated_ns is None else seconds(now_ns - self._operated_ns)
 
     def _test_roll(self, y: Sequence[float]) -> None:

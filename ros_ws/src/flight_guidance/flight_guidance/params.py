@@ -179,7 +179,7 @@ class GuidanceConfig(SteeringConfig):
         )
 
     def fence_zones(self) -> Fence | None:
-        """Return the fence as the equations of guidance use it; None without zones."""
+        """Return the fence as the equations of guidance use it, or None without zones."""
         zones = tuple(zone.zone() for zone in self.fence.values())
         if not zones:
             return None
@@ -241,7 +241,7 @@ class GuidanceConfig(SteeringConfig):
         )
 
     def waypoints(self) -> tuple[Waypoint, ...]:
-        """Return the waypoints of the section route; none if there is no route."""
+        """Return the waypoints of the section route, or none if there is no route."""
         return () if self.route is None else self.route.waypoints()
 
     def plan(self, waypoints: Sequence[Waypoint]) -> Route:
@@ -308,7 +308,7 @@ class GuidanceConfig(SteeringConfig):
         )
 
     def landing_on(self, route: Route) -> Landing | None:
-        """Return the landing on a route; None without a section `landing`.
+        """Return the landing on a route, or None without a section `landing`.
 
         Raises ParameterError if no line of the route leads to the landing's waypoint, if this line
         does not descend, if no line goes straight on from the waypoint, and for an airspeed out of
@@ -332,7 +332,10 @@ class GuidanceConfig(SteeringConfig):
         return landing_at(waypoints[number].point, route, section, box, self.params())
 
     def lander(self, route: Route | None) -> Lander | None:
-        """Return what flies the landing on the route of the parameters; None without a landing."""
+        """Return what flies the landing on the route of the parameters.
+
+        Returns None without a landing.
+        """
         landing = None if route is None else self.landing_on(route)
         return None if landing is None else Lander(landing, self.params())
 

@@ -214,7 +214,7 @@ def _is_in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> b
 
 
 def recording_note(name: str, recording: Recording, start_ns: int) -> str | None:
-    """Write a sentence about the stamps of a topic; None if all of them are usable."""
+    """Write a sentence about the stamps of a topic, or return None if all of them are usable."""
     parts = []
     if recording.unset:
         parts.append(

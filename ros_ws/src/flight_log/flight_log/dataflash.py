@@ -53,7 +53,7 @@ class Packets(DFReader.DFReader_binary):
     init_arrays_fast = init_arrays
 
     def _length(self, here: int) -> int:
-        """Return the length of the packet at a place, bytes; 0 if there is no whole packet."""
+        """Return the length of the packet at a place, bytes, or 0 if there is no whole packet."""
         form = self.formats.get(int.from_bytes(self.data_map[here + 2 : here + 3], "little"))
         if self.data_map[here : here + 2] != HEAD or form is None:
             return 0
@@ -84,12 +84,12 @@ class Packets(DFReader.DFReader_binary):
         return True
 
     def _stamp_ns(self, place: int) -> int:
-        """Return the stamp of the packet at a place, ns; 0 if the packet has no stamp."""
+        """Return the stamp of the packet at a place, ns, or 0 if the packet has no stamp."""
         self.offset = place
         return round(1e3 * stamp_us(self._parse_next(), 0.0))
 
     def loss(self) -> Loss | None:
-        """Return how many bytes hold no packet, and when; None for a log without loss."""
+        """Return how many bytes hold no packet, and when, or None for a log without loss."""
         lost = self.lost
         if lost and lost[-1][1] == self.data_len and lost[-1][1] - lost[-1][0] < TAIL:
             lost = lost[:-1]
@@ -142,7 +142,7 @@ class Lines(DFReader.DFReader_text):
         return super()._parse_next()
 
     def _message(self, here: int, line: bytes) -> Any:
-        """Return the message of a line; None if the line is damaged."""
+        """Return the message of a line, or None if the line is damaged."""
         try:
             name, *values = line.decode().split(self.delimiter)
             form = self.formats.get(name)
@@ -160,7 +160,7 @@ class Lines(DFReader.DFReader_text):
         return message
 
     def loss(self) -> Loss | None:
-        """Return how many lines hold no message, and when; None for a log without loss."""
+        """Return how many lines hold no message, and when, or None for a log without loss."""
         if not self.lost_us:
             return None
         what = f"{len(self.lost_us)} of {self._count} lines hold no message"

@@ -153,10 +153,10 @@ def kind_of_head(head: bytes) -> FileKind:
 
 
 def tlog_start(head: bytes) -> int | None:
-    """Return where a tlog begins: at the time before its first packet. None without a packet.
+    """Return the place of the time before a tlog's first packet, or None if there is no packet.
 
-    A text that a radio sends at its start may come before this time. In this case a second packet
-    must follow.
+    A radio may send a text before this time when it starts. A tlog with such a text must also have
+    a second packet.
     """
     for start in range(len(head) - TLOG_TIME.size):
         end = _packet_end(head, start)
@@ -166,7 +166,7 @@ def tlog_start(head: bytes) -> int | None:
 
 
 def _packet_end(head: bytes, start: int) -> int:
-    """Return the end of a MAVLink packet that follows its time; 0 if there is no packet."""
+    """Return the end of a MAVLink packet that follows its time, or 0 if there is no packet."""
     place = start + TLOG_TIME.size
     magic = head[place : place + 1]
     if magic not in MAVLINK or not _is_time(*TLOG_TIME.unpack_from(head, start)):

@@ -96,7 +96,7 @@ class Follower:
 
     @property
     def path(self) -> Path | None:
-        """The file that is being read; None if there is no file yet.
+        """The file that is being read, or None if there is no file yet.
 
         Raises ParameterError for a folder with several bags.
         """

@@ -36,7 +36,7 @@ def learning_message(stamp_ns: int, kind: str, sentence: str, *, level: int) -> 
 
 
 def stamped_sentence(message: Any) -> tuple[int, str]:
-    """Return the stamp, ns, and the sentence of a message of LEARNING; "" if it has none."""
+    """Return the stamp, ns, and the sentence of a message of LEARNING, or "" if it has none."""
     stamp = message.header.stamp
     return stamp.sec * NANOSECONDS + stamp.nanosec, " ".join(
         status.message for status in message.status

@@ -393,7 +393,7 @@ class LogContent:
     def reader_of(
         self, topic: str, type_name: str, expected: int
     ) -> Callable[[MessageBatch], None] | None:
-        """Return a function that takes the messages of a topic; None if the topic is not used.
+        """Return a function that takes the messages of a topic, or None if the topic is not used.
 
         `expected` is the number of messages in the index.
         """
@@ -439,7 +439,10 @@ class LogContent:
         return int(sent_ns)
 
     def samples_of(self, topic: str, type_name: str, expected: int = 0) -> TopicSamples | None:
-        """Return the samples of a topic; None if its type is no named vector and no waypoints."""
+        """Return the samples of a topic.
+
+        Returns None if its type is no named vector and no waypoints.
+        """
         is_route = topic.rpartition("/")[2] == ROUTE and type_name == PATH
         if (
             topic not in self.topics

@@ -66,7 +66,7 @@ def holds_texts(topic: str, type_name: str) -> bool:
 def log_message(
     message: Any, type_name: str, sent_ns: int, *, has_begun: bool = True
 ) -> LogMessage | None:
-    """Return a decoded message as a LogMessage; None if it is mere information, or empty.
+    """Return a decoded message as a LogMessage, or None if it is mere information, or empty.
 
     Set `has_begun` to False before the first sample. New parameters are then not taken as changes,
     because the nodes still declare their parameters at that time.

@@ -92,7 +92,7 @@ def full_name(type_name: str) -> str:
 
 
 def decoder(type_name: str) -> Decoder | None:
-    """Return a decoder for a message type; None if its messages are no named vectors.
+    """Return a decoder for a message type, or None if its messages are no named vectors.
 
     Use one decoder for each topic. A call takes several messages in their order.
     """

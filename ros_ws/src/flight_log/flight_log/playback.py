@@ -170,7 +170,7 @@ def _latched(
 
 
 def latched_depth(qos: str) -> int:
-    """Return the number of messages that a topic keeps for a late subscriber; 0 if volatile.
+    """Return the number of messages that a topic keeps for a late subscriber, or 0 if volatile.
 
     `qos` is rosbag2's YAML list of the offered profiles.
     """
@@ -188,7 +188,7 @@ def latched_depth(qos: str) -> int:
 
 
 def _unsendable_kind(message: StoredMessage) -> str | None:
-    """Return the kind of a message that no ROS topic can carry; None for any other message."""
+    """Return the kind of a message that no ROS topic can carry, or None for any other message."""
     if message.encoding != "cdr":
         return f"{message.type_name} in {message.encoding}".strip()
     return None if message.type_name else "no type"

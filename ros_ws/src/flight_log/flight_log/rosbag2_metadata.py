@@ -58,7 +58,7 @@ def plain_name(name: str) -> str:
 
 
 def part_number(name: str) -> int | None:
-    """Return the number of a file in a bag; None if its name has no number."""
+    """Return the number of a file in a bag, or None if its name has no number."""
     number = re.search(r"_(\d{1,9})$", Path(plain_name(name)).stem)
     return None if number is None else int(number[1])
 

@@ -176,7 +176,7 @@ class Scan:
 
     @property
     def faults(self) -> Faults | None:
-        """Faults of the file; None for an intact file."""
+        """Faults of the file, or None for an intact file."""
         is_intact = self.complete and not self.damaged
         return None if is_intact else Faults(not self.complete, self.damaged)
 
@@ -260,7 +260,7 @@ class Scan:
     def _parts(
         self, stream: IO[bytes], size: int, index: Sequence[McapRecord]
     ) -> Iterator[FilePart]:
-        """Yield the parts from `position` to the end of the data, or of the file so far."""
+        """Yield the parts from `position` on, up to the end of what is written so far."""
         stream.seek(0)
         if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             self.complete = False

@@ -142,7 +142,7 @@ def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> byt
 
 
 def parameter_value(message: Any) -> Any:
-    """Return the value in a rcl_interfaces/msg/ParameterValue; None for an unset value."""
+    """Return the value in a rcl_interfaces/msg/ParameterValue, or None for an unset value."""
     # In rcl_interfaces/msg/ParameterValue, the field "type" is followed by one field for each type,
     # in the order of the types from 1 on.
     kind = message.type

@@ -133,7 +133,7 @@ class RecordedRun(NamedTuple):
 
 
 def topics_text(topics: Mapping[str, str]) -> str:
-    """Return topics with their types as part of a sentence; "" if there are no topics."""
+    """Return topics with their types as part of a sentence, or "" if there are no topics."""
     names = [f"{topic} ({type_name or 'no type'})" for topic, type_name in sorted(topics.items())]
     surplus = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {surplus} more topics" if surplus > 0 else "")
@@ -363,7 +363,7 @@ def aircraft_namespaces(topics: Collection[str]) -> list[str]:
 
 
 def chosen_namespace(topics: Collection[str], namespace: str | None, where: str) -> str:
-    """Return the namespace of an aircraft; "" for the root and if there is no aircraft.
+    """Return the namespace of an aircraft, or "" for the root and if there is no aircraft.
 
     `namespace` is the choice of the caller, or None. Raises ParameterError if no aircraft is in the
     chosen namespace, or if there are several aircraft and no choice.
@@ -404,7 +404,10 @@ def names_within(namespace: str, topics: Collection[str]) -> dict[str, str]:
 
 
 def _duration(attachments: Sequence[StoredFile]) -> float | None:
-    """Return the duration of the whole flight in the attached parameters, s; None without them."""
+    """Return the duration of the whole flight in the attached parameters, s.
+
+    Returns None without them.
+    """
     for file in attachments:
         if file.name == PARAMETERS:
             with suppress(ParameterError, LookupError, OverflowError, TypeError, ValueError):

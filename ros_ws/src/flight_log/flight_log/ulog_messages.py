@@ -78,7 +78,7 @@ class _Log:
         self.stamp_us = 0  # stamp of the newest data, us
 
     def end_of(self, here: int) -> int:
-        """Return the end of the message at a place; 0 if there is no whole message."""
+        """Return the end of the message at a place, or 0 if there is no whole message."""
         size = self._size(here)
         end = here + MESSAGE.size + size
         if not size or end > len(self._content):
@@ -89,7 +89,7 @@ class _Log:
         return end if is_last or self._size(end, number) else 0
 
     def _size(self, here: int, subscribed: int | None = None) -> int:
-        """Return the size in the head of a message, bytes; 0 if no message can have such a head.
+        """Return the size in the head of a message, bytes, or 0 if no message can have such a head.
 
         `subscribed` is the number of the data to which the previous message subscribes.
         """

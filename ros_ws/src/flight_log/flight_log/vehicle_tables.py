@@ -188,7 +188,7 @@ class UnusedSensor(NamedTuple):
     value: float | None  # value of the parameter; None if the log lacks it
 
     def sentence(self) -> str:
-        """Say why the sensor did not count, as in "0 is not used, ARSPD_USE 0"."""
+        """Say why the sensor was not taken, as in "0 is not used, ARSPD_USE 0"."""
         value = "" if self.value is None else f", {self.setting} {self.value:g}"
         return f"{self.number} is not {'healthy' if self.is_used else 'used'}{value}"
 
@@ -250,7 +250,7 @@ class VehicleLog(NamedTuple):
     loss: Loss | None = None
 
     def source(self, quantity: str) -> LogField | None:
-        """Return the place of a quantity of y or of the pose; None if the log lacks it."""
+        """Return the place of a quantity of y or of the pose, or None if the log lacks it."""
         sources = ULOG_SOURCES if self.format is None else self.format.sources
         return next((source for source in sources.get(quantity, ()) if self.has(source)), None)
 

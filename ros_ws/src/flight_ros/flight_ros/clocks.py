@@ -52,7 +52,7 @@ RESTART = "the system clock of this host was set between the starts of the two: 
 
 
 def number_of_host() -> float:
-    """Return a number for this host's boot that float64 can hold; 0 if the system has none."""
+    """Return a number for this host's boot that float64 can hold, or 0 if the system has none."""
     return float(int(BOOT_ID.read_text(encoding="ascii")[:8], 16)) if BOOT_ID.exists() else 0.0
 
 

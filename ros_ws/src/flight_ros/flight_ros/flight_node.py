@@ -155,7 +155,7 @@ class FlightNode(Node, Generic[P]):
         raise NotImplementedError
 
     def awaited_topic(self) -> str | None:
-        """Return the topic whose next message the node awaits in lockstep; None for no topic."""
+        """Return the topic whose next message the node awaits in lockstep, or None for no topic."""
         return None
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
@@ -282,7 +282,7 @@ class FlightNode(Node, Generic[P]):
         self.set_parameters_atomically(changes)
 
     def clock_of(self, sender: str) -> str | None:
-        """Return what `PeerClocks.sentence_on` says; None if this node compares no clocks."""
+        """Return what `PeerClocks.sentence_on` says, or None if this node compares no clocks."""
         return None if self.clocks is None else self.clocks.sentence_on(sender)
 
     def warn_no_publisher(
@@ -339,7 +339,7 @@ class FlightNode(Node, Generic[P]):
     # Called by the event loop
 
     def _received_start_ns(self) -> int | None:
-        """Return the instant from the topic `start`, ns; None if no recent instant has come.
+        """Return the instant from the topic `start`, ns, or None if no recent instant has come.
 
         An old instant belongs to an earlier flight.
         """

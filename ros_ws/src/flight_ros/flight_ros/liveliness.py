@@ -62,7 +62,7 @@ class LivelinessMonitor:
         ]
 
     def lost_role(self) -> str | None:
-        """Return the name of the lost role; None if no role is lost.
+        """Return the name of the lost role, or None if no role is lost.
 
         A role that shut down cleanly is taken as lost after SHUTDOWN_GRACE_NS. If a report names
         the role that ended first, this role is returned instead.

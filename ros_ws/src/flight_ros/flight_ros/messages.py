@@ -117,7 +117,7 @@ class Decoder:
         self._sender = ""
 
     def decode(self, raw: bytes) -> StampedVector | None:
-        """Return the sample in a message; None for a vector without channels.
+        """Return the sample in a message, or None for a vector without channels.
 
         Raises ChannelError for an invalid message.
         """

@@ -135,7 +135,7 @@ def refuse_foreign_parameters(node: Node) -> None:
 
 
 def ready_callback(executor: SingleThreadedExecutor) -> Callable[[], None] | None:
-    """Return a callback that is ready, without blocking; None if no callback is ready.
+    """Return a callback that is ready, without blocking, or None if no callback is ready.
 
     A call of the result raises the exceptions of the callback.
     """

@@ -227,7 +227,7 @@ class Receiver(Generic[S]):
         return True
 
     def _require_publisher(self, raw: bytes, now_ns: int) -> str:
-        """Return the sender of a message; "" if the topic has no lock.
+        """Return the sender of a message, or "" if the topic has no lock.
 
         Raises ChannelError if the message is too long, or comes from a conflicting publisher.
         """

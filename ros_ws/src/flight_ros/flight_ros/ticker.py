@@ -75,7 +75,7 @@ class Ticker:
             pass
 
     def due(self) -> Tick | None:
-        """Return the newest passed deadline that was not returned yet; None if there is none."""
+        """Return the newest passed deadline that was not returned yet, or None if there is none."""
         number, late_ns = divmod(self._host.monotonic_ns() - self._start_ns, self.period_ns)
         if number <= self._last:
             return None

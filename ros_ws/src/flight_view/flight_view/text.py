@@ -117,7 +117,10 @@ def _table(first: str, *others: str) -> Table:
 
 
 def _names(flight: Flight, group: str) -> Sequence[str]:
-    """Return the names of a group of channels, in `internals` or else on its own topic."""
+    """Return the names of a group of channels.
+
+    They come from the topic `internals`, or if the flight lacks it, from the topic of the group.
+    """
     if "internals" not in flight.samples:
         return flight.samples[group].names if group in flight.samples else ()
     return [

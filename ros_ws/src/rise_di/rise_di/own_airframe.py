@@ -181,7 +181,10 @@ def _require_free(files: Sequence[Path], *, replace: bool) -> None:
 
 
 def _pairing_sentence(airframe: Airframe) -> str | None:
-    """Write a sentence on how inputs and outputs are paired; None if they are in the same order."""
+    """Write a sentence on how inputs and outputs are paired.
+
+    Returns None if they are in the same order.
+    """
     places = first_flight.pairing(airframe)
     if len(airframe.inputs) != len(airframe.outputs) or places == tuple(range(len(places))):
         return None

@@ -133,7 +133,7 @@ class _InputSteps(NamedTuple):
 
 
 def _steps(condition: FlightCondition, trim: Trim, name: str) -> _InputSteps | None:
-    """Return the response to steps of an input in both directions; None if no output moves."""
+    """Return the response to steps of an input in both directions, or None if no output moves."""
     output = driven(name)
     place = list(INPUTS).index(name)
     travel = MAX_STEP_FRACTION * float(min(-trim.lower[place], trim.upper[place]))

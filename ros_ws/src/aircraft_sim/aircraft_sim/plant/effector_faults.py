@@ -67,7 +67,7 @@ class Fault(NamedTuple):
 
     @property
     def extent(self) -> str:
-        """Strength of the fault as text; "" for a kind without a strength."""
+        """Strength of the fault as text, or "" for a kind without a strength."""
         return self.end or ("" if self.strength is None else f"{self.strength:g}")
 
 

@@ -421,8 +421,8 @@ def time_flown(summary: Mapping[str, Any]) -> str:
 def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
     """Return sentences on the engagements of a flight behind a bridge.
 
-    `has_figures` is False if the engagements are so short that no y lies in them. In this case the
-    summary has the metrics of the whole flight.
+    `has_figures` says whether a sample of y lies in an engagement. If none does, the summary has
+    the metrics of the whole flight.
     """
     if not engagements:
         return ["never engaged: the figures are of an aircraft that this controller did not fly"]

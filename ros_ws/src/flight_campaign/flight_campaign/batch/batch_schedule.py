@@ -82,7 +82,7 @@ def without_branches(course: Course) -> Iterator[TickRun]:
 
 
 def _pattern(kinds: list[TickKind]) -> tuple[TickKind, ...] | None:
-    """Return the shortest pattern that the kinds repeat; None if it exceeds LONGEST ticks."""
+    """Return the shortest pattern that the kinds repeat, or None if it exceeds LONGEST ticks."""
     for length in range(1, min(len(kinds), LONGEST) + 1):
         repeats, rest = divmod(len(kinds), length)
         if not rest and kinds[:length] * repeats == kinds:

@@ -97,7 +97,7 @@ def _last(*leaves: Any) -> FloatArray:
 def find_laws(
     names: Iterable[str], scenario: Scenario, others: Mapping[str, Scenario]
 ) -> dict[str, ControllerConfig | None]:
-    """Return the controller that flies for each name; None for a law of the catalogue.
+    """Return the controller that flies for each name, or None for a law of the catalogue.
 
     A name may be a law of the catalogue, the law of the scenario's controller, or a key of
     `others`. Each scenario in `others` stands for the law of its controller. Raises ParameterError

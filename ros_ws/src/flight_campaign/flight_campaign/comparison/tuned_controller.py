@@ -107,7 +107,7 @@ def _rise_di(gains: dict[str, FloatArray], input_scale: FloatArray) -> dict[str,
 
 
 def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
-    """Return the model of a law's feedforward; None for a law without one."""
+    """Return the model of a law's feedforward, or None for a law without one."""
     controller = benchmark.scenario.controller
     if LAWS[name].feedforward is FeedforwardModel.AIRCRAFT:
         return with_feedforward(controller, benchmark.scenario.aircraft.load()[0]).feedforward

@@ -197,7 +197,7 @@ def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray
 
 
 def fastest_zero(A: FloatArray, B: FloatArray, C: FloatArray) -> float:
-    """Return the largest real part of the zeros, 1/s; minus infinity if there are no zeros.
+    """Return the largest real part of the zeros, 1/s, or minus infinity if there are no zeros.
 
     If the largest real part is above 0, the aircraft diverges while y is held.
     """

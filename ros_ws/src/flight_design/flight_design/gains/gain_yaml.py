@@ -190,7 +190,10 @@ def _comments(selection: Selection, controller: RiseDiConfig) -> dict[str, str]:
 
 
 def _within(uncertainty: float) -> str:
-    """Write the words that a value holds for deviations up to `uncertainty`, or "" if it is 0."""
+    """Write the words that a value holds for deviations up to `uncertainty`.
+
+    Returns "" if it is 0.
+    """
     return f", the largest within +-{100 * uncertainty:g} %" if uncertainty else ""
 
 
@@ -226,7 +229,10 @@ def section_yaml(
 
 
 def below_requirement(unmet: Sequence[GainCondition], outputs: Sequence[str]) -> str:
-    """Write the first line of a file, which says which margins are too small; "" without any."""
+    """Write the first line of a file, which says which margins are too small.
+
+    Returns "" without any.
+    """
     lacking = "; ".join(condition.sentence(outputs) for condition in unmet)
     return f"Margins below the requirement: {lacking}." if lacking else ""
 

@@ -309,7 +309,10 @@ class ObserverSearch(NamedTuple):
         return float(np.log(response.error / unit + response.activity / self.activity_unit).sum())
 
     def _worst_phase(self, loops: _Loops) -> float:
-        """Return the least phase margin of uncertain aircraft, rad; infinite if there are none."""
+        """Return the least phase margin of uncertain aircraft, rad.
+
+        Returns infinity if there are none.
+        """
         uncertain = self.plant._replace(A=self.plant.A[1:], B=self.plant.B[1:])
         if not len(uncertain.A):
             return math.inf
@@ -332,7 +335,10 @@ class ObserverSearch(NamedTuple):
         return ParameterError(f"--margin: {lack or uncertain}; {MEND}")
 
     def _lack(self, loops: _Loops) -> Refusal | None:
-        """List the margins that are missing around the nominal aircraft; None if none is."""
+        """List the margins that are missing around the nominal aircraft.
+
+        Returns None if none is.
+        """
         requirement = above_zeros(self.needed, self.nominal)
         longest = float(self.margin.max())
         lacking = list[Refusal]()

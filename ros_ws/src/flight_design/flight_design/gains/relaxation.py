@@ -22,7 +22,7 @@ def binding(selection: Selection) -> GainCondition:
 
 
 def reason_against_gains(selection: Selection, *, options: Sequence[str] = ()) -> Refusal | None:
-    """Say why the best gains of the search do not meet the requirement; None if they do.
+    """Say why the best gains of the search do not meet the requirement, or return None if they do.
 
     The sentences name the condition that limits the gains most, every other unmet condition, and
     every change of the loop that reaches the margins. Such a change is a lower required margin,

@@ -202,7 +202,7 @@ def nominal_conditions(nominal: Margins, requirement: Requirement) -> tuple[Gain
 def reason_against_margins(
     margins: LoopMargins, requirement: Requirement, outputs: Sequence[str]
 ) -> Refusal | None:
-    """Say which required margins a loop lacks; None if it lacks none.
+    """Say which required margins a loop lacks, or return None if it lacks none.
 
     `outputs` are the names of the law's outputs.
     """

@@ -74,7 +74,7 @@ class Models(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """Standard deviations, before the flight, of all that is identified; 0 for a known value.
+    """Standard deviations, before the flight, of all that is identified, or 0 for a known value.
 
     `drift` is an exception: it is the noise of the disturbances in the filter. Hidden states, such
     as alpha, are states that y does not contain. If y has only the rates, the rows of the hidden

@@ -470,7 +470,10 @@ def _length(run: tuple[int, int]) -> float:
 def _other_flights(
     runs: Sequence[tuple[int, int]], taken: tuple[int, int], start_ns: int
 ) -> str | None:
-    """Return a sentence on the flights of a log that are not imported; None if there are none."""
+    """Return a sentence on the flights of a log that are not imported.
+
+    Returns None if there are none.
+    """
     others = [
         f"{seconds(first - start_ns):.1f} to {seconds(last - start_ns):.1f} s"
         for first, last in runs
@@ -501,7 +504,10 @@ def _complete(stamp_ns: Stamps, values: FloatArray, is_damaged: bool) -> tuple[S
 
 
 def gap_sentence(name: str, stamp_ns: Stamps, start_ns: int) -> str | None:
-    """Say how many samples a topic lacks, judged by its usual period; None if it lacks none."""
+    """Say how many samples a topic lacks, judged by its usual period.
+
+    Returns None if it lacks none.
+    """
     gaps = np.diff(stamp_ns)
     period = float(np.median(gaps))
     expected = _expected(stamp_ns)

@@ -49,12 +49,12 @@ class FlightRecord:
 
     @property
     def end_ns(self) -> int:
-        """Stamp of the last sample; 0 if there is no sample."""
+        """Stamp of the last sample, or 0 if there is no sample."""
         return self._samples[-1].stamp_ns if self._samples else 0
 
     @property
     def flown(self) -> int | None:
-        """Digest of the parameters that flew in the last sample; None if there is no sample."""
+        """Digest of the parameters that flew in the last sample, or None if there is no sample."""
         return self._samples[-1].flown if self._samples else None
 
     @property

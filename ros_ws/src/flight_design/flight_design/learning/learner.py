@@ -584,7 +584,7 @@ class Learner:
         latest: Mapping[str, float],
         dead: Collection[str],
     ) -> str | None:
-        """Write what `learn.margin` costs in tracking error; None if no design can be compared."""
+        """Write the cost of `learn.margin` in error, or return None if no design compares."""
         start = self._controller
         settings = start.learn
         if settings is None or settings.margin is None or self._design_of_rough is None:

@@ -369,7 +369,7 @@ def wpl_fence(content: bytes, key: str) -> FencePlaces:
 
 
 def _group(item: Item, key: str) -> int:
-    """Return the inclusion group of an item; 0 for a zone to keep out of, which has no group."""
+    """Return the inclusion group of an item, or 0 for a zone to keep out of, which has no group."""
     if item.command in {FENCE_OUT, CIRCLE_OUT}:
         return 0
     group = float(item.params[1])
@@ -394,7 +394,10 @@ def lat_lon(position: Any, above: Above = Above.AS_POSE) -> Place:
 
 
 def home_of(position: Any) -> HomePlace | None:
-    """Read the home from latitude, longitude and perhaps altitude; None for anything else."""
+    """Read the home from latitude, longitude and perhaps altitude.
+
+    Returns None for anything else.
+    """
     if not is_position(position) or not all(isinstance(value, int | float) for value in position):
         return None
     return HomePlace(

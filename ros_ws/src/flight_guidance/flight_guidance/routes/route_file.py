@@ -388,7 +388,7 @@ class _Heights:
 def _home_of_fence(
     places: FencePlaces, origin: Origin | None, heights: _Heights
 ) -> dict[str, Any] | None:
-    """Return the section `home` by the rule of `read_fence_file`; None if there is no home."""
+    """Return the section `home` by the rule of `read_fence_file`, or None if there is no home."""
     rally = [_placed(place._replace(key="rally point"), origin, heights) for place in places.rally]
     if rally:
         nearest = min(rally, key=lambda point: math.hypot(*point.point))

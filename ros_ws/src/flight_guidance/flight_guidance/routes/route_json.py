@@ -161,7 +161,7 @@ def require_wgs84(tree: Any, key: str) -> None:
 
 
 def member(tree: Any, name: str) -> Any:
-    """Return a member of a JSON object; None for anything else."""
+    """Return a member of a JSON object, or None for anything else."""
     return tree.get(name) if isinstance(tree, Mapping) else None
 
 

@@ -111,7 +111,7 @@ def _outer_elements(kinds: Sequence[tuple[str, Element]], outer: str) -> dict[El
 
 
 def _text(parent: Element | None, kind: str) -> str | None:
-    """Return the text of the first child of a kind; None if there is none."""
+    """Return the text of the first child of a kind, or None if there is none."""
     return next(
         (child.text for child in (() if parent is None else parent) if _kind(child) == kind), None
     )

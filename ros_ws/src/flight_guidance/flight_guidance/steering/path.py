@@ -137,7 +137,7 @@ def is_orbit(leg: Leg) -> bool:
 
 
 def length(leg: Leg) -> float:
-    """Return the length of a line, m; 0 for an arc."""
+    """Return the length of a line, m, or 0 for an arc."""
     return math.dist(leg.start, leg.end) if isinstance(leg, Line) else 0.0
 
 

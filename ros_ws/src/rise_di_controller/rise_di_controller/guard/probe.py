@@ -154,8 +154,8 @@ class EffectTest:
         probability of at most `false_alarm`.
 
         y is not fitted to the command, because the command also contains the response of the law to
-        the disturbances. Instead H is the ratio of two correlations with the sine, that of y to
-        that of the command.
+        the disturbances. Instead H is the correlation of y with the sine, divided by the
+        correlation of the command with the sine.
         """
         window = np.array(self._means)
         t = (window[:, 0] - window[-1, 0]) / (self._probe.window_ns / NANOSECONDS)
