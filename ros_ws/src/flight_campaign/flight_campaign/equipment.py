@@ -115,7 +115,7 @@ def drawn(
 
 
 def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, float]:
-    """Return for each entry the value of which its drawn deviation is a fraction.
+    """Return, for each entry, the value by which its drawn deviation is multiplied.
 
     These are the `published` values. For the delay it is half of the largest delay, so that the
     delay is drawn within +-100 %.

@@ -117,7 +117,7 @@ def write_certificate(
 
 
 def _require_worst(folder: Path | None, airframe: str, scenario: str) -> None:
-    """Check that the scenario flies the airframe of which unstable variants are to be written.
+    """Check that the scenario flies the airframe whose unstable variants are written.
 
     Raises ParameterError if not.
     """

@@ -318,7 +318,7 @@ REQUIRED: Any = object()
 
 
 class FieldInfo:
-    """The declaration of a field. In Annotated, only its rules count."""
+    """The declaration of a field. In Annotated, only its rules are used."""
 
     annotation: Any = None
 

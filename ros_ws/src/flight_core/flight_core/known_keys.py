@@ -102,7 +102,7 @@ def unknown_keys(parameters: Config, known: Set[str]) -> list[SetKey]:
 
 
 def _outermost(parameters: Config, found: SetKey, known: Set[str]) -> SetKey:
-    """Return the largest section around a key that is optional and of which no key is known.
+    """Return the largest optional section around a key that has no known key.
 
     Returns the key itself if there is no such section.
     """

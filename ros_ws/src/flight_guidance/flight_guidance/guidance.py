@@ -208,7 +208,7 @@ class Guidance:
         self.take_target({"leg": 0.0})
 
     def keep_link(self) -> None:
-        """Note a sign of life of the operator, from which the age of the link counts."""
+        """Note a sign of life of the operator. The age of the link is the time since it."""
         self._operated_ns = None
         self._link_lost = False
 

@@ -306,7 +306,7 @@ def _is_stamped_by_clock(start_ns: int, spans: Mapping[str, SampleSpan]) -> bool
     """Return whether the processes took their stamps from /clock.
 
     The stamps then lie long before the present, and the names of the publishers have a process id.
-    Stamps by the host's clock count from 1970, and in lockstep the names have no process id.
+    Stamps by the host's clock are times since 1970, and in lockstep the names have no process id.
     """
     return start_ns <= SINCE_EPOCH_NS and any(INSTANCE.fullmatch(sender) for sender in spans)
 
@@ -315,7 +315,7 @@ def _spans(topics: Iterable[tuple[str, Mapping[str, SampleSpan]]]) -> dict[str, 
     """Return the span of each publisher's samples over all of its topics.
 
     `topics` are names of topics with the spans of their publishers. For programs outside of the
-    stack, only the topics of aircraft count.
+    stack, only the topics of aircraft are used.
     """
     spans: dict[str, SampleSpan] = {}
     for name, senders in topics:

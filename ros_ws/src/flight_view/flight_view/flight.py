@@ -86,7 +86,7 @@ class _Topic:
 
 
 class Flight:
-    """A flight in a growing log, of which `update` reads new messages.
+    """A flight in a growing log. `update` reads the new messages.
 
     `namespace` selects an aircraft, by default the first one in the log. `scenario` replaces the
     scenario in the log. `background` has lines for the map, as `read_background` returns them.

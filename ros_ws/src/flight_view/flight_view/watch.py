@@ -55,7 +55,7 @@ def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
 def newest_run(runs: Path, namespace: str | None = None) -> Path:
     """Return the newest run that is being recorded, else the run to which `latest` points.
 
-    With a namespace, only recordings of this aircraft count, but `latest` counts in any case.
+    With a namespace, only recordings of this aircraft are considered, but `latest` always is.
     Raises ParameterError if there is no run.
     """
     if recording := runs_in_recording(runs, namespace):

@@ -61,7 +61,7 @@ def write_figure(
     Args:
         path: Path of the figure. A .pdf, .svg or .eps file has vectors and text, and a .png has
             pixels.
-        flights: The flights, each of which has a curve in every row.
+        flights: The flights. Each has a curve in every row.
         width: Width of the figure, with a unit ("88mm", "3.5in") or in m.
         channels: Names of outputs (y over y_m) and inputs (u), and "e.NAME" for the error of an
             output. If empty, the figure has every output.

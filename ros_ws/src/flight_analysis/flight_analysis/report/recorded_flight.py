@@ -179,7 +179,7 @@ def _imported_flight(recorded: RecordedRun, name: str, source: Mapping[str, str]
 
 
 def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedFlight:
-    """Return the flight of a user's own aircraft, of which the log has only the controller."""
+    """Return the flight of a user's own aircraft. The log has only its controller."""
     recorded.require("y", "u")
     controller = recorded_parameters(recorded.scenario_file(), recorded.namespace)
     summary = summarise_own(recorded.tape, controller.law, name, outcome)

@@ -490,7 +490,7 @@ def airframe_yaml(
 
 
 def signs_alone(sign: FloatArray) -> IdentifiedChannels:
-    """Return channels of which only the signs of the effects are known."""
+    """Return channels that are known only by the signs of their effects."""
     none = 0.0 * sign
     return IdentifiedChannels(
         Omega=np.diag(sign),

@@ -242,7 +242,7 @@ def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> None:
 
 
 def absence_sentence(rows: Iterable[Agreement]) -> str | None:
-    """Write a sentence on the parameters of which the log has no value at the samples, or None."""
+    """Write a sentence on the parameters without a value at the samples, or return None."""
     absent = ", ".join(row.what for row in rows if not row.is_known)
     if not absent:
         return None

@@ -152,7 +152,7 @@ def goal(
     latest: Mapping[str, float],
     dead: Collection[str] = (),
 ) -> Goal:
-    """Return the goal of a design for a model of which some parts are learned.
+    """Return the goal of a design for a model that has some learned parts.
 
     A part is a group of states and inputs that does not couple with the rest. Each part needs a
     delay margin:

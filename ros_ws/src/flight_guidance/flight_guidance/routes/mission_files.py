@@ -386,7 +386,7 @@ def _group(item: Item, key: str) -> int:
 def lat_lon(position: Any, above: Above = Above.AS_POSE) -> Place:
     """Read a position in a plan: a list of latitude, longitude and perhaps altitude.
 
-    `above` says what the altitude counts from.
+    `above` says above what the altitude is measured.
     """
     require(is_position(position), "fence", short_repr(position), "latitude and longitude")
     latitude, longitude, *altitude = position

@@ -158,10 +158,11 @@ def read_route_file(
     """Read the waypoints of a route file, whose ending is one of ENDINGS.
 
     Latitudes and longitudes are converted to north and east of the origin, by default the home in
-    the file. If the file has no altitudes, `altitude` is the altitude to fly at, m. If the file
-    counts altitudes from the ground or from the home, `altitude` is the altitude of the ground or
-    of the home. `above_sea` says whether the altitudes of `pose` count from the sea (True), or from
-    the start, which is the home in the file (False). None means that this is unknown.
+    the file. If the file has no altitudes, `altitude` is the altitude to fly at, m. If the
+    altitudes of the file are above the ground or above the home, `altitude` is the altitude of the
+    ground or of the home. `above_sea` says whether the altitudes of `pose` are above the sea
+    (True), or above the start, which is the home in the file (False). None means that this is
+    unknown.
 
     Successive equal positions become one waypoint. A waypoint is left out if the line without it
     passes within `simplify`, m. In a file with several lines, `line` chooses one by its number from
@@ -355,7 +356,7 @@ class _Heights:
     def altitude(self, place: Place) -> Any:
         """Return the altitude of a place in m, before it is validated.
 
-        Raises ParameterError if the file does not say what the altitude counts from.
+        Raises ParameterError if the file does not say above what the altitude is measured.
         """
         altitude = place.altitude
         above = place.above

@@ -19,7 +19,7 @@ A_ROUTE = "a route file"
 
 
 class Above(Enum):
-    """What the altitude of a place counts from."""
+    """Above what the altitude of a place is measured."""
 
     AS_POSE = 0  # the number needs no conversion to the reference of `pose`
     SEA = 1
