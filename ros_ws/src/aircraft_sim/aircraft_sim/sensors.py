@@ -30,7 +30,7 @@ class Sensors(NamedTuple):
 
 
 class RandomWalk(NamedTuple):
-    """The random walk of the sensors' drift, at a sample."""
+    """The value of the random walk by which the sensors drift, at one of their samples."""
 
     number: int  # number of the sample
     value: FloatArray  # (m,) value of the walk, SI

@@ -62,8 +62,8 @@ class MessageRates:
     def slow(self, now: float) -> dict[str, Refusal]:
         """Say how slow each slow message is, by name.
 
-        A message is slow if its rate is slow now. After a message has once reached the requested
-        rate, it stays slow for the time REMEMBERED after its rate was last slow.
+        A message is slow if it now comes less often than requested. If it has ever come as often as
+        requested, it is also slow for a while (REMEMBERED) after its rate has recovered.
         """
         reasons = {name: rate.slowness(name, now) for name, rate in self._rates.items()}
         return {name: reason for name, reason in reasons.items() if reason is not None}

@@ -282,8 +282,8 @@ def _correction(
 ) -> FloatArray:
     """Compute L for white noise that acts on the states.
 
-    `intensities` has the noise of groups of k states, (.., k), in the order of the states, SI per
-    root s.
+    `intensities` is a list of arrays, (.., k). Each has the noise of k successive states, and
+    together they have the noise of all states, SI per root s.
     """
     batch = np.broadcast_shapes(*(intensity.shape[:-1] for intensity in intensities))
     process = np.concatenate(

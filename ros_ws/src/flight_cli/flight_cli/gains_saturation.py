@@ -47,7 +47,8 @@ def write_limit_certificate(
 ) -> list[str]:
     """Write the certificate for a loop in which one input saturates, if a path is given.
 
-    Returns a sentence if the law has no C constants from which a checker could compute the loop.
+    Returns a sentence if the law has no C code, because a checker computes the loop from the
+    constants in that code.
     """
     if path is None:
         return []

@@ -152,7 +152,7 @@ class _ChunkIndexes:
 def full_names(remaps: Mapping[str, str]) -> dict[str, str]:
     """Return, for each topic of a log, its full name in the flight stack before a remap.
 
-    The result is the inverse of `remaps`, which has the topic of the log for each such name.
+    `remaps` maps such full names to topics of the log. The result maps the other way.
     """
     return {topic: f"/{name.lstrip('/')}" for name, topic in remaps.items()}
 

@@ -85,7 +85,10 @@ class ReservedFile:
             self.is_full = error.errno in NO_SPACE
 
     def keep(self, data: bytes) -> None:
-        """Keep data for the end of the file, in the reserve or, without a reserve, in memory."""
+        """Keep data that will be written to the end of the file.
+
+        They are kept in the space that is reserved on the disk, or in memory if none is reserved.
+        """
         if not self._reserve.closed:
             try:
                 if os.pwrite(self._reserve.fileno(), data, self._kept_bytes) == len(data):

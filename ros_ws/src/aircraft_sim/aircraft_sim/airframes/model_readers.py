@@ -278,7 +278,8 @@ def _rows(lines: Sequence[str], count: int, columns: int, key: str) -> FloatArra
 def _xflr5(text: str, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> ToolModel:
     """Read the longitudinal and the lateral 4 x 4 matrix from a log of XFLR5, SI.
 
-    The control matrices are per rad, and each control has one for either motion.
+    Each control has two matrices, one for the longitudinal and one for the lateral motion. Their
+    entries are per rad.
     """
     lines = text.splitlines()
 

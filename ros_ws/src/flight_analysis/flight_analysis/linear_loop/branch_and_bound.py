@@ -120,10 +120,10 @@ def _as_step(scaling: Scaling, part: Channels) -> dict[str, list[float]]:
     """Round the scalings X and G, and return them as the lists `t` and `g` of a step of the proof.
 
     The lists have only the scalings of the uncertain entries. Rounding is safe, because any X and G
-    prove a bound. If the X and G of the second Legendre coefficients follow from the X and G of the
-    means over a period, as in `least_bound_at`, the lists have only the X and G of the means. A
-    common factor of all X changes no bound, so X is divided by its value at the channels of a
-    delay.
+    prove a bound. A delay has channels for the means over a period and for the second Legendre
+    coefficients. If the scalings of the second follow from those of the means, as in
+    `least_bound_at`, only the means are in the lists. A common factor of all X changes no bound, so
+    X is divided by its value at the channels of a delay.
     """
     k = len(part.entries)
     count = part.uncertain if scaling.g[k:].any() else k

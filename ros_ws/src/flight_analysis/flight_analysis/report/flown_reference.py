@@ -171,7 +171,7 @@ def _reason_in_signal(tape: Tape, scenario: Scenario) -> NotCompared | None:
 def _is_whole(tape: Tape) -> bool:
     """Return whether the log shows which u_m acted at each step.
 
-    If the flight was in real time, a lost message hides this.
+    The log of a flight in real time does not show it if a message of y_m or u_m was lost.
     """
     if "u_m" not in tape or tape.start_ns < SINCE_EPOCH_NS:
         return True

@@ -244,10 +244,11 @@ class FilterBank(NamedTuple):
 
 
 class Passage:
-    """A run of the filters of a bank over a flight, y (T, m) and u (T, m), or (N, T, m) by model.
+    """A run of the filters of a bank over a flight.
 
         r = y - H z,  z+ = Phi (z + L r) + Gamma u + period gravity (sin(x) - x)
 
+    y has the shape (T, m). u has the shape (T, m), or (N, T, m) if it differs between the N models.
     If y is lost, r does not correct z. The flight is a sequence of blocks of HOLD periods, and
     `level` has the level of the wind in each block. sin(x) - x is held over a block, so that a
     block is linear. Blocks with the same level and the same lost samples share a matrix.

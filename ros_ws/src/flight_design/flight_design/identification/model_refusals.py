@@ -83,9 +83,9 @@ def reason_against_airframe(
 ) -> Refusal | None:
     """Return a refusal of the airframe `name` if too many entries ended at a bound of the search.
 
-    At most `allowed` entries may be at a bound. But a single entry is too many if the record shows
-    it clearly, with less than half of the prior standard deviation. The aircraft then lies beyond
-    the bound. Returns None if the airframe is not refused.
+    At most `allowed` entries may be at a bound. But one entry is too many if its standard deviation
+    is less than half of that before the flight. The record then shows clearly that the aircraft
+    lies beyond the bound. Returns None if the airframe is not refused.
     """
     found = at_bound(entries, factor)
     is_shown = any(entry.deviation < PRIOR / 2.0 for entry in found)

@@ -158,13 +158,14 @@ def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
     which is (m!)^2 cases. With more channels only the three orders of `_likely_orders` are tried. A
     smaller change may then exist, even if None is returned. The signs of the inputs need no search:
     an input k is reversed where D_k = -1, because its sign changes only D_k. Orders with a zero on
-    the diagonal, or with max abs(U - I) above `largest_U`, are excluded. The others are compared by
-    these criteria, one after the other:
+    the diagonal, or with max abs(U - I) above `largest_U`, are excluded. Of the others, the best
+    one is chosen by these criteria. Each decides among the orders that are equal by the criteria
+    before it:
 
-    - Most outputs keep their input.
-    - Most outputs keep their place.
-    - Most inputs keep their sign.
-    - max abs(U - I) in inputs of unit response is smallest.
+    - the largest number of outputs that keep their input,
+    - the largest number of outputs that keep their place,
+    - the largest number of inputs that keep their sign,
+    - the smallest max abs(U - I), for inputs that are scaled so that abs(Omega_ii) = 1.
 
     Raises DecompositionError if Omega is not square or not finite.
     """
