@@ -53,7 +53,7 @@ from benchmarks.tables import parser_of
 from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.metrics.by_part import errors_by_part
-from flight_analysis.metrics.time_spans import in_spans
+from flight_analysis.metrics.time_spans import is_in_spans
 from flight_analysis.report.disturbances import transients
 from flight_analysis.report.guided import control_errors
 from flight_core.rates import NANOSECONDS
@@ -289,7 +289,7 @@ def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
     t = tape.time("guidance")
     errors = control_errors(tape)
     stop = one["stop"] or GUIDED
-    is_held = in_spans(
+    is_held = is_in_spans(
         t,
         [(start + SETTLED, min(start + EACH, stop)) for start in starts if start + SETTLED < stop],
     )

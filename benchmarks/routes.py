@@ -152,7 +152,7 @@ def duration(route: Route, section: GuidanceConfig) -> float:
     for k, leg in enumerate(route.legs):
         if isinstance(leg, Line):
             length += path.length(leg)
-            if path.turns_back(leg, next(iter(route.legs[k + 1 :]), None)):
+            if path.is_too_sharp(leg, next(iter(route.legs[k + 1 :]), None)):
                 length += 4.0 * math.pi * route.radius  # at most two turns to join the next leg
         elif path.is_orbit(leg):
             if leg.end is not None:

@@ -33,7 +33,7 @@ from tests.sitl.shared_link import STATION
 
 from autopilot_bridge.params import find_map
 from flight_analysis.closed_loop.scenario import load_scenario
-from flight_analysis.metrics.time_spans import in_spans
+from flight_analysis.metrics.time_spans import is_in_spans
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_log.tape_reader import read_run
@@ -564,7 +564,9 @@ class ArduPlane(Autopilot):
             pulse = pulses.get(name, pulses["p"]) if name == "r" else pulses[name]
             edges = zip(pulse.start, pulse.stop, strict=True)
             begin = log.tape.start_ns / 1e9
-            commanded = in_spans(t, [(begin + start, begin + stop + 1.0) for start, stop in edges])
+            commanded = is_in_spans(
+                t, [(begin + start, begin + stop + 1.0) for start, stop in edges]
+            )
             commanded &= (t > span.start_ns / 1e9) & (t < stop_ns / 1e9)
             reference = np.interp(t[commanded], y_m.stamp_ns / 1e9, y_m[name])
             if commanded.any():

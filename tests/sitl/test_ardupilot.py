@@ -24,7 +24,7 @@ from tests.sitl.kit import (
 
 from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.metrics.time_spans import in_spans
+from flight_analysis.metrics.time_spans import is_in_spans
 from flight_analysis.report.guided import BANDS, control_errors
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run
@@ -115,7 +115,7 @@ def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
     for name in pulses.keys() & set("qp"):
         edges = zip(pulses[name].start, pulses[name].stop, strict=True)
         # elsewhere y_m is 0, and e is noise
-        commanded = in_spans(t, [(start, stop + 1.0) for start, stop in edges])
+        commanded = is_in_spans(t, [(start, stop + 1.0) for start, stop in edges])
         reference = np.interp(y.stamp_ns[commanded], y_m.stamp_ns, y_m[name])
         figures[name] = float(np.std(y[name][commanded] - reference) / np.std(reference))
     assert max(figures.values()) < 0.75
@@ -174,7 +174,7 @@ def test_guidance_holds_heading_altitude_and_airspeed(plane: ArduPlane, turns: i
     tape = read_run(plane.run).tape
     t = tape.time("guidance")
     errors = control_errors(tape)
-    is_held = in_spans(t, [(start + 45.0, start + each) for start in starts])
+    is_held = is_in_spans(t, [(start + 45.0, start + each) for start in starts])
     largest = {
         name: float(np.max(np.abs(errors[name][is_held]))) for name in ("heading", "altitude", "V")
     }

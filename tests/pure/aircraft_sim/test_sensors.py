@@ -16,7 +16,7 @@ from tests.closed_loop import PROTOTYPE_SERVO
 from aircraft_sim.sensors import (
     DelayLine,
     Sensors,
-    arrives,
+    has_arrived,
     initial_drift,
     measure,
     noise,
@@ -59,7 +59,7 @@ def test_noise_of_sample_k_depends_on_seed_and_not_on_earlier_calls() -> None:
     first = noise(1234, params)
     for k in (7, 3, 99):
         noise(k, params)
-        arrives(k, params._replace(dropout=0.5))
+        has_arrived(k, params._replace(dropout=0.5))
     assert (noise(1234, params) == first).all()
     assert (noise(1234, params._replace(seed=2)) != first).all()
 
@@ -73,7 +73,7 @@ def test_channel_without_noise_exact_and_does_not_change_others() -> None:
 
 @pytest.mark.parametrize("dropout", [0.05, 0.2, 0.5])
 def test_fraction_of_dropped_samples_is_specified_one(dropout: float) -> None:
-    lost = np.array([not arrives(k, sensors(NOISE, dropout=dropout)) for k in range(COUNT)])
+    lost = np.array([not has_arrived(k, sensors(NOISE, dropout=dropout)) for k in range(COUNT)])
     # Four standard deviations of a fraction.
     tolerance = 4.0 * np.sqrt(dropout * (1.0 - dropout) / COUNT)
     assert lost.mean() == approx(dropout, abs=tolerance)

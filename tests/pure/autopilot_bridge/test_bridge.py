@@ -116,7 +116,7 @@ def test_engagement_with_stale_inputs_refused_with_reason() -> None:
 def test_dry_run_computes_but_never_sends_or_engages() -> None:
     bridge = ready_bridge(0.1, dry_run=True)
     assert str(bridge.engage(at(0.0))).startswith("dry_run")
-    assert not bridge.sends("joy", at(0.0))
+    assert not bridge.is_sent("joy", at(0.0))
     assert bridge.raw_u()[0] == approx(0.1 / 0.523599)
 
 
@@ -151,7 +151,7 @@ def test_timeout_of_u_sends_neutral_then_release_values_then_nothing() -> None:
     phases = []
     for t in np.arange(0.0, 1.2, 0.01).tolist():
         receive_outputs(bridge, t + 1e-3)
-        phases.append((bridge.step(at(t + 1e-3)), t, bridge.raw(), bridge.sends("joy", at(t))))
+        phases.append((bridge.step(at(t + 1e-3)), t, bridge.raw(), bridge.is_sent("joy", at(t))))
     expected = {Phase.ENGAGED: 0.0, Phase.NEUTRAL: 0.2, Phase.RELEASE: 0.5, Phase.DISENGAGED: 1.0}
     starts = {phase: next(t for reached, t, *_ in phases if reached is phase) for phase in expected}
     assert starts == approx(expected, abs=0.011)  # a tick
@@ -340,7 +340,7 @@ def refresh(bridge: Bridge, t: float, **status: float) -> None:
 
 
 def sent(bridge: Bridge, t: float) -> set[str]:
-    return {name for name in bridge.channel_map.messages if bridge.sends(name, at(t))}
+    return {name for name in bridge.channel_map.messages if bridge.is_sent(name, at(t))}
 
 
 @pytest.mark.parametrize("lost", ["the mode is not offboard", "two autopilots"])

@@ -130,4 +130,4 @@ def test_autopilot_that_starts_again_begins_with_unknown_rates() -> None:
 def test_message_without_a_request_is_not_counted() -> None:
     stream = Stream().run(10.0)
     stream.rates.take("VFR_HUD", 10.0)
-    assert stream.rates.comes("ATTITUDE", 10.0)
+    assert stream.rates.is_coming("ATTITUDE", 10.0)

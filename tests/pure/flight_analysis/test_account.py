@@ -243,7 +243,7 @@ def test_replay_covers_no_tick_without_its_sample(topic: str, tape: Tape) -> Non
     keep = ~np.isin(signal.stamp_ns, tape["internals"].stamp_ns[10::20])
     result = replay(replace(tape, signals={**tape.signals, topic: signal.where(keep)}))
     assert result.is_equal()
-    assert result.compared.mean() == pytest.approx(0.95, abs=0.01)
+    assert result.is_compared.mean() == pytest.approx(0.95, abs=0.01)
     assert result.checked.mean() > 0.98
     assert any(f"no sample on the topic {topic}" in note for note in result.notes)
 
@@ -328,7 +328,7 @@ def test_u_of_a_foreign_aircraft_is_judged_by_the_ticks_with_a_new_y(
     """The numbers of the ticks are continuous. u is whole at any rate of y, half of u is not."""
     osprey_servo = find_scenario("osprey_servo")
     every_tick = account(foreign_flight(rate, slice(None)), osprey_servo).topics["u"]
-    assert every_tick.holds(every_tick.found)
+    assert every_tick.is_enough(every_tick.found)
     every_other = account(foreign_flight(rate, slice(None, None, 2)), osprey_servo).topics["u"]
     assert every_other.share == pytest.approx(0.5, abs=0.02)
 
@@ -372,7 +372,7 @@ def test_one_missing_sample_is_no_lack_of_short_topic(
         left_out=0,
         unsent=0,
     )
-    assert topic.holds(found) == whole
+    assert topic.is_enough(found) == whole
     assert (Account(0.97, {"u": topic}, ()).over("u") == "") == whole
 
 

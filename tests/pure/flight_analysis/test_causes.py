@@ -336,7 +336,7 @@ def test_leap_of_all_topics_is_told_and_figures_are_over_flight_time(
     assert figures(summary) == figures(intact)
     result = replay(log)
     assert result.is_equal()
-    assert result.compared.sum() == len(result.number) == 201
+    assert result.is_compared.sum() == len(result.number) == 201
 
 
 def test_pause_of_all_processes_is_no_leap_of_the_clock(

@@ -16,7 +16,7 @@ from flight_analysis.metrics.by_part import errors_by_part, inputs_by_part
 from flight_analysis.metrics.controller_log import saturation_shares, sign_switches
 from flight_analysis.metrics.errors import ErrorMetrics, error_metrics, noise_floor, tracking_error
 from flight_analysis.metrics.settling import settling_bands, settling_time, settling_times
-from flight_analysis.metrics.time_spans import in_spans
+from flight_analysis.metrics.time_spans import is_in_spans
 from flight_analysis.metrics.transients import (
     Transient,
     TransientKind,
@@ -57,7 +57,7 @@ def test_y_outside_the_reference_is_left_out() -> None:
 
 
 def test_a_span_extends_beyond_its_end() -> None:
-    assert in_spans(np.array([0.9, 1.0, 2.0, 2.5, 2.6]), [(1.0, 2.0)], 0.5).tolist() == [
+    assert is_in_spans(np.array([0.9, 1.0, 2.0, 2.5, 2.6]), [(1.0, 2.0)], 0.5).tolist() == [
         False,
         True,
         True,

@@ -246,7 +246,7 @@ def test_one_bit_of_one_gain_is_found(name: str, channel: int) -> None:
         assert first.ulps is not None
         assert first.ulps > 0
         assert first.channel == f"u.{scenario.controller.inputs[channel]}"
-        assert not result.different()[result.number < first.number].any()
+        assert not result.is_different()[result.number < first.number].any()
 
 
 BUSY = {
@@ -294,7 +294,7 @@ def test_one_bit_of_one_sample_found_and_only_there(topic: str, channels: list[s
         assert (first.number, first.t) == (101, 1.0)
         assert first.ulps == 1 or topic == "y" or channel == "y.r"  # a bit of y is more in u
         # The next tick starts from the logged state.
-        assert result.number[result.different().any(axis=1)].max() <= 102
+        assert result.number[result.is_different().any(axis=1)].max() <= 102
 
 
 def test_differences_counted_in_units_in_last_place() -> None:

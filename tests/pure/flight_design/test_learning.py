@@ -192,7 +192,7 @@ class Fixed:
 def test_replay_of_learning_flight_is_equal_to_the_bit(flown: Flown) -> None:
     result = replay(flown.run)
     assert result.is_equal()
-    assert result.compared.all()
+    assert result.is_compared.all()
     assert any("observer.part" in note for note in result.notes)
 
 

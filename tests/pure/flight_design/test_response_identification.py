@@ -10,7 +10,7 @@ from flight_core.rates import nanoseconds
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 from flight_design.identification.response_identification import Response, identify_response
-from flight_design.identification.step_response_fit import begins_with_Omega
+from flight_design.identification.step_response_fit import has_direction_of_Omega
 
 OUTPUTS = ("p", "r")
 INPUTS = ("aileron", "rudder")
@@ -103,6 +103,6 @@ def test_response_whose_sign_is_not_that_of_omega_is_no_fit() -> None:
     # 1120 / (s^2 + 23 s + 267), all of it in the slow part: an elevator of 110 rad/s^2 per rad had
     # an Omega of -0.016
     t = np.arange(0.02, 0.8, 0.02)
-    assert not begins_with_Omega(t, np.array([0.07, 0.003, -0.016, 23.0, 267.0, 1120.0]))
-    assert begins_with_Omega(t, np.array([0.07, 0.04, 110.0, 23.0, 0.0, 0.0]))
-    assert begins_with_Omega(t, np.array([0.07, 0.04, -48.0, 13.0, 104.0, -40.0]))
+    assert not has_direction_of_Omega(t, np.array([0.07, 0.003, -0.016, 23.0, 267.0, 1120.0]))
+    assert has_direction_of_Omega(t, np.array([0.07, 0.04, 110.0, 23.0, 0.0, 0.0]))
+    assert has_direction_of_Omega(t, np.array([0.07, 0.04, -48.0, 13.0, 104.0, -40.0]))

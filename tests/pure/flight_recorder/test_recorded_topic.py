@@ -26,7 +26,7 @@ def recorded(name: str = "/y", *, is_foreign: bool = False) -> RecordedTopic:
 def lost(topic: RecordedTopic, messages: Iterable[tuple[int, str]]) -> list[int]:
     """How many messages were lost before each of these, which are sequences and publishers."""
     return [
-        0 if topic.continues(sequence) else topic.lost_before(sequence, publisher)
+        0 if topic.is_next(sequence) else topic.lost_before(sequence, publisher)
         for sequence, publisher in messages
     ]
 

@@ -413,7 +413,7 @@ class Engagement:
     def _check_sent(self, now_ns: int) -> None:
         rows = list(self._map.inputs.values())
         phase = self.bridge.phase
-        assert self.bridge.sends("joy", now_ns) == (phase is not Phase.DISENGAGED)
+        assert self.bridge.is_sent("joy", now_ns) == (phase is not Phase.DISENGAGED)
         raw = self.bridge.raw()
         if phase is not Phase.ENGAGED:
             self._sent = None

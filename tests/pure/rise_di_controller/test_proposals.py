@@ -301,16 +301,16 @@ def test_simulated_time_waits_for_each_proposal_that_is_due_and_takes_it_after_l
     flight = Flight(simulated=True)
     acts_ns = END_NS + nanoseconds(4.0)
     flight.learning.ticked(flight.controller, 0)
-    assert flight.learning.waits(nanoseconds(4.0))
+    assert flight.learning.is_waiting(nanoseconds(4.0))
     flight.receive({}, stamp_ns=0, sentence=None)  # of the first tick, without a rough model
     for now_ns in range(NANOSECONDS, acts_ns + 1, NANOSECONDS):
         flight.learning.ticked(flight.controller, now_ns)
-        assert flight.learning.waits(now_ns) is (now_ns >= acts_ns)
+        assert flight.learning.is_waiting(now_ns) is (now_ns >= acts_ns)
     flight.receive()
     flight.receive()
     assert len(flight.sentences) == 1  # it came twice
     assert flight.learning.step(flight.controller, acts_ns - 1) is None
-    assert not flight.learning.waits(acts_ns)
+    assert not flight.learning.is_waiting(acts_ns)
     assert flight.learning.step(flight.controller, acts_ns) is not None
     assert flight.sentences[1:] == ["flies model"]
 
@@ -321,7 +321,7 @@ def test_simulated_time_waits_for_no_proposal_of_a_deactivated_law() -> None:
     flight.controller.tick(flight.now_ns, active=False)
     flight.learning.step(flight.controller, flight.now_ns)
     assert not flight.learning.ticked(flight.controller, flight.now_ns)  # an identification is due
-    assert not flight.learning.waits(flight.now_ns + nanoseconds(60.0))
+    assert not flight.learning.is_waiting(flight.now_ns + nanoseconds(60.0))
 
 
 def test_identifications_begin_at_their_times_and_then_tests_at_theirs() -> None:

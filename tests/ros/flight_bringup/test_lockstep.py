@@ -136,7 +136,7 @@ def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are
     for run in runs[1:]:
         result = replay(run)
         assert result.is_equal()
-        assert result.compared.sum() == len(result.compared) > 100
+        assert result.is_compared.sum() == len(result.is_compared) > 100
         assert not result.notes
 
 
@@ -182,7 +182,7 @@ def test_other_nodes_end_within_three_seconds_of_kill_and_name_it(
         result = replay(log)
         assert result.is_equal()
         # the last complete chunk can end between the internals of a tick and its y
-        assert result.compared.sum() >= len(result.compared) - 1 > 100
+        assert result.is_compared.sum() >= len(result.is_compared) - 1 > 100
 
 
 def test_diverged_aircraft_ends_flight_with_reason_and_log(start: Start, tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
     require_equal_bits(recorded, tape)
     result = replay(run)
     assert result.is_equal()
-    assert result.compared.all()
+    assert result.is_compared.all()
     steps = replay_guidance(recorded, flight_scenario.guidance)
     assert steps.is_equal()
     assert steps.checked == steps.steps

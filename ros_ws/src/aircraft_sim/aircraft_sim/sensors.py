@@ -123,7 +123,7 @@ def walk(number: int, drift: RandomWalk, params: Sensors) -> RandomWalk:
     return RandomWalk(number, value)
 
 
-def arrives(number: int, params: Sensors) -> bool:
+def has_arrived(number: int, params: Sensors) -> bool:
     """Return whether sample `number` >= 0 arrives, or is lost at random.
 
     It arrives if v >= dropout, where v is uniform in [0, 1), and independent of the noise.

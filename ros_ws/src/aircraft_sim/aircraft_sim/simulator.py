@@ -185,7 +185,7 @@ class Simulator:
                 number, measured[size_y:], self._vane_state, self._vanes
             )
             measured = np.concatenate([measured[:size_y], self._vane_state.reading])
-        y = measured if sensors.arrives(number, self._sensors) else None
+        y = measured if sensors.has_arrived(number, self._sensors) else None
         self._delay_line, arrived = sensors.transmit(self._delay_line, t_ns, y, self._sensors)
         return arrived
 

@@ -65,7 +65,7 @@ class StateSpaceModel:
         """Fly from t to t + duration with u held, deviations from trim, SI."""
         steps = divide(duration_ns, self._plant.step_ns, "step", "the duration")
         begin = (t_ns - self._block_ns) // self._plant.step_ns
-        if not 0 <= begin <= begin + steps <= BLOCK or self._drifts(t_ns):
+        if not 0 <= begin <= begin + steps <= BLOCK or self._is_drifting(t_ns):
             self._block_ns = t_ns
             begin = 0
             self._block = plant.forcing(t_ns, max(steps, BLOCK), self._plant, self._state.x)
@@ -119,7 +119,7 @@ class StateSpaceModel:
         _, _, _, phi, theta, *_ = self._states()
         return self._into @ (wind_field.body_axes(phi, theta, self._psi) @ self._wind_dot)
 
-    def _drifts(self, t_ns: int) -> bool:
+    def _is_drifting(self, t_ns: int) -> bool:
         """Return whether the drift at t differs from the one that the block was computed with."""
         drift = self._plant.drift
         if drift is None:

@@ -561,7 +561,7 @@ class Bridge:
             return math.nan if row.release is None else row.release
         return self._raw(name, 0.0) if row.neutral == "trim" else row.neutral
 
-    def sends(self, name: str, now_ns: int) -> bool:
+    def is_sent(self, name: str, now_ns: int) -> bool:
         """Return whether a message of the map is sent in this phase. A dry run sends no message."""
         if self.dry_run:
             return False

@@ -79,7 +79,7 @@ class Conditions:
         reading = self._conditions.get(name)
         if stale := staleness(row.topic, reading, row.max_age, now_ns):
             return joined_faults({f"{name}: {row.field}": stale})
-        if reading is None or row.holds(reading.value):
+        if reading is None or row.is_met_by(reading.value):
             return None
         return Refusal(f"{row.sentence} ({row.field} is {reading.value:g})")
 
@@ -93,7 +93,7 @@ class Conditions:
         rows = self._map.conditions.items()
         readings = ((row, self._conditions.get(name)) for name, row in rows if not row.transmitter)
         return any(
-            reading is not None and not row.holds(reading.value) for row, reading in readings
+            reading is not None and not row.is_met_by(reading.value) for row, reading in readings
         )
 
     def is_active(self, name: str, now_ns: int, *, engaged: bool) -> bool:

@@ -171,12 +171,12 @@ def _fault(types: Types, used: UsedField) -> Refusal | None:
         element = _element((node, content))
         field = (node, content) if match[2] is None else element
         member_kind = element[1] if element[0] is Nodetype.NAME else ""
-    if components is None or _has(definitions, field, components):
+    if components is None or _has_components(definitions, field, components):
         return None
     return Refusal(f"{used.path}: no {', '.join(components) or 'number'}")
 
 
-def _has(definitions: Types, field: Any, components: str) -> bool:
+def _has_components(definitions: Types, field: Any, components: str) -> bool:
     """Return whether a field has the given components, as members or in an array.
 
     If `components` is "", the result says whether the field is a number.

@@ -272,7 +272,7 @@ class ConditionRow(WatchedRow):
         "with `--blind` ignores such a row",
     )
 
-    def holds(self, raw: float) -> bool:
+    def is_met_by(self, raw: float) -> bool:
         """Return whether a raw value meets the condition."""
         value = self.masked(raw)
         if self.within is None:

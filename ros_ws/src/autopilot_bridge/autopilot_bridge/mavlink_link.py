@@ -242,7 +242,9 @@ class Link:
         slow = [reason for message, reason in self._rates.slow(now).items() if message in names]
         refusals = {message: reason for message, reason in self._denied.items() if message in names}
         denied = [
-            reason for message, reason in refusals.items() if not self._rates.comes(message, now)
+            reason
+            for message, reason in refusals.items()
+            if not self._rates.is_coming(message, now)
         ]
         return joined((self.conflict, *slow, *denied, TAKEN if slow else None))
 
@@ -431,7 +433,7 @@ class Link:
             AUTOPILOT,
         ) or name == "BAD_DATA":
             return
-        if not self._admits(message, address, now):
+        if not self._is_admitted(message, address, now):
             return
         if message.get_header().incompat_flags & SIGNED and self._config.passphrase_file is None:
             self._clash = Refusal(
@@ -447,7 +449,7 @@ class Link:
         if (queue := self._queues.get(name)) is not None:
             queue.append(MavlinkMessage(message, received_ns))
 
-    def _admits(self, message: Any, address: Address, now: float) -> bool:
+    def _is_admitted(self, message: Any, address: Address, now: float) -> bool:
         """Return whether a message of the autopilot comes from the sender that the lock admits.
 
         If the sender is new, the link requests the rates of its messages.

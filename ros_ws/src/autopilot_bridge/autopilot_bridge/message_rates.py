@@ -71,11 +71,11 @@ class MessageRates:
     def lasting(self, now: float) -> Refusal | None:
         """Say which messages have been slow for at least SLOW_ENDS s, or return None."""
         reasons = joined(
-            rate.slowness(name, now) for name, rate in self._rates.items() if rate.lasts(now)
+            rate.slowness(name, now) for name, rate in self._rates.items() if rate.has_lasted(now)
         )
         return None if reasons is None else Refusal(f"{reasons}; for {SLOW_ENDS:g} s")
 
-    def comes(self, name: str, now: float) -> bool:
+    def is_coming(self, name: str, now: float) -> bool:
         """Return whether a message comes at the requested rate."""
         rate = self._rates[name]
         return rate.is_known(now) and rate.slowness(name, now) is None
@@ -108,7 +108,7 @@ class _Rate:
     def is_known(self, now: float) -> bool:
         return now - self._began >= self._window
 
-    def lasts(self, now: float) -> bool:
+    def has_lasted(self, now: float) -> bool:
         return self._slow_since is not None and now - self._slow_since >= SLOW_ENDS
 
     def step(self, now: float) -> bool:

@@ -341,7 +341,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
 
     def _send(self, now_ns: int, slack_ns: int) -> None:
         for name, outgoing in self._outgoing.items():
-            if self._bridge.sends(name, now_ns) and outgoing.is_due(now_ns, slack_ns):
+            if self._bridge.is_sent(name, now_ns) and outgoing.is_due(now_ns, slack_ns):
                 try:
                     outgoing.send(now_ns, self._bridge.raw().tolist())
                 except ChannelError as error:

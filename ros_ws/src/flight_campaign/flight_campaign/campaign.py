@@ -101,7 +101,7 @@ def define(
     """
     if sweep is not None:
         sweep.scaled(scenario.controller, 1.0)
-    if single_flights.flies_alone(scenario):
+    if single_flights.is_flown_alone(scenario):
         single_flights.require_single_flights(scenario)
     else:
         build_course(scenario)
@@ -147,7 +147,7 @@ def _default_chunk(scenario: Scenario, aircraft: int) -> int:
     """Return the default number of aircraft that fly at once."""
     if aircraft < 1:
         return 1
-    if single_flights.flies_alone(scenario):
+    if single_flights.is_flown_alone(scenario):
         return single_flights.CHUNK
     from flight_campaign.batch.device import chunk_of_device  # noqa: PLC0415 - JAX, which the command needs only for flights
 
@@ -161,7 +161,7 @@ def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
     the learner of a scenario. Raises ParameterError if an aircraft does not fit into memory.
     """
     definition = Definition.model_validate_json(text)
-    if single_flights.flies_alone(definition.scenario()):
+    if single_flights.is_flown_alone(definition.scenario()):
         figures = single_flights.fly_chunk_singly(definition, job, learner)
     else:
         figures = fly_chunk_figures(text, job)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from flight_campaign.equipment import is_of_equipment
-from flight_campaign.statistics import Tally, lost_track
+from flight_campaign.statistics import Tally, has_lost_track
 from flight_core.vectors import FloatArray
 
 if TYPE_CHECKING:  # it takes some tenths of a second to load
@@ -59,7 +59,7 @@ def encode_chunk(chunk: Chunk, seed: int, factor: float) -> bytes:
             "number": pl.int_range(chunk.first, chunk.first + count, eager=True),
             "factor": pl.repeat(factor, count, dtype=pl.Float64, eager=True),
             "diverged": diverged,
-            "lost": lost_track(chunk.diverged, chunk.figures["score"]),
+            "lost": has_lost_track(chunk.diverged, chunk.figures["score"]),
             **chunk.figures,
             **chunk.entries,
         }

@@ -67,7 +67,7 @@ def learned(tape: Tape, events: Sequence[Event]) -> LearningOutcome:
     )
 
 
-def flies_alone(scenario: Scenario) -> bool:
+def is_flown_alone(scenario: Scenario) -> bool:
     """Return whether the aircraft fly one by one, because they learn or are guided."""
     return scenario.has_learner() or scenario.guidance is not None
 

@@ -141,7 +141,7 @@ class Tally(Config):
         return cls(
             flights=len(bounded),
             diverged=int((~bounded).sum()),
-            lost=int(lost_track(diverged, scores).sum()),
+            lost=int(has_lost_track(diverged, scores).sum()),
             figures={
                 name: FigureStatistics.from_values(np.asarray(values)[bounded])
                 for name, values in figures.items()
@@ -212,7 +212,7 @@ class Tally(Config):
         return count / self.flights, low, high
 
 
-def lost_track(diverged: FloatArray, scores: FloatArray) -> NDArray[np.bool_]:
+def has_lost_track(diverged: FloatArray, scores: FloatArray) -> NDArray[np.bool_]:
     """Return which flights lost track, (N,).
 
     A flight lost track if it did not diverge, but has a score above LOSS_OF_TRACK_SCORE.

@@ -33,7 +33,7 @@ from flight_campaign.campaign_report import (
     write_results,
 )
 from flight_campaign.definition import Definition, Sweep
-from flight_campaign.single_flights import flies_alone
+from flight_campaign.single_flights import is_flown_alone
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
 from flight_cli.output import (
     COUNT_COLUMNS,
@@ -158,7 +158,7 @@ class Campaign:
             expected = "a file in a folder that exists"
             require(self.rows.parent.is_dir(), "rows", self.rows, expected)
         monte_carlo = self._continued() if Path(self.scenario).is_dir() else self._begun()
-        is_single = flies_alone(monte_carlo.definition.scenario())
+        is_single = is_flown_alone(monte_carlo.definition.scenario())
         from flight_campaign.batch.device import device_name  # noqa: PLC0415 - JAX takes a second
 
         place = "" if is_single or self.scheduler is not None else f" on {device_name()}"

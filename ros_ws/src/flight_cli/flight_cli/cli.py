@@ -180,7 +180,7 @@ def _repeat_interrupt(ignored: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(ignored)
 
 
-def _looks_on(words: Sequence[str]) -> bool:
+def _is_onlooker(words: Sequence[str]) -> bool:
     """Return whether a command only shows a flight and so should yield its CPU time to it.
 
     A page with buttons that deactivate the law, or that command a hold, does not yield, because it
@@ -196,7 +196,7 @@ def main() -> None:
     """
     gc.set_threshold(GARBAGE_THRESHOLD)
     compute_in_one_thread()
-    if _looks_on(sys.argv[1:]):
+    if _is_onlooker(sys.argv[1:]):
         with suppress(OSError):
             os.nice(NICE)
             # Run as a batch process, which does not interrupt a node when it wakes up.

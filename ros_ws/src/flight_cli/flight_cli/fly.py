@@ -161,7 +161,7 @@ class Fly(RouteWords):
             for sentence in limits_beyond_stops(scenario) + opposite_signs(scenario):
                 warn(f"warning: {sentence}")
         composed = self.composed
-        if self._may_choose(scenario) and not stepping:
+        if self._is_host_decisive(scenario) and not stepping:
             stepping = _falls_back(shortage([scenario], cores_given, composed=composed))
             composed = composed or stepping
         learn = _learner(scenario)
@@ -217,7 +217,7 @@ class Fly(RouteWords):
             require(unset, f"--{name}", "no --route", "the file of a route: --route FILE")
         return scenario if files is None else self._with_files(scenario)
 
-    def _may_choose(self, scenario: Scenario) -> bool:
+    def _is_host_decisive(self, scenario: Scenario) -> bool:
         """Return whether the capacity of the host decides between real time and lockstep.
 
         The capacity does not decide if an autopilot or a simulator has its own time, or if a user

@@ -112,7 +112,7 @@ class Replay:
             else:
                 _show(answer, notes)
         equal = result.is_equal() and (guidance_replay is None or guidance_replay.is_equal())
-        part = STATUS_SHORTFALL if result.compared.sum() < WHOLE * answer.ticks else 0
+        part = STATUS_SHORTFALL if result.is_compared.sum() < WHOLE * answer.ticks else 0
         raise typer.Exit(part if equal else DIFFERS)
 
 
@@ -210,7 +210,7 @@ def _show(answer: Shown, notes: Sequence[str]) -> None:
     console = Console(soft_wrap=True, highlight=False)
     result = answer.result
     first = result.first()
-    compared_count = int(result.compared.sum())
+    compared_count = int(result.is_compared.sum())
     summary = f"{compared_count} ticks"
     if compared_count != answer.ticks:
         summary = f"{compared_count} of {answer.ticks} ticks checked"
@@ -219,7 +219,7 @@ def _show(answer: Shown, notes: Sequence[str]) -> None:
         others = ", yet with other parameters" if result.other_parameters.any() else ""
         console.print(f"{summary}{equal}{others}")
     else:
-        rows = np.flatnonzero(result.different().any(axis=1))
+        rows = np.flatnonzero(result.is_different().any(axis=1))
         console.print(
             f"tick {first.number} differs first, at t = {first.t:.6g} s: {_difference(first)}"
         )
@@ -244,7 +244,7 @@ def _show(answer: Shown, notes: Sequence[str]) -> None:
 
 def _count_by_group(result: ReplayResult) -> dict[str, int]:
     """Count the ticks in which each group of channels differs."""
-    different = result.different()
+    different = result.is_different()
     groups = [name.split(".")[0] for name in result.names]
     ticks = {group: different[:, np.array(groups) == group].any(axis=1) for group in groups}
     counts = Counter({group: int(differs.sum()) for group, differs in ticks.items()})
@@ -285,10 +285,10 @@ def _as_json(answer: Shown, notes: Sequence[str], settings: list[str]) -> dict[s
         "open_loop": bool(settings),
         "set": settings,
         "ticks": len(result.number),
-        "checked": int(result.compared.sum()),
+        "checked": int(result.is_compared.sum()),
         "equal": result.is_equal(),
         "other_parameters": int(result.other_parameters.sum()),
-        "differing": int(result.different().any(axis=1).sum()),
+        "differing": int(result.is_different().any(axis=1).sum()),
         "differing_by_group": _count_by_group(result),
         "first": None if first is None else {**asdict(first), "ulps": first.ulps},
         "u_difference": _u_figures(result, answer.inputs),

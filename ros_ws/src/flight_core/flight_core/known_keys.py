@@ -95,7 +95,9 @@ def unknown_keys(parameters: Config, known: Set[str]) -> list[SetKey]:
     """
     sections: dict[str, SetKey] = {}
     for each in set_keys(parameters):
-        if each.key not in known and not (each.value is A_SECTION and _knows_in(each.key, known)):
+        if each.key not in known and not (
+            each.value is A_SECTION and _has_known_key(each.key, known)
+        ):
             shown = _outermost(parameters, each, known)
             sections.setdefault(shown.name, shown)
     return list(sections.values())
@@ -115,13 +117,13 @@ def _outermost(parameters: Config, found: SetKey, known: Set[str]) -> SetKey:
         if field is None:  # the name of a section of a mapping
             continue
         key = ".".join(keys[:depth])
-        if field.default is None and not _knows_in(key, known):
+        if field.default is None and not _has_known_key(key, known):
             return SetKey(key, ".".join(names[:depth]), A_SECTION)
         schema = _section(field.annotation)[0]
     return found
 
 
-def _knows_in(section: str, known: Set[str]) -> bool:
+def _has_known_key(section: str, known: Set[str]) -> bool:
     """Return whether any key of a section is known."""
     return any(key.startswith(f"{section}.") for key in known)
 

@@ -55,7 +55,7 @@ class PublisherLock:
         """Return whether there is no publisher, or the last sample is older than the age limit."""
         return self.publisher is None or self.age_ns(now_ns) > max_age_ns
 
-    def holds(self, sender: str, now_ns: int) -> bool:
+    def is_held_by(self, sender: str, now_ns: int) -> bool:
         """Return whether the sender is the locked publisher and has not timed out.
 
         A publisher has timed out if its last sample is older than the age limit of a restart.
@@ -111,7 +111,7 @@ class PublisherLock:
         if sequence > 0:
             has_gone_back = sequence <= self._sequence
             self._sequence = sequence
-            if has_gone_back and (is_shared or self.holds(sender, now_ns)):
+            if has_gone_back and (is_shared or self.is_held_by(sender, now_ns)):
                 self._went_back_ns = now_ns
                 is_shared = True
         if is_shared:

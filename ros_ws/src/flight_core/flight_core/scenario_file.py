@@ -61,7 +61,7 @@ def parse_sections(
     sections: Sections = {}
     is_simulated = False
     for name, schema in schemas.items():
-        matching = [pattern for pattern in found if _matches(pattern, name, namespace)]
+        matching = [pattern for pattern in found if _is_for(pattern, name, namespace)]
         own = [pattern for pattern in matching if _is_of(pattern, name)]
         if namespace is None:
             _require_one_namespace(own, name, path)
@@ -100,22 +100,22 @@ def parse_sections(
     return sections
 
 
-def names_node(content: bytes, path: Path, name: str, key: str, namespace: str) -> bool:
+def is_given_to_node(content: bytes, path: Path, name: str, key: str, namespace: str) -> bool:
     """Return whether a section for the node `name` has the parameter `key`.
 
     Sections for all nodes are left out. Raises ParameterError if the content is no ROS parameter
     file.
     """
     return any(
-        _is_of(pattern, name) and _matches(pattern, name, namespace) and key in values
+        _is_of(pattern, name) and _is_for(pattern, name, namespace) and key in values
         for pattern, values in _all_sections(content, path).items()
     )
 
 
-def gives_all(content: bytes, path: Path, key: str) -> bool:
+def is_given_to_all(content: bytes, path: Path, key: str) -> bool:
     """Return whether a file gives the parameter `key` to all nodes.
 
-    Raises as `names_node` does.
+    Raises as `is_given_to_node` does.
     """
     return any(
         pattern.rpartition("/")[2] in WILDCARDS and key in values
@@ -124,12 +124,15 @@ def gives_all(content: bytes, path: Path, key: str) -> bool:
 
 
 def section_names(content: bytes, path: Path) -> list[str]:
-    """Return the full names of the nodes that have a section, in order. Raises as `names_node`."""
+    """Return the full names of the nodes that have a section, in order.
+
+    Raises as `is_given_to_node` does.
+    """
     return list(_all_sections(content, path))
 
 
 def has_general(content: bytes, path: Path) -> bool:
-    """Return whether there is a section for all nodes. Raises as `names_node` does."""
+    """Return whether there is a section for all nodes. Raises as `is_given_to_node` does."""
     return any(pattern.rpartition("/")[2] in WILDCARDS for pattern in _all_sections(content, path))
 
 
@@ -170,7 +173,7 @@ def _is_mapping(value: object) -> bool:
     return isinstance(value, dict)
 
 
-def _matches(pattern: str, name: str, namespace: str | None) -> bool:
+def _is_for(pattern: str, name: str, namespace: str | None) -> bool:
     """Return whether a section is for a node, in any namespace if `namespace` is None."""
     *_, last = pattern.split("/")
     if namespace is None:

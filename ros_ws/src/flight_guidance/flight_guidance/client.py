@@ -76,7 +76,7 @@ class GuidanceClient(Client):
                 f"{publisher.topic_name}: no subscriber, expected a flight with "
                 "guidance in this domain"
             )
-            self._spin_until(lambda: self._reaches_guidance(publisher), subscribed)
+            self._spin_until(lambda: self._is_matched_by_guidance(publisher), subscribed)
             self._log.take()
             publisher.publish(route)
             unconfirmed = f"guidance did not confirm its reception in {ROUTE_TIMEOUT:g} s"
@@ -88,7 +88,7 @@ class GuidanceClient(Client):
             # A guidance node that starts later must not receive the route and fly it.
             self._node.destroy_publisher(publisher)
 
-    def _reaches_guidance(self, publisher: Publisher) -> bool:
+    def _is_matched_by_guidance(self, publisher: Publisher) -> bool:
         """Return whether guidance is among the matched subscribers of a topic.
 
         The result is False as long as a subscriber in the graph is not matched.
@@ -109,7 +109,7 @@ class GuidanceClient(Client):
         """
         reasons: list[Refusal] = []
 
-        def answered() -> bool:
+        def is_answered() -> bool:
             if is_taken():
                 reasons.clear()
                 return True
@@ -117,7 +117,7 @@ class GuidanceClient(Client):
             return bool(reasons)
 
         try:
-            self._spin_until(answered, "", TARGET_TIMEOUT)
+            self._spin_until(is_answered, "", TARGET_TIMEOUT)
         except ParameterError:
             if self._cancelled.is_set():
                 raise

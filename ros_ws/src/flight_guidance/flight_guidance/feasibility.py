@@ -320,7 +320,7 @@ def require_inside(route: Route, fence: Fence, margin: float) -> None:
             points = [path.along(leg.start, leg.end, k / count) for k in range(count + 1)]
         north, east = np.array(points).T
         inside = clearance(fence.zones, north, east)
-        if path.turns_back(leg, next(iter(route.legs[number + 1 :]), None)):
+        if path.is_too_sharp(leg, next(iter(route.legs[number + 1 :]), None)):
             inside[-1] -= TURN_BACK * route.radius
         worst = int(np.argmin(inside))
         outermost = (

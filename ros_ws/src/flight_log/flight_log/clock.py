@@ -67,7 +67,7 @@ class StampClock:
         """
         latest = np.maximum.accumulate(np.append(self._last_ns or 0, stamp_ns))[:-1]
         if self._step_ns:
-            return self._taken(stamp_ns, self._after_step(stamp_ns), len(stamp_ns), 0)
+            return self._taken(stamp_ns, self._is_after_step(stamp_ns), len(stamp_ns), 0)
         keep = (stamp_ns != 0) | (latest <= STEP_NS)
         places = np.flatnonzero(keep)
         stamps = stamp_ns[places]
@@ -109,11 +109,11 @@ class StampClock:
                 self._step_ns = jump_ns
                 self._step_at_ns = self._last_ns or 0
                 after_step = int(places[first])
-                keep[after_step:] = self._after_step(stamp_ns[after_step:])
+                keep[after_step:] = self._is_after_step(stamp_ns[after_step:])
                 return self._taken(stamp_ns, keep, len(stamp_ns), after_step)
             # The first clock is confirmed here. Earlier messages only stay if they fit it.
             if self._last_ns is None:
-                keep[places[:first]] &= _begins(stamps[: first + 1], offsets[: first + 1])
+                keep[places[:first]] &= _is_same_clock(stamps[: first + 1], offsets[: first + 1])
             self._follow(stamps[first:after], offsets[first:after])
         return self._taken(stamp_ns, keep, len(stamp_ns))
 
@@ -154,7 +154,7 @@ class StampClock:
         is_ahead = jump_ns > LEAP_NS and offset_ns > self._offset_ns + LEAP_NS
         return jump_ns, is_ahead and has_time and not self._is_history
 
-    def _after_step(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _is_after_step(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return a mask of the samples that stay after a step of the clock.
 
         After a forward step, only samples with a stamp before the step are left out. After a
@@ -192,7 +192,7 @@ class StampClock:
         )
 
 
-def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _is_same_clock(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return which of the samples before the last one may have the same clock as it has."""
     away_ns = stamp_ns[-1] - stamp_ns[:-1]
     lead_ns = offset_ns[-1] - offset_ns[:-1]

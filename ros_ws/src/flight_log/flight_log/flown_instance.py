@@ -114,7 +114,7 @@ def _of_motion(
         for number in moving_numbers(motions, MOST if fields & AIRSPEEDS else STILL)
     }
     first, *others = moving
-    if all(_agree(moving[first], moving[number], fields) for number in others):
+    if all(_is_same_sensor(moving[first], moving[number], fields) for number in others):
         return first, Reason.AGREES if others else Reason.MOVES
     ways_out = " or ".join(f"--instance {name}={number}" for number in moving)
     raise ParameterError(
@@ -144,7 +144,7 @@ def _deviation(values: np.ndarray) -> float:
     return float(finite.std()) if len(finite) else 0.0
 
 
-def _agree(first: MessageTable, second: MessageTable, fields: Set[str]) -> bool:
+def _is_same_sensor(first: MessageTable, second: MessageTable, fields: Set[str]) -> bool:
     """Return whether two sensors agree in each field.
 
     The rms difference of a field may be UNLIKE times the standard deviation of the first sensor.
@@ -209,7 +209,8 @@ def _airspeed(
         unlike = [
             number
             for number in candidates
-            if number not in numbers and not _agree(candidates[number], table, {"Airspeed"})
+            if number not in numbers
+            and not _is_same_sensor(candidates[number], table, {"Airspeed"})
         ]
         if not unlike:
             return table, tuple(sorted(numbers)), Reason.PRIMARY

@@ -33,7 +33,7 @@ from flight_log.flight_processes import SampleSpan
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import Times
 from flight_log.learning_messages import DIAGNOSTIC_ARRAY
-from flight_log.log_messages import StoredText, holds_texts
+from flight_log.log_messages import StoredText, has_texts
 from flight_log.named_vectors import (
     PATH,
     STAMP,
@@ -255,7 +255,7 @@ class TopicSamples:
         names = self._names()
         columns = self._samples[names]
         signal = columns.signal(tuple(map(printable, names)))
-        keep = ~self._unset_zeros(name, signal, columns)
+        keep = ~self._is_unset(name, signal, columns)
         # The nodes refuse a publisher whose stamps are far from their clock.
         most = self._most()
         for publisher in self._publishers.values():
@@ -276,7 +276,7 @@ class TopicSamples:
             signal = Signal(stamps[keep], signal.names, values[keep], sender)
         return signal
 
-    def _unset_zeros(self, name: str, signal: Signal, columns: Columns) -> NDArray[np.bool_]:
+    def _is_unset(self, name: str, signal: Signal, columns: Columns) -> NDArray[np.bool_]:
         """Return a mask of the samples whose stamp was left at zero, shape (N,).
 
         The number of these samples is also stored for each publisher.
@@ -413,7 +413,7 @@ class LogContent:
             return lambda batch: self.diagnostics.extend(
                 data for data in map(bytes, batch.data) if IN_MESSAGE in data
             )
-        if holds_texts(topic, type_name):
+        if has_texts(topic, type_name):
             return lambda batch: self.texts.extend(
                 StoredText(
                     topic=topic,

@@ -54,7 +54,7 @@ class StoredText:
     data: bytes
 
 
-def holds_texts(topic: str, type_name: str) -> bool:
+def has_texts(topic: str, type_name: str) -> bool:
     """Return whether the messages of a topic can become LogMessages."""
     return (
         (topic, type_name) in {(ROSOUT, LOG), (PARAMETER_EVENTS, PARAMETER_EVENT)}

@@ -118,7 +118,7 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float)
 
 
-def near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+def is_near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return a mask of the stamps that are near the median of the five stamps around them.
 
     A damaged stamp is far from this median.

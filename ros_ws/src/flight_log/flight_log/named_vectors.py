@@ -236,7 +236,7 @@ class _JointStateDecoder:
     def __call__(self, table: Table) -> Decoded:
         if not self._names and len(table):
             self._learn(bytes(table[0]))
-        has_layout = self._same_layout(table)
+        has_layout = self._has_same_layout(table)
         samples = []
         if has_layout.any():
             rows = table if has_layout.all() else table[has_layout]
@@ -270,7 +270,7 @@ class _JointStateDecoder:
             self._learn(unknown[-1])
         return Decoded(samples, unreadable)
 
-    def _same_layout(self, table: Table) -> NDArray[np.bool_]:
+    def _has_same_layout(self, table: Table) -> NDArray[np.bool_]:
         """Return a mask of the messages that have the learnt layout."""
         if not self._names or table.shape[1] != self._template.nbytes:
             return np.zeros(len(table), dtype=np.bool_)

@@ -137,7 +137,7 @@ def _scheduled(
 ) -> Iterator[ScheduledMessage]:
     """Yield the messages of the selected topics with their due times."""
     stamped_topics = {
-        topic for topic, message in last_messages.items() if begins_with_stamp(_definition(message))
+        topic for topic, message in last_messages.items() if is_stamped(_definition(message))
     }
     now_ns = 0
     for message in messages:
@@ -202,7 +202,7 @@ def _definition(message: StoredMessage) -> str:
         return message.definition
 
 
-def begins_with_stamp(text: str) -> bool:
+def is_stamped(text: str) -> bool:
     """Return whether the first field of a message type is a header or a time.
 
     `text` is the definition of the type, in ros2msg or ros2idl.

@@ -30,8 +30,8 @@ from flight_log.log_samples import (
     SETTING,
     Instances,
     Sample,
+    is_near,
     is_number,
-    near,
     parameters_of,
     table_of,
     tables_of,
@@ -330,7 +330,7 @@ def _read_ulog(path: Path, kind: FileKind, choice: Choice) -> VehicleLog:
     for data in log.data_list:
         columns = {name: np.asarray(values, dtype=np.float64) for name, values in data.data.items()}
         stamps = 1000 * data.data["timestamp"].astype(np.int64)
-        keep = near(stamps)
+        keep = is_near(stamps)
         table = table_of(stamps[keep], {name: values[keep] for name, values in columns.items()})
         instances.setdefault(data.name, {})[data.multi_id] = table
     vehicle, is_vtol = _vehicle(instances)

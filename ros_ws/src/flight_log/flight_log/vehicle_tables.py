@@ -252,7 +252,9 @@ class VehicleLog(NamedTuple):
     def source(self, quantity: str) -> LogField | None:
         """Return the place of a quantity of y or of the pose, or None if the log lacks it."""
         sources = ULOG_SOURCES if self.format is None else self.format.sources
-        return next((source for source in sources.get(quantity, ()) if self.has(source)), None)
+        return next(
+            (source for source in sources.get(quantity, ()) if self.has_field(source)), None
+        )
 
     def start_ns(self, quantity: str) -> int:
         """Return the first stamp of a quantity, which the log must have."""
@@ -271,7 +273,7 @@ class VehicleLog(NamedTuple):
                 values[name] = earlier[-1]
         return values
 
-    def has(self, source: LogField) -> bool:
+    def has_field(self, source: LogField) -> bool:
         """Return whether the log has samples of a field."""
         return source.message in self.tables and source.field in self.tables[source.message].fields
 

@@ -223,7 +223,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def inputs(self) -> Sequence[PolledSubscription]:
         return [topic.subscription for topic in self._topics.among(LOOP)]
 
-    def runs_in_lockstep(self) -> bool:
+    def is_in_lockstep(self) -> bool:
         # Even in a lockstep flight the recorder ticks by the clock of the host. Each tick writes
         # many instants of the flight, and publishes up to where the log is complete.
         return False
@@ -309,7 +309,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
             if self.simulated is not None:
                 sent_ns, received_ns = map(self.simulated.at, (sent_ns, received_ns))  # noqa: PLW2901 - the log has one time
             self._bag.write(topic.channel, received_ns, sent_ns, sequence, message)
-            if topic.continues(sequence):
+            if topic.is_next(sequence):
                 continue
             if count := topic.lost_before(sequence, sender_of(message)):
                 self.lost[topic.name] += count

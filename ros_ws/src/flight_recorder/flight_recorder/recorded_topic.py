@@ -33,7 +33,7 @@ class RecordedTopic:
         self.heard_ns = now_ns
         self.sent_ns = sent_ns
 
-    def continues(self, sequence: int) -> bool:
+    def is_next(self, sequence: int) -> bool:
         """Return whether a message is the next one after the last, as far as its number shows.
 
         The sequence number shows nothing if the topic is foreign, or if two publishers have the

@@ -137,7 +137,7 @@ def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> int | None:
                 "the loopback profile has no effect: sockets open to the network: "
                 f"{', '.join(sockets)}"
             )
-        if node.runs_in_lockstep():
+        if node.is_in_lockstep():
             _run_lockstep(nodes, stop)
         else:
             _run_real_time(nodes, stop)
@@ -338,7 +338,7 @@ def _start_instants(
     Returns [] after a signal.
     """
     starts: dict[FlightNode[Any], int] = {}
-    waiting = [node for node in nodes if node.waits_for_start()]
+    waiting = [node for node in nodes if node.is_waiting_for_start()]
     while not stop.is_requested:
         for node in nodes:
             node.warn_without_time()

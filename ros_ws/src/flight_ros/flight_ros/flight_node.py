@@ -123,7 +123,7 @@ class FlightNode(Node, Generic[P]):
         """Return the subscriptions that need a publisher before a flight begins in real time."""
         return ()
 
-    def waits_for_start(self) -> bool:
+    def is_waiting_for_start(self) -> bool:
         """Return whether the topic `start` gives the instant of tick 0."""
         return self._start_subscription is not None
 
@@ -425,7 +425,7 @@ class FlightNode(Node, Generic[P]):
             ),
         ]
 
-    def runs_in_lockstep(self) -> bool:
+    def is_in_lockstep(self) -> bool:
         """Return whether the event loop calls `advance` in lockstep instead of `tick`."""
         return self.parameters.lockstep
 

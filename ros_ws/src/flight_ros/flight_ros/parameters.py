@@ -18,7 +18,7 @@ from rclpy.parameter import Parameter
 from flight_core.fields import short_repr
 from flight_core.files import require_no_octal
 from flight_core.parameters import NodeConfig, ParameterError, flatten, nest, one_of, require
-from flight_core.scenario_file import ROS_PARAMETERS, gives_all, names_node
+from flight_core.scenario_file import ROS_PARAMETERS, is_given_to_all, is_given_to_node
 from flight_core.text import bounded
 
 P = TypeVar("P", bound=NodeConfig)
@@ -107,9 +107,9 @@ def _is_global(node: Node, key: str, arguments: Sequence[str]) -> bool:
         if option == "--params-file":
             path = Path(value)
             content = path.read_bytes()
-            if names_node(content, path, name, key, node.get_namespace()):
+            if is_given_to_node(content, path, name, key, node.get_namespace()):
                 return False
-            is_given |= gives_all(content, path, key)
+            is_given |= is_given_to_all(content, path, key)
         elif option in {"-p", "--param"}:
             words = value.partition(":=")[0].split(":")
             if words[-1].split(".")[0] == key:

@@ -240,7 +240,7 @@ class Receiver(Generic[S]):
         if (
             not self._grows
             and 0 < GROWTH * self._longest < len(raw)
-            and self.lock.holds(sender, now_ns)
+            and self.lock.is_held_by(sender, now_ns)
         ):
             require_size(raw, GROWTH * self._longest)
         return sender

@@ -322,7 +322,7 @@ class Control:
             orbits = scenario.guidance.drag is None
             page_state["radius"] = math.ceil(scenario.guidance.least_radius()) if orbits else 0  # m
         if "bridge" in nodes:
-            page_state["bridge"] = {"map": self._map(), "sends": self._sends()}
+            page_state["bridge"] = {"map": self._map(), "sends": self._is_sending()}
         return page_state
 
     def _controller(self) -> ControllerConfig:
@@ -435,12 +435,12 @@ class Control:
         """Return the name of the channel map of the bridge."""
         return Path(str(self._link.parameters("bridge", ["map"]).get("map", ""))).stem
 
-    def _sends(self) -> bool:
+    def _is_sending(self) -> bool:
         """Return whether the bridge of the flight may send commands to an autopilot."""
         return self._link.parameters("bridge", ["dry_run"]).get("dry_run") is not True
 
     def _require_simulated(self) -> None:
-        if not self._real and "bridge" in self._link.nodes() and self._sends():
+        if not self._real and "bridge" in self._link.nodes() and self._is_sending():
             raise RefusedError(
                 HTTPStatus.FORBIDDEN,
                 "the bridge sends to an autopilot: gains need rise-di watch --control --real",

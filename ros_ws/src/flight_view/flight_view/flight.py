@@ -301,7 +301,7 @@ class Flight:
             return 0.0
         return RATES[name]
 
-    def _shows(self, namespace: str) -> bool:
+    def _is_shown(self, namespace: str) -> bool:
         """Return whether the page shows the aircraft in a namespace, or may come to show it."""
         return self._namespace in {None, namespace}
 
@@ -465,7 +465,7 @@ class Flight:
             .removesuffix(f"/{ROUTE}")
             .removesuffix(f"/{LEARNING}")
         )
-        if messages.topic not in SHARED and not self._shows(namespace):
+        if messages.topic not in SHARED and not self._is_shown(namespace):
             return
         store = typestore()
         for sent_ns, data in zip(messages.sent_ns, messages.data, strict=True):
@@ -482,7 +482,7 @@ class Flight:
                 continue
             has_begun = self._first_ns is not None
             event = log_message(message, messages.type_name, sent_ns, has_begun=has_begun)
-            if event is not None and (event.namespace is None or self._shows(event.namespace)):
+            if event is not None and (event.namespace is None or self._is_shown(event.namespace)):
                 self._add_event(event)
 
     def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:

@@ -145,13 +145,13 @@ class Server:
             stream.close()
         await self.http.close_all_connections()
 
-    def knows(self, token: str | bytes) -> bool:
+    def is_token(self, token: str | bytes) -> bool:
         """Return whether a token is the right one for this server."""
         return hmac.compare_digest(
             token.encode() if isinstance(token, str) else token, self.token.encode()
         )
 
-    def accepts(self, host: str) -> bool:
+    def is_own_name(self, host: str) -> bool:
         """Return whether a Host header is exactly the name of this server."""
         return host in {f"{name}:{self.port}" for name in (ADDRESS, "localhost", "[::1]")}
 
@@ -361,13 +361,13 @@ class _Handler(RequestHandler):
         return cast("HTTP1Connection", self.request.connection).stream
 
     def prepare(self) -> None:
-        if not self.server.accepts(self.request.host):
+        if not self.server.is_own_name(self.request.host):
             raise HTTPError(HTTPStatus.FORBIDDEN)
         self.require_token()
 
     def require_token(self) -> None:
         """Raise HTTPError for a request without the token, or beyond MAX_CONNECTIONS."""
-        if not self.server.knows(self.request.headers.get(TOKEN_HEADER, "")):
+        if not self.server.is_token(self.request.headers.get(TOKEN_HEADER, "")):
             raise HTTPError(HTTPStatus.UNAUTHORIZED, reason=NO_TOKEN)
         self._is_kept = self.server.http.admit(self.stream)
         if not self._is_kept and not isinstance(self, _Control):
@@ -474,7 +474,7 @@ class _News(_Handler, WebSocketHandler):
 
     def on_message(self, message: str | bytes) -> Awaitable[None] | None:
         if not self._is_kept:
-            if not self.server.knows(message):
+            if not self.server.is_token(message):
                 self.close(POLICY_VIOLATION, NO_TOKEN)
             elif not self.server.http.admit(self._peer):
                 self.close(TRY_AGAIN_LATER, FULL)

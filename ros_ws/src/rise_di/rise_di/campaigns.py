@@ -16,7 +16,7 @@ from flight_campaign import engines
 from flight_campaign.campaign import MonteCarlo, define
 from flight_campaign.campaign_report import write_results
 from flight_campaign.definition import Definition, Sweep
-from flight_campaign.single_flights import flies_alone
+from flight_campaign.single_flights import is_flown_alone
 from flight_core.arguments import FilePath, as_count, as_numbers_by_name, as_path
 from flight_core.parameters import ParameterError, require
 from flight_design.learning.scenario_learner import quick_learner
@@ -169,7 +169,7 @@ def resume_campaign(
 def _engine(definition: Definition, workers: int | None) -> engines.Engine:
     """Return the engine, which uses processes with a learner or a route, and threads otherwise."""
     count = None if workers is None else as_count(workers, "workers", 1)
-    is_single = flies_alone(definition.scenario())
+    is_single = is_flown_alone(definition.scenario())
     return engines.dask(count, on_devices=False) if is_single else engines.threads(count)
 
 

@@ -115,7 +115,7 @@ class Controller:
         self._at_start = self._parameters = parameters
         self._given_up = parameters.given_up()
         self._has_learned_model = False
-        self._learned = _with_feedforward(parameters)
+        self._learned = _has_feedforward(parameters)
         zero = np.zeros(len(parameters.outputs))
         self._errors = divergence.Errors(zero, zero)
         self._least = divergence.least(parameters.outputs)
@@ -203,7 +203,7 @@ class Controller:
             self._effects = self._effect_test(new.parameters)
         self._given_up = new.parameters.given_up()
         self._has_learned_model = not self._has_models_of_start(new.parameters)
-        self._learned = _with_feedforward(new.parameters)
+        self._learned = _has_feedforward(new.parameters)
 
     def still_vanes(self) -> tuple[str, ...]:
         """Return the names of the vanes that the observer ignores because they stand still.
@@ -490,7 +490,7 @@ class Controller:
         return tuple(name for name in ("y", "y_m") if ages.get(name, limit + 1.0) > limit)
 
 
-def _with_feedforward(parameters: ControllerConfig) -> NDArray[np.bool_]:
+def _has_feedforward(parameters: ControllerConfig) -> NDArray[np.bool_]:
     """Return a mask, (m,), of the channels in which the feedforward acts.
 
     In a model that a learner proposes, channels without a learned model have no feedforward.

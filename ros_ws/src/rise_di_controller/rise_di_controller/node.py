@@ -349,7 +349,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         if self._learning is None:
             return True
         self._proposals.poll(now_ns)
-        self._waits_for_proposal = self._learning.waits(now_ns)
+        self._waits_for_proposal = self._learning.is_waiting(now_ns)
         return not self._waits_for_proposal
 
     def _decode_proposal(self, raw: bytes) -> Report:

@@ -112,7 +112,7 @@ def without_effect(fdm: jsbsim.FGFDMExec, commands: Mapping[str, Command]) -> li
     return [
         name
         for name, command in commands.items()
-        if not _moves(
+        if not _has_effect(
             fdm,
             command_paths(command, engine_count(fdm)),
             -PART if fdm[_first(command)] > PART else PART,
@@ -124,7 +124,7 @@ def _first(command: Command) -> str:
     return command_paths(command, 1)[0][0]
 
 
-def _moves(fdm: jsbsim.FGFDMExec, paths: Iterable[tuple[str, float]], part: float) -> bool:
+def _has_effect(fdm: jsbsim.FGFDMExec, paths: Iterable[tuple[str, float]], part: float) -> bool:
     """Return whether a change of a command changes an acceleration.
 
     `paths` has the properties of the command with their values at the command 1, and `part` is the
@@ -160,7 +160,7 @@ def sentence_without_effect(
     properties = (
         [] if model is None else [path for path in _read_by_model(model) if manager.hasNode(path)]
     )
-    effective = [path for path in properties if _moves(fdm, [(path, 1.0)], PART)]
+    effective = [path for path in properties if _has_effect(fdm, [(path, 1.0)], PART)]
     if effective:
         reads = f"; its flight control reads {', '.join(effective)}: name them in `commands`"
     else:

@@ -493,7 +493,7 @@ def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str | Un
         for i in engines
         if not (fdm[running_property(i)] or idle[i]) and fdm[thrust_property(i)] <= 0.0
     ]
-    if stopped and not _engines_start(condition):
+    if stopped and not _is_startable(condition):
         return f"engine {', '.join(stopped)} cannot be started"
     accelerations = residuals(fdm)
     axis = AXES_OF_RESIDUALS[int(np.argmax(np.abs(accelerations) / TOLERANCE))]
@@ -510,7 +510,7 @@ def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str | Un
     )
 
 
-def _engines_start(condition: FlightCondition) -> bool:
+def _is_startable(condition: FlightCondition) -> bool:
     """Return whether every engine starts at sea level at half of the speed.
 
     An engine that gives thrust has started, too.

@@ -80,14 +80,14 @@ class ReplayResult(NamedTuple):
     published: NDArray[np.bool_] | None = None
 
     @property
-    def compared(self) -> NDArray[np.bool_]:
+    def is_compared(self) -> NDArray[np.bool_]:
         """Mask of the ticks that are compared with the log, shape (N,).
 
         The state before such a tick is known, and the log has its y and u.
         """
         return self.checked if self.published is None else self.checked & self.published
 
-    def different(self) -> NDArray[np.bool_]:
+    def is_different(self) -> NDArray[np.bool_]:
         """Return a mask of the computed values that differ from the log in a bit, shape (N, k)."""
         different: NDArray[np.bool_] = self.checked[:, None] & (
             _bits(self.recorded) != _bits(self.computed)
@@ -99,14 +99,14 @@ class ReplayResult(NamedTuple):
 
         Every checked tick must be equal in every bit. Ticks that were not checked do not matter.
         """
-        return not self.different().any() and not self.other_parameters.any()
+        return not self.is_different().any() and not self.other_parameters.any()
 
     def first(self) -> ReplayDifference | None:
         """Return the first difference in the first tick that differs, or None without a difference.
 
         If several channels of this tick differ, a channel of u is preferred to the others.
         """
-        different = self.different()
+        different = self.is_different()
         rows = np.flatnonzero(different.any(axis=1))
         if len(rows) == 0:
             return None

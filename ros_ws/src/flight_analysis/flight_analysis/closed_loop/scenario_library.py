@@ -111,7 +111,7 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
     values of the recorded commands, so that the flight can be repeated without a second file.
     Raises ParameterError if the new file cannot be written.
     """
-    if not scenario.reference_model.recorded and _reaches_nodes(scenario.path, namespace):
+    if not scenario.reference_model.recorded and _is_for_nodes(scenario.path, namespace):
         return scenario
     return save_scenario(scenario, run / f"{scenario.name}.yaml")
 
@@ -146,7 +146,7 @@ def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
         raise ParameterError(f"{path.name}: {error}") from None
 
 
-def _reaches_nodes(path: Path, namespace: str) -> bool:
+def _is_for_nodes(path: Path, namespace: str) -> bool:
     """Return whether the nodes in a namespace read all values of a scenario file.
 
     Each section of the file must be for one of these nodes. If the file has a section for all

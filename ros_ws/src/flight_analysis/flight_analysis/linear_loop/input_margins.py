@@ -209,7 +209,7 @@ def _phases(form: "SchurForm", period: float) -> FloatArray:
     w = _frequencies(form.eigenvalues, period)
     L = _loop_of_sensitivity(_sensitivity(form, np.exp(1j * w * period)))
     phase, _ = _phase_margins(form, w, L, period)
-    return np.where(_stable(form)[:, None], phase, 0.0)
+    return np.where(_is_stable(form)[:, None], phase, 0.0)
 
 
 def _batch_shape(plant: LinearPlant, law: LinearLaw) -> tuple[int, ...]:
@@ -323,7 +323,7 @@ def _sensitivity(form: SchurForm, z: ComplexArray) -> ComplexArray:
 
 def _margins(form: SchurForm, period: float, *, together: bool) -> Margins:
     """Compute the margins of the aircraft of a batch, from their closed loops in Schur form."""
-    stable = _stable(form)
+    stable = _is_stable(form)
     m = form.R.shape[-1]
     w, S = on_grid(form, period)
     near = _around_peaks(S, w)
@@ -356,7 +356,7 @@ def _margins(form: SchurForm, period: float, *, together: bool) -> Margins:
     )
 
 
-def _stable(form: SchurForm) -> NDArray[np.bool_]:
+def _is_stable(form: SchurForm) -> NDArray[np.bool_]:
     return np.asarray(np.max(np.abs(form.eigenvalues), axis=1) <= 1.0 + SPECTRAL_RADIUS_TOLERANCE)
 
 

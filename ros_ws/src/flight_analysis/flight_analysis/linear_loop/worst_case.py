@@ -226,7 +226,7 @@ def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float)
     becomes unstable up to the size `largest`.
     """
 
-    def unstable(size: FloatArray) -> NDArray[np.bool_]:
+    def is_unstable(size: FloatArray) -> NDArray[np.bool_]:
         z = np.linalg.eigvals(part.at(size[:, None] * corner).A)
         largest_near = _near(z, frequency, part.period).max(axis=-1)
         return np.asarray(largest_near > 1.0 + SPECTRAL_RADIUS_TOLERANCE)
@@ -234,7 +234,7 @@ def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float)
     low, high = 0.0, largest
     while high - low > RESOLUTION / 2.0:
         sizes = np.linspace(low, high, 9)
-        outside = unstable(sizes[1:])
+        outside = is_unstable(sizes[1:])
         if not outside.any():
             return np.inf
         place = int(np.argmax(outside))

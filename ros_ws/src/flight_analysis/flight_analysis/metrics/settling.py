@@ -94,9 +94,13 @@ def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling
         leaves = transient.stop + SETTLING_DWELL - transient.start
         until = {}
         times = {}
-        for name in filter(transient.excites, error.names):
+        for name in filter(transient.is_excitation_of, error.names):
             until[name] = min(
-                [later.start for later in transients if later.excites(name) and later.start > start]
+                [
+                    later.start
+                    for later in transients
+                    if later.is_excitation_of(name) and later.start > start
+                ]
                 + [end]
             )
             inside = (t >= start) & ((t < until[name]) | (until[name] == end))

@@ -35,7 +35,7 @@ def mask_spans(
     return spans
 
 
-def in_spans(
+def is_in_spans(
     t: FloatArray, spans: Iterable[tuple[float, float]], settle: float = 0.0
 ) -> NDArray[np.bool_]:
     """Return a mask, (N,), of the instants that are in a span or up to `settle` s after it.

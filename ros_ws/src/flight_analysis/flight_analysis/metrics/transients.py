@@ -14,7 +14,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from flight_analysis.metrics.time_spans import in_spans, mask_spans
+from flight_analysis.metrics.time_spans import is_in_spans, mask_spans
 from flight_core.modes import Mode
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
@@ -70,7 +70,7 @@ class Transient:
     start: float
     stop: float
 
-    def excites(self, channel: str) -> bool:
+    def is_excitation_of(self, channel: str) -> bool:
         """Return whether the transient excites a channel.
 
         A command excites only the channel that it commands. Every other transient excites all
@@ -171,7 +171,7 @@ def part_masks(
         spans = [
             (transient.start, transient.stop) for transient in transients if transient.kind is kind
         ]
-        parts[kind] = in_spans(t, spans, settle) & free
+        parts[kind] = is_in_spans(t, spans, settle) & free
         free &= ~parts[kind]
     return {
         "whole": np.ones(len(t), dtype=bool),

@@ -89,7 +89,7 @@ class Account(NamedTuple):
         parts = [
             f"{math.floor(100.0 * topic.share)} % of {name}"
             for name, topic in accounts.items()
-            if topic.share is not None and not topic.holds(topic.found)
+            if topic.share is not None and not topic.is_enough(topic.found)
         ]
         return f"over {', '.join(parts)}" if parts else ""
 
@@ -182,7 +182,7 @@ def account(
         for name, topic in topics.items()
         if topic.expected is not None
         and topic.is_of_stack
-        and not topic.holds(topic.expected - topic.unsent)
+        and not topic.is_enough(topic.expected - topic.unsent)
     ]
     # Given a planned end, a log that was cut off at its end is noticed as well.
     parts = [lost.sentence for lost in tape.lost_parts if planned_ns is None or not lost.is_end]
@@ -294,7 +294,7 @@ def _lack(
     The text continues "the log lacks ...". `late_u` is True if the first u of the flight was late.
     """
     facts = []
-    missing = not topic.holds(topic.found + topic.unsent) or (
+    missing = not topic.is_enough(topic.found + topic.unsent) or (
         topic.share is not None and topic.share < LEAST
     )
     begins_late = missing and topic.first is not None and topic.first - leeway.begin > SILENCE
@@ -353,7 +353,7 @@ def _is_of_host(
     if leeway.end is not None and topic.last < end - leeway.end - SILENCE:
         return False
     before = np.array([topic.first - SILENCE / 2.0])
-    return topic.first <= SILENCE or bool(starved.holds(before)[0])
+    return topic.first <= SILENCE or bool(starved.is_starved(before)[0])
 
 
 def account_of_json(summary: Mapping[str, Any]) -> Account | None:

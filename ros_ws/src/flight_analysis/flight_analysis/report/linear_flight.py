@@ -147,7 +147,9 @@ def error_pair(
         e=e,
         y_m=y_m,
         linear=_linear_errors(tape, controller, aircraft, airframes, ticks, y_m, e[0]),
-        is_flown=_flown(tape, ticks, may_pause=may_pause) & _sampled(seconds_of, ticks) & is_finite,
+        is_flown=_is_flown(tape, ticks, may_pause=may_pause)
+        & _is_sampled(seconds_of, ticks)
+        & is_finite,
         not_numbers=int(np.count_nonzero(~is_finite)),
         noise=np.array([0.0 if is_true else floor.get(name, 0.0) for name in names]),
         knowledge=knowledge,
@@ -503,7 +505,7 @@ def _has_path(tape: Tape, controller: ControllerConfig) -> bool:
     return {"x.theta", "x.phi", WIND} <= set(truth.names)
 
 
-def _flown(tape: Tape, ticks: FloatArray, *, may_pause: bool) -> NDArray[np.bool_]:
+def _is_flown(tape: Tape, ticks: FloatArray, *, may_pause: bool) -> NDArray[np.bool_]:
     """Return a mask of the ticks from the first engagement on.
 
     If `may_pause` is True, the ticks of an inactive controller are left out. If the log has no
@@ -521,7 +523,7 @@ def _flown(tape: Tape, ticks: FloatArray, *, may_pause: bool) -> NDArray[np.bool
     return is_begun & (mode[before] != Mode.INACTIVE) if may_pause else is_begun
 
 
-def _sampled(t: FloatArray, ticks: FloatArray) -> NDArray[np.bool_]:
+def _is_sampled(t: FloatArray, ticks: FloatArray) -> NDArray[np.bool_]:
     """Return a mask of the ticks, (N,), that lie in no gap between the samples at the times t."""
     after = np.clip(np.searchsorted(t, ticks), 1, len(t) - 1)
     return t[after] - t[after - 1] <= LONGEST_INTERVAL

@@ -72,7 +72,7 @@ class TopicAccount(NamedTuple):
         """
         return None if self.expected is None else min(self.found / max(self.expected, 1), 1.0)
 
-    def holds(self, count: int) -> bool:
+    def is_enough(self, count: int) -> bool:
         """Return whether `count` samples are as good as all that were expected.
 
         This is also the case if the expected number is unknown. If the topic is short, one missing
@@ -125,7 +125,7 @@ def topic_accounts(
     )
     if has_clock:
         for name, step_ns in periods.items():
-            if ends_last(tape, name):
+            if is_last_to_end(tape, name):
                 continue
             topics[name] = _with_unsent(tape, name, topics[name], step_ns)
             if unsent_at_end := _unsent_rest(tape, name, step_ns, span.end_ns):
@@ -309,7 +309,7 @@ def _of_foreign(topic: TopicAccount) -> TopicAccount:
     return topic._replace(expected=topic.expected - topic.unsent, unsent=0, is_of_stack=False)
 
 
-def ends_last(tape: Tape, name: str) -> bool:
+def is_last_to_end(tape: Tape, name: str) -> bool:
     """Return whether a topic ends later than all other topics of the flight.
 
     In this case a gap in the topic may be a jump of the clock.

@@ -82,7 +82,7 @@ def judge(
         controller = scenario.controller
         aircraft = scenario.aircraft
         section = scenario.guidance
-    may_pause = _may_pause(tape, scenario)
+    may_pause = _is_pause_allowed(tape, scenario)
     verdict = TrackingVerdict([], [])
     if controller is not None:
         verdict = tracking_verdict(tape, controller, aircraft, may_pause=may_pause, starved=starved)
@@ -128,7 +128,7 @@ def _never_flown_by_host(starved: Starvation, end: float) -> Outcome:
     )
 
 
-def _may_pause(tape: Tape, scenario: Scenario | None) -> bool:
+def _is_pause_allowed(tape: Tape, scenario: Scenario | None) -> bool:
     """Return whether the law may be inactive at times, because somebody else activates it.
 
     Behind a bridge this is the autopilot. With `start_active: false` it is the user. In any other
@@ -147,7 +147,7 @@ def _engagement(tape: Tape, *, may_pause: bool, starved: Starvation = FED) -> li
     if "internals" not in tape or "mode" not in tape["internals"].names:
         return []
     mode = tape["internals"]["mode"]
-    is_asked = ~starved.holds(tape.time("internals"))
+    is_asked = ~starved.is_starved(tape.time("internals"))
     if may_pause:
         is_asked &= mode != Mode.INACTIVE
     elif "u" in tape and len(tape["u"].stamp_ns):

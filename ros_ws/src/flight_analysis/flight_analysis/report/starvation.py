@@ -46,7 +46,7 @@ class Starvation(NamedTuple):
         """The total length of the spans, s."""
         return math.fsum(stop - start for start, stop in self.spans)
 
-    def holds(self, t: FloatArray) -> NDArray[np.bool_]:
+    def is_starved(self, t: FloatArray) -> NDArray[np.bool_]:
         """Return a mask of the instants t, (N,), that lie within a span."""
         inside = np.zeros(len(t), dtype=bool)
         for start, stop in self.spans:
@@ -76,11 +76,11 @@ def starvation(
     is_missing = np.zeros(count, dtype=bool)
     for name, rate in rates.items():
         if name in topics and topics[name].is_of_stack:
-            is_missing |= _missing(tape, name, max(step, 1.0 / rate), step, count)
+            is_missing |= _is_missing(tape, name, max(step, 1.0 / rate), step, count)
     length = max(round(WINDOW / step), 1)
     is_starved = _windowed(is_missing, length) >= 1.0
     if not drops:
-        is_missing |= _missing(tape, "internals", step, step, count)
+        is_missing |= _is_missing(tape, "internals", step, step, count)
     is_starved &= _windowed(is_missing, length) >= BUSY * length
     # Each such instant is in the middle of a WINDOW that was starved.
     t: FloatArray = step * np.arange(count, dtype=np.float64)
@@ -95,7 +95,7 @@ def starvation(
     return Starvation(tuple(spans))
 
 
-def _missing(tape: Tape, name: str, period: float, step: float, count: int) -> NDArray[np.bool_]:
+def _is_missing(tape: Tape, name: str, period: float, step: float, count: int) -> NDArray[np.bool_]:
     """Return a mask of the instants k * step at which a node should have sent a sample, (count,).
 
     `period` is the period of the samples, s, and is at least a step.

@@ -40,7 +40,7 @@ from flight_analysis.report.flown_models import FlownController
 from flight_analysis.report.flown_reference import reason_not_compared
 from flight_analysis.report.guided import guidance_notices, guidance_summary
 from flight_analysis.report.model_spans import errors_by_model
-from flight_analysis.report.sample_counts import WHOLE, ends_last, is_simulated
+from flight_analysis.report.sample_counts import WHOLE, is_last_to_end, is_simulated
 from flight_analysis.report.shortfalls import judge
 from flight_analysis.report.starvation import BUSY
 from flight_analysis.report.timing import (
@@ -167,7 +167,7 @@ def summarise(
         ticks = tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate"))
     age = age_metrics(tape)
     is_real_time = tape.start_ns > SINCE_EPOCH_NS
-    if is_real_time and not ends_last(tape, "internals"):
+    if is_real_time and not is_last_to_end(tape, "internals"):
         flight_account = _with_late_ticks(flight_account, ticks, scenario)
     busy = flight_account.busy
     busy_notes = [busy] if busy else []

@@ -130,7 +130,7 @@ class EventInterval(NamedTuple):
     extent: str
 
 
-def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.bool_]:
+def _is_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.bool_]:
     """Return a mask of the ticks in which a vane stands still, shape (N,).
 
     After an engagement, a vane is only said to stand still once it has moved, or once `time` s have
@@ -192,7 +192,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
         observer = of_flight.controller.observer if isinstance(of_flight, Scenario) else None
         time = 0.0 if observer is None or observer.vanes is None else observer.vanes.time
         for name in measures.names:
-            if (still := _stands_still(measures[name], tape, time)).any():
+            if (still := _is_still(measures[name], tape, time)).any():
                 first, last = t[still][[0, -1]]
                 listed.append(
                     EventInterval(

@@ -128,7 +128,7 @@ def tracking_verdict(
     verdict = _verdict(pair, aircraft)
     if starved is None or not starved.spans or not verdict.shortfalls:
         return verdict
-    fed = pair._replace(is_flown=pair.is_flown & ~starved.holds(pair.t))
+    fed = pair._replace(is_flown=pair.is_flown & ~starved.is_starved(pair.t))
     remaining = _verdict(fed, aircraft) if fed.is_flown.any() else nothing
     is_excused = len(remaining.shortfalls) < len(verdict.shortfalls)
     return remaining._replace(is_excused=is_excused)

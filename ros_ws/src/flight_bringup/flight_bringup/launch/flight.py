@@ -156,9 +156,9 @@ class Flight:
         failures = [flight._failure for flight in flights if flight._failure]
         if failures and all(flight._is_stopped for flight in flights):
             raise RuntimeError("; ".join(failures))
-        return [EmitEvent(event=ShutdownProcess(process_matcher=self._has))]
+        return [EmitEvent(event=ShutdownProcess(process_matcher=self._has_process))]
 
-    def _has(self, process: Action) -> bool:
+    def _has_process(self, process: Action) -> bool:
         return any(process is each for each in self._processes)
 
 

@@ -28,7 +28,7 @@ class _Range(NamedTuple):
     def clip(self, u: Array) -> Array:
         return jnp.minimum(jnp.maximum(u, self.low), self.high)
 
-    def has(self, u: Array) -> Array:
+    def is_inside(self, u: Array) -> Array:
         """Return which aircraft have a u inside the range, (N,)."""
         return jnp.all((u >= self.low) & (u <= self.high), axis=0)
 
@@ -38,12 +38,12 @@ def allocate(v: Array, u_before: Array, dt: Array, params: Allocation) -> tuple[
     rate_range = _Range(*bounds(u_before, dt, params.limits))
     stops = _Range(*(0.0 * u_before + end for end in (params.limits.lower, params.limits.upper)))
     u = product(params.T, v)
-    free = rate_range.has(u)
+    free = rate_range.is_inside(u)
 
     def at_limits() -> tuple[Array, Array]:
         u_passed = _exchanged(u, stops, params)
         target = _where_not(
-            stops.has(u_passed) | free,
+            stops.is_inside(u_passed) | free,
             u_passed,
             lambda: _by_priority(jnp.zeros_like(u), v, stops, params),
         )
@@ -53,7 +53,9 @@ def allocate(v: Array, u_before: Array, dt: Array, params: Allocation) -> tuple[
             move = _by_priority(start, product(params.effect, target - start), rate_range, params)
             return _towards(move, product(params.exchange, target - move), rate_range, params)
 
-        limited_u = jnp.where(free, u, _where_not(rate_range.has(target) | free, target, at_rate))
+        limited_u = jnp.where(
+            free, u, _where_not(rate_range.is_inside(target) | free, target, at_rate)
+        )
         return limited_u, jnp.where(free, v, product(params.effect, limited_u))
 
     return jax.lax.cond(jnp.all(free), lambda: (u, v), at_limits)
@@ -78,7 +80,7 @@ def _by_priority(start: Array, v: Array, limits: _Range, params: Allocation) -> 
 def _towards(u: Array, move: Array, limits: _Range, params: Allocation) -> Array:
     """Move u, which is within the limits, by `move` or as far as the limits allow."""
     destination = _exchanged(u + move, limits, params)
-    arrives = limits.has(destination)
+    arrives = limits.is_inside(destination)
 
     def partly() -> Array:
         def halve(
@@ -86,7 +88,7 @@ def _towards(u: Array, move: Array, limits: _Range, params: Allocation) -> Array
         ) -> tuple[Array, Array, Array, Array]:
             reached, target, part, size = now
             halfway = _exchanged(u + (part + 0.5 * size) * move, limits, params)
-            fits = limits.has(halfway)
+            fits = limits.is_inside(halfway)
             return (
                 jnp.where(fits, halfway, reached),
                 jnp.where(fits, target, halfway),
@@ -127,5 +129,5 @@ def _exchanged(u: Array, limits: _Range, params: Allocation) -> Array:
         return number + 1, moved
 
     return jax.lax.while_loop(
-        lambda now: (now[0] < SWEEPS) & ~jnp.all(limits.has(now[1])), sweep, (0, u)
+        lambda now: (now[0] < SWEEPS) & ~jnp.all(limits.is_inside(now[1])), sweep, (0, u)
     )[1]

@@ -221,7 +221,7 @@ def build_course(scenario: Scenario) -> Course:
     # Compute tick by tick all that does not depend on the aircraft.
     error, noise = _sensor_errors(errors, ticks, tick_ns // sample_ns, len(outputs))
     y_m, y_m_dot = _references(scenario, ticks, tick_ns)
-    arrives = [sensors.arrives(k, errors) for k in range(ticks)]
+    arrives = [sensors.has_arrived(k, errors) for k in range(ticks)]
     phase, dt = _phases(ticks, late, seconds(tick_ns), scenario.controller.max_age, arrives)
     delayed_ticks = np.maximum(np.arange(ticks) - late, 0)
     wind, forcing = _forcing(ticks, steps, plant)

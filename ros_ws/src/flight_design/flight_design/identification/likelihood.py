@@ -427,7 +427,7 @@ class Likelihood:
         model must not gain by a better guess.
         """
         (r,), (e,), (half_log_det,) = self.passed(theta, levels)
-        scale = np.mean(e[self.fitted()] ** 2, axis=0)
+        scale = np.mean(e[self.is_fitted()] ** 2, axis=0)
         log_likelihood = -np.sum(e**2 / scale + np.log(scale), axis=1) / 2.0 - half_log_det
         return Innovations(r, e, log_likelihood)
 
@@ -548,7 +548,7 @@ class Likelihood:
             f"search, {bounds[0]:.2g}, expected less"
         )
 
-    def known(self) -> NDArray[np.bool_]:
+    def is_known(self) -> NDArray[np.bool_]:
         """Return the mask of the samples that can be used, (T,).
 
         These samples have a y, and lie after the transient of the filter.
@@ -557,11 +557,11 @@ class Likelihood:
             np.arange(len(self._y)) >= TRANSIENT / self._period - 0.5
         )
 
-    def fitted(self) -> NDArray[np.bool_]:
+    def is_fitted(self) -> NDArray[np.bool_]:
         """Return the mask of the samples to which the model is fitted, (T,)."""
-        return self.known() & ~held_out(len(self._y), self._spans[0].stop)
+        return self.is_known() & ~held_out(len(self._y), self._spans[0].stop)
 
-    def _counted(self, theta: FloatArray, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _is_counted(self, theta: FloatArray, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return the mask of the samples that are used in the fit, (T,).
 
         A span is left out if no level of the wind explains it. A span with a gust is left out if

@@ -181,7 +181,7 @@ class Search(Likelihood):
     def _ends(self, flown: FloatArray | None, used: NDArray[np.bool_]) -> list[SearchEnd]:
         """Search from the best starts, and return the ends of these searches."""
         coarse = self.coarse
-        fitted = coarse.fitted()
+        fitted = coarse.is_fitted()
         zero = self._lagging(np.zeros(len(self.prior)))
         candidates = [(coarse.cost(zero, fitted), zero)]
         begins = [(zero, level) for level in STARTS]
@@ -231,7 +231,7 @@ class Search(Likelihood):
         free[self._winds] = winds
         free[self._servo] = False
         coarse = self.coarse
-        fitted = coarse.fitted()
+        fitted = coarse.is_fitted()
         for _ in range(START_STEPS):
             self.progress()
             theta, _, progressed = coarse._step(
@@ -256,7 +256,7 @@ class Search(Likelihood):
         for iteration in range(STEPS):
             self.progress()
             span_levels = self.levels(theta) if levels is None else levels
-            mask = used & self._counted(theta, span_levels) if iteration > unsettled else used
+            mask = used & self._is_counted(theta, span_levels) if iteration > unsettled else used
             theta, hessian, progressed = self._step(
                 theta, span_levels, mask, np.ones(len(theta), dtype=bool)
             )
@@ -346,7 +346,7 @@ class Search(Likelihood):
         Returns the fit, and the part of each entry's standard deviation that the delay causes,
         (entries,).
         """
-        theta, used = fit.theta, self.fitted()
+        theta, used = fit.theta, self.is_fitted()
         slopes = self._slopes(theta, fit.levels, used, np.ones(len(theta), dtype=bool))
         before = np.diag(self.prior**-2)
         inverse: FloatArray = np.asarray(np.linalg.inv(self._hessian(slopes)), float)

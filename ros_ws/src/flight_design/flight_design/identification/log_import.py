@@ -318,9 +318,9 @@ def _commands(
         topic = channel_map.messages[row.message].topic.rpartition("/")[2]
         source = LogField(topic, row.field)
         before_1_14 = ULOG_TORQUES.get((topic, row.field), source)
-        source = source if log.has(source) or not log.has(before_1_14) else before_1_14
+        source = source if log.has_field(source) or not log.has_field(before_1_14) else before_1_14
         require(
-            log.has(source),
+            log.has_field(source),
             f"inputs.{name}",
             f"no {topic}.{row.field} in the log",
             "this field: a map of the autopilot that wrote the log",
@@ -347,7 +347,7 @@ def _commands(
     else:
         expected = "its pulses"
     require(
-        log.has(source),
+        log.has_field(source),
         f"inputs.{name}",
         f"no {source.message}.{source.field} in the log",
         expected,
@@ -363,7 +363,7 @@ def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
     """
     quantity, sign = row.motion
     sources = log.format.torques.get(quantity, ()) if log.format else ()
-    source = next(filter(log.has, sources), None)
+    source = next(filter(log.has_field, sources), None)
     if source is None:
         expected = "a DataFlash log with RATE: sticks of a multicopter command angles or rates"
         raise ParameterError(
@@ -415,8 +415,8 @@ def _flight(
             "one of them, as in a flight",
         )
         in_air = speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
-        keep &= _bridged(stamps, in_air)
-    if log.has(FLOWN_AS):  # A VTOL flies as a plane and as a multicopter.
+        keep &= _is_bridged(stamps, in_air)
+    if log.has_field(FLOWN_AS):  # A VTOL flies as a plane and as a multicopter.
         keep &= log.at(FLOWN_AS, stamps) == VEHICLE_TYPES[kind]
     require(
         bool(keep.any()),
@@ -428,7 +428,7 @@ def _flight(
     if needs_manual:
         expected = "it, for only there the sticks are the commands, or --servos"
         modes = () if log.format is None else log.format.mode
-        mode = next(filter(log.has, modes), None)
+        mode = next(filter(log.has_field, modes), None)
         if mode is None:
             raise ParameterError(
                 f"the log: found no message with the mode, expected MANUAL in {expected}"
@@ -446,7 +446,7 @@ def _flight(
     return taken, _other_flights(runs, taken, start_ns)
 
 
-def _bridged(stamps: Stamps, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _is_bridged(stamps: Stamps, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Close the gaps of at most BRIDGED between two kept samples in a mask (N,)."""
     before = np.maximum.accumulate(np.where(keep, stamps, np.iinfo(np.int64).min // 2))
     after = np.minimum.accumulate(np.where(keep, stamps, np.iinfo(np.int64).max // 2)[::-1])[::-1]

@@ -402,7 +402,7 @@ def identify_model(
     parts = [part for _, part in fitted]
     first = join_innovations([fit.before for _, fit in fits], every)
     last = join_innovations([fit.after for _, fit in fits], every)
-    coupled = flown if flown is not None and _couples(flown, airframe) else None
+    coupled = flown if flown is not None and _has_new_coupling(flown, airframe) else None
     if coupled is not None:
         search = study.search(model, whole_aircraft(model), coupled=True)
         by_flown = search.flying(search.model_errors(coupled), fits)
@@ -466,7 +466,7 @@ def _unless_white(parts: list[Part], refusal: Coupling) -> list[Part]:
     return [part._replace(refusal=refusal) for part in parts]
 
 
-def _couples(flown: Airframe, nominal: Airframe) -> bool:
+def _has_new_coupling(flown: Airframe, nominal: Airframe) -> bool:
     """Return whether a model couples states that do not couple in the nominal model.
 
     This is so if an entry of A or B is not zero where the nominal entry is zero.

@@ -145,7 +145,7 @@ def fit_channel(
     first = int(u.stamp_ns[excited[0]] - BEFORE * NANOSECONDS)
     last = int(u.stamp_ns[excited[-1]] + AFTER * NANOSECONDS)
     y_of_channel = y.within([(first, last)])
-    is_settled = _settled(y_of_channel.stamp_ns / NANOSECONDS)
+    is_settled = _is_settled(y_of_channel.stamp_ns / NANOSECONDS)
     measured = y_of_channel[output][is_settled]
     if not len(measured) or not np.ptp(measured):
         return None
@@ -182,7 +182,7 @@ def fit_channel(
     return _model(fits[chosen], misfits[chosen], float(np.median(np.diff(t))))
 
 
-def _settled(t: FloatArray) -> NDArray[np.bool_]:
+def _is_settled(t: FloatArray) -> NDArray[np.bool_]:
     """Return the mask (N,) of the samples that come at least SETTLED s after each long gap."""
     if len(t) < 2:
         return np.ones(len(t), dtype=bool)

@@ -431,7 +431,7 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
 # The step response
 
 
-def _moves(parts: Iterable[FloatArray]) -> bool:
+def _has_motion(parts: Iterable[FloatArray]) -> bool:
     """Return whether the values of a channel change in any of the given parts of a log."""
     return any(len(part) and np.ptp(part) > 0.0 for part in parts)
 
@@ -460,7 +460,7 @@ def _fitted_response(
             inputs[j]: [part.u[:, j] for part in rows],
             outputs[j]: [part.y[:, j] for part in rows],
         }
-        still = next((name for name, parts in recorded.items() if not _moves(parts)), None)
+        still = next((name for name, parts in recorded.items() if not _has_motion(parts)), None)
         usable = still is None and bool(np.isfinite(responses[..., j]).all())
         columns.append(
             fitted_column(t, responses[..., j], j) if usable else no_column(len(outputs))

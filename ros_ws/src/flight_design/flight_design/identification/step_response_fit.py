@@ -100,7 +100,7 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
         trial = _search(t, whiten, step[:, j] / size, size, free, best.theta)
         if best.chi_squared - trial.chi_squared > MIN_GAIN * (
             sum(free) - sum(best.free)
-        ) and begins_with_Omega(t, trial.theta):
+        ) and has_direction_of_Omega(t, trial.theta):
             best = trial
     inside = (np.array(best.free) > 0) & (best.theta > LOWER + 1e-6) & (best.theta < UPPER - 1e-6)
     # source: R. T. Birge, Phys. Rev. 40, 1932
@@ -133,7 +133,7 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
     )
 
 
-def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
+def has_direction_of_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
     """Return whether a fitted response begins in the direction of Omega.
 
     The direction is the sign of the sum of the response, up to the time EARLY after the delay and
@@ -159,7 +159,7 @@ def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size:
     whiten = _whitener(responses[:, early])
     none = whiten @ responses[0, early]
     misfit = whiten @ (responses[0, early] - fitted)
-    if begins_with_Omega(t, theta):
+    if has_direction_of_Omega(t, theta):
         return max(float(none @ none - misfit @ misfit) - len(theta), 0.0)
     return 0.0
 

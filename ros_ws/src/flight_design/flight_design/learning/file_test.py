@@ -81,7 +81,7 @@ def is_contradicted(found: Identification, believed: Unknown) -> bool:
     not white, or whose best known effect on an output is at its bound, is wrong for another reason,
     such as parts that couple.
     """
-    parts = [part for part in found.parts if _counts(part, believed.factor)]
+    parts = [part for part in found.parts if _is_counted(part, believed.factor)]
     name = found.airframe.name
     if any(reason_against_airframe(p.entries, name, AT_BOUND, believed.factor) for p in parts):
         return True
@@ -96,7 +96,7 @@ def is_contradicted(found: Identification, believed: Unknown) -> bool:
     return degrees > 0.0 and float(chi2.sf(square, degrees)) < CONTRADICTED
 
 
-def _counts(part: Part, factor: float) -> bool:
+def _is_counted(part: Part, factor: float) -> bool:
     """Return whether the model of a part explains the record, and the part does not couple."""
     return (
         not isinstance(part.refusal, Coupling)

@@ -147,7 +147,7 @@ class Lander:
             return {}
         course, ground_speed = course_and_speed(pose)
         path_sink = min(-landing.slope * ground_speed, self._params.vertical.sink)
-        if height > landing.decrab and self._misses(height, path_sink, pose):
+        if height > landing.decrab and self._is_outside_box(height, path_sink, pose):
             self._flares = False
             return self._go_around(pose, route)
         height_ahead = height + self._params.vertical.alpha_time * pose["climb"]
@@ -156,7 +156,7 @@ class Lander:
             return commands
         return commands | self._along_line(pose, math.sin(course - landing.course) * ground_speed)
 
-    def _misses(self, height: float, path_sink: float, pose: Mapping[str, float]) -> bool:
+    def _is_outside_box(self, height: float, path_sink: float, pose: Mapping[str, float]) -> bool:
         """Return whether the aircraft would touch down outside of the zone `box`."""
         if self._landing.box is None:
             return False

@@ -258,14 +258,14 @@ def _is_near(state: GuidanceState, pose: Mapping[str, float], place: Point) -> b
     return abs(complex(*place) - _place(pose)) <= NEAR * max(float(state.target.V), 1.0)
 
 
-def _stops(route: Route, number: int) -> bool:
+def _is_stop(route: Route, number: int) -> bool:
     """Return whether an aircraft stops at the end of a leg.
 
     It stops if the next leg is a hover, or if the corner has no fillet.
     """
     following = next(iter(route.legs[number + 1 :]), None)
     hovers = following is not None and path.is_orbit(following)
-    return hovers or bool(path.turns_back(route.legs[number], following))
+    return hovers or bool(path.is_too_sharp(route.legs[number], following))
 
 
 def _along_route(
@@ -290,7 +290,7 @@ def _along_route(
             state = state._replace(loitered=min(state.loitered + share, 1.0))
         ends = has_loitered(state, pose, route)
         return on_leg(state, state.leg + 1, route) if ends else state, 0.0
-    stopped = _stops(route, state.leg) and _is_near(state, pose, leg.end)
+    stopped = _is_stop(route, state.leg) and _is_near(state, pose, leg.end)
     if not stopped and not path.is_passed(leg, position):
         return state, 0.0
     distance = math.dist(leg.end, position)
@@ -407,14 +407,14 @@ def _on_path(
     to_go = path.to_go(leg, position)
     speed = state.V_c
     slope = 0.0
-    if _stops(route, state.leg):
+    if _is_stop(route, state.leg):
         speed, slope = _approach(max(to_go, 0.0), speed, gains)
     across = -clip(gains.k_p * error.e, ACROSS * speed)
     # complex numbers have the direction along the path + i to the right
     velocity = complex(math.sqrt(speed**2 - across**2), across)
     later = _parts(_place(pose) + gains.lead * _velocity(pose))
     entered_leg = leg
-    if path.is_passed(leg, later) and not _stops(route, state.leg):
+    if path.is_passed(leg, later) and not _is_stop(route, state.leg):
         entered_leg = route.legs[state.leg + 1]
     error_later = path.error(entered_leg, later)
     track = cmath.rect(1.0, error_later.track)

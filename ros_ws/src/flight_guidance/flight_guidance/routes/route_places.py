@@ -151,7 +151,7 @@ def _joined(lines: Sequence[Geometry]) -> list[Geometry]:
     for line in lines:
         may_continue = bool(geometries and geometries[-1].places and line.places)
         end, begin = (geometries[-1].places[-1], line.places[0]) if may_continue else (None, None)
-        if end is not None and begin is not None and _meets(end, begin):
+        if end is not None and begin is not None and _is_same_place(end, begin):
             geometries[-1] = geometries[-1]._replace(
                 places=[*geometries[-1].places[:-1], *line.places[1:]]
             )
@@ -160,7 +160,7 @@ def _joined(lines: Sequence[Geometry]) -> list[Geometry]:
     return geometries
 
 
-def _meets(end: Place, begin: Place) -> bool:
+def _is_same_place(end: Place, begin: Place) -> bool:
     """Return whether two places are the same position on the antimeridian."""
     try:
         return bool(

@@ -406,7 +406,7 @@ def distance_from(legs: Sequence[Leg], point: Point) -> float:
     return min(distances)
 
 
-def turns_back(leg: Leg, following: Leg | None) -> bool:
+def is_too_sharp(leg: Leg, following: Leg | None) -> bool:
     """Return whether the corner between two lines is too sharp for a fillet, beyond SHARPEST."""
     if not isinstance(leg, Line) or not isinstance(following, Line):
         return False

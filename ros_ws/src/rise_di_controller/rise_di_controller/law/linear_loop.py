@@ -85,7 +85,7 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
     # Put the sets of gains in the last axis. Without sets, the last axis has the columns of the
     # matrix.
     sets = () if candidates is None else (candidates,)
-    at_once = candidates is None and _takes_columns(params)
+    at_once = candidates is None and _has_columns(params)
     if at_once:
         params = _for_columns(params)
         sets = (1,)
@@ -135,7 +135,7 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
     return LinearLaw(above[..., :size], above[..., size:], below[..., :size], below[..., size:])
 
 
-def _takes_columns(params: Any) -> bool:
+def _has_columns(params: Any) -> bool:
     """Return whether the law can step many states at once, with one state in each column.
 
     RISE-DI can, alone or with an observer without vanes.

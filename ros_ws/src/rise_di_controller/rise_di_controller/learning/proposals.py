@@ -199,7 +199,7 @@ class Learning:
             self._due.append(now_ns)
         return due
 
-    def waits(self, now_ns: int) -> bool:
+    def is_waiting(self, now_ns: int) -> bool:
         """Return whether the tick at `now_ns` waits for a proposal; in real time none does."""
         return any(
             self._acts_ns(end_ns) <= now_ns and end_ns not in self._received for end_ns in self._due
