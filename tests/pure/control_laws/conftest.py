@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The law of the example, installed for the tests of this folder."""
+"""Install the law of the example for the tests of this folder."""
 
 from collections.abc import Iterator
 

@@ -43,9 +43,9 @@ NOISE = np.array([0.0017, 0.0017, 0.0017, 0.03])  # of osprey_servo
 
 @cache
 def sections() -> dict[str, dict[str, Any]]:
-    """Sections of a controller by a name.
+    """Return sections of a controller by name.
 
-    With "observer" in the name it is the observer for osprey_servo by rule, with 20 ms of margin.
+    A name with "observer" has the observer for osprey_servo by rule, with a margin of 20 ms.
     """
     rise = SERVO.rise_di()
     leading = with_feedforward(rise, AIRFRAME).model_dump()
@@ -100,7 +100,7 @@ def prepared(parameters: ControllerConfig) -> tuple[GuardParams, TunedLaw]:
 
 
 def at(y: Any, **others: Any) -> Measurements:
-    """Measurements of four channels; what is not given is 0."""
+    """Return measurements of four channels, in which a field that is not given is 0."""
     zero = np.zeros(4)
     fields = {"y_m": zero, "y_m_dot": zero, "u_trim": zero, "u_before": zero} | others
     return Measurements(y + zero, **{key: value + zero for key, value in fields.items()})
@@ -113,14 +113,14 @@ def sample(ms: float, value: Any) -> StampedVector:
 def tick(
     parameters: ControllerConfig, state: ControllerState, ms: float, y: Any, y_m: Any = 0.0
 ) -> ControllerState:
-    """The state after a tick with fresh y and y_m."""
+    """Return the state after a tick with fresh y and y_m."""
     return guard.tick(
         state, round(ms * MS), sample(ms, y), [sample(ms, y_m)], *prepared(parameters)
     )[0]
 
 
 def random_flight(law: TunedLaw, size: float, ticks: int = 20) -> tuple[Any, Measurements]:
-    """A state of a law after some ticks without limits, and the measurements of the last one."""
+    """Return the state of a law after some ticks without limits, and the last measurements."""
     generator = np.random.default_rng(1)
     measurements = at(size * generator.standard_normal(4))
     state = law.control_law.engage(measurements, law.params)
@@ -139,9 +139,9 @@ def bits(state: Any) -> dict[str, bytes]:
 
 
 def first_change(name: str, parameters: Any, e: FloatArray, u: FloatArray) -> FloatArray:
-    """The largest change of u in the first tick after an engagement at a constant error.
+    """Return the largest change of u in the first tick after an engagement at a constant error.
 
-    It comes by the gains alone.
+    It is computed from the gains alone.
     """
     law = name.partition(",")[0]
     if law == "lqg":

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The excitation of an identification, by closed forms.
+"""Test the excitation of an identification against closed forms.
 
-It has doublets and a multisine on one input after another.
+It applies doublets and a multisine to one input after the other.
 """
 
 from dataclasses import replace
@@ -58,7 +58,7 @@ def controller(**changes: Any) -> ExcitationConfig:
 
 @pytest.fixture(scope="module")
 def excited() -> FloatArray:
-    """The excitation every DT in units of the amplitude, (T, m)."""
+    """Return the excitation at steps of DT, (T, m), in units of the amplitude."""
     params = controller()
     arrays = params.law_params()
     return np.array([excitation.signal(k * DT, arrays) for k in range(round(params.duration / DT))])
@@ -77,7 +77,7 @@ def test_live_page_offers_no_gains_of_timetable() -> None:
 
 
 def test_inputs_are_excited_in_turn(excited: FloatArray) -> None:
-    """Not more than one input is excited at a time, and no input in a pause."""
+    """At most one input is excited at a time, and none in a pause."""
     active = excited != 0.0
     assert active.sum(axis=1).max() == 1
     assert not active[: round(1.5 / DT)].any()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The observer beside each law: a Kalman filter that starts, restarts and changes."""
+"""Test the observer that any law can have: a Kalman filter that starts, restarts and changes."""
 
 from typing import NamedTuple
 
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("example_law")
 
 
 class Matrices(NamedTuple):
-    """Those of an observer."""
+    """The matrices of an observer."""
 
     Phi: FloatArray
     Gamma: FloatArray

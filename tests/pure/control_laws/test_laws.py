@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control laws through their one protocol: engagement, limits, retuning, replay, JAX."""
+"""Test the control laws through their protocol: engagement, limits, retuning, replay, JAX."""
 
 from dataclasses import replace
 from typing import Any
@@ -163,7 +163,7 @@ def test_new_parameters_leave_u_as_it_is(name: str) -> None:
 
 @EVERY_LAW
 def test_every_law_flies_and_replays(name: str) -> None:
-    """Replay equals the flight to the last bit."""
+    """A replay of each law equals the flight to the last bit."""
     scenario = replace(SERVO, controller=controller(name))
     tape = simulate(scenario)
     result = replay(tape, scenario.controller)
@@ -181,9 +181,9 @@ def test_every_law_flies_and_replays(name: str) -> None:
 
 
 def test_only_gains_change_in_flight() -> None:
-    """Neither the law nor its channels change in flight.
+    """Neither the law nor its channels can change in flight.
 
-    The models do so by a learner alone, of RISE-DI.
+    Only a learner can change the models, and only those of RISE-DI.
     """
     assert {"K", "Lambda", "lead", "filter_time", "upper", "hold"} <= controller("pid").tunable()
     for name in (*NAMES, *OBSERVED):
@@ -225,7 +225,7 @@ def test_linear_model_predicts_step_of_law(name: str) -> None:
 
 
 def responses(name: str, parameters: Any, z: complex) -> FloatArray:
-    """The transfer matrix from y to u at z, worked out by hand."""
+    """Return the transfer matrix from y to u at z, derived by hand."""
     T = DT
     K = np.array(
         parameters.K if hasattr(parameters, "K") else gain(np.array(1.0), np.array(parameters.k_d))
@@ -278,7 +278,7 @@ def test_a_state_is_restored_from_its_fields(name: str) -> None:
 
 @EVERY_LAW
 def test_law_is_same_under_jax(name: str) -> None:
-    """A law gives the same under NumPy and JAX, and over many aircraft."""
+    """A law gives the same u with NumPy and with JAX, also for many aircraft at once."""
     law = controller(name).tuned_law()
 
     def column(value: Any) -> Any:

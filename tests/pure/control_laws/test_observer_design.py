@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Design of the observer.
+"""Test the design of the observer.
 
-Its models stand against an integrator of scipy, its gains against scipy's Riccati solver.
+Its models are compared with an integrator of scipy, and its gains with scipy's Riccati solver.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ M = 4
 
 
 def osprey() -> NominalModel:
-    """The osprey with the lags and the noise of osprey_servo, channels in the airframe's order."""
+    """Return the osprey with the lags and noise of osprey_servo, with channels in its own order."""
     one = np.ones(M)
     return NominalModel(
         A=AIRFRAME.matrix_a(),
@@ -48,9 +48,9 @@ def osprey() -> NominalModel:
 
 
 def weights(*batch: int) -> Weights:
-    """Weights around those that a tuning found for the osprey.
+    """Return the weights that a tuning found for the osprey.
 
-    With leading axes they are random ones around these.
+    With leading axes they are random weights around these.
     """
     middle = Weights(
         *map(np.array, ([0.05] * M, [0.3] * M, [0.9, 0.4, 0.4], [4.7, 0.6, 1.9], [0.004]))
@@ -73,7 +73,7 @@ def extended_weights() -> ExtendedStateWeights:
 
 
 def uncertain(count: int) -> NominalModel:
-    """The osprey and `count` - 1 uncertain ones, side by side."""
+    """Return models of the osprey and of `count` - 1 uncertain ones, as one array."""
     A, B = nominal_and_sampled(AIRFRAME, 0.4, count - 1, seed=1)
     return osprey()._replace(A=A, B=B)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sections of laws and observers that a controller refuses, and their digests."""
+"""Test which sections of laws and observers a controller refuses, and test their digests."""
 
 from importlib.metadata import EntryPoint, EntryPoints
 from typing import Any
@@ -45,7 +45,7 @@ def test_page_names_every_registered_law_and_parameters() -> None:
 
 
 def test_unregistered_law_refused() -> None:
-    """The sentence lists the registered laws."""
+    """The refusal lists the registered laws."""
     registered = "excitation, indi, l1, lqg, lqi, mackunis, pi, pid, rise_di"
     refused(
         f"controller.law: found 'adrc', expected a registered law: {registered}",
@@ -71,7 +71,10 @@ def test_law_of_more_than_y_refused() -> None:
 
 
 def test_compared_laws_are_those_that_a_scenario_names() -> None:
-    """The excitation controls nothing, and `pid` is a package of an example."""
+    """All registered laws are compared, except two.
+
+    The excitation controls nothing, and `pid` belongs to the package of an example.
+    """
     assert {law.law for law in LAWS.values()} == {*laws.names()} - {"excitation", "pid"}
 
 
@@ -169,10 +172,7 @@ def test_an_invalid_observer_is_refused() -> None:
 
 
 def test_unfit_feedforward_refused() -> None:
-    """A nominal model with a different D is refused.
-
-    So is a model with a zero in the right half plane.
-    """
+    """A nominal model with another D or with a zero in the right half plane is refused."""
     values = sections()["pi, observer"]
     B = np.reshape(values["feedforward"]["B"], (-1, 4))
     negative = values | {"feedforward": values["feedforward"] | {"B": (-B).ravel().tolist()}}
@@ -189,7 +189,7 @@ def test_unfit_feedforward_refused() -> None:
 
 
 def test_digest_depends_on_law() -> None:
-    """Logs of versions without the key law keep the digest."""
+    """A log of a version without the key `law` keeps its digest."""
     digests = {name: controller(name).digest() for name in (*NAMES, *OBSERVED)}
     assert len(set(digests.values())) == len(digests)
     section = AnyLaw.validate_mapping(sections()["rise_di"] | {"law": "rise_di"}, "controller")

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each control law against an independent result.
+"""Test each control law against an independent result.
 
-It is a closed form, another recursion, or an exact integration of a known plant.
+The result is a closed form, another recursion, or an exact integration of a known plant.
 """
 
 from typing import Any, NamedTuple
@@ -29,7 +29,7 @@ COLUMN = (1, 1)
 
 
 def integrator(Omega: float = 2.0, period: float = DT, limit: float = np.inf) -> NominalModel:
-    """One output that integrates its input: y_dot = Omega u."""
+    """Return a model with one output that integrates its input: y_dot = Omega u."""
     one = np.ones(1)
     wide = np.full(1, limit)
     return NominalModel(
@@ -53,12 +53,12 @@ def integrator(Omega: float = 2.0, period: float = DT, limit: float = np.inf) ->
 
 @pytest.fixture(scope="module")
 def osprey() -> NominalModel:
-    """The osprey without actuators or limits."""
+    """Return the osprey without actuators or limits."""
     return tuning.build_benchmark(find_scenario("osprey_gust", 0.1)).model
 
 
 def at(y: Any, y_m: Any = 0.0, **others: Any) -> Measurements:
-    """Measurements of one aircraft; the others are 0, and x is y."""
+    """Return measurements of one aircraft in which x is y and all other fields are 0."""
     y = np.atleast_1d(np.asarray(y, dtype=float))[:, None]
     zero = np.zeros_like(y)
     measurements = Measurements(
@@ -76,7 +76,7 @@ def at(y: Any, y_m: Any = 0.0, **others: Any) -> Measurements:
 
 
 class Flight(NamedTuple):
-    """A flight of one output that integrates: one value a tick."""
+    """A flight of one integrating output, with one value for each tick."""
 
     y: FloatArray
     u: FloatArray
@@ -92,9 +92,9 @@ def fly(
     model: NominalModel,
     Omega: float | None = None,
 ) -> Flight:
-    """The exact flight of y_dot = Omega u + d, y_m = 0, actuators ideal.
+    """Return the exact flight of y_dot = Omega u + d with y_m = 0 and ideal actuators.
 
-    u is held over a tick, and d is its mean over one.
+    u is held over a tick, and d is the mean over the tick.
     """
     response = model.Omega[0, 0] if Omega is None else Omega
     measurements = at(y)
@@ -117,7 +117,10 @@ def gains(**values: Any) -> dict[str, FloatArray]:
 
 
 def law_of(name: str, model: NominalModel, **values: Any) -> tuple[ControlLaw, Any]:
-    """A law of the catalogue and its parameters; the initial ones of a search without gains."""
+    """Return a law of the catalogue and its parameters.
+
+    Without gains, these are the initial ones of a search.
+    """
     law = LAWS[name]
     return law.control_law(model), law.params(gains(**values) or initial_gains(law, model), model)
 
@@ -138,7 +141,7 @@ def test_doubling_solves_the_riccati_equation(osprey: NominalModel) -> None:
 
 
 def recursion(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray, steps: int) -> FloatArray:
-    """The gain of a long finite horizon, by the Riccati recursion backwards in time."""
+    """Return the gain of a long finite horizon, by the Riccati recursion backwards in time."""
     P = Q
     for _ in range(steps):
         gain = np.linalg.solve(R + G.T @ P @ G, G.T @ P @ F)
@@ -193,7 +196,7 @@ def test_filtered_difference_of_ramp_converges_to_slope() -> None:
 
 
 def test_l1_estimates_disturbance_in_one_tick() -> None:
-    """The predictor of L1 estimates a constant disturbance."""
+    """The predictor of L1 estimates a constant disturbance in one tick."""
     model = integrator()
     flight = fly(*law_of("l1", model, K=3.0, bandwidth=20.0), 3, 0.1, 0.7, model)
     x = l1.ADAPTATION_POLE * DT
@@ -267,7 +270,7 @@ def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
 
 
 def test_observer_converges(osprey: NominalModel) -> None:
-    """The estimates converge to states, wind and disturbance of the model."""
+    """The estimates converge to the states, the wind and the disturbance of the model."""
     # s: faster than the 30 s below
     values = initial_gains(LAWS["lqg"], osprey) | {"wind_time": np.full((3, 1), 0.6)}
     _, params = law_of("lqg", osprey, **values)
@@ -292,7 +295,7 @@ def test_observer_converges(osprey: NominalModel) -> None:
 
 
 def test_anti_windup_stops_and_releases_integral() -> None:
-    """The integral stops in saturation, and moves on the way back."""
+    """The integral stops in saturation, and changes when this leads back into the limits."""
     integral = conditional_integration(
         np.zeros(3), np.ones(3), np.ones(3), np.array([0.5, -0.5, 0.0])
     )
@@ -301,7 +304,7 @@ def test_anti_windup_stops_and_releases_integral() -> None:
 
 @pytest.mark.parametrize("name", list(LAWS))
 def test_rival_law_is_same_under_jax(name: str, osprey: NominalModel) -> None:
-    """A law gives the same under NumPy and JAX, and over a fleet."""
+    """A law gives the same u with NumPy and with JAX, also for a fleet."""
     generator, (control_law, params) = np.random.default_rng(1), law_of(name, osprey)
     # all but the vanes
     shapes = ((4, 3), (4, 1), (4, 1), (4, 1), (4, 3), (4, 3), (8, 3), (8, 3), (4, 3))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Steps of the reference model that fail: the last y_m goes on, and the next step is tried."""
+"""Test that y_m goes on and the next step is tried after a failed step of the model."""
 
 import math
 from typing import Any

@@ -1,11 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Live commands u_m: bounds, age limit, and the ending when their publisher is lost.
+"""Test live commands u_m: their bounds, age limit, and what ends them without a publisher.
 
-The ending levels the wings.
-
-A stand-in for guidance rolls each aircraft into a bank: p_m = k (phi_c - phi), the turn
-coordinated. It ends at several instants of the roll-in.
+The ending levels the wings. A stand-in for guidance rolls each aircraft into a coordinated turn
+with p_m = k (phi_c - phi). It falls silent at several instants of the roll-in.
 """
 
 import math
@@ -140,9 +138,9 @@ AIRCRAFT: dict[str, tuple[Any, float]] = {
 
 
 def flight(scenario: Scenario, bank_deg: float, lost: float, duration: float) -> FloatArray:
-    """Samples [t, phi] of a flight, shape (N, 2).
+    """Return the samples [t, phi] of a flight, (N, 2).
 
-    Its guidance rolls to a bank from t = 1 s and falls silent at `lost`.
+    Its guidance rolls to a bank from t = 1 s on, and falls silent at `lost`.
     """
     speed = scenario.aircraft.channels().speed
     varied = scenario.vary(

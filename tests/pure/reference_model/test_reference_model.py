@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The reference model and its commands against closed forms and exact simulation."""
+"""Test the reference model and its commands against closed forms and an exact simulation."""
 
 import math
 from pathlib import Path

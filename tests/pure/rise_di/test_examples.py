@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The docstrings of the names of `rise_di`: the sections of Google style, and examples that run."""
+"""Test the docstrings of the names of `rise_di`: Google's sections, and examples that run."""
 
 import doctest
 import inspect
@@ -31,14 +31,14 @@ EXAMPLES = sorted(name for name, value in PUBLIC.items() if ">>> " in (inspect.g
 
 
 def section(documented: object, title: str) -> str | None:
-    """The lines of a section of a docstring; None without the section."""
+    """Return the lines of a section of a docstring, or None without such a section."""
     text = inspect.getdoc(documented) or ""
     match = re.search(rf"^{title}:\n((?:(?: .*)?\n)*(?: .*)?)", text, re.MULTILINE)
     return match and match[1]
 
 
 def parameters(function: Callable[..., Any]) -> list[str]:
-    """Names of the parameters of a function, without self and cls."""
+    """Return the names of the parameters of a function, without self and cls."""
     return [name for name in inspect.signature(function).parameters if name not in {"self", "cls"}]
 
 

@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The Python interface `rise_di`.
+"""Test the Python interface `rise_di`.
 
-The tests are of its names, its laziness, its types, flights and logs, and the sentences about wrong
-input.
+The tests cover its names, lazy imports, types, flights, logs, and the sentences about wrong input.
 """
 
 import re
@@ -31,7 +30,7 @@ def tape() -> rise_di.Tape:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> rise_di.FlightResult:
-    """A run of a scenario that differs from its file."""
+    """Return a run of a scenario that differs from its file."""
     return rise_di.fly(SOFT, runs=tmp_path_factory.mktemp("runs"))
 
 
@@ -53,7 +52,7 @@ def test_the_import_loads_no_library() -> None:
 
 
 def test_the_interface_needs_no_ros() -> None:
-    """Every name is loaded, and none of the modules is of ROS."""
+    """All names of `rise_di` can be loaded without a module of ROS."""
     ros = {"rclpy", "flight_ros", "ament_index_python", "launch", "sensor_msgs"}
     assert (
         not modules_loaded_by("import rise_di\nfor name in dir(rise_di): getattr(rise_di, name)")
@@ -112,7 +111,7 @@ def test_other_gains_on_the_recorded_inputs_are_an_open_loop(run: rise_di.Record
 
 
 def test_numpy_is_accepted_wherever_numbers_are() -> None:
-    """Arrays of any real type, scalars and shapes, against lists of Python numbers."""
+    """Arrays of any real type and shape give the same results as lists of Python numbers."""
     gains = {"beta": [2.0, 2.0, 1.0, 1.0], "D": [1, -1, 1, 1], "k_g": 3.0}
     arrays = {
         "beta": np.array(gains["beta"], dtype=np.float32),

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The lateral motion of the Boeing 747 of NASA CR-2144, typed in as its tables print it.
+"""Test with the lateral motion of the Boeing 747 of NASA CR-2144, as its tables print it.
 
-The condition is Mach 0.8, 40 000 ft (Heffley, Jewell).
+The condition is Mach 0.8 at 40 000 ft (Heffley, Jewell).
 """
 
 from pathlib import Path

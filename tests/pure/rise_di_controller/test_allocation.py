@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Allocation of the inputs of a law to more effectors.
+"""Test the allocation of the inputs of a law to a larger number of effectors.
 
-The tests are of stops, rates and priority, and of a flight that replays to the bit.
+The tests cover stops, rates, priority, and a flight whose replay is equal to the bit.
 """
 
 from typing import Any
@@ -27,7 +27,10 @@ DT = 0.01
 
 
 def drawn(generator: np.random.Generator, m: int, p: int, rate: float = np.inf) -> Allocation:
-    """An allocation by the pseudo-inverse that the ranges weigh, of a drawn C B of full rank."""
+    """Return an allocation for a random C B of full rank.
+
+    Its pseudo-inverse is weighted by the ranges of the effectors.
+    """
     stops = generator.uniform(0.2, 1.0, p)
     Omega = generator.normal(size=(m, p))
     T = stops[:, None] * np.linalg.pinv(Omega * stops)
@@ -37,7 +40,7 @@ def drawn(generator: np.random.Generator, m: int, p: int, rate: float = np.inf) 
 def demands(
     seed: int, count: int, size: float, rate: float = np.inf
 ) -> list[tuple[Allocation, FloatArray]]:
-    """Demands of `size` times the v of an effector position inside the stops."""
+    """Return allocations, each with a demand that is `size` times the v of a reachable position."""
     generator = np.random.default_rng(seed)
     pairs = []
     for _ in range(count):
@@ -74,10 +77,11 @@ def test_effectors_stay_inside_stops_and_rates_and_give_what_is_returned(size: f
 
 
 def test_effectors_beyond_their_stops_leave_the_others_the_whole_demand() -> None:
-    """New stops of 0.5 leave the first effector at 0.6.
+    """An effector beyond its new stop does not reduce what the others are asked for.
 
-    It moves back to 0.4 to 0.5 in a tick. The change of effect that is asked for counts from there
-    on, not from where it was.
+    With the new stops of 0.5, the first effector stands at 0.6 and moves back to between 0.4 and
+    0.5 in one tick. The demanded change of the effect is measured from its position inside the
+    stops, and not from 0.6.
     """
     T = np.array([[0.5], [0.5]])
     limits = Limits(np.full(2, -0.5), np.full(2, 0.5), np.full(2, 0.2 / DT))
@@ -89,7 +93,10 @@ def test_effectors_beyond_their_stops_leave_the_others_the_whole_demand() -> Non
 
 
 def most(params: Allocation, v: FloatArray) -> float:
-    """The largest s for which some u inside the stops gives s v, by a linear program."""
+    """Return the largest s for which some u inside the stops gives s v.
+
+    It is found with a linear program.
+    """
     m, p = params.effect.shape
     stops = [(-stop, stop) for stop in params.limits.upper]
     equal: dict[str, Any] = {"A_eq": np.column_stack([params.effect, -v]), "b_eq": np.zeros(m)}
@@ -97,9 +104,10 @@ def most(params: Allocation, v: FloatArray) -> float:
 
 
 def test_what_some_effectors_inside_the_stops_give_is_given() -> None:
-    """Ten sweeps met 98.8 % of 500 demands to 1 %.
+    """A demand is met if the effectors can meet it within their stops.
 
-    Here about 50 are at 0.9 of what a linear program finds: three may miss.
+    Ten sweeps met 98.8 % of 500 demands to 1 %. This test has about 50 demands at 0.9 of the limit
+    that a linear program finds, and at most three of them may be missed.
     """
     misses = hard = 0
     for params, v in demands(3, 100, 1.0):
@@ -114,7 +122,11 @@ def test_what_some_effectors_inside_the_stops_give_is_given() -> None:
 
 
 def test_beyond_the_stops_the_first_input_keeps_what_a_linear_program_finds_for_it() -> None:
-    """Within 1/16: the halvings resolve 1/32 of a demand, and the sweeps lack a little."""
+    """The first input keeps as much of its demand as a linear program finds possible.
+
+    The tolerance is 1/16, because the halvings resolve 1/32 of a demand, and the sweeps do not
+    converge fully.
+    """
     compared = 0
     for params, v in demands(4, 40, 3.0):
         if most(params, v) >= 1.0:
@@ -126,9 +138,9 @@ def test_beyond_the_stops_the_first_input_keeps_what_a_linear_program_finds_for_
 
 
 def full_mixing(**changes: Any) -> dict[str, Any]:
-    """A section controller of osprey_servo with inputs v = C B u.
+    """Return a controller section of osprey_servo whose inputs are v = C B u.
 
-    NumPy alone finds the inverse here.
+    The inverse is computed by NumPy alone.
     """
     # per deg and %
     Omega = np.array(
@@ -149,7 +161,7 @@ def full_mixing(**changes: Any) -> dict[str, Any]:
 
 
 def mixed(**changes: Any) -> dict[str, Any]:
-    """Changes of the controller of osprey_servo for this allocation."""
+    """Return the changes that make the controller of osprey_servo use this allocation."""
     return {
         "outputs": ["q", "V", "p", "r"],
         "inputs": ["v_q", "v_V", "v_p", "v_r"],
@@ -170,9 +182,9 @@ def mixed(**changes: Any) -> dict[str, Any]:
 
 
 def test_a_flight_with_an_allocation_at_its_stops_tracks_and_replays_to_the_bit() -> None:
-    """The elevator has a third of what the commands take.
+    """The flight tracks although the elevator has a third of the range that the commands need.
 
-    The allocation binds, and the integrals of q do not wind up.
+    The allocation is at its stops, and the integrals of q do not wind up.
     """
     stop = [0.01, 0.5, 0.3, 0.3]
     scenario = find_scenario("osprey_servo", 10.0).vary(
@@ -201,9 +213,10 @@ def test_a_flight_with_an_allocation_at_its_stops_tracks_and_replays_to_the_bit(
     ],
 )
 def test_shipped_aircraft_track_without_an_effector(name: str, effector: str, channel: str) -> None:
-    """Half of the effect is left, which D = I survives.
+    """The shipped aircraft still track when an effector has lost its whole effect.
 
-    e is within twice that of the whole aircraft, 15 mrad/s; u is inside.
+    The remaining effectors keep half of the effect, for which D = I is still right. The error is at
+    most twice the 15 mrad/s of the undamaged aircraft, and u stays inside the limits.
     """
     scenario = find_scenario(name)
     actuators = scenario.aircraft.actuators.model_dump() | {"faults": [f"{effector} lost 1"]}
@@ -220,9 +233,10 @@ def test_shipped_aircraft_track_without_an_effector(name: str, effector: str, ch
 
 
 def test_a_vehicle_that_is_no_aeroplane_flies_and_replays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The vehicle has six rotors, no V, and no guidance.
+    """A hexarotor flies, which has no channel V and no guidance.
 
-    It is 64 mrad/s off at most in the two commands of 0.5 rad/s, so a sixth of these.
+    The commands are two pulses of 0.5 rad/s. The error is 64 mrad/s at most, and the bound is a
+    sixth of the commands.
     """
     monkeypatch.chdir(REPOSITORY)  # the scenario names its airframe from there
     path = "examples/hexarotor/hexarotor_flight.yaml"
@@ -255,7 +269,10 @@ def test_an_allocation_that_does_not_fit_is_refused_with_a_sentence(
 
 
 def test_a_map_with_a_wrong_sign_contradicts_the_effect_of_an_effector() -> None:
-    """The D of the law is I for any sign of an effector, so `effect` tells the sign."""
+    """A wrong sign of an effector is found in `effect`.
+
+    D of the law is I for either sign, so that it cannot show the sign.
+    """
     channel_map = named_map("ardupilot")
     frame = load_airframe("osprey")
     assert not check_scenario(

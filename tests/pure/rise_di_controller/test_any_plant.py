@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Theorem 1 on random aircraft, with the right D and gains by the rules.
+"""Test Theorem 1 on random aircraft, with the right D and with gains by the rules.
 
-e converges to the ultimate bound of sampling.
+The error e must converge to the ultimate bound of a sampled law.
 
 An aircraft is drawn in coordinates (y, z) that show its zero dynamics, z_dot = A_zy y + A_zz z at y
-= y_m, and then rotated. The law has D and gains only. `gains` computes them from the true aircraft,
-because these tests check the theorem and not an identification.
+= y_m, and is then rotated. The law only knows D and the gains. `gains` computes them from the true
+aircraft, because these tests check the theorem and not an identification.
 """
 
 from typing import NamedTuple
@@ -41,11 +41,11 @@ class Sines(NamedTuple):
     phase: FloatArray  # (m,)
 
     def at(self, t: float) -> FloatArray:
-        """Shape (m,)."""
+        """Return y_m at the time t, (m,)."""
         return self.amplitude * np.sin(self.frequency * t + self.phase)
 
     def rate(self, t: float) -> FloatArray:
-        """The derivative, shape (m,)."""
+        """Return the derivative of y_m at the time t, (m,)."""
         return self.amplitude * self.frequency * np.cos(self.frequency * t + self.phase)
 
 
@@ -60,12 +60,12 @@ class Task(NamedTuple):
 
 
 def abscissa(matrix: FloatArray) -> float:
-    """The largest real part of the eigenvalues; -inf where there are none."""
+    """Return the largest real part of the eigenvalues, or -inf for an empty matrix."""
     return float(np.linalg.eigvals(matrix).real.max()) if matrix.size else -np.inf
 
 
 def random_task(n: int, m: int, seed: int) -> Task:
-    """Random task of relative degree one, C B = S D U.
+    """Return a random task of relative degree one, with C B = S D U.
 
     The aircraft and its zero dynamics have at least MIN_DAMPING.
     """
@@ -97,9 +97,9 @@ def random_task(n: int, m: int, seed: int) -> Task:
 
 
 def slew_of_the_ideal_control(task: Task, scale: FloatArray) -> FloatArray:
-    """Slew v*_dot over a flight, shape (N, m), of the input v* = u / scale that keeps e = 0.
+    """Return the slew v*_dot of the ideal control over a flight, (N, m).
 
-    It is by finite differences.
+    The input v* = u / scale keeps e = 0. Its slew is found with finite differences.
     """
     aircraft = task.aircraft
     rotation = task.rotation
@@ -127,14 +127,14 @@ def slew_of_the_ideal_control(task: Task, scale: FloatArray) -> FloatArray:
 
 
 def gains(task: Task, sign: Sign) -> LawParams:
-    """Gains by rule, last channel first, with V = D U D of the scaled Omega.
+    """Return gains by rule, last channel first, with V = D U D of the scaled Omega.
 
-    Inputs are scaled by the pivots of Omega, abs(Delta_k / Delta_(k-1)), which are never zero;
-    Omega_kk may be zero. K is that of (22): K_m = 10 1/s, k_d,i = 1 + (m - 1) sum_{j>i} V_ij^2 K_j,
-    which makes the symmetric part of V K positive definite: 2 abs(V_ij) K_j abs(r_i r_j) <= (m - 1)
-    V_ij^2 K_j r_i^2 + K_j r_j^2 / (m - 1). beta: (30), with zeta_Nd,i = max abs((D U v*_dot)_i),
-    which is N_d at e = 0, and a margin of a half. Lambda is 2 1/s. omega is over-estimated by 2,
-    because it must not be too small.
+    Inputs are scaled by the pivots of Omega, abs(Delta_k / Delta_(k-1)), which are never zero,
+    although Omega_kk may be zero. K is from (22): K_m = 10 1/s and k_d,i = 1 + (m - 1) sum_{j>i}
+    V_ij^2 K_j. Then the symmetric part of V K is positive definite, because 2 abs(V_ij) K_j abs(r_i
+    r_j) <= (m - 1) V_ij^2 K_j r_i^2 + K_j r_j^2 / (m - 1). beta is from (30) with a margin of one
+    half, where zeta_Nd,i = max abs((D U v*_dot)_i) is N_d at e = 0. Lambda is 2 1/s. omega is
+    estimated too large by a factor of 2, because it must not be too small.
     """
     m = len(task.D)
     Omega = task.aircraft.C @ task.aircraft.B
@@ -157,9 +157,9 @@ def gains(task: Task, sign: Sign) -> LawParams:
 
 
 def fly(task: Task, law: LawParams, dt: float) -> FloatArray:
-    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m).
+    """Return the errors e at 0, dt, 2 dt, ..., (ticks, m).
 
-    An error above 100 ends the flight.
+    A flight ends if an error is above 100.
     """
     y_m = [task.reference.at(k * dt) for k in range(round(DURATION / dt) + 1)]
     x_0 = task.rotation[:, : len(task.D)] @ (y_m[0] + task.e_0)
@@ -167,7 +167,7 @@ def fly(task: Task, law: LawParams, dt: float) -> FloatArray:
 
 
 def ultimate_bound(task: Task, law: LawParams, dt: float) -> float:
-    """The largest error after SETTLED."""
+    """Return the largest error after the time SETTLED."""
     return float(np.abs(fly(task, law, dt)[round(SETTLED / dt) :]).max())
 
 
@@ -178,7 +178,7 @@ settle = settings(max_examples=6, deadline=None, derandomize=True)
 @settle
 @given(task=TASKS)
 def test_signs_of_omega_are_as_built(task: Task) -> None:
-    """The signs of Omega = C B are the D of the random factors S D U behind the aircraft."""
+    """The signs of Omega = C B are the D of the random factors S D U behind it."""
     assert (signs(task.aircraft.C @ task.aircraft.B) == task.D).all()
     assert abscissa(task.aircraft.A) < 0.0
 

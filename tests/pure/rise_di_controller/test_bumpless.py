@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""No event in any mode makes u jump.
+"""Test that no event in any mode makes u jump.
 
-u is that of the controller, that which the aircraft applies, and that which a bridge sends.
+The tests check the u of the controller, the u that the aircraft applies, and the u that a bridge
+sends.
 
-u of the controller moves by a step of the law, by the ramp to trim or by the rate limit.
+In each tick, the u of the controller changes at most by a step of the law, by the ramp to trim or
+by the rate limit.
 """
 
 from collections.abc import Callable, Mapping
@@ -44,7 +46,7 @@ RETUNED: Mapping[str, Mapping[str, Any]] = {
 
 
 class Loop:
-    """A controller at 100 Hz, as its node runs it. Each u is checked."""
+    """Run a controller at 100 Hz as its node does, and check each u."""
 
     def __init__(self, **changes: Any) -> None:
         self._scenario = SCENARIO.vary(controller=changes)
@@ -67,21 +69,21 @@ class Loop:
 
     @property
     def mode(self) -> Mode:
-        """Mode of the controller."""
+        """Return the mode of the controller."""
         return self._controller.mode
 
     @property
     def u(self) -> FloatArray:
-        """The last u."""
+        """Return the last u."""
         return self._u
 
     @property
     def dt(self) -> float:
-        """The step of the law in the last tick, s; 0 at an engagement."""
+        """Return the step of the law in the last tick, s. At an engagement it is 0."""
         return self._dt
 
     def retune(self, name: str) -> None:
-        """Replace parameters by those of RETUNED."""
+        """Replace parameters by a set of RETUNED."""
         self._scenario = self._scenario.vary(controller=dict(RETUNED[name]))
         self._controller.retune(self._scenario.controller)
 
@@ -90,21 +92,21 @@ class Loop:
         self._active = active
 
     def configure(self, *, active: bool) -> None:
-        """Deactivate, clean up and configure between two ticks; activate too where `active`."""
+        """Deactivate, clean up and configure between two ticks, and activate again if `active`."""
         self._controller.restart()
         self.activate(active=active)
 
     def receive(self, *, y: bool = True, y_m: bool = True) -> None:
-        """Receive the samples of these topics from now on."""
+        """Choose which topics have samples from now on."""
         self._has_y = y
         self._has_y_m = y_m
 
     def replace_publisher(self) -> None:
-        """Another publisher of y, whose sensors differ."""
+        """Replace the publisher of y by one with other sensor errors."""
         self._offset = 0.03 - self._offset
 
     def overrun(self, duration: float) -> None:
-        """Run no tick for some seconds."""
+        """Let `duration` s pass without a tick."""
         self._now_ns += nanoseconds(duration)
 
     def ticks(self, count: int) -> None:
@@ -154,13 +156,12 @@ class Loop:
         self._u_ns = now_ns
 
     def _step_of_the_law(self, logged: Mapping[str, float]) -> FloatArray:
-        """The largest change of u in a tick of dt; 0 at an engagement, where dt is 0.
+        """Return the largest change of u that a tick may make, (m,).
 
-        e_p is the error one tick ago.
-
-        input_scale (K abs(e - e_p + Lambda dt (e + e_p) / 2) + dt beta), equation (23), and what
-        the limits kept back one tick ago; but at most SLEW dt. SLEW dt where u is outside of new
-        limits.
+        It is input_scale (K abs(e - e_p + Lambda dt (e + e_p) / 2) + dt beta), from equation (23),
+        plus the part that the limits held back one tick ago, and at most SLEW dt. e_p is the error
+        one tick ago. If u is outside of new limits, it is SLEW dt. At an engagement dt is 0, and so
+        is the result.
         """
         law = self._scenario.rise_di().law_params()
         limits = self._scenario.controller.guard().limits
@@ -280,7 +281,7 @@ FADING = (LARGEST + 2.0 * LARGEST) * STEP / RAMP
 
 
 class Applied:
-    """u that the aircraft applies at each step, of messages at 100 Hz."""
+    """Record the u that the aircraft applies at each step, while messages arrive at 100 Hz."""
 
     def __init__(self) -> None:
         self._input = AppliedInput(1, nanoseconds(HELD), nanoseconds(RAMP))
@@ -288,9 +289,9 @@ class Applied:
         self.u: list[float] = []
 
     def fly(self, duration: float, publisher: str | None = None, u: float | None = None) -> None:
-        """Fly with the messages of a publisher, None: without messages.
+        """Fly with the messages of a publisher, or without messages if `publisher` is None.
 
-        `u`: in place of the u of PUBLISHED.
+        If `u` is given, it replaces the u of PUBLISHED.
         """
         for _ in range(round(duration / STEP)):
             now_ns = nanoseconds(self._number * STEP)
@@ -306,9 +307,9 @@ class Applied:
 @pytest.mark.parametrize("silence", [0.0, 0.1, 0.3, 0.5, 1.0])
 @pytest.mark.parametrize("publisher", ["first", "restarted"])
 def test_u_that_returns_does_not_jump(publisher: str, silence: float) -> None:
-    """A publisher goes on with another u after the ramp has begun.
+    """A publisher sends another u after the ramp has begun, and u does not jump.
 
-    A restarted publisher does so at any time.
+    A restarted publisher may do so at any time.
     """
     u = PUBLISHED["first" if publisher == "first" and silence < HELD else "restarted"]
     aircraft = Applied()
@@ -334,9 +335,9 @@ def test_no_sequence_of_publishers_and_silences_makes_applied_u_jump(
 
 @pytest.mark.parametrize("duration", [0.05, 0.12, 0.2, 1.0])
 def test_overrun_leaves_u_where_aircraft_has_it(duration: float) -> None:
-    """The age limit, hold and ramp are equal.
+    """After an overrun, controller and aircraft have the same u within two periods of the ramp.
 
-    u of controller and aircraft are equal within two periods of the ramp.
+    They have the same age limit, hold and ramp.
     """
     loop = engaged_loop()
     before = loop.u
@@ -360,11 +361,10 @@ COMMANDED = 1.5  # u of the active controller, beyond the limits of each input o
 
 
 class Engagement:
-    """A bridge at 100 Hz with y, a controller and a conflicting controller of opposite u.
+    """Run a bridge at 100 Hz with y, a controller, and another controller with the opposite u.
 
-    The aircraft is far from trim while ENGAGED.
-
-    The node of the bridge activates the controller at an engagement. Each sent u is checked.
+    The aircraft is far from trim while the bridge is ENGAGED. The bridge's node activates the
+    controller at an engagement. Each sent u is checked.
     """
 
     def __init__(self) -> None:
@@ -397,11 +397,11 @@ class Engagement:
             self._check_sent(now_ns)
 
     def now_ns(self) -> int:
-        """The instant of the last tick."""
+        """Return the instant of the last tick, ns."""
         return nanoseconds(1000.0 + self._t)
 
     def _receive_u(self, sender: str, u: float, now_ns: int) -> None:
-        """As the receiver of the node."""
+        """Take or refuse a u as the receiver of the node does."""
         try:
             self.bridge.u_lock.check(sender, now_ns)
         except ChannelError:

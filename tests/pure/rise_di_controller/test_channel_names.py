@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A channel that is named twice: no log and no replay could tell the two apart."""
+"""Test that a channel may not be named twice: no log and no replay could tell the two apart."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from rise_di_controller.params import ControllerConfig
 
 
 def twice(names: Sequence[str]) -> list[str]:
-    """The names with the last but one in place of the last."""
+    """Return the names with the last but one repeated in place of the last."""
     return [*names[:-1], names[-2]]
 
 
@@ -42,7 +42,7 @@ def test_state_of_a_model_named_twice_refused(name: str) -> None:
 
 @pytest.mark.parametrize("law", ["pi", "pid", "l1"])
 def test_other_laws_refuse_it_too(law: str) -> None:
-    """The rule is that of every controller, not of the law."""
+    """Every controller has this rule, whichever law it flies."""
     parameters = find_scenario("osprey_servo").controller
     common = {key: getattr(parameters, key) for key in ControllerConfig.model_fields}
     names = twice(parameters.outputs)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Omega = S D U: the factors, the dependence of D, and refusals.
+"""Test the decomposition Omega = S D U: its factors, what D depends on, and what is refused.
 
-Further tests are of the pairing of channels with D = I.
+Further tests are about the pairing of channels that gives D = I.
 """
 
 import math
@@ -52,7 +52,7 @@ def product(sdu: SDU) -> FloatArray:
 
 
 def decomposed(Omega: FloatArray) -> SDU:
-    """S D U of Omega; examples without it are left out."""
+    """Return S D U of Omega. Hypothesis leaves out an Omega that has no such factors."""
     try:
         return decompose(Omega)
     except DecompositionError:
@@ -227,13 +227,16 @@ def test_search_keeps_bad_pairing_unless_u_limited() -> None:
 
 
 def test_search_changes_pairing_beyond_signs() -> None:
-    """Where no change of input signs gives D = I, the search changes the pairing."""
+    """If no change of the input signs gives D = I, the search also changes the pairing."""
     assert pairing_of(EXCHANGE)[:3] == ((0, 1), (1, 0), (1, 1))
 
 
 @pytest.mark.parametrize("m", [6, 16])
 def test_search_pairs_many_channels(m: int) -> None:
-    """Sixteen have (16!)^2 orders, 4e26, of which no computer tries all."""
+    """Many channels are paired in a short time.
+
+    Sixteen channels have (16!)^2 = 4e26 orders, which no computer can try one by one.
+    """
     random = np.random.default_rng(m)
     inputs = random.permutation(m)
     Omega = 0.02 * random.uniform(-1.0, 1.0, (m, m))
@@ -245,7 +248,7 @@ def test_search_pairs_many_channels(m: int) -> None:
 
 
 def test_coupling_without_own_response_is_infinite() -> None:
-    """The coupling is infinite where an output does not respond to the paired input."""
+    """The coupling is infinite if an output does not respond to its paired input."""
     assert coupling(np.array([[1.0, 1.0], [1.0, 0.0]])) == math.inf
     with pytest.raises(DecompositionError, match="found Omega_22 = 0"):
         unit_diagonal(np.array([[1.0, 1.0], [1.0, 0.0]]))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a law with a learned model diverges or oscillates, from its error."""
+"""Test how the error shows that a law with a learned model diverges or oscillates."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,10 @@ def test_running_mean_square_reaches_that_of_a_constant_error() -> None:
 
 
 def noise(frequency: float, damping: float) -> FloatArray:
-    """White noise through a resonance, as wind through a loop; frequency in Hz, rms 1."""
+    """Return white noise behind a resonance, like the wind's effect on a loop.
+
+    The frequency is in Hz, and the rms is 1.
+    """
     pole = np.exp(2.0 * np.pi * frequency * DT * (-damping + 1j * np.sqrt(1.0 - damping**2)))
     x = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], RANDOM.normal(size=len(T)))
     return np.asarray(x / np.std(x))
@@ -56,9 +59,9 @@ def noise(frequency: float, damping: float) -> FloatArray:
 def flown(
     e: FloatArray, learned: NDArray[np.bool_] = LEARNED, before: float = BEFORE
 ) -> divergence.Oscillations:
-    """The error of 20 s of the initial law, then e under a learned model.
+    """Return the error of 20 s under the initial law, followed by e under a learned model.
 
-    It ends where an oscillation is found.
+    The result ends where an oscillation is found.
     """
     oscillations = divergence.Oscillations(divergence.least(("q",)))
     for value in before * noise(1.0, 0.5)[:2000]:
@@ -103,7 +106,7 @@ def test_wind_and_small_oscillations_are_none(e: FloatArray) -> None:
 
 @pytest.mark.parametrize("amplitude, expected", [(0.05, True), (0.02, False)])
 def test_record_oscillates_by_more_than_is_harmless(amplitude: float, expected: bool) -> None:
-    """Harmless is an rms of 0.02 rad/s, an amplitude of 0.028."""
+    """An oscillation is harmless up to an rms of 0.02 rad/s, an amplitude of 0.028 rad/s."""
     y = np.stack(
         [amplitude * np.sin(2.0 * np.pi * 2.2 * T), RANDOM.normal(0.0, 1.0, len(T))], axis=1
     )

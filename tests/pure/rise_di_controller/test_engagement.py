@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bumpless transfer in flight: no event makes u jump, and tracking recovers.
+"""Test bumpless transfer in flight: no event makes u jump, and tracking recovers.
 
 The events are engagement, re-engagement and new gains.
 
-The servos are those of scenario osprey_servo, without noise, with sines as commands, at 100 Hz and
-in steps of 5 ms. The loop calls the controller as the node does. Events happen at ten random
-instants, one in each 4 s of 40 s.
+The servos are those of scenario osprey_servo. There is no noise, the commands are sines, the loop
+runs at 100 Hz, and it is integrated in steps of 5 ms. It calls the controller as the node does.
+Events happen at ten random instants, one in each 4 s of 40 s.
 """
 
 from collections.abc import Callable
@@ -73,7 +73,7 @@ class Tick(NamedTuple):
 
 @cache
 def references() -> FloatArray:
-    """y_m of the scenario at each tick, in the law's order."""
+    """Return y_m of the scenario at each tick, in the law's order."""
     y_m = simulate(SERVO)["y_m"]
     return np.column_stack([y_m[name] for name in SERVO.controller.outputs])[:4000]
 
@@ -85,9 +85,10 @@ def fly(
     *,
     latched: bool = True,
 ) -> list[Tick]:
-    """Simulate the scenario, or the reference y_m from the state x_0. Without latching e_0 is 0.
+    """Simulate the scenario, or fly the reference y_m from the state x_0.
 
-    New parameters are taken between two ticks by `retuning.retune_state`, as in the node.
+    Without latching e_0 is 0. New parameters take effect between two ticks by
+    `retuning.retune_state`, as in the node.
     """
     hardware = SERVO.aircraft.plant()
     aircraft = plant.initial_state(hardware)
@@ -132,7 +133,10 @@ def fly(
 
 
 def instants(seed: int) -> list[int]:
-    """Ten random ticks, one in the first 1.5 s of each 4 s, so that 2.5 s remain for the event."""
+    """Return ten random ticks, one in the first 1.5 s of each 4 s.
+
+    Then 2.5 s remain for the event.
+    """
     return [
         400 * i + int(offset)
         for i, offset in enumerate(np.random.default_rng(seed).integers(10, 150, 10))
@@ -140,7 +144,7 @@ def instants(seed: int) -> list[int]:
 
 
 def step_of_the_law(tick: Tick) -> FloatArray:
-    """Largest change of u by (23) in a tick.
+    """Return the largest change of u that (23) allows in a tick.
 
     It is input_scale (K abs(e - e_p + Lambda dt (e + e_p) / 2) + dt beta).
     """
@@ -161,7 +165,7 @@ def step_of_the_law(tick: Tick) -> FloatArray:
 def assert_no_jumps(records: list[Tick]) -> None:
     """Check that u changes only by a step of the law or by the ramp to trim.
 
-    It does not change at all at an engagement.
+    At an engagement it must not change at all.
     """
     for tick in records:
         if tick.after.mode is Mode.ENGAGED:
@@ -172,19 +176,18 @@ def assert_no_jumps(records: list[Tick]) -> None:
 
 
 def engagements(records: list[Tick]) -> list[int]:
-    """Numbers of the ticks that re-engaged the law."""
+    """Return the numbers of the ticks in which the law engaged again."""
     is_engaged = [tick.after.mode is Mode.ENGAGED for tick in records]
     return [k for k in range(1, len(is_engaged)) if is_engaged[k] > is_engaged[k - 1]]
 
 
 def assert_bumpless_re_engagement(records: list[Tick], modes: set[Mode]) -> None:
-    """Ten re-engagements from these modes without a jump of u.
+    """Check that ten re-engagements from these modes do not make u jump.
 
-    After each of them tracking recovers.
-
-    One second after each engagement q, p and r are close to the undisturbed flight; V, which is
-    slower, is nearer to it. Measured: within 4 mrad/s and 0.43 m/s, after errors of up to 120
-    mrad/s and 0.9 m/s at engagement.
+    Tracking must recover after each of them. One second after an engagement, q, p and r must be
+    close to the undisturbed flight, and V, which is slower, must be closer than at the engagement.
+    Measured were at most 4 mrad/s and 0.43 m/s, after errors of up to 120 mrad/s and 0.9 m/s at the
+    engagement.
     """
     instants = engagements(records)
     assert len(instants) == 10
@@ -205,7 +208,7 @@ def undisturbed() -> list[Tick]:
 
 
 def test_loop_equals_simulation_to_last_bit() -> None:
-    """The loop of this file gives the bits of the simulation."""
+    """The loop of this file computes the same bits as the simulation."""
     u = simulate(SERVO.vary(flight={"duration": 3.0}))["u"]
     assert (
         np.array([tick.after.u for tick in undisturbed()[: len(u.values)]]).tobytes()
@@ -246,7 +249,7 @@ def test_re_engagement_after_deactivation_is_bumpless(policy: str) -> None:
 
 
 def gains(rng: np.random.Generator, sign: str) -> ControllerConfig:
-    """The scenario's gains, each times a random factor between 0.6 and 1.4."""
+    """Return the scenario's gains, each times a random factor between 0.6 and 1.4."""
     section = SERVO.rise_di()
     changes = {}
     for key in ("k_d", "Lambda", "beta"):
@@ -295,7 +298,7 @@ OFF_TRIM = {"q": 0.1, "V": 2.0, "p": 0.2, "r": 0.1}
 
 @cache
 def upset(*, latched: bool) -> tuple[FloatArray, FloatArray]:
-    """Errors e (600, 4) and inputs u (600, 4) of 6 s in the law's order.
+    """Return the errors e and the inputs u of 6 s, (600, 4) each, in the law's order.
 
     Without latching e_0 is 0.
     """

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Feedforward: its numbers, its effect on the error, and bumpless transfer.
+"""Test the feedforward: its numbers, its effect on the error, and bumpless transfer.
 
-It is off by default.
+By default there is no feedforward.
 """
 
 from collections.abc import Callable, Mapping
@@ -73,13 +73,16 @@ CONTROLLER: dict[str, Any] = SERVO.controller.model_dump() | {
 
 
 def small_aircraft(rate: float = 100.0, **model: Any) -> ControllerConfig:
-    """A controller of the small aircraft; lead is half a period unless `model` has it."""
+    """Return a controller of the small aircraft.
+
+    The lead is half a period unless `model` has one.
+    """
     values = CONTROLLER | {"rate": rate, "feedforward": MODEL | {"lead": (0.5 / rate,) * 2} | model}
     return AnyLaw.validate_mapping(values, "controller")
 
 
 def reference(t: float) -> FloatArray:
-    """A reference that is at rest until 0 and moves afterwards.
+    """Return a reference that rests until t = 0 and moves afterwards.
 
     Its second derivative is continuous.
     """
@@ -94,9 +97,9 @@ def nominal_of(params: ControllerConfig) -> Nominal:
 
 
 def largest_error(params: ControllerConfig) -> float:
-    """Largest error in 6 s with the guard, sampled at the controller's rate.
+    """Return the largest error in 6 s behind the guard, sampled at the controller's rate.
 
-    The steps of the integration are a tenth of a period.
+    Ten integration steps make a period.
     """
     limits = params.guard()
     law = params.tuned_law()
@@ -175,7 +178,7 @@ def test_on_nominal_plant_feedforward_alone_leaves_sampling_error() -> None:
 
 
 def short(**changes: Any) -> Scenario:
-    """The manoeuvre and gusts of osprey_servo within 12 s."""
+    """Return osprey_servo with its manoeuvre and gusts shortened to 12 s."""
     pulses = {
         "q": {"start": [1.0, 4.0], "stop": [2.0, 5.0], "value": [0.1, -0.1]},
         "V": {"start": [0.5], "stop": [6.0], "value": [1.5]},
@@ -194,7 +197,7 @@ def short(**changes: Any) -> Scenario:
 
 
 def both(scenario: Scenario) -> tuple[Scenario, Scenario]:
-    """The scenario without feedforward, and with that of its airframe as published."""
+    """Return the scenario without feedforward and with the one of its published airframe."""
     config = with_feedforward(scenario.controller, scenario.aircraft.load()[0])
     return scenario.vary(controller={"feedforward": None}), scenario.vary(
         controller=config.model_dump()
@@ -206,9 +209,9 @@ def ticks(
     y: Callable[[float], FloatArray],
     missing: tuple[float, float] = (9.0, 9.0),
 ) -> list[ControllerState]:
-    """States at every 10 ms from 0.5 to 1.5 s, while the reference moves.
+    """Return the states at every 10 ms from 0.5 to 1.5 s, while the reference moves.
 
-    No samples are received in `missing`.
+    No samples arrive in the interval `missing`.
     """
     state = guard.initial_state(2)
     states = []
@@ -298,7 +301,7 @@ def test_an_unusable_nominal_model_is_refused(change: Mapping[str, Any], sentenc
 
 
 def test_feedforward_lowers_needed_beta() -> None:
-    """The gain beta has to exceed only the slew of the ideal input left over by the feedforward."""
+    """With a feedforward, beta only has to exceed the slew of the remaining ideal input."""
     # N_d is -D U times the slew of the ideal control less the slew of u_ff. For 20 aircraft at +-30
     # % in calm air the mean remainder is 20 %, 17 %, 20 % and 37 % of the slew of elevator, thrust,
     # aileron and rudder; the test allows half.
@@ -320,7 +323,10 @@ def test_feedforward_reduces_error_of_nominal_osprey_with_servos() -> None:
 
 
 def test_airframe_takes_the_states_of_a_feedforward_that_it_lacks() -> None:
-    """The bank angle of PX4's rates, which their airframe does without."""
+    """The airframe gets the states that a feedforward has and it lacks.
+
+    Here this is the bank angle, which the feedforward of PX4's rates has.
+    """
     scenario = find_scenario(str(REPOSITORY / "examples/px4_airplane/rates.yaml"))
     law = scenario.rise_di()
     former = law.feedforward

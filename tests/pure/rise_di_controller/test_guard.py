@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guard of the law: alignment of y_m, engagement, failsafe, saturation, anti-windup and the log."""
+"""Test the guard: alignment of y_m, engagement, failsafe, saturation, anti-windup and the log."""
 
 from collections.abc import Callable
 from typing import Any
@@ -129,7 +129,7 @@ def test_y_m_bounded_ahead_of_clock(offset: int) -> None:
 
 @pytest.mark.parametrize("signal", ["y", "y_m"])
 def test_controller_refuses_stamp_ahead_of_clock(signal: str) -> None:
-    """Else later samples with right stamps would be out of order."""
+    """A later sample with a right stamp would be out of order after a stamp ahead of the clock."""
     controller = Controller(PARAMS)
     take = controller.take_y if signal == "y" else controller.take_y_m
     with pytest.raises(ChannelError, match="ahead of the clock"):
@@ -161,7 +161,7 @@ BUSY: dict[str, Callable[[int], tuple[int, bool, bool]]] = {
 
 @pytest.mark.parametrize("case", BUSY)
 def test_stamp_of_u_is_that_of_its_y_and_never_goes_back(case: str) -> None:
-    """A receiver and the report take the stamps of a topic for a clock, also after a failsafe."""
+    """The receiver and the report use the stamps of a topic as its clock, also after a failsafe."""
     controller = Controller(PARAMS)
     stamps: list[int] = []
     used: list[int] = []
@@ -185,7 +185,7 @@ def test_stamp_of_u_is_that_of_its_y_and_never_goes_back(case: str) -> None:
 
 
 def test_new_sample_is_step_of_law() -> None:
-    """A new y is one step of the law, with the measured dt."""
+    """A new y causes one step of the law, with the measured dt."""
     first, second = run((0, sample(0, 1.0), [sample(0)]), (12, sample(12, 1.1), [sample(12)]))
     law_state = engage(np.full(4, 1.0), np.zeros(4))
     _, u = step(law_state, np.full(4, 1.1), np.zeros(4), np.array(0.012), PARAMS.law_params())
@@ -195,7 +195,10 @@ def test_new_sample_is_step_of_law() -> None:
 
 @pytest.mark.parametrize("gap_ms, dt_ms", [(1, 2), (25, 25), (80, 80), (110, 110), (111, 0)])
 def test_dt_is_the_time_that_passed_or_the_law_engages_again(gap_ms: int, dt_ms: int) -> None:
-    """At least a fifth of the period of 10 ms, at most the age limit of 100 ms and a period."""
+    """The step is between a fifth of the period and the age limit plus a period.
+
+    The period is 10 ms, and the age limit is 100 ms.
+    """
     (state,) = run((0, sample(0, 1.0), [sample(0)]))
     _, inputs = tick(state, gap_ms, sample(gap_ms, 1.0), [sample(gap_ms)])
     assert inputs is not None
@@ -211,9 +214,9 @@ def test_a_repeated_sample_changes_nothing() -> None:
 
 
 def test_failsafe_holds_ramps_and_re_engages(osprey_gust: Scenario) -> None:
-    """The input holds, then ramps to trim.
+    """The input holds and then ramps to trim.
 
-    Fresh samples re-engage the law without a jump of u.
+    Fresh samples engage the law again, and u does not jump.
     """
     params = osprey_gust.vary(controller={"max_age": 0.1, "hold": 0.2, "ramp": 0.4}).controller
     y = sample(10, 1.1)
@@ -272,7 +275,10 @@ def test_deactivation_holds_or_ramps_input_as_configured(
 
 
 def test_inactive_controller_commands_trim() -> None:
-    """A bridge engages only with a fresh u, and activates the controller after that."""
+    """An inactive controller sends the trim.
+
+    A bridge engages only with a fresh u, and activates the controller afterwards.
+    """
     state, inputs = tick(guard.initial_state(4), 0, None, [sample(0)], active=False)
     assert (state.mode, inputs) == (Mode.INACTIVE, None)
     state, inputs = tick(state, 0, sample(0, 1.0), [sample(0)], active=False)
@@ -297,7 +303,7 @@ STATES = st.builds(LawState, PAIRS, PAIRS, PAIRS, PAIRS)
 @pytest.mark.parametrize("sign", list(Sign))
 @given(state=STATES, y=PAIRS)
 def test_anti_windup_leaves_unsaturated_law(sign: Sign, state: LawState, y: FloatArray) -> None:
-    """Without saturation the law is the same to the last bit."""
+    """Without saturation, the law with anti-windup gives the same bits as the law alone."""
     law = TWO._replace(sign=sign)
     zero = np.zeros(2)
     dt = np.array(0.01)
@@ -323,7 +329,7 @@ def test_saturation_leaves_input_inside_limits(
 
 
 def test_saturation_moves_to_new_limits_at_rate() -> None:
-    """Without a limit of the rate u is inside at once."""
+    """A u outside of new limits moves back at the limited rate, or at once without such a limit."""
     u = np.array([5.0, -5.0])
     before = np.array([3.0, -3.0])
     for rate, expected in ((10.0, [2.9, -2.9]), (1000.0, [1.0, -1.0]), (np.inf, [1.0, -1.0])):

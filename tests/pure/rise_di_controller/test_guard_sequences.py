@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Any sequence of samples, losses, overruns and activations.
+"""Test any sequence of samples, losses, overruns and activations.
 
-The tests are of when the guard engages, how far u moves, when u is at trim, and that no stamp of u
+The tests check when the guard engages, how far u moves, when u is at trim, and that no stamp of u
 goes back.
 """
 
@@ -44,7 +44,7 @@ VALUES = st.sampled_from([-0.3, 0.0, 0.05, 1.0, 1e9])  # rad/s and m/s
 
 
 class Sequence(RuleBasedStateMachine):
-    """A guard, its clock and the newest samples, with the instant at which the failsafe began."""
+    """A guard with its clock, its newest samples and the instant at which the failsafe began."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -59,9 +59,9 @@ class Sequence(RuleBasedStateMachine):
 
     @rule(active=st.booleans(), policy=st.sampled_from([*PARAMS]))
     def activate(self, active: bool, policy: str) -> None:
-        """Activate or deactivate, with what u does after a deactivation.
+        """Activate or deactivate the guard, with a policy for u after a deactivation.
 
-        A held u may not change to a ramp.
+        A held u must not turn into a ramp.
         """
         if self.state.mode is not Mode.INACTIVE:
             self.guard = PARAMS[policy]
@@ -69,22 +69,22 @@ class Sequence(RuleBasedStateMachine):
 
     @rule(duration=st.integers(1, 1000))
     def overrun(self, duration: int) -> None:
-        """Run no tick for some ms."""
+        """Let `duration` ms pass without a tick."""
         self.now_ns += duration * MS
 
     @rule(offset=STAMPS, value=VALUES)
     def receive_y(self, offset: int, value: float) -> None:
-        """Receive a y, old or ahead of the clock too."""
+        """Receive a y, which may be old or ahead of the clock."""
         self.y = StampedVector(self.now_ns + offset, np.full(4, value))
 
     @rule(offset=STAMPS, value=VALUES)
     def receive_y_m(self, offset: int, value: float) -> None:
-        """Receive a y_m, which is kept where it is newer."""
+        """Receive a y_m, which is kept if it is newer."""
         self._keep_y_m(StampedVector(self.now_ns + offset, np.full(4, value)))
 
     @rule(count=st.integers(1, 12), offset=STAMPS, y=VALUES, y_m=VALUES)
     def fly(self, count: int, offset: int, y: float, y_m: float) -> None:
-        """Run ticks, each with a new y and a new y_m of one stamp, after which no y_m is."""
+        """Run ticks, each with a new y and a new y_m of the same stamp. No y_m is newer than y."""
         for k in range(count):
             stamp_ns = self.now_ns + offset
             self.y = StampedVector(stamp_ns, np.full(4, y))
@@ -148,7 +148,10 @@ class Sequence(RuleBasedStateMachine):
         assert self.state.u == pytest.approx(expected, rel=0.0, abs=EXACT)
 
     def _expected(self, ramped: float) -> tuple[FloatArray, Mode]:
-        """The u and the mode, `ramped` s after the end of the hold: a straight line to trim."""
+        """Return the expected u and mode, `ramped` s after the end of the hold.
+
+        u moves to trim along a straight line.
+        """
         part = min(max(ramped / CONFIG.ramp, 0.0), 1.0)
         mode = Mode.HOLD if ramped <= 0.0 else Mode.RAMP if part < 1.0 else Mode.TRIM
         return (1.0 - part) * self.begin_u, mode if self.active else Mode.INACTIVE

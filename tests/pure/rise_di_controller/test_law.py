@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A step of the law against hand-worked numbers and closed forms."""
+"""Test a step of the law against numbers by hand and against closed forms."""
 
 import copy
 from typing import Any
@@ -29,14 +29,14 @@ DT = 0.1
 
 
 def one_channel(sign: Sign, D: float = -1.0) -> LawParams:
-    """K = 2, Lambda = 3, beta = 4, input scale 1/2."""
+    """Return the law of one channel: K = 2, Lambda = 3, beta = 4 and an input scale of 1/2."""
     return law_params(
         gain(np.array(1.0), np.array([])), 3.0, 4.0, D, sign, input_scale=0.5, eps=0.1
     )
 
 
 def respond(params: LawParams, errors: list[float], dt: float = DT) -> list[float]:
-    """Inputs u of one channel for a series of errors, of which the first is that of engagement."""
+    """Return the inputs u of one channel for a series of errors, the first at the engagement."""
     state = engage(np.array([errors[0]]), np.zeros(1))
     inputs = []
     for e in errors[1:]:
@@ -74,7 +74,7 @@ def test_implicit_sign_zeroes_predicted_error() -> None:
 
 @pytest.mark.equation(21)
 def test_softened_sign_is_saturated_line() -> None:
-    """The softened sign is proportional inside the width and +-1 outside."""
+    """The softened sign is proportional within its width, and +-1 outside."""
     # e = 0.05, eps = 0.1: s = 0.5, Pi = 0.1 4 0.5 = 0.2, integral 0.0025: v = 2 (0.05 + 3 0.0025) +
     # 0.2 = 0.315
     assert respond(one_channel(Sign.SOFT), [0.0, 0.05]) == approx([0.1575], abs=1e-15)
@@ -132,7 +132,10 @@ def test_channels_do_not_mix(e: list[float]) -> None:
 
 @pytest.mark.parametrize("sign", [*Sign])
 def test_a_step_changes_none_of_its_arguments(sign: Sign) -> None:
-    """State, y, y_m and every parameter: gains are shared by all ticks and all aircraft."""
+    """A step changes neither the state, y and y_m nor a parameter.
+
+    All ticks and all aircraft share the gains.
+    """
     params = one_channel(sign)
     state = LawState(*(np.array([value]) for value in (1.0, 2.0, 3.0, 4.0)))
     y, y_m, dt, u_trim, u_before = (np.array([value]) for value in (1.5, 0.5, DT, 0.2, 0.1))
@@ -171,9 +174,9 @@ def test_retuned_law_keeps_its_input_also_where_the_sign_of_an_effect_changes() 
 def test_outward_increment_is_reduced_by_what_is_beyond(
     before: float, after: float, change: float, beyond: float, expected: float
 ) -> None:
-    """The formula of the docstring: a part of the increment, or `after` to the bit.
+    """The increment is reduced as the formula of the docstring says, or `after` stays to the bit.
 
-    It is a part where change and beyond have one sign.
+    It is reduced if `change` and `beyond` have the same sign.
     """
     values = (np.array([value]) for value in (before, after, change, beyond))
     integral = limited_integral(*values)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lost samples of y.
+"""Test what law and observer do when samples of y are lost.
 
-Law and observer predict over each period without a sample, no more and no less.
+They predict over each period without a sample, no more and no less.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ LAST = 80  # the last tick before the loss
 
 
 def samples(ticks: int) -> FloatArray:
-    """Samples of y, (ticks, 4): a slow motion and noise."""
+    """Return samples of y, (ticks, 4), with a slow motion and noise."""
     t = np.arange(ticks)[:, None] / 100.0
     noise = np.random.default_rng(6).normal(size=(ticks, 4))
     return 0.1 * np.sin(3.0 * t + np.arange(4.0)) + 0.002 * noise
@@ -32,7 +32,7 @@ def y_m_at(k: int) -> FloatArray:
 
 
 def flown(lost: int) -> tuple[ControllerState, ControllerState, FloatArray]:
-    """The states before and after the tick that follows `lost` samples, and the y of that tick."""
+    """Return the states before and after the tick that follows `lost` samples, and its y."""
     controller = Controller(OBSERVER)
     y = samples(LAST + lost + 2)
     before = controller.state
@@ -47,7 +47,7 @@ def flown(lost: int) -> tuple[ControllerState, ControllerState, FloatArray]:
 
 
 def by_hand(state: ControllerState, y: FloatArray, lost: int, predicted: int) -> ControllerState:
-    """A step of law, observer and feedforward after `predicted` predictions."""
+    """Make a step of law, observer and feedforward after `predicted` predictions."""
     guard, law = OBSERVER.guard(), OBSERVER.tuned_law()
     assert state.y is not None
     assert state.y_m is not None
@@ -77,9 +77,9 @@ def by_hand(state: ControllerState, y: FloatArray, lost: int, predicted: int) ->
 
 @pytest.mark.parametrize("lost", [0, 1, 2, 5])
 def test_law_predicts_over_every_lost_period(lost: int) -> None:
-    """The observer's estimates and u are those of as many predictions as samples are lost.
+    """For each lost sample the observer predicts once.
 
-    Those of one more or one less differ.
+    One prediction more or less gives other estimates and another u.
     """
     before, after, y = flown(lost)
     expected = by_hand(before, y, lost, lost)
@@ -91,9 +91,10 @@ def test_law_predicts_over_every_lost_period(lost: int) -> None:
 
 
 def test_prediction_keeps_the_estimates_of_a_motion_that_is_lost() -> None:
-    """Where no y comes the estimates move on as the model does.
+    """Without y the estimates follow the model.
 
-    After ten lost samples they are nearer to those without a loss than estimates that stood still.
+    After ten lost samples they are closer to those of a flight without a loss than estimates that
+    were kept constant.
     """
     count = 9
     before, after, y = flown(count)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ticks of the observer against hand-worked numbers, around a law that gives the trim."""
+"""Test ticks of the observer against numbers by hand, around a law that gives the trim."""
 
 from typing import Any
 
@@ -37,7 +37,10 @@ def vector(value: float) -> FloatArray:
 
 
 def params(bound: float = np.inf, rate: float = np.inf) -> ObserverParams:
-    """Phi = 0.5, Gamma = 2, H = 1, L = 0.25, F = 3, full after 0.5 s."""
+    """Return an observer with Phi = 0.5, Gamma = 2, H = 1, L = 0.25 and F = 3.
+
+    It has its full effect after 0.5 s.
+    """
     Phi, Gamma, H, L, F = (np.array([[value]]) for value in (0.5, 2.0, 1.0, 0.25, 3.0))
     return ObserverParams(
         law=(),
@@ -63,10 +66,7 @@ def measured(e: float, u_before: float = TRIM) -> Measurements:
 
 
 def respond(errors: list[float], observer: ObserverParams) -> list[float]:
-    """The inputs u less the trim for a series of errors.
-
-    The first error is that of engagement.
-    """
+    """Return the inputs u minus the trim for a series of errors, the first at the engagement."""
     law = with_observer(TRIM_LAW)
     state = law.engage(measured(errors[0]), observer)
     inputs = []
@@ -131,9 +131,9 @@ def test_filter_starts_in_its_steady_state_and_predicts_where_no_y_came() -> Non
 
 
 def test_new_observer_without_record_starts_from_error_and_trim_keeps_contribution() -> None:
-    """As after the first tick u stays 10.7.
+    """A new observer without a record starts from the error, z = H'e = 0.5, as at an engagement.
 
-    The estimate begins as at engagement, z = H'e = 0.5.
+    u keeps the 10.7 that it has after the first tick.
     """
     law = with_observer(TRIM_LAW)
     old = params()

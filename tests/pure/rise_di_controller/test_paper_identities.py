@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: D102, N802 - functions have the symbols of the paper as names
-"""The equations of the paper on a random plant, and its errata.
+"""Test the equations of the paper on a random plant, and its errata.
 
-Each erratum has a counterexample, and its repair.
+Each erratum has a counterexample and a repair.
 
-The closed loop here is the continuous one of the paper, (1), (2), (20), (21), integrated to 1e-10,
-to check the paper. The sampled law is `rise_di_controller.law.law`. The last test of the first
-part shows that it converges to the continuous one.
+The closed loop here is the continuous loop of the paper, (1), (2), (20), (21), integrated to 1e-10,
+so that the paper itself is checked. The sampled law is `rise_di_controller.law.law`. The last test
+of the first part shows that it converges to the continuous one.
 """
 
 from collections.abc import Callable
@@ -48,9 +48,9 @@ DIFFERENCED = 1e-5
 
 
 class Problem(NamedTuple):
-    """A plant (1) with f = W sin(G x + omega t), a model (2), and gains.
+    """A plant (1), a model (2), and gains.
 
-    The model has u_m = a sin(nu t + 1).
+    f = W sin(G x + omega t), and u_m = a sin(nu t + 1).
     """
 
     A: FloatArray
@@ -89,9 +89,9 @@ class Problem(NamedTuple):
 
 
 def random_problem(seed: int, n: int = 6, m: int = 3) -> Problem:
-    """Random plant with Omega = S D U: B = C^+ Omega plus a part that C does not see.
+    """Return a random plant with Omega = S D U.
 
-    A and A_m are shifted to be Hurwitz.
+    B = C^+ Omega plus a part that C does not see. A and A_m are shifted to be Hurwitz.
     """
     rng = np.random.default_rng(seed)
 
@@ -128,7 +128,7 @@ def random_problem(seed: int, n: int = 6, m: int = 3) -> Problem:
 class Loop:
     """The closed loop (1), (2), (20), (21), and its signals at an instant.
 
-    No e_i changes sign over the interval.
+    No e_i changes its sign in the interval.
     """
 
     p: Problem
@@ -145,12 +145,12 @@ class Loop:
         return x, x_m, integral_e, Pi
 
     def e(self, t: float) -> FloatArray:
-        """Equation (3)."""
+        """Return e by equation (3)."""
         x, x_m, _, _ = self.unpack(t)
         return np.asarray(self.p.C @ x - self.p.C @ x_m)
 
     def u(self, t: float) -> FloatArray:
-        """Equation (20)."""
+        """Return u by equation (20)."""
         _, _, integral_e, Pi = self.unpack(t)
         return (
             -self.p.D * (self.p.K * (self.e(t) - self.e_0 + self.p.Lambda * integral_e))
@@ -168,41 +168,39 @@ class Loop:
         return np.asarray(self.p.C @ (self.x_dot(t) - self.x_m_dot(t)))
 
     def r(self, t: float) -> FloatArray:
-        """Equation (4)."""
+        """Return r by equation (4)."""
         return self.e_dot(t) + self.p.Lambda * self.e(t)
 
     def z(self, t: float) -> FloatArray:
         return np.concatenate([self.e(t), self.r(t)])
 
     def u_dot(self, t: float) -> FloatArray:
-        """Equation (23)."""
+        """Return u_dot by equation (23)."""
         return -self.p.D * self.p.K * self.r(t) - self.p.D * self.p.beta * np.sign(self.e(t))
 
     def f_dot(self, t: float) -> FloatArray:
         return self.p.f_dot(t, self.unpack(t)[0], self.x_dot(t))
 
     def unforced(self, t: float) -> FloatArray:
-        """r_dot without the term of u_dot."""
+        """Return r_dot without the term of u_dot."""
         p = self.p
         plant = p.C @ p.A @ self.x_dot(t) + p.C @ self.f_dot(t)
         model = p.C @ p.A_m @ self.x_m_dot(t) + p.C @ p.B_m @ p.u_m_dot(t)
         return np.asarray(plant - model + p.Lambda * self.e_dot(t))
 
     def r_dot(self, t: float) -> FloatArray:
-        """Equation (12)."""
+        """Return r_dot by equation (12)."""
         return np.asarray(self.unforced(t) + self.p.C @ self.p.B @ self.u_dot(t))
 
     def N(self, t: float) -> FloatArray:
-        """Equation (15)."""
+        """Return N by equation (15)."""
         return np.asarray(self.M @ self.unforced(t) + self.e(t))
 
     def split(self, t: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Equations (17), (18) with x_urho = 0, so c1 = 0 in (7).
+        """Return N_d and N~ of (17) and (18), and the term that the paper puts into N~.
 
-        They give N_d, N~, and the term that the paper puts into N~.
-
-        x_o = C^+ C x is the part that the outputs show, x_u the rest, likewise for the model. The
-        term is -M C A_m x_mu_dot.
+        The term is -M C A_m x_mu_dot. x_o = C^+ C x is the part of x that the outputs show, and x_u
+        is the rest, likewise for the model. With x_urho = 0, c1 is 0 in (7).
         """
         p = self.p
         projection = np.linalg.pinv(p.C) @ p.C
@@ -217,17 +215,17 @@ class Loop:
         return N_d, N_tilde, -self.M @ p.C @ p.A_m @ (x_m_dot - x_mo_dot)
 
     def switched(self, t: float) -> FloatArray:
-        """D U D beta Sgn(e)."""
+        """Return D U D beta Sgn(e)."""
         return np.asarray(
             (self.p.D[:, None] * self.p.U * self.p.D) @ (self.p.beta * np.sign(self.e(t)))
         )
 
     def coupled(self, t: float) -> FloatArray:
-        """D (U - I) D K r."""
+        """Return D (U - I) D K r."""
         return np.asarray(self.p.D * ((self.p.U - np.eye(3)) @ (self.p.D * self.p.K * self.r(t))))
 
     def V1(self, t: float) -> float:
-        """Equation (31)."""
+        """Return V1 by equation (31)."""
         e = self.e(t)
         r = self.r(t)
         return float(e @ e + r @ self.M @ r) / 2.0
@@ -275,26 +273,26 @@ def loop() -> Loop:
 def differenced(
     signal: Callable[[float], FloatArray | float], t: float, h: float = 1e-3
 ) -> FloatArray:
-    """The derivative of a signal by the fourth-order central difference."""
+    """Return the derivative of a signal by the central difference of fourth order."""
     s = [np.asarray(signal(t + k * h)) for k in (-2, -1, 1, 2)]
     return np.asarray((s[0] - 8.0 * s[1] + 8.0 * s[2] - s[3]) / (12.0 * h))
 
 
 def close(a: FloatArray | float, b: FloatArray | float, tolerance: float) -> bool:
-    """Whether two values agree, relative to their size where that is above one."""
+    """Return whether two values agree. If they are larger than 1, the tolerance is relative."""
     return bool(np.max(np.abs(np.asarray(a) - b)) < tolerance * max(1.0, float(np.max(np.abs(b)))))
 
 
 @pytest.mark.equation(4)
 def test_r_of_4_differentiates_3(loop: Loop) -> None:
-    """e_dot of the simulation, and so r of (4), is the derivative of (3)."""
+    """The simulated e_dot is the derivative of (3), so r of (4) is right."""
     for t in INSTANTS:
         assert close(loop.e_dot(t), differenced(loop.e, t), DIFFERENCED)
 
 
 @pytest.mark.equation(10, 11)
 def test_r_of_10_is_r_of_4(loop: Loop) -> None:
-    """(10) writes r of (4) in terms of the plant."""
+    """Equation (10) gives the r of (4) in terms of the plant."""
     p = loop.p
     for t in INSTANTS:
         x, x_m, _, _ = loop.unpack(t)
@@ -371,7 +369,7 @@ def test_25_and_26_give_Phi_without_last_entry(loop: Loop) -> None:
 
 @pytest.mark.equation(27)
 def test_27_bounds_Phi() -> None:
-    """(27) holds where zeta_U bounds every entry of U."""
+    """(27) is true if zeta_U bounds every entry of U."""
     # abs(Phi_i) <= zeta_U sum_(j>i) k_j abs(r_j); with a zeta_U below 0.9 max abs(U_ij), r along
     # that j violates it.
     p = random_problem(4)
@@ -387,7 +385,7 @@ def test_27_bounds_Phi() -> None:
 
 @pytest.mark.equation(32)
 def test_V1_dot_of_32_has_gain_22(loop: Loop) -> None:
-    """The gain (22) gives three squares in V1_dot of (32)."""
+    """With the gain (22), V1_dot of (32) consists of three squares."""
     k_g = 1.0
     k_d = np.array([3.0, 1.5, 0.0])
     for t in INSTANTS:
@@ -427,9 +425,9 @@ def test_sampled_law_converges_to_20_with_period(loop: Loop, sign: Sign) -> None
 
 
 def at_rest() -> Loop:
-    """The instant t = 0 of a loop with z = 0.
+    """Return a loop that has z = 0 at t = 0.
 
-    y is on y_m, and f is such that y_dot is on y_m_dot with u = 0.
+    y is equal to y_m, and f is such that y_dot = y_m_dot with u = 0.
     """
     p = random_problem(4)
     x_m = np.array([0.4, -0.8, 0.5, 0.9, -0.3, 0.7])
@@ -442,7 +440,7 @@ def at_rest() -> Loop:
 
 @pytest.mark.equation(16, 17, 18)
 def test_N_d_at_rest_is_ideal_slew() -> None:
-    """At rest N_d = -D U times the slew of the ideal input."""
+    """With z = 0, N_d is -D U times the slew of the ideal input."""
     # u* = Omega^-1 (y_m_dot - C A x - C f) keeps e = 0; beta has to exceed its slew along the
     # flight.
     loop = at_rest()
@@ -471,7 +469,7 @@ def test_N_d_at_rest_is_ideal_slew() -> None:
 
 @pytest.mark.equation(19)
 def test_N_tilde_of_18_contradicts_19() -> None:
-    """N_tilde as in (18) does not vanish with z, so (19) is false."""
+    """N_tilde of (18) does not vanish with z, so that (19) is false."""
     loop = at_rest()
     assert np.linalg.norm(loop.z(0.0)) < 1e-12
     _, N_tilde, term = loop.split(0.0)
@@ -480,7 +478,7 @@ def test_N_tilde_of_18_contradicts_19() -> None:
 
 @pytest.mark.equation(19)
 def test_moved_reference_term_restores_19(loop: Loop) -> None:
-    """N_tilde vanishes with z once the term of the reference is part of N_d."""
+    """N_tilde vanishes with z if the term of the reference is moved to N_d."""
     _, N_tilde, _ = at_rest().split(0.0)
     assert np.linalg.norm(N_tilde) < 1e-12
     p = loop.p  # for z != 0 it is linear in z, so (19) holds with a constant rho
@@ -494,7 +492,7 @@ def test_moved_reference_term_restores_19(loop: Loop) -> None:
 
 @pytest.mark.equation(30)
 def test_bound_30_sums_row_of_U() -> None:
-    """The bound in (30) has two indices: row i sums the entries of row i of U."""
+    """The bound in (30) needs two indices, because row i sums the entries of row i of U."""
     # Psi = (D U D - I) beta Sgn(e): over all signs the maximum of its i-th entry is sum_(j>i)
     # abs(U_ij) beta_j.
     p = random_problem(4)
@@ -506,9 +504,9 @@ def test_bound_30_sums_row_of_U() -> None:
 
 
 def coupled_flight(beta: FloatArray) -> float:
-    """The largest e after 6 s with U_12 = 3 in the small example.
+    """Return the largest e after 6 s of the small example with U_12 = 3.
 
-    K_1 is increased as step 3 requires.
+    K_1 is increased, as step 3 of the paper requires.
     """
     case = example(0.0025, 15.0)
     S, D = decompose(case.plant.C @ case.plant.B)[:2]
@@ -525,7 +523,7 @@ def coupled_flight(beta: FloatArray) -> float:
 
 @pytest.mark.equation(30)
 def test_beta_from_row_j_fails() -> None:
-    """A beta with row j of U in place of entry ij does not track."""
+    """A beta computed with row j of U in place of entry ij does not track."""
     # The last row of U has only its diagonal entry, so with this index the condition is beta_1 >=
     # zeta_Nd,1 only.
     assert coupled_flight(np.array([2.1, 2.1])) > 5e-3  # measured 1.3e-2 for any period
@@ -538,9 +536,9 @@ def test_beta_that_counts_entry_ij_of_U_tracks() -> None:
 
 
 def lemma_1_ratio(T: float) -> float:
-    """The ratio of the integrals of abs(e_dot) and abs(e) over 1..T for e = sin(t^2)/t.
+    """Return the ratio of the integrals of abs(e_dot) and abs(e) over 1..T for e = sin(t^2)/t.
 
-    It is computed in s = t^2, 8 midpoints a radian.
+    The integrals are taken over s = t^2, with 8 midpoints per radian.
     """
     ds = (T * T - 1.0) / round(8 * T * T)
     s = np.arange(1.0 + ds / 2.0, T * T, ds)
@@ -552,7 +550,7 @@ def lemma_1_ratio(T: float) -> float:
 
 @pytest.mark.equation(40)
 def test_40_has_counterexample() -> None:
-    """(40) fails for a bounded e with a bounded derivative that tends to zero."""
+    """(40) is false for a bounded e that tends to zero and has a bounded derivative."""
     # (40) keeps the ratio below gamma_2 + (gamma_1 + sup abs(e)) / integral abs(e), which falls
     # with T. For e = sin(t^2)/t, abs(e_dot) <= 3, the ratio grows like T / log T, so no gamma_1,
     # gamma_2 exist.
@@ -561,7 +559,7 @@ def test_40_has_counterexample() -> None:
 
 @pytest.mark.equation(40)
 def test_gamma_2_grows_as_period_falls() -> None:
-    """gamma_2 of the sampled law with the literal sign is not bounded over the period."""
+    """gamma_2 of the sampled law with the literal sign grows without bound as the period falls."""
     # Chatter decreases with dt, its slope more slowly: (29) with this gamma_2 requires a beta that
     # grows without bound.
     ratios = []
@@ -581,11 +579,10 @@ def test_gamma_2_grows_as_period_falls() -> None:
 def replayed(
     cycle: counterexample.Cycle, e_dot_0: float, dt: float = 2e-4, acts: float = 1.0
 ) -> float:
-    """The largest e in the last half second of 4 s under the sampled law.
+    """Return the largest e in the last half second of 4 s under the sampled law.
 
-    y_dot = u + f(t), f the recorded one, e(0) = 0.
-
-    f is periodic, with f(t + half a period) = -f(t) up to a constant, which sets e_dot(0) = f(0):
+    The plant is y_dot = u + f(t) with the recorded f, and e(0) = 0. f is periodic. After half a
+    period it has the opposite sign, up to a constant. The constant sets e_dot(0) = f(0), because
     the law engages with u = 0.
     """
     half = cycle.t[-1]
@@ -608,7 +605,7 @@ def replayed(
 
 @pytest.mark.equation(29)
 def test_no_beta_serves_every_f() -> None:
-    """For every beta some f within the same bounds keeps the error from zero."""
+    """For every beta there is an f within the same bounds that keeps the error away from zero."""
     # K = 10, Lambda = 1, so Q = diag(1, 9) > 0, and abs(f_dot) <= 1. The formula is the limit of a
     # large beta: 2.6 % at 2.
     for beta, tolerance in ((2.0, 0.03), (1000.0, 1e-3)):
@@ -622,7 +619,7 @@ def test_no_beta_serves_every_f() -> None:
 
 
 def test_recorded_f_has_same_limit() -> None:
-    """The recorded f as a function of time leads the sampled law to the same limit."""
+    """The recorded f leads the sampled law to the same limit cycle as a function of time."""
     # From 10 % beside the cycle. Measured 2.9 % below it at 0.2 ms and 0.3 % at 0.05 ms.
     cycle = counterexample.limit_cycle(2.0)
     assert replayed(cycle, 1.1 * cycle.e_dot[0]) == approx(np.max(cycle.e), rel=0.05)
@@ -630,7 +627,7 @@ def test_recorded_f_has_same_limit() -> None:
 
 
 def test_same_f_allows_convergence() -> None:
-    """The same f lets the error vanish from rest, and at a longer period."""
+    """With the same f, the error vanishes from rest, and also at a longer period."""
     # beta exceeds abs(f_dot), so e = 0 solves the loop too. The theorem claims convergence from
     # every start. At beta = 20 the cycle attracts so weakly that the sampling of 0.2 ms takes the
     # law off it.
@@ -642,7 +639,7 @@ def test_same_f_allows_convergence() -> None:
 
 @pytest.mark.equation(47)
 def test_classical_condition_replaces_lemma_1() -> None:
-    """With U = I the classical condition keeps P positive."""
+    """With U = I, the classical condition keeps P positive."""
     # beta_i > sup abs(N_d,i) + sup abs(N_d,i_dot) / Lambda_i and zeta_b = sum beta_i abs(e_i(0)) -
     # e(0)' N_d(0).
     case = example(0.005, 15.0)
@@ -662,7 +659,7 @@ def test_classical_condition_replaces_lemma_1() -> None:
 
 
 def test_invertible_matrix_may_lack_decomposition() -> None:
-    """A matrix with a leading minor of zero has no decomposition."""
+    """A matrix whose leading minor is zero has no decomposition."""
     # (S D U)_11 = S_11 d_1 is never zero, so no choice of S, D, U gives [[0, 1], [1, 0]].
     with pytest.raises(DecompositionError, match="leading minor 1"):
         decompose(np.array([[0.0, 1.0], [1.0, 0.0]]))
@@ -672,9 +669,9 @@ def test_invertible_matrix_may_lack_decomposition() -> None:
 
 
 def hidden_state(pole: float) -> tuple[float, float]:
-    """The largest x_2 and the last e of a plant whose zero is `pole`, on sin t.
+    """Return the largest x_2 and the last e on the reference sin t for a zero at `pole`.
 
-    x_1_dot = x_2 + u, x_2_dot = pole x_2 + x_1, y = x_1.
+    The plant is x_1_dot = x_2 + u, x_2_dot = pole x_2 + x_1, y = x_1.
     """
     plant = KnownPlant(
         np.array([[0.0, 1.0], [1.0, pole]]), np.eye(2, 1), np.eye(1, 2), lambda *_: np.zeros(2)
@@ -711,7 +708,7 @@ def test_servo_between_u_and_plant_makes_Omega_zero() -> None:
 
 
 def behind_a_servo(T_eps: float) -> float:
-    """The largest e over eps in the last of 10 s: y_dot = u behind a servo of 20 ms.
+    """Return the largest e / eps in the last of 10 s for y_dot = u behind a servo of 20 ms.
 
     The sign is softened, and e(0) = eps / 2.
     """
@@ -729,7 +726,7 @@ def behind_a_servo(T_eps: float) -> float:
 
 
 def test_softened_sign_settles_within_routh_limit() -> None:
-    """The loop with a servo settles inside the limit of Routh."""
+    """The loop with a servo settles within the limit of Routh's criterion."""
     # Lambda + 1/T_eps < 1/tau, so T_eps > 20.4 ms at Lambda = 1, and somewhat more for the lag of
     # sampling, 0.75 ms.
     assert behind_a_servo(0.8 * 0.0204) > 0.5  # measured 1.5: a limit cycle, because s saturates
@@ -737,7 +734,7 @@ def test_softened_sign_settles_within_routh_limit() -> None:
 
 
 def osprey(gust: float = 0.0) -> dynamics.Aircraft:
-    """The osprey in a vertical gust of this speed at t = 0."""
+    """Return the osprey in a vertical gust of the given speed, which begins at t = 0."""
     gusts = {"vertical": Gust(start=0.0, speed=gust, length=15.24)}
     return AircraftConfig(airframe="osprey", rate=100.0, step=0.01, gusts=gusts).load()[1]
 
@@ -746,9 +743,9 @@ V, ALPHA, Q, THETA = range(4)
 
 
 def gravity_slope(q: float) -> float:
-    """The V part of f_dot in level flight at the pitch rate q.
+    """Return the V part of f_dot in level flight at the pitch rate q.
 
-    It is the difference of f over 1 us of theta_dot = q.
+    It is the difference quotient of f over 1 us of theta_dot = q.
     """
     aircraft = osprey()
     x = np.zeros(8)
@@ -758,7 +755,10 @@ def gravity_slope(q: float) -> float:
 
 @pytest.mark.equation("Assumption 2")
 def test_f_dot_grows_with_pitch_rate() -> None:
-    """f_dot of gravity grows with q, so Assumption 2 presumes a bounded flight."""
+    """The part of f_dot from gravity grows with q.
+
+    So Assumption 2 presumes that the flight is bounded.
+    """
     assert [gravity_slope(q) for q in (1.0, 10.0, 100.0)] == approx(
         [-GRAVITY, -10.0 * GRAVITY, -100.0 * GRAVITY]
     )
@@ -766,7 +766,10 @@ def test_f_dot_grows_with_pitch_rate() -> None:
 
 @pytest.mark.equation("Assumption 2")
 def test_f_dot_is_bounded_by_z() -> None:
-    """f_dot of gravity is bounded by z once the part with q - q_m is in N_tilde."""
+    """The part of f_dot from gravity is bounded by z.
+
+    For this, its part with q - q_m must be put into N_tilde.
+    """
     q_m = 0.1
     for e_q in (-10.0, -0.1, 0.1, 10.0):
         assert abs(gravity_slope(q_m + e_q) - gravity_slope(q_m)) <= GRAVITY * abs(e_q) * (
@@ -776,7 +779,10 @@ def test_f_dot_is_bounded_by_z() -> None:
 
 @pytest.mark.equation(5, 6, 7, 8, 9)
 def test_bound_7_fails_in_gust() -> None:
-    """In a gust alpha leaves trim while e is zero, so (7) cannot hold at every instant."""
+    """(7) cannot be true at every instant.
+
+    In a gust alpha leaves the trim while e is zero.
+    """
     # The ideal input keeps the outputs at trim, x_m = 0: z = 0, but alpha rises to 21.1 deg, so x_u
     # <= c1 norm(z) is false.
     aircraft = osprey(gust=10.12)
@@ -793,9 +799,9 @@ def test_bound_7_fails_in_gust() -> None:
 
 
 def largest_y_m_ddot(model: ReferenceMatrices, rise: float) -> float:
-    """The peak of abs(y_m_ddot) for a command that rises to one within `rise` seconds.
+    """Return the peak of abs(y_m_ddot) for a command that rises to one within `rise` s.
 
-    It is by second differences.
+    It is found with second differences.
     """
     one = np.ones((1, 1))
     zero = np.zeros(1)
@@ -815,7 +821,7 @@ def largest_y_m_ddot(model: ReferenceMatrices, rise: float) -> float:
 
 
 def test_first_order_model_unbounds_N_d() -> None:
-    """A step command through a model of first order makes N_d unbounded."""
+    """A command step through a first-order model makes N_d unbounded."""
     # y_m_ddot contains C B_m u_m_dot = 4 / rise: a tenth of the rise needs ten times the beta, and
     # no beta suffices for a step.
     first_order = ReferenceMatrices(np.array([[-4.0]]), np.array([[4.0]]), np.array([[1.0]]))
@@ -824,7 +830,7 @@ def test_first_order_model_unbounds_N_d() -> None:
 
 
 def test_second_order_model_bounds_N_d() -> None:
-    """N_d stays bounded for any step."""
+    """N_d stays bounded for any command step through a second-order model."""
     # C B_m = 0, and y_m_ddot <= omega^2 = 16.
     model = second_order(np.array([4.0]), np.array([0.9]))
     assert all(largest_y_m_ddot(model, rise) < 16.1 for rise in (0.1, 0.01, 0.001))

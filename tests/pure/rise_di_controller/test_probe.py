@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The probe of the inputs while engaged, and the test of the answer."""
+"""Test the probe of the inputs during an engagement, and the test of the response."""
 
 from functools import cache
 from typing import Any
@@ -29,12 +29,12 @@ EFFECT = (0.02, 0.02, 0.02, 0.0)  # rad/s, the default
 
 
 def with_probe(**values: Any) -> dict[str, Any]:
-    """Changes of a controller."""
+    """Return the changes that give a controller a probe."""
     return {"probe": {"effect": EFFECT, "window": WINDOW} | values}
 
 
 def probed(duration: float, *faults: str) -> Scenario:
-    """The osprey in calm air, without commands, with the default probe."""
+    """Return the osprey with the default probe, in calm air and without commands."""
     calm = find_scenario("osprey_servo", duration)
     still = calm.reference_model.model_copy(update={"pulses": {}, "coordinated_turn": None})
     return calm.vary(
@@ -48,7 +48,7 @@ def jammed(surface: str) -> Tape:
 
 
 def alarms(tape: Tape) -> list[tuple[float, str]]:
-    """(t, sentence) of each test that finds an input without effect."""
+    """Return (t, sentence) for each test that finds an input without effect."""
     effects = tape["effects"]
     reasons = (reason_against_inputs(effects.names, row) for row in effects.values.tolist())
     rows = zip(tape.time("effects").tolist(), reasons, strict=True)
@@ -64,7 +64,10 @@ def test_surface_stuck_in_trim_in_calm_air_is_seen_and_no_other(surface: str) ->
 
 
 def test_healthy_surfaces_are_not_called_stuck_in_commands_and_gusts() -> None:
-    """With the commands and the two gusts of the scenario: 80 tests of three surfaces."""
+    """No healthy surface is reported as stuck during commands and two gusts.
+
+    More than 80 windows of three surfaces are tested.
+    """
     tape = simulate(
         find_scenario("osprey_servo", 48.0).vary(
             controller=with_probe(),
@@ -82,7 +85,10 @@ def test_flight_with_a_probe_replays_to_the_bit() -> None:
 
 
 def test_sines_are_orthogonal_over_the_window_and_tell_u_alone() -> None:
-    """Two sines have whole numbers of periods in a window, so each is seen without the other."""
+    """The sines have whole numbers of periods in a window.
+
+    So each is seen without the others.
+    """
     controller = probed(20.0).controller
     probe = controller.guard().probe
     assert probe is not None
@@ -94,14 +100,17 @@ def test_sines_are_orthogonal_over_the_window_and_tell_u_alone() -> None:
 
 
 def test_weakest_input_has_the_lowest_frequency() -> None:
-    """The rudder of the osprey has a sixth of the elevator's effect (input_scale)."""
+    """The rudder has the lowest frequency, because its effect is a sixth of the elevator's."""
     probe = probed(20.0).controller.guard().probe
     assert probe is not None
     assert probe.harmonic[:3].argmin() == 2
 
 
 def test_engagement_begins_at_the_u_of_before() -> None:
-    """The first u of the law differs by a step of it: 0.01 rad/s of K e at most, of noise."""
+    """The first u of the law is close to the last u before the engagement.
+
+    It differs by one step of the law, which is at most 0.01 rad/s of K e from noise.
+    """
     tape = jammed("elevator")
     u = tape["internals"]
     first = u.values[:2, [u.names.index(f"u.{name}") for name in SURFACES]]
@@ -115,7 +124,11 @@ def test_engagement_begins_at_the_u_of_before() -> None:
 
 
 def test_false_alarms_are_no_more_than_stated() -> None:
-    """Of a surface with the least effect, in white noise: y = LEAST_EFFECT gain u + noise."""
+    """The rate of false alarms is at most the stated one.
+
+    The surface has the least effect that still passes, in white noise: y = LEAST_EFFECT gain u +
+    noise.
+    """
     false_alarm, trials = 0.05, 400
     probe = Probe(np.array([0.01]), np.array([12.0]), nanoseconds(WINDOW))
     random = np.random.default_rng(7)
@@ -157,7 +170,7 @@ def test_probe_that_cannot_be_measured_refused(changes: dict[str, Any], sentence
 
 
 def test_what_has_no_probe_refuses_one() -> None:
-    """Effectors of an allocation, the C code and campaigns."""
+    """An allocation, the C code and campaigns refuse a probe, because they do not fly one."""
     with pytest.raises(ParameterError, match="probe: found an allocation beside it"):
         find_scenario("x8_elevons").vary(controller={"probe": {"window": WINDOW}})
     with pytest.raises(ParameterError, match=r"controller\.probe"):

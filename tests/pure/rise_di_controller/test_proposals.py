@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Proposals of a learner as the controller takes or refuses them.
-
-They come in real time and in simulated time.
-"""
+"""Test which proposals of a learner the controller takes or refuses, in real and simulated time."""
 
 import math
 import re
@@ -63,7 +60,7 @@ class Flight:
         self.engage()
 
     def engage(self) -> ControlOutput:
-        """A tick with y and y_m of now."""
+        """Run a tick with a new y and y_m."""
         now = StampedVector(self.now_ns, np.zeros(len(START.outputs)))
         self.controller.take_y(now, self.now_ns)
         self.controller.take_y_m(now, self.now_ns)
@@ -73,7 +70,7 @@ class Flight:
         return output
 
     def receive(self, change: dict[str, Any] | None = None, **replaced: Any) -> None:
-        """A proposal of now."""
+        """Receive a proposal with the present stamp."""
         digest = self.controller.digest
         proposal = Proposal(
             stamp_ns=self.now_ns,
@@ -85,7 +82,7 @@ class Flight:
         self.learning.receive(proposal._replace(**replaced), self.controller, self.now_ns)
 
     def step(self, count: int = 20) -> int:
-        """Steps until the parameters change; how many it took."""
+        """Make steps until the parameters change, and return how many it took."""
         for k in range(count):
             if self.learning.step(self.controller, self.now_ns) is not None:
                 return k + 1
@@ -93,7 +90,7 @@ class Flight:
 
     @property
     def sentences(self) -> list[str]:
-        """What happened."""
+        """Return the sentences of the events."""
         return [event.sentence for event in self.events]
 
 
@@ -279,7 +276,10 @@ def test_second_and_late_proposals_are_refused() -> None:
 
 
 def test_empty_proposal_of_a_test_delays_and_refuses_nothing() -> None:
-    """The learner tests the aircraft every 2 s, also while a model is certified."""
+    """An empty proposal tells that a test was passed; it delays and refuses no model.
+
+    The learner tests the aircraft every 2 s, also while a model is certified.
+    """
     flight = Flight()
     flight.receive({}, sentence=None)
     flight.receive()  # 0 s later: a proposal would be too soon
@@ -463,7 +463,10 @@ def test_law_of_the_start_flies_where_all_parts_oscillate() -> None:
 
 
 def diverge(flight: Flight, monkeypatch: pytest.MonkeyPatch, *outputs: str) -> None:
-    """A step in which outputs diverge; the window of the next proposal is 10 s later."""
+    """Make a step in which outputs diverge.
+
+    The next window for a proposal is 10 s later, and time moves on to it.
+    """
     monkeypatch.setattr(flight.controller, "diverging", lambda: outputs)
     flight.step(1)
     monkeypatch.undo()
@@ -471,7 +474,7 @@ def diverge(flight: Flight, monkeypatch: pytest.MonkeyPatch, *outputs: str) -> N
 
 
 def faded(time: float) -> dict[str, Any]:
-    """A change to a model that differs from CHANGE in one number."""
+    """Return a change to a model that differs from CHANGE in one number."""
     return CHANGE | {"observer.fade": time}
 
 
@@ -507,7 +510,10 @@ def test_parameters_that_diverged_are_not_taken_again_in_the_engagement(
 def test_part_has_no_further_model_after_its_second_fallback(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Of a learner that proposes on and on, as one whose models all have the same fault."""
+    """A part gets no further model after its second fallback.
+
+    The learner here goes on proposing, like one whose models all have the same fault.
+    """
     flight = Flight()
     for time in (0.5, 0.6):
         flight.receive(faded(time))
@@ -552,9 +558,10 @@ def test_part_has_no_further_model_after_its_second_fallback(
 
 
 def test_margin_of_a_proposal_is_certified_to_its_end() -> None:
-    """The model has 31 ms.
+    """A proposed model is certified up to the delay margin that it asks for.
 
-    A learner that found u 20 ms late asks for 30 ms, one that found it 40 ms late for 50 ms.
+    This one has a margin of 31 ms. A learner that found u 20 ms late asks for 30 ms, and one that
+    found 40 ms asks for 50 ms.
     """
     flight = Flight()
     flight.receive(CHANGE | {"observer.margin": 0.05})
@@ -568,9 +575,10 @@ def test_margin_of_a_proposal_is_certified_to_its_end() -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_authority_towards_each_limit_is_that_of_the_limit(sign: float) -> None:
-    """An elevator of -0.1 and +0.4 rad has 5.615 rad/s^2 down and 22.46 up.
+    """The authority towards each limit is the effect times this limit.
 
-    Its effect B is 56.15 / s^2.
+    With an effect B of 56.15 / s^2, an elevator between -0.1 and +0.4 rad has 5.615 rad/s^2 in one
+    direction and 22.46 in the other.
     """
     parameters = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
     assert parameters.feedforward is not None

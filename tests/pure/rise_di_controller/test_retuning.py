@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""New models in flight: u stays, and the observer and the feedforward go on from the motion.
+"""Test new models in flight: u stays, and observer and feedforward go on from the motion.
 
-The numbers are worked by hand for an engaged controller of one channel. Its law gives 0.2, its
-observer 0.4 and its feedforward 0.1 above a trim of 10.
+The numbers are by hand, for an engaged controller of one channel. Its law gives 0.2, its observer
+0.4 and its feedforward 0.1 above a trim of 10.
 """
 
 from typing import Any
@@ -44,7 +44,7 @@ TICK = PastTick(e=np.array([2.0]), u=np.array([0.6]), y_m=np.array([7.0]), dt=DT
 
 
 def params(F: float = 3.0, **changes: Any) -> ObserverParams:
-    """Phi = 0.5, Gamma = 2, H = 1, L = 0.25 and u_o of at most 5."""
+    """Return an observer with Phi = 0.5, Gamma = 2, H = 1, L = 0.25 and a u_o of at most 5."""
     Phi, Gamma, H, L = (np.array([[value]]) for value in (0.5, 2.0, 1.0, 0.25))
     bound = np.array([changes.pop("bound", 5.0)])
     return ObserverParams(
@@ -60,13 +60,13 @@ def params(F: float = 3.0, **changes: Any) -> ObserverParams:
 
 
 def model(drift: float, effect: float) -> Nominal:
-    """x_dot = drift x + effect u, y = x."""
+    """Return the model x_dot = drift x + effect u, y = x."""
     one = np.eye(1)
     return nominal_model(drift * one, effect * one, one, 0.0 * one, np.zeros(1))
 
 
 def engaged(u_o: float = OF_OBSERVER, y_m: tuple[float, float] = (7.0, 7.0)) -> ControllerState:
-    """The state after two ticks, with y_m at each of them."""
+    """Return the state after two ticks with the given y_m."""
     # u = -D input_scale (K (e - e_0 + Lambda integral_e) + Pi) = 0.5 (5 (2 - 2) + Pi)
     of_law = OF_LAW + OF_OBSERVER - u_o
     e = np.array([2.0])
@@ -115,7 +115,7 @@ def retuned(
 
 
 def contributions(state: ControllerState) -> tuple[float, float, float]:
-    """What the law, the observer and the feedforward contribute to u."""
+    """Return what the law, the observer and the feedforward contribute to u."""
     law: FloatArray = control(state.law.law, state.law.law, HALF)
     return law.item(), state.law.u_o.item(), state.u_ff.item()
 
@@ -162,10 +162,10 @@ def test_law_takes_over_from_an_observer_that_ends() -> None:
 
 
 def test_new_feedforward_goes_on_and_the_observer_gives_way_to_it() -> None:
-    """y_m rises by 0.5 in a tick of 0.1 s.
+    """y_m rises by 0.5 in a tick of 0.1 s, and the new feedforward takes this slope into account.
 
     u = (5 - (-2) 7.5) / 4 = 5, which is 4.7 more than at the engagement. The observer gives up what
-    that adds.
+    the feedforward adds.
     """
     before = engaged(y_m=(7.0, 7.5))
     after = retuned(before, params(), params(), (model(-1.0, 4.0), model(-2.0, 4.0)))
@@ -188,7 +188,7 @@ def test_equal_feedforward_is_left_alone() -> None:
 
 
 def test_without_a_record_the_trim_takes_over_the_feedforward() -> None:
-    """One tick tells no slope of y_m, so the new feedforward begins again at y_m."""
+    """One tick does not show the slope of y_m, so the new feedforward begins again at y_m."""
     before = engaged()._replace(history=(TICK,))
     after = retuned(before, params(), params(), (model(-1.0, 4.0), model(-2.0, 4.0)))
     assert contributions(after) == approx((OF_LAW, OF_OBSERVER, 0.0))
@@ -200,7 +200,7 @@ def test_without_a_record_the_trim_takes_over_the_feedforward() -> None:
 
 
 def test_record_holds_what_each_tick_had() -> None:
-    """Seven ticks of 10 ms with one that had no y, in a record of four."""
+    """The record has seven ticks of 10 ms, one of them without y, and room for four."""
     flown = find_scenario("osprey_learn").rise_di()
     observed = dict(flatten(find_scenario("osprey_observer").rise_di().model_dump()))
     change = {name: value for name, value in observed.items() if name.split(".")[0] in DESIGNED}

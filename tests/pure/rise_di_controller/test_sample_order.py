@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples that come again, a first second of garbage, gaps, and a y that stands still."""
+"""Test repeated samples, a first second of garbage, gaps, and a y that stands still."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -36,7 +36,7 @@ def noise(seed: int = 5) -> Iterator[FloatArray]:
 
 
 def take(controller: Controller, value: FloatArray, stamp_ns: int, now_ns: int) -> str:
-    """Why a sample is not taken, as the node counts it; empty for a sample taken."""
+    """Return why a sample is not taken, as the node counts it, or "" if it is taken."""
     try:
         refusal = controller.take_y(StampedVector(stamp_ns, value), now_ns)
     except ChannelError as error:
@@ -45,7 +45,7 @@ def take(controller: Controller, value: FloatArray, stamp_ns: int, now_ns: int) 
 
 
 def step(controller: Controller, value: FloatArray | None, k: int) -> str:
-    """A tick with a y, or with none, and y_m of 0; why y is not taken."""
+    """Run a tick with a y, or without one, and with y_m = 0. Return why y is not taken, or ""."""
     now_ns = k * PERIOD_NS
     reason = "" if value is None else take(controller, value, now_ns, now_ns)
     controller.take_y_m(StampedVector(now_ns, ZERO), now_ns)
@@ -58,7 +58,10 @@ def step(controller: Controller, value: FloatArray | None, k: int) -> str:
 
 @pytest.mark.parametrize("behind_ns", [0, 1, 5 * MS], ids=["again", "1 ns older", "older"])
 def test_one_wrong_sample_sent_again_is_never_three_that_agree(behind_ns: int) -> None:
-    """A lost sample has a stamp, too: neither itself nor an older one comes after it."""
+    """The stamp of a lost sample is remembered.
+
+    So neither this sample nor an older one is accepted afterwards.
+    """
     controller = Controller(SERVO)
     calm = noise()
     for k in range(1, 200):
@@ -84,7 +87,10 @@ def test_frozen_sample_does_not_come_again_either() -> None:
 
 
 def test_sample_beyond_its_bound_does_not_take_the_place_of_another() -> None:
-    """No aircraft gives such a value, so the stamp beside it is none of an aircraft."""
+    """A value that no aircraft can give is refused together with its stamp.
+
+    A right sample may still have this stamp.
+    """
     controller = Controller(SERVO)
     assert "is beyond" in take(controller, np.full(4, np.nan), PERIOD_NS, PERIOD_NS)
     assert take(controller, ZERO, PERIOD_NS, PERIOD_NS) == ""
@@ -103,7 +109,7 @@ def test_sample_from_the_future_does_not_keep_later_ones_out() -> None:
 
 
 def garbage(kind: str, k: int, rng: np.random.Generator) -> FloatArray:
-    """What a gyro that starts adds to q at the sample k."""
+    """Return what a gyro adds to q at the sample k while it starts."""
     size = {"one": 20.0 * (k == 60), "all": rng.uniform(-20.0, 20.0), "ramp": 0.3 * k}[kind]
     noise: FloatArray = size * np.eye(4)[0] * (k < 100)
     return noise
@@ -111,7 +117,10 @@ def garbage(kind: str, k: int, rng: np.random.Generator) -> FloatArray:
 
 @pytest.mark.parametrize("kind, at", [("one", 5.0), ("all", 2.0), ("all", 60.0), ("ramp", 2.0)])
 def test_garbage_in_the_first_second_does_not_open_the_test(kind: str, at: float) -> None:
-    """A glitch of 3 rad/s, five times what full inputs change q by, is lost as without garbage."""
+    """A glitch of 3 rad/s, five times what full inputs can change, is lost.
+
+    It is lost after a first second of garbage as well as without it.
+    """
     controller = Controller(SERVO)
     calm = noise()
     rng = np.random.default_rng(1)
@@ -125,7 +134,7 @@ def test_garbage_in_the_first_second_does_not_open_the_test(kind: str, at: float
 
 @pytest.mark.parametrize("first", [0.0, 20.0])
 def test_one_wrong_sample_in_the_first_second_leaves_no_trace(first: float) -> None:
-    """A glitch of 1 rad/s, twice what full inputs change q by, is lost a second later."""
+    """A glitch of 1 rad/s, twice what full inputs can change, is lost one second later."""
     controller = Controller(SERVO)
     calm = noise()
     for k in range(1, 200):
@@ -134,7 +143,10 @@ def test_one_wrong_sample_in_the_first_second_leaves_no_trace(first: float) -> N
 
 
 def test_noise_of_the_first_second_is_learned() -> None:
-    """Vibration of five times the noise: no sample is lost, in the first second and after it."""
+    """No sample is lost to a vibration of five times the noise.
+
+    This is true in the first second and after it.
+    """
     controller = Controller(SERVO)
     loud = noise()
     assert [*filter(None, (step(controller, 5.0 * next(loud), k) for k in range(1, 1000)))] == []
@@ -147,8 +159,8 @@ def test_noise_of_the_first_second_is_learned() -> None:
 def test_knock_opens_the_test_of_jumps_for_less_than_a_minute(after: float, taken: bool) -> None:
     """A change of 0.5 rad/s at 5 s is within the power of the inputs.
 
-    Five times as much is possible then, and less from second to second. After a minute 2 rad/s are
-    as impossible as before.
+    After it, five times as much is accepted, and less from second to second. After a minute, 2
+    rad/s are as impossible as they were before.
     """
     controller = Controller(SERVO)
     calm = noise()
@@ -167,7 +179,7 @@ def test_knock_opens_the_test_of_jumps_for_less_than_a_minute(after: float, take
 
 
 def at_rate(rate: float) -> ControllerConfig:
-    """The controller of osprey_turbulence with its feedforward, without an observer."""
+    """Return the controller of osprey_turbulence with its feedforward and without an observer."""
     section = find_scenario("osprey_turbulence").controller.model_dump()
     left_out = ("observer", "schedule", "learn")
     values = {name: value for name, value in section.items() if name not in left_out}
@@ -178,7 +190,7 @@ GAP = 0.09  # s
 
 
 def after_gap(parameters: ControllerConfig, *, has_gap: bool) -> tuple[FloatArray, float]:
-    """The u and the dt of the tick after a gap, in a pitch that swings; y is y_m throughout."""
+    """Return the u and the dt of the tick after a gap, while the pitch swings and y equals y_m."""
     controller = Controller(parameters)
     rate = parameters.rate
     end = round((1.5 + GAP) * rate)
@@ -196,9 +208,9 @@ def after_gap(parameters: ControllerConfig, *, has_gap: bool) -> tuple[FloatArra
 
 @pytest.mark.parametrize("rate", [200.0, 1000.0])
 def test_gap_within_the_age_limit_counts_in_full_at_any_rate(rate: float) -> None:
-    """A gap of 90 ms: the input of the feedforward is as without, and as far off as at 100 Hz.
+    """After a gap of 90 ms, the feedforward has the same input as without a gap, at any rate.
 
-    y_m is linear over the gap: 1 % of u.
+    The error is the same as at 100 Hz. It is 1 % of u, because y_m is taken as linear over the gap.
     """
     ratios = []
     for parameters in (at_rate(100.0), at_rate(rate)):
@@ -212,7 +224,7 @@ def test_gap_within_the_age_limit_counts_in_full_at_any_rate(rate: float) -> Non
 
 
 def test_steps_of_the_model_are_at_most_ten_periods_long() -> None:
-    """So that a gap of 100 periods of a fast model is as stable as one of ten."""
+    """The model is as stable over a gap of 100 of its periods as over one of ten."""
     period_ns = MS
     assert [step_count(span * period_ns, period_ns) for span in (1, 10, 11, 20, 21, 101)] == [
         1, 1, 2, 2, 3, 11,
@@ -222,7 +234,10 @@ def test_steps_of_the_model_are_at_most_ten_periods_long() -> None:
 
 
 def test_gap_beyond_the_age_limit_engages_again_and_says_so() -> None:
-    """Stamps ahead of the clock leave no tick without a fresh y, but a gap of 0.12 s."""
+    """A gap between stamps restarts the law, although every tick had a fresh y.
+
+    The stamps before the gap were ahead of the clock. The gap is 0.12 s.
+    """
     controller = Controller(SERVO)
     calm = noise()
     for k in range(1, 150):
@@ -250,7 +265,7 @@ def still(controller: Controller, count: int, first: int, value: FloatArray) -> 
 
 
 def moving(controller: Controller, count: int) -> FloatArray:
-    """Ticks with noise; the last y."""
+    """Run ticks with noise, and return the last y."""
     calm = noise()
     value = ZERO
     for k in range(1, count + 1):
@@ -260,7 +275,10 @@ def moving(controller: Controller, count: int) -> FloatArray:
 
 
 def test_y_that_stands_still_is_lost_and_the_failsafe_begins() -> None:
-    """As a frozen pose: five periods, and from then on no sample, until a value changes."""
+    """A y that does not change is lost after five periods, like a frozen pose.
+
+    From then on no sample is accepted until a value changes.
+    """
     controller = Controller(SERVO)
     last = moving(controller, 150)
     reason = still(controller, 40, 151, last)
@@ -280,7 +298,7 @@ def test_y_that_stands_still_is_lost_and_the_failsafe_begins() -> None:
 
 @pytest.mark.parametrize("count", [1, MOVING])
 def test_y_that_has_not_moved_before_is_not_frozen(count: int) -> None:
-    """A simulation in trim without noise gives zeros, and a bridge may repeat its samples."""
+    """A simulation in trim without noise sends zeros, and a bridge may repeat its samples."""
     controller = Controller(SERVO)
     last = moving(controller, count)
     assert not any(still(controller, 500, count + 1, last))
@@ -295,7 +313,7 @@ def test_one_value_that_changes_is_enough() -> None:
 
 
 def test_sensor_that_repeats_now_and_then_is_not_frozen() -> None:
-    """Coarse steps of an airspeed at rest, gyros without noise: stretches of equal samples."""
+    """An airspeed in coarse steps and gyros without noise repeat equal samples for a while."""
     controller = Controller(SERVO)
     rng = np.random.default_rng(3)
     for k in range(1, 3000):
@@ -304,7 +322,7 @@ def test_sensor_that_repeats_now_and_then_is_not_frozen() -> None:
 
 
 def test_repeats_faster_than_the_ticks_are_not_frozen() -> None:
-    """A y of 100 Hz that is sent at 1 kHz: ten equal samples are one period."""
+    """If a y of 100 Hz is sent at 1 kHz, ten equal samples are one period."""
     controller = Controller(SERVO)
     moving(controller, 150)
     value = ZERO
@@ -319,7 +337,10 @@ def test_repeats_faster_than_the_ticks_are_not_frozen() -> None:
 
 @pytest.mark.slow
 def test_frozen_y_in_flight_is_told_and_replayed_to_the_bit() -> None:
-    """From 5 s on every value stands still while stamps go on: 0.15 s later the failsafe begins."""
+    """Every value stands still from 5 s on, while the stamps go on.
+
+    The failsafe begins 0.15 s later.
+    """
     scenario = find_scenario("osprey_servo", 8.0).vary(
         aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
     )
@@ -353,7 +374,7 @@ def test_frozen_y_in_flight_is_told_and_replayed_to_the_bit() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["osprey_gust", "jsbsim_c172p"])
 def test_healthy_flights_have_no_frozen_y(name: str) -> None:
-    """Without noise, in trim before the first command and long after the last."""
+    """No sample is lost without noise, in trim before the first command and long after the last."""
     quiet: dict[str, Any] = {"sensors": {}}
     reasons: list[Refusal | None] = []
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples that no aircraft can give are lost.
+"""Test that samples that no aircraft can give are lost.
 
-A state that is not finite begins again, and u is a number whatever comes.
+The law engages again if its state is not finite, and u is always a number.
 """
 
 from collections.abc import Iterable
@@ -32,7 +32,7 @@ NOISE = np.array([0.0017, 0.0017, 0.0017, 0.03])  # rad/s and m/s, of osprey_ser
 
 
 def noisy(ticks: int, seed: int = 1) -> FloatArray:
-    """Samples of y, (ticks, 4): a slow motion and noise."""
+    """Return samples of y, (ticks, 4), with a slow motion and noise."""
     t = np.arange(ticks)[:, None] / 100.0
     return 0.1 * np.sin(t + np.arange(4.0)) + NOISE * np.random.default_rng(seed).normal(
         size=(ticks, 4)
@@ -42,9 +42,9 @@ def noisy(ticks: int, seed: int = 1) -> FloatArray:
 def flown(
     controller: Controller, y: Iterable[FloatArray | None], first: int = 0
 ) -> tuple[FloatArray, list[Mode], list[str]]:
-    """The u after each tick, (T, m), the modes, and why samples are lost.
+    """Return the u after each tick, (T, m), the modes, and why samples are lost.
 
-    None: no sample of y comes; y_m is always 0.
+    In `y`, None stands for a tick without a sample of y. y_m is always 0.
     """
     u = []
     modes = []
@@ -62,7 +62,7 @@ def flown(
 
 @cache
 def without_sample(observed: bool) -> FloatArray:
-    """The u of a flight to which the sample of SPIKE never comes."""
+    """Return the u of a flight in which the sample SPIKE never arrives."""
     y: list[FloatArray | None] = list(noisy(SPIKE + 60))
     y[SPIKE] = None
     return flown(Controller(OBSERVER if observed else SERVO), y)[0]
@@ -74,10 +74,10 @@ def without_sample(observed: bool) -> FloatArray:
 def test_wrong_sample_is_as_one_that_did_not_arrive(
     observed: bool, channel: int, size: float
 ) -> None:
-    """To the bit.
+    """A wrong sample leaves the same u, to the bit, as a sample that did not arrive.
 
-    Twice the change that full inputs make in a period is 0.7 rad/s and 4 m/s: 3 rad/s and 30 m/s
-    are above.
+    In a period, full inputs can change y by half of 0.7 rad/s and of 4 m/s. The wrong samples are 3
+    rad/s and 30 m/s off.
     """
     config = OBSERVER if observed else SERVO
     unit = np.array([1.0, 1.0, 1.0, 10.0])
@@ -94,7 +94,7 @@ def test_wrong_sample_is_as_one_that_did_not_arrive(
 def test_bounds_hold_from_the_first_sample_on(channel: int, bound: float) -> None:
     """The bounds are 2000 deg/s, the range of a gyro, and the speed of sound.
 
-    They are those of y and of y_m, so that the law never engages with more.
+    They apply to y and to y_m, so that the law never engages with more.
     """
     controller = Controller(SERVO)
     unit = np.eye(4)[channel]
@@ -120,9 +120,9 @@ def test_bound_is_a_parameter() -> None:
 
 
 def test_jump_that_stays_is_taken_at_its_third_sample() -> None:
-    """The law engages again, from the u of then and with the estimates of the new y.
+    """The law engages again from its last u, with the estimates of the new y.
 
-    Nothing is locked out for ever.
+    So a y that really jumped is not refused for ever.
     """
     controller = Controller(OBSERVER)
     before, _, _ = flown(controller, noisy(SPIKE))
@@ -141,9 +141,9 @@ def test_jump_that_stays_is_taken_at_its_third_sample() -> None:
 
 
 def test_samples_that_disagree_are_all_lost() -> None:
-    """The failsafe begins as without samples.
+    """Samples that disagree with each other start the failsafe, as if there were none.
 
-    It ends with the third sample in a row that agrees.
+    The failsafe ends with the third sample in a row that agrees.
     """
     controller = Controller(SERVO)
     flown(controller, noisy(SPIKE))
@@ -159,9 +159,9 @@ def test_samples_that_disagree_are_all_lost() -> None:
 
 
 def test_samples_that_never_agree_are_taken_again() -> None:
-    """The y is 2 rad/s more and less in turn.
+    """A y that alternates by 2 rad/s is accepted again after a few samples.
 
-    The possible change of 0.6 rad/s grows with the periods since the last sample taken.
+    The possible change of 0.6 rad/s grows with the periods since the last accepted sample.
     """
     controller = Controller(SERVO)
     flown(controller, noisy(SPIKE))
@@ -172,7 +172,10 @@ def test_samples_that_never_agree_are_taken_again() -> None:
 
 
 def test_abrupt_motion_within_the_power_of_the_inputs_is_taken() -> None:
-    """Full elevator moves q by 0.29 rad/s in a period: as much comes at once, after calm air."""
+    """A full elevator changes q by 0.29 rad/s in a period.
+
+    Such a change is accepted, even after calm air.
+    """
     controller = Controller(SERVO)
     limit = float(SERVO.guard().limits.upper[0]) / SERVO.input_scale[0] / 100.0
     assert limit == pytest.approx(0.29, abs=0.01)
@@ -185,9 +188,9 @@ def test_abrupt_motion_within_the_power_of_the_inputs_is_taken() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["osprey_turbulence", "osprey_vanes", "x8_elevons"])
 def test_flights_lose_no_sample(name: str) -> None:
-    """Every sample of y after the first tick becomes a tick.
+    """Gusts, turbulence, commands and engagement are possible motion.
 
-    Gusts, turbulence, commands and engagement are possible motion.
+    So every sample of y after the first tick becomes a tick.
     """
     scenario = find_scenario(name, 4.0).vary(
         aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
@@ -201,9 +204,9 @@ def test_flights_lose_no_sample(name: str) -> None:
 
 @pytest.mark.parametrize("reading", [1e308, -4.0, np.nan])
 def test_reading_beyond_half_a_turn_is_that_of_the_tick_before(reading: float) -> None:
-    """A vane alone does not take y from the law.
+    """A vane with an impossible reading does not make the law lose y.
 
-    It stands still, and a vane that stands still is left out.
+    The reading is treated as unchanged, and a vane that stands still is left out.
     """
     config = find_scenario("osprey_vanes").controller
     readings = 0.02 * np.random.default_rng(2).normal(size=(SPIKE + 1, 2))
@@ -219,7 +222,7 @@ def test_reading_beyond_half_a_turn_is_that_of_the_tick_before(reading: float) -
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, on the infinite state
 def test_state_that_is_not_finite_begins_again() -> None:
-    """The law engages from the last u, in the tick itself, and flies on."""
+    """The law engages from the last u in the same tick, and flies on."""
     controller = Controller(OBSERVER)
     u, _, _ = flown(controller, noisy(50))
     law = controller.state.law
@@ -310,7 +313,11 @@ ROWS = st.lists(
 def test_u_is_a_number_within_its_limits_whatever_comes(
     name: str, observed: bool, rows: list[tuple[Any, ...]]
 ) -> None:
-    """Each law behind the controller, and behind the guard alone, which has no bounds of y."""
+    """Any y and y_m give a u that is a number within its limits.
+
+    Each law is flown behind the controller, and also behind the guard alone, which has no bounds of
+    y.
+    """
     config = LAWS[name].model_copy(update=LIMITS | (MODELS if observed else {}))
     controller = Controller(config)
     law = config.tuned_law()

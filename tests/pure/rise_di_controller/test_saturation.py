@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flights in saturation: the effect of anti-windup and of a rate limit.
+"""Test flights in saturation: the effect of anti-windup and of a rate limit.
 
 Without saturation they have no effect.
 
-The servos are those of scenario osprey_servo, without noise, with tighter stops of one actuator.
-"guarded": the controller has the stops as its limits. "unguarded": only the actuators have them,
-and the integrals wind up. Everything is sampled at 100 Hz and integrated in steps of 5 ms: the
-results are within 2 % of those at 500 Hz and 2 ms, in a fifth of the time.
+The servos are those of scenario osprey_servo, without noise, and one actuator has tighter stops. In
+a "guarded" flight the controller has the stops as its limits. In an "unguarded" one only the
+actuators have them, and the integrals wind up. Everything is sampled at 100 Hz and integrated in
+steps of 5 ms. The results are within 2 % of those at 500 Hz and 2 ms, in a fifth of the time.
 """
 
 import math
@@ -34,9 +34,9 @@ UNGUARDED: dict[str, Any] = {"lower": None, "upper": None, "slew": None}
 
 
 def with_stops(name: str, stop: float, *, guarded: bool) -> Scenario:
-    """The scenario with the stops of one actuator at -stop and stop.
+    """Return the scenario with the stops of one actuator at -stop and stop.
 
-    `guarded` is whether the controller has these limits.
+    `guarded` says whether the controller has these limits, too.
     """
     actuators = SERVO.aircraft.actuators.model_dump()
     # all stops are symmetric
@@ -60,7 +60,7 @@ def state(tape: Tape, name: str) -> FloatArray:
 
 
 def last_beyond(t: FloatArray, values: FloatArray, bound: float) -> float:
-    """The last instant at which abs(values) is above a bound."""
+    """Return the last instant at which abs(values) is above a bound."""
     return float(t[np.abs(values) > bound].max())
 
 
@@ -68,7 +68,7 @@ def last_beyond(t: FloatArray, values: FloatArray, bound: float) -> float:
 def pulse_flight(
     name: str, stop: float, duration: float, channel: str, *edges: float, guarded: bool
 ) -> Tape:
-    """A flight with the stops of one actuator and one pulse on a channel."""
+    """Return a flight with tighter stops of one actuator and one pulse on a channel."""
     pulses = {channel: pulse(*edges)}
     scenario = with_stops(name, stop, guarded=guarded)
     return simulate(
@@ -151,7 +151,10 @@ def rudder_flight(rate_deg: float, *, limited: bool = False, sign: str = "auto")
 
 
 def end_of_r(tape: Tape) -> float:
-    """The largest error of r in the last 3 s, which begin 3.8 s after the end of the gust."""
+    """Return the largest error of r in the last 3 s.
+
+    They begin 3.8 s after the end of the gust.
+    """
     return float(np.abs(error(tape)["r"][tape.time("truth") > 7.0]).max())
 
 

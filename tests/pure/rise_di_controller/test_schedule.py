@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Schedule of input_scale over dynamic pressure.
+"""Test the schedule of input_scale over dynamic pressure.
 
-The tests are of its equation, bumpless transfer, a flight with a delay, and replay.
+The tests cover its equation, bumpless transfer, a flight with a delay, and replay.
 """
 
 from functools import cache
@@ -38,7 +38,7 @@ FAST = {
 
 
 def flight(schedule: bool, delay: float, duration: float) -> Scenario:
-    """The c172p in calm air, from 46.3 to 62.3 m/s, with a delayed y."""
+    """Return the c172p in calm air, which accelerates from 46.3 to 62.3 m/s, with a delayed y."""
     pulse = {"V": {"start": [1.0], "stop": [1000.0], "value": [FASTER]}}
     return C172P.vary(
         flight={"duration": duration},
@@ -50,7 +50,7 @@ def flight(schedule: bool, delay: float, duration: float) -> Scenario:
 
 @cache
 def flown(schedule: bool) -> Tape:
-    """A flight with y 30 ms late, until it rests or is in its limit cycle."""
+    """Return a flight with y 30 ms late, which ends when it is at rest or in its limit cycle."""
     return simulate(flight(schedule, 0.03, 60.0 if schedule else 35.0))
 
 
@@ -105,16 +105,13 @@ def test_change_of_scale_leaves_u_as_it_is() -> None:
 
 
 def rms(tape: Tape) -> dict[str, float]:
-    """Standard deviation of the rates over the last 5 s, mrad/s."""
+    """Return the standard deviation of the rates over the last 5 s, mrad/s."""
     last = tape.time("y") > tape.time("y")[-1] - 5.0
     return {name: 1e3 * float(np.std(tape["y"][name][last])) for name in ("q", "p", "r")}
 
 
 def test_schedule_keeps_delayed_loop_at_rest() -> None:
-    """At 1.8 times the dynamic pressure the loop with delay stays at rest.
-
-    It does so with the schedule alone.
-    """
+    """At 1.8 times the dynamic pressure, only the schedule keeps the loop with delay at rest."""
     # Without it, the loop with 30 ms of delay is in a limit cycle of tens of mrad/s in q. The
     # margin at trim is 18 ms.
     assert rms(flown(False))["q"] > 10.0
@@ -138,7 +135,10 @@ def test_model_of_trim_beside_schedule_refused(name: str) -> None:
 
 
 def test_schedule_of_airspeed_alone_refused() -> None:
-    """The factor of channel V is 1: nothing would follow the schedule."""
+    """A schedule of V alone is refused.
+
+    The factor of channel V is 1, so nothing would follow the schedule.
+    """
     values = flight(schedule=True, delay=0.0, duration=1.0).controller.model_dump()
     place = C172P.controller.outputs.index("V")
     for key in (

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flights with the right D, which track, and with a wrong D, which diverge.
+"""Test flights with the right D, which track, and with a wrong D, which diverge.
 
-Three aircraft: the Osprey with the elevator sign of textbooks (trailing edge down positive), the
-Osprey with rudder and aileron exchanged, and a plant whose Omega = C B has a positive diagonal and
-a negative determinant.
+There are three aircraft: the Osprey with the elevator sign of textbooks (trailing edge down
+positive), the Osprey with rudder and aileron exchanged, and a plant whose Omega = C B has a
+positive diagonal and a negative determinant.
 """
 
 import math
@@ -29,7 +29,7 @@ UNLIMITED = CALM_SERVO.vary(aircraft={"actuators": {}}, controller={"lower": Non
 
 
 def trailing_edge_down(scenario: Scenario, folder: Path) -> Scenario:
-    """The same flight with an airframe whose positive elevator pitches the nose down.
+    """Return the same flight with an airframe whose positive elevator pitches the nose down.
 
     D is unchanged.
     """
@@ -44,7 +44,7 @@ def trailing_edge_down(scenario: Scenario, folder: Path) -> Scenario:
 
 
 def first(t: FloatArray, values: FloatArray, bound: float) -> float:
-    """The first instant at which abs(values) is above a bound; inf where there is none."""
+    """Return the first instant at which abs(values) is above a bound, or inf."""
     is_beyond = np.abs(values) > bound
     return float(t[is_beyond][0]) if is_beyond.any() else math.inf
 
@@ -53,7 +53,7 @@ def first(t: FloatArray, values: FloatArray, bound: float) -> float:
     "scenario", [pytest.param(CALM_SERVO, id="servos"), pytest.param(UNLIMITED, id="no limits")]
 )
 def test_flipped_elevator_tracks_with_right_d(scenario: Scenario, tmp_path: Path) -> None:
-    """The trailing edge down is positive."""
+    """With the trailing edge down positive, the flight tracks with D = (-1, 1, 1, 1)."""
     # D = (-1, 1, 1, 1). Measured rms of q: 1.97 mrad/s through servos, 1.95 without limits; the
     # prototype: 2.0 and 2.2.
     right = trailing_edge_down(scenario, tmp_path).vary(
@@ -65,7 +65,7 @@ def test_flipped_elevator_tracks_with_right_d(scenario: Scenario, tmp_path: Path
 
 
 def test_sign_in_airframe_and_d_cancels(tmp_path: Path) -> None:
-    """A sign change in the airframe and in D gives the same flight to the last bit."""
+    """A change of a sign both in the airframe and in D gives the same flight to the last bit."""
     original = CALM_SERVO.vary(flight={"duration": 4.0})
     flipped = trailing_edge_down(original, tmp_path).vary(controller={"D": [-1, 1, 1, 1]})
     nose_up = simulate(original)
@@ -76,7 +76,7 @@ def test_sign_in_airframe_and_d_cancels(tmp_path: Path) -> None:
 
 
 def test_flipped_elevator_diverges_with_identity_d(tmp_path: Path) -> None:
-    """With the trailing edge down positive the flight diverges at the first command."""
+    """With the trailing edge down positive and D = I, the flight diverges at the first command."""
     # Diverged: abs(e_q) above 1 rad/s, ten times the command. Measured at 2.38 s, 0.38 s after it;
     # the prototype: 2.38 s. It grows further, by a factor of e each 0.08 s: 34.9 rad/s, where the
     # aircraft is lost, 0.08 ln 34.9 = 0.28 s later.
@@ -117,14 +117,14 @@ def fly_small(D: list[float], K: list[float]) -> FloatArray:
 
 @pytest.mark.parametrize("K", [[1.0, 1.0], [20.0, 5.0]], ids=str)
 def test_negative_determinant_diverges_with_identity_d(K: list[float]) -> None:
-    """A negative determinant with D = I diverges for every K."""
+    """With a negative determinant and D = I, the flight diverges for every K."""
     # det(Omega K) < 0 means an unstable exponential for any K. Measured at 0.37 to 3.2 s; the
     # prototype: 0.66 to 1.6 s.
     assert len(fly_small([1.0, 1.0], K)) * 0.01 < 4.0
 
 
 def test_negative_determinant_converges_with_22() -> None:
-    """A negative determinant with the right D converges where K has the order of (22)."""
+    """A flight with a negative determinant and the right D converges if K has the order of (22)."""
     # Measured in the last 3 s: 1.3e-3, a hundredth of the reference.
     errors = fly_small([1.0, -1.0], [20.0, 5.0])
     assert len(errors) == len(SINES)
@@ -132,7 +132,7 @@ def test_negative_determinant_converges_with_22() -> None:
 
 
 def test_negative_determinant_diverges_without_22() -> None:
-    """A negative determinant with the right D diverges where K lacks the order of (22)."""
+    """With a negative determinant and the right D, a flight without the order of (22) diverges."""
     # K = (5, 5) is not of the form (22), which has the larger gain first: trace(Omega D K) = 5 - 5
     # leaves the damping to A. Measured slow divergence at 7.4 s; the prototype: at 7.5 s.
     assert 6.0 < len(fly_small([1.0, -1.0], [5.0, 5.0])) * 0.01 < 9.0

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An observer over the airspeed.
+"""Test an observer that is scheduled over the airspeed.
 
-The tests are of the airframe at another speed, models between the speeds, flights with u late, and
+The tests cover the airframe at another speed, models between the speeds, flights with u late, and
 replay.
 """
 
@@ -51,7 +51,7 @@ SHIPPED = find_scenario("osprey_observer").vary(
 
 @pytest.fixture(scope="module")
 def scheduled() -> RiseDiConfig:
-    """From 0.7 to 1.4 of the trim speed."""
+    """Return a controller with an observer for 0.7 to 1.4 of the trim speed."""
     speeds = (0.7, 1.4)
     return selected_observer(
         SHIPPED.rise_di(), SHIPPED, OSPREY, 0.03, uncertain=False, speeds=speeds
@@ -59,7 +59,7 @@ def scheduled() -> RiseDiConfig:
 
 
 def margin(controller: RiseDiConfig, ratio: float) -> float:
-    """Delay margin of a controller around the osprey at another speed, s."""
+    """Return the delay margin of a controller around the osprey at another speed, s."""
     frame = at_speed(OSPREY, ratio, "thrust")
     rows, columns = law_order(frame, controller)
     plant = LinearPlant(
@@ -75,9 +75,9 @@ def margin(controller: RiseDiConfig, ratio: float) -> float:
 
 
 def test_short_period_is_as_fast_as_the_aircraft_and_a_turn_as_wide() -> None:
-    """An aircraft of one shape moves alike along its path.
+    """Frequencies, and rates caused by a surface, grow in proportion to V.
 
-    Frequencies and rates by a surface grow with V.
+    An aircraft of the same shape follows the same path at another speed.
     """
     places = [OSPREY.index(name) for name in ("alpha", "q")]
     faster = at_speed(OSPREY, 1.3, "thrust")
@@ -100,7 +100,7 @@ def test_short_period_is_as_fast_as_the_aircraft_and_a_turn_as_wide() -> None:
 
 @pytest.mark.parametrize("ratio", [0.7, 1.4])
 def test_lift_balances_weight_at_each_speed(ratio: float) -> None:
-    """A[alpha,V] is -2 g / V^2 in level flight; the file of the osprey has it 4 % smaller."""
+    """In level flight A[alpha,V] is -2 g / V^2, and in the file of the osprey it is 4 % smaller."""
     faster = at_speed(OSPREY, ratio, "thrust")
     entry = faster.matrix_a()[OSPREY.index("alpha"), OSPREY.index("V")]
     assert entry == approx(-2.0 * 9.81 / (ratio * 25.0) ** 2, rel=0.05)
@@ -168,7 +168,10 @@ def test_flight_over_speeds_has_no_jump_of_u_and_is_replayed_to_the_bit(
 
 @pytest.mark.parametrize("key", ["B", "F"])
 def test_other_models_at_another_speed_leave_u_as_it_is(scheduled: RiseDiConfig, key: str) -> None:
-    """At 1.2 of the trim speed; with B the feedforward starts again, with F the observer."""
+    """New models leave u as it is at 1.2 of the trim speed.
+
+    With another B the feedforward starts again, and with another F the observer does.
+    """
     values = scheduled.model_dump()
     loop = rise_di.Loop(scheduled)
     u = []
@@ -221,7 +224,7 @@ LEARNS = find_scenario("osprey_learn_speeds").rise_di()
 
 
 class Learns:
-    """A controller that learns beside a schedule, and the proposals of its flight.
+    """A controller with a schedule and a learner, and the proposals of its flight.
 
     It flies at 1.2 of the trim speed for 6 s.
     """
@@ -236,7 +239,7 @@ class Learns:
             self.tick()
 
     def tick(self) -> None:
-        """A tick, with small errors along a motion of q."""
+        """Run a tick with small errors along a motion of q."""
         self.now_ns += NANOSECONDS // 100
         t = self.now_ns / NANOSECONDS
         y_m = np.array([0.02 * np.sin(2.0 * t), 0.0, 0.0, 5.0])
@@ -248,7 +251,7 @@ class Learns:
         self.learning.step(self.controller, self.now_ns)
 
     def propose(self, change: dict[str, Any]) -> str:
-        """What becomes of a proposal."""
+        """Return what the controller does with a proposal."""
         proposal = Proposal(
             stamp_ns=self.now_ns,
             start=LEARNS.digest(),
@@ -320,7 +323,10 @@ def no_design(start: RiseDiConfig, model: Airframe, goal: Goal) -> SelectedObser
 
 
 def test_effects_at_another_speed_are_reduced_to_the_trim_speed() -> None:
-    """A record at 1.24 of the trim speed, where effects of surfaces are 54 % larger."""
+    """The record is flown at 1.24 of the trim speed.
+
+    There the effects of the surfaces are 54 % larger.
+    """
     faster = {"start": [0.0, 2.0], "stop": [100.0, 100.0], "value": [3.0, 3.0]}
     scenario = find_scenario("osprey_learn_speeds").vary(
         flight={"duration": 20.0},

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A month of uptime, and stamps of any year.
+"""Test a month of uptime, and stamps of any year.
 
 Times are whole nanoseconds, so that u does not depend on when a flight began.
 """
@@ -18,9 +18,9 @@ LATEST = 2**31 - 1  # s: the last second of a stamp of ROS 2
 
 
 def flown(scenario: str, start: int) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Values of u and internals over two seconds, from an instant in s on.
+    """Return the values of u and of the internals over two seconds that begin at `start`, in s.
 
-    A failsafe is between them.
+    There is a failsafe in between.
     """
     parameters = find_scenario(scenario).controller
     controller = Controller(parameters)
@@ -47,6 +47,9 @@ def test_no_bit_of_u_depends_on_the_uptime(scenario: str, start: int) -> None:
 
 
 def test_flight_time_of_a_month_keeps_its_nanoseconds() -> None:
-    """Float64 has 53 bits: 2^53 ns are 104 days."""
+    """Flight times keep their nanoseconds for 104 days.
+
+    float64 has 53 bits, and 2^53 ns are 104 days.
+    """
     of_ticks = MONTH * 10**9 + np.arange(1000, dtype=np.int64) * 999_983
     assert [nanoseconds(seconds(int(t_ns))) for t_ns in of_ticks] == of_ticks.tolist()
