@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The account of a flight says what a log lacks.
+"""Test that the account of a flight says what a log lacks.
 
-Every command says so, and no figure stands for more than was recorded.
+Every command says so, and no figure covers more than was recorded.
 """
 
 import json
@@ -65,9 +65,9 @@ TABLES = ("errors", "inputs", "ticks")
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The log of a flight of two seconds in one process, with the first command of the scenario.
+    """Return the log of two seconds in one process, with the first command of the scenario.
 
-    A sample of y every 5 ms, so that the log is read quickly.
+    There is a sample of y every 5 ms, so that the log is read quickly.
     """
     scenario = find_scenario("osprey_gust").vary(
         flight={"duration": 2.0},
@@ -79,12 +79,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def figures(whole: Path) -> dict[str, Any]:
-    """The summary of the whole log."""
+    """Return the summary of the whole log."""
     return read_flight(whole.parent).summary
 
 
 def replayed(log: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    """What `rise-di replay --json` prints."""
+    """Return what `rise-di replay --json` prints."""
     with pytest.raises(typer.Exit) as end:
         Replay(run=log, as_json=True).execute()
     assert end.value.exit_code in {0, 1, STATUS_SHORTFALL}
@@ -95,7 +95,7 @@ def replayed(log: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
 def test_whole_log_lacks_nothing(
     whole: Path, figures: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The counts by hand: 200 Hz, 100 Hz and 50 Hz over two seconds, both ends included."""
+    """The counts are by hand: 200 Hz, 100 Hz and 50 Hz over two seconds, with both ends."""
     assert (figures["outcome"]["sentence"], figures["notes"], figures["account"]["lacks"]) == (
         "completed",
         [],
@@ -130,7 +130,7 @@ def test_every_command_says_what_log_lacks(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Half of the logs have flight time, those of y_m, u and truth the time of day."""
+    """Half of the logs have flight times. Those of y_m, u and truth have the time of day."""
     since = EPOCH * (topic in {"y_m", "u", "truth"})
     log = damage(
         whole, tmp_path / "damaged" / "damaged_0.mcap", f"/{topic}", DAMAGES[name], from_ns=since
@@ -192,7 +192,10 @@ def test_replay_claims_no_tick_without_its_u(
 def test_flight_counts_from_its_first_u(
     begin: float, outcome: str, tape: Tape, osprey_gust: Scenario
 ) -> None:
-    """As of a controller that takes a y after many that were too old."""
+    """A flight is counted from its first u.
+
+    The controller may first have received many y that were too old.
+    """
     late = {name: tape[name] for name in ("y", "y_m", "truth")} | {
         "u": tape["u"].where(tape.time("u") >= begin)
     }
@@ -204,7 +207,10 @@ def test_flight_counts_from_its_first_u(
 def test_number_of_the_first_tick_tells_that_u_came_before_the_log(
     tape: Tape, osprey_gust: Scenario
 ) -> None:
-    """The log lacks u and `internals` until 1.9 s. Tick 191 is its first one: the law has flown."""
+    """Tick 191 is the first in the log, so the law had already flown.
+
+    The log has no u and no `internals` before 1.9 s.
+    """
     late = {name: tape[name].where(tape.time(name) >= 1.9) for name in ("u", "internals")}
     signals = {name: tape[name] for name in ("y", "y_m", "truth")} | late
     flight = Tape(signals, duration=2.0)
@@ -222,8 +228,8 @@ def test_clock_that_stands_now_and_then_is_named(
 ) -> None:
     """A hundredth of the samples may have the instant of the sample before.
 
-    Every sample has an instant of its own: more of them are a fault of the clock, not of the
-    recorder.
+    Every sample has an instant of its own. If more than a hundredth repeat one, the clock is at
+    fault, and not the recorder.
     """
     y = tape["y"]
     stamp_ns = y.stamp_ns.copy()
@@ -238,7 +244,10 @@ def test_clock_that_stands_now_and_then_is_named(
 
 @pytest.mark.parametrize("topic", ["y", "u"])
 def test_replay_covers_no_tick_without_its_sample(topic: str, tape: Tape) -> None:
-    """A twentieth of y or of u is missing: 95 % of the ticks are compared."""
+    """A tick whose y or u is missing is not compared.
+
+    A twentieth of the samples is missing, so 95 % of the ticks are compared.
+    """
     signal = tape[topic]
     keep = ~np.isin(signal.stamp_ns, tape["internals"].stamp_ns[10::20])
     result = replay(replace(tape, signals={**tape.signals, topic: signal.where(keep)}))
@@ -271,9 +280,10 @@ def test_replay_without_some_y_is_incomplete(
 def test_samples_that_busy_host_withheld_are_no_lack_of_log(
     of_y: str, lost: int, lacks: bool, tape: Tape, osprey_gust: Scenario
 ) -> None:
-    """The last 0.1 s of a flight in real time.
+    """Samples that a busy host never sent are not missing from the log.
 
-    The numbers of the messages tell whether the pose was sent.
+    The case is the last 0.1 s of a flight in real time. The numbers of the messages show whether
+    the pose was sent.
     """
     begin_ns = NANOSECONDS * 1_795_000_000
     until = 1.8 if of_y == "after" else 2.0
@@ -289,9 +299,9 @@ def test_samples_that_busy_host_withheld_are_no_lack_of_log(
 
 
 def foreign_flight(rate: float, ticks_held: slice) -> Tape:
-    """Ten seconds of an aircraft of another maker, whose timer has 0.3 ms of jitter.
+    """Return ten seconds of a foreign aircraft whose timer has a jitter of 0.3 ms.
 
-    The controller has 100 Hz and publishes u at each tick with a new y.
+    The controller runs at 100 Hz and publishes u at each tick with a new y.
     """
     rng = np.random.default_rng(3)
     y_t = np.arange(0.0, 10.0, 1.0 / rate)
@@ -325,7 +335,10 @@ def foreign_flight(rate: float, ticks_held: slice) -> Tape:
 def test_u_of_a_foreign_aircraft_is_judged_by_the_ticks_with_a_new_y(
     rate: float,
 ) -> None:
-    """The numbers of the ticks are continuous. u is whole at any rate of y, half of u is not."""
+    """With continuous numbers of the ticks, u is complete at any rate of y.
+
+    Half of u is not.
+    """
     osprey_servo = find_scenario("osprey_servo")
     every_tick = account(foreign_flight(rate, slice(None)), osprey_servo).topics["u"]
     assert every_tick.is_enough(every_tick.found)
@@ -358,7 +371,10 @@ def test_missing_part_of_bag_is_named(whole: Path, tmp_path: Path) -> None:
 def test_one_missing_sample_is_no_lack_of_short_topic(
     found: int, expected: int, whole: bool
 ) -> None:
-    """99 %, or all but one: the last tick of a flight may come after its end."""
+    """A share of 99 % is enough, and so is one missing sample.
+
+    The last tick of a flight may come after its end.
+    """
     topic = TopicAccount(
         expected=expected,
         found=found,
@@ -377,12 +393,15 @@ def test_one_missing_sample_is_no_lack_of_short_topic(
 
 
 def stamps(*parts: range) -> Iterator[Any]:
-    """Stamps of 100 Hz in ns by their numbers."""
+    """Yield the stamps, ns, that samples of 100 Hz have by their numbers."""
     yield from (np.array(part, dtype=np.int64) * (NANOSECONDS // 100) for part in parts)
 
 
 def test_stray_messages_are_no_step_of_clock() -> None:
-    """A second publisher with old stamps beside the first; a step is of successive messages."""
+    """Old stamps of a second publisher are no step of the clock.
+
+    A step is between successive messages.
+    """
     first, second = stamps(range(1000, 1200), range(1, 201))
     stamp_ns = np.stack([first, second], axis=1).ravel()
     clock = StampClock()
@@ -394,7 +413,7 @@ def test_stray_messages_are_no_step_of_clock() -> None:
 @pytest.mark.parametrize("damaged", [[0], [40], [199], [40, 41, 42]])
 @pytest.mark.parametrize("by", [-5 * NANOSECONDS, 2**62], ids=["back", "forth"])
 def test_samples_with_damaged_stamps_are_left_out_alone(damaged: list[int], by: int) -> None:
-    """The clock goes on behind them: the samples after a damaged stamp stay."""
+    """Only the samples with a damaged stamp are left out, because the clock goes on after them."""
     (log_ns,) = stamps(range(1000, 1200))
     stamp_ns = log_ns.copy()
     stamp_ns[damaged] += by
@@ -406,7 +425,7 @@ def test_samples_with_damaged_stamps_are_left_out_alone(damaged: list[int], by: 
 
 @pytest.mark.parametrize("late", [0.6, 3.0])
 def test_first_sample_that_a_busy_recorder_stored_late_before_a_pause_stays(late: float) -> None:
-    """The next sample comes 0.6 s after the first one is stored, and is stored at once."""
+    """The next sample comes 0.6 s after the first one was stored, and is stored at once."""
     (log_ns,) = stamps(range(1000, 1200))
     stamp_ns = log_ns.copy()
     log_ns[0] = log_ns[1] - nanoseconds(0.6)
@@ -420,10 +439,11 @@ def test_first_sample_that_a_busy_recorder_stored_late_before_a_pause_stays(late
 @pytest.mark.parametrize("size", [400, 60])
 @pytest.mark.parametrize("live", [0, 100])
 def test_pause_in_history_of_publisher_is_no_step_of_clock(live: int, size: int) -> None:
-    """A recorder that joins late stores 3 s of history at once.
+    """A pause within stored history is no step of the clock.
 
-    The publisher paused for 0.6 s in it; `live` samples come later. The same pause is a step where
-    the log goes on in between.
+    A recorder that joins late stores 3 s of history at once. The publisher paused for 0.6 s in this
+    history, and `live` samples come later. If the log continues in between, the same pause is a
+    step.
     """
     (stamp_ns,) = stamps(range(1000, 1300))
     stamp_ns[200:] += nanoseconds(0.6)
@@ -478,9 +498,9 @@ def test_samples_before_the_flight_stand_for_none_of_the_flight(
 
 
 def test_rms_is_weighted_by_time() -> None:
-    """Of a second with e = 3, nine tenths are missing after a second with e = 1.
+    """A second with e = 1 is followed by a second with e = 3 that lacks nine tenths of its samples.
 
-    By hand the rms is sqrt((1 + 9) / 2).
+    The rms by hand is sqrt((1 + 9) / 2).
     """
     t = np.concatenate([np.arange(0.0, 1.0, 0.001), np.arange(1.0, 2.0, 0.01)])
     e = np.where(t < 1.0, 1.0, 3.0)
@@ -490,9 +510,9 @@ def test_rms_is_weighted_by_time() -> None:
 
 
 def test_process_has_ready_time_of_its_own_start() -> None:
-    """A controller of two aircraft that was killed and started again.
+    """A process has the ready time of its own start, even if a namesake was killed before.
 
-    A recorder without samples stands beside.
+    There are controllers of two aircraft, and a recorder without samples.
     """
     second = NANOSECONDS
     ready = [
@@ -524,7 +544,7 @@ def test_process_has_ready_time_of_its_own_start() -> None:
 def test_processes_of_a_lockstep_flight_have_their_samples_and_no_time_of_day(
     whole: Path, figures: dict[str, Any]
 ) -> None:
-    """Nodes in lockstep have no process id. Nothing is said of a recorder, which sends nothing."""
+    """Nodes in lockstep have no process id, and a recorder that sends nothing is not listed."""
     ready = [("/recorder", EPOCH), ("/controller", EPOCH), ("/aircraft", EPOCH)]
     spans = {
         "/controller": SampleSpan(first_ns=0, last_ns=2 * NANOSECONDS, samples=402),
@@ -553,7 +573,7 @@ def test_processes_of_a_lockstep_flight_have_their_samples_and_no_time_of_day(
 
 
 def test_recorder_in_the_hosts_time_has_no_number_of_samples() -> None:
-    """It sends none: a zero would say that nothing was sent that should be."""
+    """A recorder sends no samples, and a zero would say that it should have sent some."""
     ready = [("/recorder", EPOCH), ("/controller", EPOCH)]
     spans = {"/controller#7": SampleSpan(first_ns=EPOCH, last_ns=EPOCH + NANOSECONDS, samples=200)}
     processes = flight_processes(spans, ready, "")
@@ -562,7 +582,7 @@ def test_recorder_in_the_hosts_time_has_no_number_of_samples() -> None:
 
 
 def test_summary_counts_commands_of_flight(figures: dict[str, Any]) -> None:
-    """The first edge of the scenario is at 2.0 s, the end of the flight."""
+    """The flight ends at 2.0 s, when the first command of the scenario begins."""
     edges = command_edges(find_scenario("osprey_gust"))
     assert figures["account"]["commands"] == {
         "given": len(edges),
@@ -610,7 +630,7 @@ def test_python_says_nothing_of_a_log_that_lacks_nothing(whole: Path) -> None:
 
 @pytest.fixture(scope="module")
 def half(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> RecordedFlight:
-    """A flight whose log ends in the middle, with a failsafe in its last ticks and a model."""
+    """Return a flight with a learned model whose log ends in the middle of a failsafe."""
     run = tmp_path_factory.mktemp("half") / "run"
     flight = read_flight(damage(whole, run / "run_0.mcap", "", DAMAGES["ends in the middle"]))
     rms = dict.fromkeys(flight.summary["errors"], 0.1)
@@ -619,7 +639,10 @@ def half(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> RecordedFligh
 
 
 def test_every_table_of_the_page_says_its_share(half: RecordedFlight) -> None:
-    """The samples of a process and the margins are no figures of the flight."""
+    """Each table with figures of the flight says which share of it the figures cover.
+
+    The samples of a process and the margins are not figures of the flight.
+    """
     events = [EventInterval("gust", 0.0, 1.0, "1 s")]
     tables = flight_tables(half.summary, half.units, events)
     captions = [table.caption for table in tables]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The age of u at the aircraft, judged by the delay margin of the gains.
+"""Test the age of u at the aircraft against the delay margin of the gains.
 
 An independent publisher sends the diagnostics with the age.
 """
@@ -21,7 +21,7 @@ from flight_log.age_of_u import age_of_u
 
 
 def diagnostics(second: int, node: str, **values: str) -> bytes:
-    """A message of /diagnostics of a node."""
+    """Return a message on /diagnostics from a node."""
     types: dict[str, Any] = STORE.types
     header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](second, 0), "")
     pairs = [
@@ -62,9 +62,9 @@ def margin() -> float:
 def test_age_of_u_beside_delay_margin_of_gains(
     beyond: float, verdict: str, tape: Tape, margin: float
 ) -> None:
-    """`beyond` is the age beyond the delay of the gains and their margin, s.
+    """An age of u above the planned one gets a note with the delay margin.
 
-    An age as planned has no note.
+    `beyond` is how far the age exceeds the delay of the gains plus their margin, s.
     """
     mean = max(SERVO.controller.delay + margin + beyond, 0.0)
     figures = summarise(

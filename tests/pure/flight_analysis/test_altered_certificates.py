@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Altered certificates, each with the name and the digest of its own content.
+"""Test altered certificates, each with the name and the digest of its own content.
 
-The checker refuses what is false or has two readings, in one sentence. What it accepts is true, and
-says what it says: the list below names each with its reason.
+The checker refuses in one sentence what is false or has two readings. What it accepts is true and
+says what it says. The list below names each alteration with its reason.
 """
 
 import copy
@@ -59,14 +59,14 @@ def servo() -> Content:
 
 @pytest.fixture(scope="module")
 def other() -> Content:
-    """The certificate of another loop."""
+    """Return the certificate of another loop."""
     linear = loop_of("jsbsim_c172p")
     content: Content = json.loads(certificate(linear, guarantee_of("jsbsim_c172p"), {}))
     return content
 
 
 def signed(content: Content) -> str:
-    """The text of a content with the name and the digest of its numbers, if they have one."""
+    """Return a content as text, with the name and the digest of its numbers if they have one."""
     rest = {key: value for key, value in content.items() if key != "digest"}
     try:
         with np.errstate(all="ignore"):
@@ -81,7 +81,7 @@ def signed(content: Content) -> str:
 def verdict(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[int, str]]:
-    """The status and the words of the checker for a text."""
+    """Return a function that gives the checker's status and words for a text."""
     module = _checker()
 
     def run(text: str | bytes, *words: str) -> tuple[int, str]:
@@ -97,7 +97,7 @@ def verdict(
 
 
 def put(value: Any, *path: str | int) -> Alter:
-    """Put a value at a place."""
+    """Return an alteration that puts a value at a place."""
 
     def alter(content: Content) -> None:
         inner: Any = content
@@ -109,7 +109,7 @@ def put(value: Any, *path: str | int) -> Alter:
 
 
 def drop(*path: str | int) -> Alter:
-    """Leave a place out."""
+    """Return an alteration that leaves a place out."""
 
     def alter(content: Content) -> None:
         inner: Any = content
@@ -121,7 +121,7 @@ def drop(*path: str | int) -> Alter:
 
 
 def times(factor: float, *path: str | int) -> Alter:
-    """Multiply the numbers of a place."""
+    """Return an alteration that multiplies the numbers of a place."""
 
     def alter(content: Content) -> None:
         inner: Any = content
@@ -133,12 +133,12 @@ def times(factor: float, *path: str | int) -> Alter:
 
 
 def both(*alters: Alter) -> Alter:
-    """Do several."""
+    """Return an alteration that does several."""
     return lambda content: [alter(content) for alter in alters]
 
 
 def swap(*path: str | int, places: tuple[int, int]) -> Alter:
-    """Exchange two members of a list."""
+    """Return an alteration that exchanges two members of a list."""
 
     def alter(content: Content) -> None:
         inner: Any = content
@@ -151,7 +151,7 @@ def swap(*path: str | int, places: tuple[int, int]) -> Alter:
 
 
 def one_step(t: float = 0.0, g: float = 0.0) -> Alter:
-    """One step a part, over all frequencies."""
+    """Return an alteration with one step in each part, over all frequencies."""
 
     def alter(content: Content) -> None:
         for part in content["parts"]:
@@ -163,7 +163,10 @@ def one_step(t: float = 0.0, g: float = 0.0) -> Alter:
 
 
 def without_entry(content: Content) -> None:
-    """A box without one of its entries: smaller, and true."""
+    """Leave out one entry of the box.
+
+    The box becomes smaller, and the certificate stays true.
+    """
     i = content["names"].index("A[q,alpha]")
     for key in ("F", "G", "part", "names"):
         content[key].pop(i)
@@ -180,12 +183,12 @@ def without_entry(content: Content) -> None:
 
 
 def first(**members: Any) -> Alter:
-    """A step before the others of the first part."""
+    """Return an alteration that adds a step before those of the first part."""
     return lambda content: content["parts"][0]["steps"].insert(0, members)
 
 
 def last(**members: Any) -> Alter:
-    """A step behind the others of the first part."""
+    """Return an alteration that adds a step after those of the first part."""
     return lambda content: content["parts"][0]["steps"].append(members)
 
 
@@ -196,12 +199,15 @@ def steered_backwards(content: Content) -> None:
 
 
 def constants(old: str, new: str) -> Alter:
-    """Other exported constants."""
+    """Return an alteration of the exported constants."""
     return lambda content: content.update(constants=content["constants"].replace(old, new))
 
 
 def compiled(text: str) -> Alter:
-    """Constants with a text for their rows: {0} are the rows, {1} the same with other gains."""
+    """Return constants with another text for their rows.
+
+    In the text {0} stands for the rows, and {1} for the rows with other gains.
+    """
 
     def alter(content: Content) -> None:
         header = content["constants"]
@@ -214,14 +220,14 @@ def compiled(text: str) -> Alter:
 
 
 def exchanged(pattern: str) -> Alter:
-    """Exchange the two groups of a pattern in the constants."""
+    """Return an alteration that exchanges the two groups of a pattern in the constants."""
     return lambda content: content.update(
         constants=re.sub(pattern, r"\2\1", content["constants"], count=1)
     )
 
 
 def exchanged_in_names(one: str, other: str) -> Alter:
-    """Exchange two words in the names of the entries."""
+    """Return an alteration that exchanges two words in the names of the entries."""
     words = {one: other, other: one}
 
     def alter(content: Content) -> None:
@@ -234,7 +240,7 @@ def exchanged_in_names(one: str, other: str) -> Alter:
 
 
 def only_the_first(name: str) -> Alter:
-    """Leave out all but the first value of a row of the constants."""
+    """Return an alteration that keeps only the first value of a row of the constants."""
     pattern = rf"(/\* {name} \*/ \{{[\d.]+)[^}}]*"
     return lambda content: content.update(constants=re.sub(pattern, r"\1", content["constants"]))
 
@@ -459,7 +465,7 @@ def test_true_certificate_is_proved_and_says_what_holds(
 def test_another_loop_with_these_constants_is_refused(
     servo: Content, other: Content, tmp_path: Path, verdict: Callable[..., tuple[int, str]]
 ) -> None:
-    """With and without the header beside it: the law is computed from the constants."""
+    """The law is computed from the constants, with and without the header file."""
     header = tmp_path / "rise_di_parameters.h"
     header.write_text(servo["constants"])
     assert verdict(signed(servo), str(header))[0] == 0
@@ -490,9 +496,10 @@ def _leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 def test_no_mutation_of_a_leaf_proves_another_claim(
     verdict: Callable[..., tuple[int, str]],
 ) -> None:
-    """Of 60 leaves, drawn by member so that the few beside the steps have their turn.
+    """A mutation is refused, or the checker's claim is word for word the original one.
 
-    A mutation is refused, or the claim is word for word that of the certificate as it is.
+    It is made in 60 leaves. They are drawn by member, so that the few outside the steps are drawn,
+    too.
     """
     servo = certified(loop_guarantee(servo_loop()))
     _, claim = verdict(signed(servo))

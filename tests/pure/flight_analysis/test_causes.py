@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The cause that an account names has its evidence in the log.
+"""Test that the log has evidence for the cause that an account names.
 
-No damage of a log is told as a busy host.
+A damaged log must not be told as a busy host.
 """
 
 import json
@@ -43,7 +43,7 @@ STAMPED = (*LOOP, "/pose")
 
 
 class Sent(NamedTuple):
-    """A message in the order of the recording; times in ns."""
+    """A message in the order of the recording, with times in ns."""
 
     topic: str
     log_ns: int
@@ -52,16 +52,16 @@ class Sent(NamedTuple):
 
 
 class Messages(list[Sent]):
-    """Messages that a failing test does not print."""
+    """A list of messages that a failing test does not print."""
 
     def __repr__(self) -> str:
         return f"{len(self)} messages"
 
 
 def read_messages(log: Path) -> Messages:
-    """The messages of a log by the time of day, numbered as by its publishers.
+    """Return the messages of a log with the time of day and the numbers of their publishers.
 
-    A message is stored 1 ms after the stamp.
+    A message is stored 1 ms after its stamp.
     """
     numbers: Counter[str] = Counter()
     messages = []
@@ -80,7 +80,7 @@ def read_messages(log: Path) -> Messages:
 def write_messages(
     log: Path, copy: Path, messages: Sequence[Sent], *, attached: bool = True
 ) -> Path:
-    """Write messages with the schemas and the attachments of a log, in small chunks."""
+    """Write messages with the schemas and attachments of a log, in small chunks."""
     copy.parent.mkdir(parents=True, exist_ok=True)
     with log.open("rb") as source, copy.open("wb") as target:
         reader = make_reader(source)
@@ -109,12 +109,12 @@ def write_messages(
 
 @pytest.fixture(scope="module")
 def numbered(recorded: Path) -> Messages:
-    """The messages of a flight of two seconds."""
+    """Return the messages of a flight of two seconds."""
     return read_messages(recorded / "run_0.mcap")
 
 
 def damaged(messages: list[Sent], kind: str, at: float, size: float, topic: str) -> list[Sent]:
-    """Messages with a damage that begins at a part of the flight and has a size in s."""
+    """Damage messages from a fraction `at` of the flight on, by a size in s."""
     begin_ns = EPOCH + nanoseconds(2.0 * at)
     end_ns = begin_ns + nanoseconds(size)
     leap_ns = nanoseconds(size)
@@ -213,13 +213,16 @@ def test_no_damaged_byte_is_told_as_a_busy_host(
 
 
 def told(log: Path) -> list[str]:
-    """Return the headline of a log's outcome, and what stands below it."""
+    """Return the headline of a log's outcome, followed by the sentences below it."""
     outcome = read_flight(log).summary["outcome"]
     return [outcome["sentence"], *outcome["details"]]
 
 
 def check(log: Path) -> None:
-    """No sentence on a damaged log names a busy host, and no share below 90 % is a success."""
+    """Check that no sentence on a damaged log names a busy host.
+
+    A share below 90 % must not be told as a success.
+    """
     try:
         summary = read_flight(log).summary
     except ParameterError:
@@ -234,7 +237,7 @@ def check(log: Path) -> None:
 
 
 def figures(summary: dict[str, Any]) -> dict[str, Any]:
-    """The figures of a summary that depend on the time."""
+    """Return the figures of a summary that depend on the time."""
     return {key: summary[key] for key in ("duration", "errors", "inputs", "transients", "ticks")}
 
 
@@ -254,7 +257,7 @@ def test_two_damages_of_a_log_are_not_told_as_a_busy_host(
     kinds: list[str],
     jumbled: bool,
 ) -> None:
-    """Damages of two topics, also with each two messages swapped and a tenth of them twice."""
+    """Two topics are damaged, also with neighbours swapped and a tenth of the messages repeated."""
     messages: list[Sent] = list(numbered)
     for kind, topic in zip(kinds, topics, strict=False):
         messages = damaged(messages, kind, at, 0.5, topic)
@@ -269,7 +272,7 @@ def test_two_damages_of_a_log_are_not_told_as_a_busy_host(
 def test_log_that_begins_late_is_no_flight_that_began_late(
     numbered: Messages, recorded: Path, tmp_path: Path
 ) -> None:
-    """The numbers of the ticks tell of those before the log."""
+    """The numbers of the ticks show that there were ticks before the log."""
     log = write_messages(
         recorded / "run_0.mcap",
         tmp_path / "run_0.mcap",
@@ -295,9 +298,9 @@ def test_short_hole_that_is_the_lack_is_named(
 def test_outcome_of_another_flight_beside_a_log_is_not_believed(
     beside: str, numbered: Messages, recorded: Path, tmp_path: Path
 ) -> None:
-    """A log without its outcome in a folder of another name.
+    """Neither a summary that names no flight nor the outcome of a launch is believed.
 
-    Beside it are a summary that names no flight, and the outcome of a launch.
+    They lie beside a log without an outcome, in a folder of another name.
     """
     half = damaged(numbered, "cut", 0.5, 0.0, "")
     log = write_messages(recorded / "run_0.mcap", tmp_path / "other" / "run_0.mcap", half)
@@ -319,7 +322,7 @@ def test_outcome_of_another_flight_beside_a_log_is_not_believed(
 def test_leap_of_all_topics_is_told_and_figures_are_over_flight_time(
     kind: str, by: float, pose: bool, numbered: Messages, recorded: Path, tmp_path: Path
 ) -> None:
-    """The figures of the log without the leap are the right values, to the last digit."""
+    """The figures of the log without the leap are the expected values, to the last digit."""
     messages = [sent for sent in numbered if pose or sent.topic != "/pose"]
     intact = read_flight(
         write_messages(recorded / "run_0.mcap", tmp_path / "intact" / "run_0.mcap", messages)
@@ -342,10 +345,7 @@ def test_leap_of_all_topics_is_told_and_figures_are_over_flight_time(
 def test_pause_of_all_processes_is_no_leap_of_the_clock(
     numbered: Messages, recorded: Path, tmp_path: Path
 ) -> None:
-    """The flight goes on in the pause, as the flight times of truth tell.
-
-    The numbers go on behind the pause.
-    """
+    """Flight times of truth and the numbers go on after a pause, so the flight went on in it."""
     remaining = [
         sent
         for sent in numbered
@@ -365,9 +365,9 @@ def test_pause_of_all_processes_is_no_leap_of_the_clock(
 
 
 def test_rate_of_another_aircraft_is_that_of_its_log(tape: Tape, osprey_gust: Scenario) -> None:
-    """Each fifth sample of 500 Hz, numbered without a gap.
+    """The samples of y at a fifth of 500 Hz have numbers without a gap.
 
-    The processes are those of a controller, and no aircraft.
+    The log has the processes of a controller, and no aircraft.
     """
     signals = {name: tape[name] for name in ("y_m", "u", "internals")}
     every = np.arange(len(tape["y"].stamp_ns)) % 5 == 0
@@ -402,7 +402,7 @@ def test_simulated_flight_without_truth_lacks_it(
 def test_ticks_of_less_than_nine_tenths_are_no_success(
     numbered: Messages, recorded: Path, tmp_path: Path
 ) -> None:
-    """A controller that leaves out each second tick, with numbers that go on."""
+    """The controller leaves out every second tick, while its numbers go on."""
     ticks: Counter[str] = Counter()
     messages = []
     for sent in numbered:
@@ -416,7 +416,7 @@ def test_ticks_of_less_than_nine_tenths_are_no_success(
 def test_ticks_of_another_controller_do_not_count_among_those_of_the_flight(
     recorded: Path, tmp_path: Path
 ) -> None:
-    """A second controller sends forty of its ticks from t = 1 s on. The nodes refuse them."""
+    """A second controller sends forty ticks from t = 1 s on, and the nodes refuse them."""
     tape = read_run(recorded).tape
     nodes = dict.fromkeys(("u", "internals"), "/controller#7") | {"y_m": "/reference_model#8"}
     messages = []
@@ -480,7 +480,7 @@ def test_another_controller_begins_where_its_numbers_are_there_again(
 
 
 def test_two_ticks_stored_in_reverse_replay_as_one_controller(recorded: Path) -> None:
-    """Of ticks with the instant of the tick before in the log, the numbers tell the order."""
+    """The numbers tell the order of two ticks that the log has in reverse."""
     run = read_run(recorded)
     signal = run.tape["internals"]
     order = np.arange(len(signal.stamp_ns))
@@ -530,7 +530,7 @@ def test_outcome_in_the_log_is_before_that_of_a_summary_beside(
 def test_summary_of_another_flight_is_not_believed(
     recorded: Path, numbered: Messages, tmp_path: Path, later_by: int
 ) -> None:
-    """A log without an outcome takes that of the summary of its flight alone."""
+    """A log without an outcome takes the outcome of a summary only if it is of the same flight."""
     run = tmp_path / "run"
     log = write_messages(recorded / "run_0.mcap", run / "run_0.mcap", numbered)
     summary = read_flight(log).summary

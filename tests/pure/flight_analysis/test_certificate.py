@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The certificate of a guarantee, by the checker that imports nothing of this stack."""
+"""Test the certificate of a guarantee with the checker, which imports nothing of this stack."""
 
 import hashlib
 import json
@@ -73,7 +73,7 @@ def servo() -> Content:
 
 
 def signed(content: Content) -> Content:
-    """The content with the name and the digest that it has."""
+    """Return the content with the name and the digest of its numbers."""
     rest = {key: value for key, value in content.items() if key != "digest"}
     rest["loop"] = _checker().digest_of(rest)
     text = json.dumps(rest, sort_keys=True)
@@ -81,7 +81,7 @@ def signed(content: Content) -> Content:
 
 
 def run(content: Content, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """The checker, in this process."""
+    """Run the checker in this process."""
     path = folder / "certificate.json"
     path.write_text(json.dumps(content))
     command = [str(CHECKER), str(path), *words]
@@ -93,10 +93,10 @@ def run(content: Content, folder: Path, *words: str) -> subprocess.CompletedProc
 
 @pytest.mark.parametrize("name", ["osprey_servo", "jsbsim_c172p"])
 def test_checker_proves_a_guarantee(name: str, tmp_path: Path) -> None:
-    """The size is the guarantee's.
+    """The checker proves the size of the guarantee.
 
-    Of c172p an interval was proved across a crossing that the pencil hid beside an integrator: the
-    checker refused it.
+    For c172p an interval had been proved across a crossing that the pencil did not show because of
+    an integrator. The checker refused it.
     """
     linear = loop_of(name)
     guarantee = guarantee_of(name)
@@ -110,7 +110,10 @@ def test_checker_proves_a_guarantee(name: str, tmp_path: Path) -> None:
 
 
 def test_motion_of_the_checker_is_the_exact_loop(servo: Content, tmp_path: Path) -> None:
-    """Four coefficients of w close it within 1e-8, at the corners of the guarantee."""
+    """The motion of the checker is the exact closed loop within 1e-8, with four coefficients of w.
+
+    This is checked at the corners of the guarantee.
+    """
     module = _checker()
     linear = loop_of("osprey_servo")
     assert linear.box is not None
@@ -131,7 +134,7 @@ def test_motion_of_the_checker_is_the_exact_loop(servo: Content, tmp_path: Path)
 
 
 def _numbers(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """The places of all reals of a JSON value that are not 0."""
+    """Return the places of all real numbers of a JSON value that are not 0."""
     if isinstance(value, dict):
         return [place for key, inner in value.items() for place in _numbers(inner, (*path, key))]
     if isinstance(value, list):
@@ -145,7 +148,7 @@ def test_certificate_with_an_altered_number_is_refused(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Thirty reals, one at a time, in the last digit: the digest is another."""
+    """Thirty real numbers are altered in the last digit, one at a time, and the digest changes."""
     module = _checker()
     places = _numbers(servo)
     path = tmp_path / "certificate.json"
@@ -163,7 +166,10 @@ def test_certificate_with_an_altered_number_is_refused(
 
 
 def _states_exchanged(servo: Content) -> Content:
-    """The names q and alpha exchanged everywhere: the same numbers tell of other entries."""
+    """Exchange the names q and alpha everywhere.
+
+    The same numbers then describe other entries.
+    """
     other = {"q": "alpha", "alpha": "q"}
     states = [other.get(name, name) for name in servo["states"]]
     place = re.compile(r"(?<=[\[,])(q|alpha)(?=[\],])")
@@ -179,7 +185,7 @@ def _states_exchanged(servo: Content) -> Content:
 def test_certificate_with_the_name_of_another_loop_is_refused(
     alter: Callable[[Content], Content], servo: Content, tmp_path: Path
 ) -> None:
-    """The name that a report or a replay shows is that of these names and numbers."""
+    """The name that a report or a replay shows belongs to these names and numbers."""
     assert servo["loop"] == loop_of("osprey_servo").digest
     named = signed(alter(servo))
     assert named["loop"] != servo["loop"]
@@ -241,7 +247,7 @@ gusts:
 
 @pytest.mark.usefixtures("coarse")
 def test_section_that_gains_wrote_has_margins_and_a_certificate(tmp_path: Path) -> None:
-    """The conditions are those of its selection, to the six digits of the section."""
+    """The conditions are those of the selection, to the six digits that the section has."""
     frame, section = tmp_path / "one.yaml", tmp_path / "gains.yaml"
     path = tmp_path / "certificate.json"
     frame.write_text(ONE_CHANNEL)
@@ -276,7 +282,10 @@ def test_file_with_some_sections_is_no_section_alone(tmp_path: Path) -> None:
 
 
 def test_export_puts_the_certificate_beside_the_code_of_its_constants(tmp_path: Path) -> None:
-    """Without a computed guarantee there is none; with other constants the checker refuses it."""
+    """Without a computed guarantee there is no certificate.
+
+    The checker refuses the certificate together with other constants.
+    """
     code = tmp_path / "c"
     exported = rise_di.export("osprey_servo", code, proof=False)
     assert not any(path.name == "certificate.json" for path in exported.files)
@@ -294,7 +303,7 @@ def test_export_puts_the_certificate_beside_the_code_of_its_constants(tmp_path: 
 def test_command_certifies_an_aircraft_of_jsbsim_or_refuses_before_the_work(
     tmp_path: Path,
 ) -> None:
-    """The loop is y_dot = Omega u: four entries of B, and the name of the loop of the scenario."""
+    """The loop of y_dot = Omega u has four entries of B and the name of the scenario's loop."""
     path = tmp_path / "certificate.json"
     words = ["gains", "guarantee", "jsbsim:c172p", "--scenario", "jsbsim_c172p", "--samples", "1"]
     refused = invoke(*words, "--worst", str(tmp_path / "worst"))
@@ -313,7 +322,10 @@ def test_command_certifies_an_aircraft_of_jsbsim_or_refuses_before_the_work(
 
 @pytest.mark.usefixtures("coarse")
 def test_law_without_c_code_has_a_certificate_without_constants(tmp_path: Path) -> None:
-    """Vanes are no condition of the proof, only of the C code: an entry shows it."""
+    """Vanes do not prevent a proof, only the C code.
+
+    A changed entry shows that the proof is real.
+    """
     path = tmp_path / "certificate.json"
     words = ["gains", "guarantee", "osprey", "--scenario", "osprey_vanes", "--samples", "1"]
     words += ["--uncertainty", "0", "--entry", "A[q,q]=0.6"]

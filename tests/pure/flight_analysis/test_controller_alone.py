@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay and report of a flight of which only the section of the controller is known.
+"""Test replay and report of a flight of which only the controller's section is known.
 
-Whoever flies an aircraft of their own has no section for one.
+Users who fly their own aircraft have no section for it.
 """
 
 import json

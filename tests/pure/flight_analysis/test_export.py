@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Export of flights as tables and figures, read back with independent readers."""
+"""Test the export of flights as tables and figures, which independent readers read back."""
 
 import csv
 from pathlib import Path

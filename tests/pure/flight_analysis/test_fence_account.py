@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a flight says of its fence, its altitudes and its places: figures and notices."""
+"""Test what a flight tells about its fence, altitudes and places, as figures and notices."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,10 @@ SECTION = GuidanceConfig.validate_mapping(
 
 
 def flown(*north: float, engaged: int = 0) -> Tape:
-    """A pose a second at places to the north; guidance steps from the sample `engaged` on."""
+    """Return a flight with one pose per second at the given places to the north.
+
+    The topic of guidance begins with the sample `engaged`.
+    """
     stamp_ns = np.arange(len(north)) * nanoseconds(1.0)
     pose = Signal(stamp_ns, ("north", "east"), np.column_stack([north, np.zeros(len(north))]))
     steps = Signal(stamp_ns[engaged:], ("mode",), np.zeros((len(north) - engaged, 1)))
@@ -71,7 +74,7 @@ def test_time_outside_counts_while_guidance_flies() -> None:
 
 
 def test_true_pose_tells_where_the_simulation_knows_it() -> None:
-    """The measured pose is 30 m off, whoever moved it; the aircraft is where it is."""
+    """The true pose is used where the simulation has it, because the measured one is 30 m off."""
     measured = flown(490.0, 490.0, 490.0)
     north = 520.0 * np.ones(3)
     height = np.zeros(3)
@@ -91,7 +94,7 @@ def test_true_pose_tells_where_the_simulation_knows_it() -> None:
 
 
 def test_aircraft_with_a_pose_that_is_off_leaves_its_lane() -> None:
-    """Guidance holds the measured line, 40 m beside the true one, in a lane 60 m wide."""
+    """Guidance tracks the measured line, which is 40 m beside the true one in a lane of 60 m."""
     lane = ZoneConfig(north=(-50.0, 900.0, 900.0, -50.0), east=(-30.0, -30.0, 30.0, 30.0))
     route = {"north": [0.0, 800.0, 1600.0], "east": [0.0] * 3, "altitude": [0.0] * 3}
     scenario = calm_osprey(15.0, route=route)
@@ -122,7 +125,7 @@ def test_home_lies_between_the_altitudes() -> None:
 
 
 def test_notices_say_when_an_aircraft_is_outside() -> None:
-    """While the pose is lost, `fence.clearance` is LARGEST: unknown."""
+    """While the pose is lost, `fence.clearance` is LARGEST, which means unknown."""
     notices = Notices(0.0, 0.2, lambda speed: 100.0)
     log = dict.fromkeys(Notices.CHANNELS, 0.0)
     texts = [
@@ -137,7 +140,7 @@ def test_notices_say_when_an_aircraft_is_outside() -> None:
 
 
 def test_flight_that_ends_far_from_its_last_orbit_is_not_completed() -> None:
-    """An orbit of 180 m is joined within a radius of the circle."""
+    """An orbit of 180 m counts as joined within one radius of the circle."""
     route = {"north": [0.0, 1000.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
     section = SECTION.model_copy(
         update={"fence": {}, "route": RouteConfig.validate_mapping(route, "route"), "radius": 180}
@@ -155,7 +158,10 @@ def test_flight_that_ends_far_from_its_last_orbit_is_not_completed() -> None:
 
 
 def test_landing_beside_its_touch_down_zone_says_so() -> None:
-    """A zone of 400 by 20 m from the threshold on; the wheels touch 300 m on and 14 m beside."""
+    """The zone begins at the threshold and is 400 m long and 20 m wide.
+
+    The wheels touch after 300 m, 14 m beside the centre line.
+    """
     zone = {"north": [0.0, 400.0, 400.0, 0.0], "east": [-10.0, -10.0, 10.0, 10.0]}
     touchdown = ZoneConfig.validate_mapping(zone, "touchdown")
     section = SECTION.model_copy(update={"touchdown": touchdown})

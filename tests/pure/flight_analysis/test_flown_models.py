@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The margins of a flight that learned are those of each model that flew.
+"""Test that a flight that learned has the margins of each model that flew.
 
-The models fly around the file and around the true aircraft.
+The margins are around the file and around the true aircraft.
 """
 
 from pathlib import Path
@@ -37,7 +37,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def learns() -> Scenario:
-    """A flight that flies the initial law up to 4 s, then the file."""
+    """Return a flight with the initial law until 4 s, and with the model of the file afterwards."""
     return find_scenario("osprey_learn").vary(
         flight={"duration": 11.0},
         aircraft={"rate": 100.0, "step": 0.005},
@@ -80,7 +80,10 @@ def test_each_model_that_flew_has_its_times(controllers: tuple[FlownController, 
 def test_margins_are_of_each_model_around_file_and_true_aircraft(
     learns: Scenario, flight: Tape, controllers: tuple[FlownController, ...], tmp_path: Path
 ) -> None:
-    """The true aircraft by another way: its matrices in a file, around which the parameters fly."""
+    """The true aircraft is also built in another way, as a file with its matrices.
+
+    The parameters of each model then fly around this file.
+    """
     loops = flown_loops(flight, learns, controllers).loops
     assert [(each.name, each.aircraft) for each in loops] == [
         ("start", FILE),
@@ -122,7 +125,7 @@ def test_page_has_margins_and_curves_of_each_model(
 def test_what_was_learned_is_drawn_beside_true_value_and_file(
     learns: Scenario, flight: Tape
 ) -> None:
-    """B[q, elevator] of the osprey is 0.98 1/s^2 per deg."""
+    """The value of the file is B[q, elevator] = 0.98 1/s^2 per deg."""
     lines = learned_lines(flight, learns)
     assert lines[FILE]["B[q, elevator]"] == pytest.approx(0.98 * 180.0 / np.pi, rel=1e-4)
     ratio = lines[TRUE]["B[q, elevator]"] / lines[FILE]["B[q, elevator]"]

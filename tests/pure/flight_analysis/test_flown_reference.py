@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight whose y_m is not that of its scenario has flown other commands, however well it did."""
+"""Test that a flight whose y_m is not the scenario's has flown other commands.
+
+This is told even if it tracked them well.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -87,7 +90,7 @@ FAULTS: MappingProxyType[str, Callable[[FloatArray], FloatArray]] = MappingProxy
 
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
 def test_fault_of_the_reference_model_is_told(fault: Callable[[FloatArray], FloatArray]) -> None:
-    """The law tracks y_m, so most of these leave no error."""
+    """The law tracks y_m, so that most of these faults leave no error."""
     tape = flown("servo")
     y_m = replace(tape["y_m"], values=fault(tape["y_m"].values.copy()))
     (told,) = reference_shortfalls(with_y_m(tape, y_m), servo())
@@ -102,7 +105,7 @@ def with_y_m(tape: Tape, y_m: Signal) -> Tape:
 def test_fault_of_the_reference_model_is_told_where_guidance_commands(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Guidance answers to the turn that is missing, so u_m differs; y_m is no answer to it."""
+    """Guidance reacts to the missing turn, so u_m differs, and y_m does not follow from it."""
 
     class Faulty(Reference):
         def sample(self, number: int) -> FloatArray:
@@ -115,7 +118,10 @@ def test_fault_of_the_reference_model_is_told_where_guidance_commands(
 
 
 def test_fault_is_told_from_its_first_sample_to_its_last() -> None:
-    """Three seconds of p are reversed, while its pulse is on."""
+    """A reversed p is told from its first sample to its last.
+
+    It is reversed for three seconds of its pulse.
+    """
     tape = flown("servo")
     values = tape["y_m"].values.copy()
     values[1250:1550, 2] *= -1.0
@@ -127,7 +133,7 @@ def test_fault_is_told_from_its_first_sample_to_its_last() -> None:
 
 
 def test_flight_of_other_commands_is_told() -> None:
-    """The file that judges has another pulse than the file that flew."""
+    """The file that judges has another pulse than the file that was flown."""
     pulses = {name: each.model_dump() for name, each in servo().reference_model.pulses.items()}
     pulses["p"]["value"] = [0.39, *pulses["p"]["value"][1:]]
     other = servo().vary(reference_model={"pulses": pulses})
@@ -140,7 +146,7 @@ def test_flight_of_other_commands_is_told() -> None:
 def in_real_time(
     late: Callable[[int], int], *, lost: slice | None = None, part: float = 1.0
 ) -> Tape:
-    """Return the guided flight as of nodes in real time, where a u_m arrives some samples late.
+    """Return the guided flight as nodes in real time log it, with u_m some samples late.
 
     `part` of its u_m is sent.
     """
@@ -180,7 +186,7 @@ def in_real_time(
 
 
 def test_u_m_may_arrive_late_in_real_time() -> None:
-    """Each u_m acts 0 to 3 samples after its stamp, and no bit is left unexplained."""
+    """Each u_m takes effect 0 to 3 samples after its stamp, and every bit of y_m is explained."""
     delays = np.random.default_rng(1).integers(0, 4, 10_000)
     errors = reference_errors(in_real_time(lambda k: int(delays[k])), guided())
     assert isinstance(errors, ReferenceErrors)
@@ -188,9 +194,10 @@ def test_u_m_may_arrive_late_in_real_time() -> None:
 
 
 def test_u_m_that_hardly_changes_does_not_hide_when_it_acted() -> None:
-    """A u_m of 1e-6 that is taken a step too early is wrong by more than 1e-9 only steps later.
+    """A u_m of 1e-6 that is taken a step too early shows only some steps later.
 
-    y_m is off by 1e-10, so that no bit tells.
+    Only then is it wrong by more than 1e-9. y_m is off by 1e-10, so that it cannot be compared bit
+    by bit.
     """
     rng = np.random.default_rng(2)
     delays = rng.integers(0, 4, 10_000)
@@ -204,7 +211,10 @@ def test_u_m_that_hardly_changes_does_not_hide_when_it_acted() -> None:
 
 
 def test_u_m_that_the_log_lost_is_no_fault_of_the_reference_model() -> None:
-    """The u_m with the largest step is missing: y_m is off for a moment, less than is harmless."""
+    """The u_m with the largest step is missing in the log.
+
+    y_m is off for a moment, by less than a harmful error.
+    """
     p = flown("guided")["u_m"]["p"]
     k = int(np.argmax(np.abs(np.diff(p)))) + 1
     tape = in_real_time(lambda k: 1, lost=slice(k, k + 1))
@@ -215,7 +225,10 @@ def test_u_m_that_the_log_lost_is_no_fault_of_the_reference_model() -> None:
 
 
 def test_u_m_that_acts_after_its_age_limit_is_told() -> None:
-    """A reference model that flies commands of half a second ago is no late network."""
+    """Commands that are half a second old are a fault of the reference model.
+
+    They are not explained by a slow network.
+    """
     tape = in_real_time(lambda k: 50)
     (shortfall,) = reference_shortfalls(tape, guided())
     assert shortfall.aim is Aim.REFERENCE
@@ -249,7 +262,7 @@ def test_log_without_a_channel_of_y_m_is_not_compared() -> None:
 
 
 def test_reference_model_of_a_user_flies_no_command_of_the_scenario() -> None:
-    """They are not counted, do not split the errors, and nothing settles after them."""
+    """Such commands are not counted, do not divide the errors, and have no settling."""
     of_stack = rise_di.summarise(flown("servo"), servo())
     own = rise_di.summarise(with_reference_model_of_a_user(), servo())
     assert of_stack["account"]["commands"]["given"] > 0
@@ -261,7 +274,10 @@ def test_reference_model_of_a_user_flies_no_command_of_the_scenario() -> None:
 
 
 def test_reference_model_that_was_started_by_itself_begins_at_its_first_sample() -> None:
-    """No message says when t = 0 was: y_m does, unless the log begins later."""
+    """No message tells the instant of t = 0.
+
+    It is the first y_m, unless the log begins later.
+    """
     tape = flown("servo")
     y_m = tape["y_m"]
     alone = replace(

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The guarantee for every aircraft of a box: closed forms and corners.
+"""Test the guarantee for every aircraft of a box against closed forms and corners.
 
-SLICOT is an independent program where installed.
+Where it is installed, SLICOT is an independent reference.
 """
 
 import itertools
@@ -50,7 +50,7 @@ PERIOD = 0.01
 
 
 def radii(linear: LinearLoop, d: FloatArray) -> FloatArray:
-    """The spectral radii of the exact loops of some deviations, (N, k)."""
+    """Return the spectral radii of the exact loops for some deviations, (N, k)."""
     assert linear.box is not None
     aircraft = plants_at(linear.nominal, linear.box, d)
     still = np.zeros(len(linear.inputs))
@@ -71,7 +71,7 @@ def servo_guarantee() -> Guarantee:
 
 
 def integrator(k: float, part: float) -> LinearLoop:
-    """U = -k y around y_dot = (1 + d) u."""
+    """Return the loop of u = -k y around y_dot = (1 + d) u."""
     plant = LinearPlant(np.zeros((1, 1, 1)), np.ones((1, 1, 1)), np.eye(1))
     law = LinearLaw(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[-k]]))
     box = Box(
@@ -97,7 +97,7 @@ def integrator(k: float, part: float) -> LinearLoop:
 
 @pytest.mark.parametrize("k", [120.0, 150.0, 180.0])
 def test_gain_of_integrator_may_rise_to_two_over_k_period(k: float) -> None:
-    """y+ = (1 - k T (1 + d)) y is unstable from d = 2 / (k T) - 1 on."""
+    """The loop y+ = (1 - k T (1 + d)) y is unstable from d = 2 / (k T) - 1 on."""
     guarantee = loop_guarantee(integrator(k, 0.1))
     limit = 2.0 / (k * PERIOD) - 1.0
     # at most above by the 1e-6 of the limit of stability; below by the level's room of 0.4 %
@@ -111,7 +111,10 @@ def test_gain_of_integrator_may_rise_to_two_over_k_period(k: float) -> None:
 def test_quick_proof_ends_below_the_limit_or_at_the_most_that_was_asked_for(
     most: float, proved: float
 ) -> None:
-    """The integrator with k T = 1.5 is stable up to d = 1 / 3, 10 / 3 times its box of 0.1."""
+    """A quick proof ends below the limit, or at the size that was asked for.
+
+    With k T = 1.5 the integrator is stable up to d = 1 / 3, which is 10 / 3 times its box of 0.1.
+    """
     size = quick_guarantee(integrator(150.0, 0.1), most).stable / 0.1
     assert proved / (1.0 + guarantee_module.GAPS[0]) * 0.99 < size < proved * (1.0 + 1e-5)
 
@@ -121,7 +124,7 @@ def test_quick_proof_of_an_unstable_loop_is_none() -> None:
 
 
 def test_each_step_of_the_work_is_told() -> None:
-    """A size that is proved was tried, so it was told."""
+    """Each size that is tried is told, and so the proved size is among them."""
     told: list[str] = []
     guarantee = loop_guarantee(integrator(150.0, 0.3), report=told.append)
     sizes = [float(text.split()[-2]) for text in told if text.startswith("proving every aircraft")]
@@ -131,7 +134,10 @@ def test_each_step_of_the_work_is_told() -> None:
 
 
 def test_disk_margin_of_integrator_is_that_of_its_worst_gain() -> None:
-    """S - 1/2 at pi / T is 1 / (1 - k T (1 + d) / 2) - 1/2, the largest for the largest gain."""
+    """The disk margin is the one of the largest gain.
+
+    There S - 1/2 at pi / T is 1 / (1 - k T (1 + d) / 2) - 1/2, which is largest.
+    """
     guarantee = loop_guarantee(integrator(120.0, 0.2))
     half = 120.0 * PERIOD * 1.2 / 2.0
     disk = 1.0 / (1.0 / (1.0 - half) - 0.5)
@@ -152,7 +158,7 @@ def test_loop_without_box_is_refused() -> None:
 
 
 def test_bound_of_a_real_product_is_its_closed_form() -> None:
-    """Sum abs(u_i v_i) is mu of u v^T with real entries: det = 1 - sum v_i delta_i u_i."""
+    """For real entries, mu of u v^T is sum abs(u_i v_i), because det = 1 - sum v_i delta_i u_i."""
     u = np.array([1.0, -2.0, 0.5, 3.0])
     v = np.array([0.3, 0.2, -4.0, 0.1])
     M = np.outer(u, v).astype(complex)
@@ -163,14 +169,14 @@ def test_bound_of_a_real_product_is_its_closed_form() -> None:
 
 
 def test_imaginary_scalar_has_no_real_perturbation() -> None:
-    """det(1 - j delta) is never 0 for a real delta: G alone shows it."""
+    """det(1 - j delta) is never 0 for a real delta, and only G can show this."""
     M = np.array([[2j]])
     value, _ = least_bound(M, 1, 0.05)
     assert value < 0.05
 
 
 def test_every_scaling_is_above_corners_of_small_matrices() -> None:
-    """A corner with eigenvalue 1 / size of M Delta shows mu from below."""
+    """A corner for which M Delta has the eigenvalue 1 / size is a lower bound of mu."""
     rng = np.random.default_rng(4)
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     for _ in range(20):
@@ -182,7 +188,7 @@ def test_every_scaling_is_above_corners_of_small_matrices() -> None:
 
 
 def test_bound_below_one_is_that_of_the_eigenvalues() -> None:
-    """Matrices scaled around the bound 1, all below it, all above, and some of each."""
+    """The matrices have bounds around 1: all below it, all above it, or some of each."""
     rng = np.random.default_rng(4)
     M = rng.standard_normal((40, 5, 5)) + 1j * rng.standard_normal((40, 5, 5))
     scaling = Scaling(0.3 * rng.standard_normal(5), np.r_[rng.standard_normal(3), 0.0, 0.0])
@@ -207,7 +213,7 @@ def test_bound_is_that_of_slicot() -> None:
 
 @pytest.mark.parametrize("name", ["osprey_servo", "osprey_twin"])
 def test_loop_with_entries_pulled_out_is_the_exact_loop(name: str) -> None:
-    """Two Legendre coefficients leave out what is of the order (period rate)^4: 1e-5."""
+    """Two Legendre coefficients neglect terms of the order (period rate)^4, which is 1e-5."""
     linear = boxed(name, 0.7)
     assert linear.box is not None
     d = np.sign(np.random.default_rng(1).standard_normal((20, len(linear.box.names))))
@@ -219,9 +225,10 @@ def test_loop_with_entries_pulled_out_is_the_exact_loop(name: str) -> None:
 
 @pytest.mark.parametrize("late", [0.003, 0.012, 0.026])
 def test_channels_of_a_delay_hold_each_constant_delay(late: float) -> None:
-    """A delay of j + f periods is e_i = 1 for i < j, and 1 over the first f of a period for i = j.
+    """Any constant delay lies within the channels of the delay.
 
-    Two coefficients of each e_i are at most its block: the spectral radius is that of the exact
+    For a delay of j + f periods, e_i is 1 for i < j, and e_j is 1 over the first f of a period. Two
+    coefficients of each e_i are within its block, and the spectral radius is the one of the exact
     loop.
     """
     linear = boxed("osprey_servo", 0.5)
@@ -249,7 +256,7 @@ def test_channels_of_a_delay_hold_each_constant_delay(late: float) -> None:
 
 
 def test_guarantee_with_a_late_input_is_below_each_constant_delay() -> None:
-    """The loop of an integrator, u = -k y: no gain of the box and no delay within is unstable."""
+    """No gain of the box and no delay within the limit makes the loop u = -k y unstable."""
     linear = integrator(60.0, 0.1)
     in_time = loop_guarantee(linear)
     guarantee = loop_guarantee(linear, 0.01)
@@ -268,7 +275,10 @@ def test_guarantee_with_a_late_input_is_below_each_constant_delay() -> None:
 
 
 def oscillator(law: tuple[float, float]) -> LinearLoop:
-    """U = law y around an oscillator of 200 rad/s with a damping of 0.05, off by up to 1 %."""
+    """Return the loop of u = law y around an oscillator of 200 rad/s with a damping of 0.05.
+
+    Its gain is uncertain by 1 %.
+    """
     w = 200.0
     A = np.array([[0.0, 1.0], [-w * w, -0.1 * w]])
     plant = LinearPlant(A[None], np.array([[[0.0], [w * w]]]), np.eye(2))
@@ -289,7 +299,10 @@ def oscillator(law: tuple[float, float]) -> LinearLoop:
 
 
 def test_guarantee_with_a_late_input_holds_for_a_delay_that_changes() -> None:
-    """Each constant delay up to a period is stable, a sequence of 0 and a period is not."""
+    """A delay that changes can destabilise a loop that is stable for each constant delay.
+
+    The delay alternates between 0 and a period, and the constant delays reach up to a period.
+    """
     linear = oscillator((0.5446, 0.00031))
     for delay in np.linspace(0.0, PERIOD, 21):
         loop = linear.loop._replace(delay=delay)
@@ -311,7 +324,10 @@ def test_guarantee_with_a_late_input_holds_for_a_delay_that_changes() -> None:
 
 
 def test_size_between_two_gaps_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sizes up to 0.7 of the least unstable one can be proved: gaps of 0.32 and 0.64 say 0.61."""
+    """Sizes up to 0.7 of the least unstable one can be proved here.
+
+    The gaps of 0.32 and 0.64 alone would find 0.61.
+    """
     monkeypatch.setattr(
         guarantee_module, "_proof", lambda _, size, *__, **___: [] if size <= 0.7 else None
     )
@@ -320,10 +336,11 @@ def test_size_between_two_gaps_is_found(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_bound_from_zero_holds_where_a_delay_has_no_effect() -> None:
-    """At 0 rad/s a constant delay changes nothing: the scaling of 0 is silent on its channels.
+    """A constant delay has no effect at 0 rad/s, so the scaling for 0 does not treat its channels.
 
-    The limit of c172p, u up to 10 ms late, was 33 % beside 76 % found. With another delay at each
-    tick 73.6 % is found by a search over delays of 0 or 10 ms.
+    For c172p with u up to 10 ms late, the proved limit had been 33 %, while the least unstable
+    aircraft was at 76 %. If the delay may change at each tick, a search over delays of 0 and 10 ms
+    finds one at 73.6 %.
     """
     c172p = find_scenario("jsbsim_c172p")
     guarantee = loop_guarantee(scenario_loop(c172p, c172p.controller, 1, 0.3), 0.01)
@@ -351,9 +368,10 @@ def test_no_corner_is_unstable_or_has_less_than_guaranteed() -> None:
 
 @pytest.mark.usefixtures("coarse")
 def test_first_unstable_aircraft_is_the_nearest_that_a_search_found() -> None:
-    """Another program, climbing by the exponential of each aircraft, found one at 74.8 %.
+    """An independent program found an unstable aircraft at 74.8 %.
 
-    The search that walks by slopes alone had ended at 76.6 %.
+    It follows the exponential of each aircraft uphill. A search that only uses slopes had ended at
+    76.6 %.
     """
     linear = boxed("osprey_observer")
     guarantee = loop_guarantee(linear)
@@ -365,7 +383,7 @@ def test_first_unstable_aircraft_is_the_nearest_that_a_search_found() -> None:
 
 
 def test_guarantee_says_what_is_exact_in_every_aircraft() -> None:
-    """The rows of the angles and gravity are exact, and no more is said than is proved."""
+    """The rows of the angles and gravity are exact, and the text says no more than is proved."""
     text = guarantee_text(servo_guarantee())
     assert "the linear loop is stable for every aircraft within 74." in text[0]
     kinematic = "A[V,theta], A[theta,q], A[beta,phi], A[phi,p], A[phi,r]"
@@ -376,7 +394,7 @@ def test_guarantee_says_what_is_exact_in_every_aircraft() -> None:
 
 
 def test_factor_with_a_nan_is_not_inside() -> None:
-    """A Cholesky factor of NaN raises nothing, and no comparison with NaN is true."""
+    """A Cholesky factor of NaN raises no error, and every comparison with NaN is false."""
     N = np.diag([0.1 + 0.0j, 0.1])
     assert Centre(np.ones(2), np.zeros(2), np.eye(2)).is_inside(N, 1.0)
     for d, g in ((np.nan, 0.0), (1.0, np.nan)):
@@ -385,7 +403,10 @@ def test_factor_with_a_nan_is_not_inside() -> None:
 
 
 def test_search_is_at_or_below_corners() -> None:
-    """Each least figure is at or below that of 150 corners, and the disk is that of the bound."""
+    """The search finds figures at or below those of 150 corners.
+
+    Its disk margin is the one of the bound.
+    """
     linear = boxed("osprey_observer")
     assert linear.box is not None
     search = worst_in_box(linear.nominal, linear.law, linear.loop, linear.box)
@@ -446,7 +467,7 @@ def test_report_shows_the_guarantee_that_was_computed_for_its_loop(tmp_path: Pat
 
 @pytest.mark.usefixtures("coarse")
 def test_command_fails_below_uncertainty_and_writes_unstable_aircraft(tmp_path: Path) -> None:
-    """The first unstable one is inside the box, 1.2 times as far off is outside."""
+    """The nearest unstable aircraft is inside the box, and one 1.2 times as far off is outside."""
     folder = tmp_path / "first"
     arguments = ["gains", "guarantee", "osprey", "--uncertainty", "0.75"]
     arguments += ["--worst", str(folder), "--samples", "1"]
@@ -463,7 +484,7 @@ def test_command_fails_below_uncertainty_and_writes_unstable_aircraft(tmp_path: 
 def test_frequency_without_proof_leaves_no_guarantee_and_no_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Rounding can leave no interval around a frequency, as of a flying wing near its limit."""
+    """Rounding can leave no interval around a frequency, as for a flying wing near its limit."""
     monkeypatch.setattr(branch_and_bound, "interval_at", lambda *_: None)
     monkeypatch.setattr(guarantee_module, "BOXES", 20)
     monkeypatch.setattr(guarantee_module, "FEWER_BOXES", 20)
@@ -475,10 +496,10 @@ def test_frequency_without_proof_leaves_no_guarantee_and_no_error(
 def test_command_bounds_the_effectors_behind_an_allocation(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """An elevon acts on q and on p at once.
+    """An elevon acts on q and on p at the same time.
 
-    The box of the file is larger than that of the law's inputs, and an aircraft of it is unstable
-    earlier.
+    The box of the airframe file is larger than the one of the law's inputs, so that an unstable
+    aircraft is found at a smaller size.
     """
     asked: list[LinearLoop] = []
 

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of merit and plots of a guided flight: a log worked by hand, and the log of a flight."""
+"""Test figures of merit and plots of a guided flight.
+
+One log is computed by hand, and another is from a flight.
+"""
 
 import json
 import math
@@ -39,9 +42,9 @@ SPEED = 40.0  # m/s, trim
 
 
 def log(**channels: ArrayLike) -> Tape:
-    """A guided flight of 40 s to the north in steady level flight, except for these channels.
+    """Return 40 s of steady level flight to the north with other values in these channels.
 
-    `_` stands for a dot.
+    In their names, `_` stands for a dot.
     """
     replacements = {name.replace("__", "."): value for name, value in channels.items()}
     level: dict[str, Any] = dict.fromkeys(names(("q", "V", "p", "r")), 0.0) | {
@@ -54,7 +57,7 @@ def log(**channels: ArrayLike) -> Tape:
 
 
 def near(*values: Any) -> Any:
-    """A tuple of numbers, approximately."""
+    """Return numbers that are compared approximately."""
     return approx(values)
 
 
@@ -144,7 +147,7 @@ def test_wind_follows_from_velocities_over_ground_and_through_air() -> None:
 
 @pytest.fixture(scope="module")
 def flight() -> RecordedFlight:
-    """The first seconds of the route of the osprey: a capture."""
+    """Return the first seconds of the osprey's route, in which it captures the first leg."""
     scenario = find_scenario("osprey_route").vary(flight={"duration": 4.0})
     tape = simulate(scenario)
     return RecordedFlight("osprey_route", scenario, tape, summarise(tape, scenario))

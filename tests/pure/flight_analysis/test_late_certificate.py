@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The certificate of a guarantee with a late u, and sequences of delays beside it."""
+"""Test the certificate of a guarantee with a late u, and sequences of delays."""
 
 import copy
 import json
@@ -39,7 +39,7 @@ def observer() -> LinearLoop:
 
 @pytest.fixture(scope="module")
 def guarantee(observer: LinearLoop) -> Guarantee:
-    """What is proved for a fifth less than what is unstable: without disks and finer steps."""
+    """Return what is proved with a gap of a fifth, without disks and without finer steps."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(guarantee_module, "GAPS", (0.2,))
         patch.setattr(guarantee_module, "HALVINGS", 0)
@@ -63,7 +63,7 @@ def test_checker_proves_a_guarantee_with_a_late_u(
 
 
 def _until(change: float, begin: float, end: float, degrees: int) -> FloatArray:
-    """The coefficients of what is 1 before a time and -1 behind it, from begin to end."""
+    """Return the coefficients of a signal that is 1 before the time `change` and -1 after it."""
     part = np.clip((change - begin) / (end - begin), 0.0, 1.0)
     integrals = [Legendre.basis(i, [0, 1]).integ(lbnd=0) for i in range(degrees)]
     return np.array(
@@ -76,7 +76,7 @@ def _until(change: float, begin: float, end: float, degrees: int) -> FloatArray:
 def test_channels_of_the_checker_hold_each_delay_of_each_input(
     delay: float, late: float, observer: LinearLoop, tmp_path: Path
 ) -> None:
-    """With e_j of constant delays that differ by input, the modes are those of the exact loop."""
+    """With constant delays that differ by input, the modes are those of the exact loop."""
     module, rng = _checker(), np.random.default_rng(4)
     linear = observer._replace(loop=observer.loop._replace(delay=delay))
     period, m = linear.loop.period, len(linear.inputs)
@@ -164,7 +164,7 @@ def test_altered_certificate_with_a_late_u_is_refused(
 def test_part_with_exact_entries_alone_has_no_certificate(
     observer: LinearLoop, guarantee: Guarantee
 ) -> None:
-    """The checker proves steps of boxes: a part without entries has none."""
+    """The checker proves steps of boxes, so a part without entries has no certificate."""
     proof = [*guarantee.proof, {"entries": [], "steps": [], "levels": [(0, 0.0)]}]
     with pytest.raises(ValueError, match="a part with exact entries alone"):
         certificate(observer, guarantee._replace(proof=proof), {})
@@ -173,8 +173,8 @@ def test_part_with_exact_entries_alone_has_no_certificate(
 class Ticks:
     """The motion of an aircraft from tick to tick, by exponentials, with each u late or in time.
 
-    The states are x, actuators, u of the two ticks before, and the law. u acts 3 ms behind its
-    tick, or a period later.
+    The states are x, the actuators, u of the last two ticks, and the law. A u in time acts 3 ms
+    after its tick, and a late one acts a period later.
     """
 
     def __init__(self, plant: LinearPlant, linear: LinearLoop) -> None:
@@ -194,7 +194,7 @@ class Ticks:
         self.rest = np.vstack([*self.u[:2], xi])
 
     def growth(self, is_late: NDArray[np.bool_]) -> float:
-        """The spectral radius of a period of a sequence of ticks, (ticks, inputs)."""
+        """Return the spectral radius of a period of a sequence of ticks, (ticks, inputs)."""
         total = np.eye(self.x.shape[1])
         for now, last in zip(is_late, np.roll(is_late, 1, axis=0), strict=True):
             x = self.x
@@ -211,7 +211,10 @@ class Ticks:
 def test_sequences_of_delays_inside_a_certificate_are_stable_and_one_outside_leaves(
     observer: LinearLoop, guarantee: Guarantee
 ) -> None:
-    """A search found the sequence, of an aircraft that each constant delay leaves stable."""
+    """The sequence outside was found by a search.
+
+    Its aircraft is stable for each constant delay.
+    """
     rng, box = np.random.default_rng(6), observer.box
     assert box is not None
     for _ in range(300):
@@ -236,7 +239,7 @@ def test_sequences_of_delays_inside_a_certificate_are_stable_and_one_outside_lea
 def test_ticks_of_the_search_are_the_exact_loop(
     delay: float, late: float, observer: LinearLoop
 ) -> None:
-    """A choice that stays is a constant delay of some inputs."""
+    """If a choice of late inputs is kept, these inputs have a constant delay."""
     timing = observer.loop._replace(delay=delay)
     ticks = ticks_of(observer.nominal, observer.law, timing, late)
     assert len(ticks.maps) == 16
@@ -251,7 +254,10 @@ def test_ticks_of_the_search_are_the_exact_loop(
 def test_search_finds_a_sequence_that_leaves_below_each_constant_delay(
     observer: LinearLoop,
 ) -> None:
-    """It leaves by exponentials of another hand, and a little nearer it is stable again."""
+    """The sequence leaves by exponentials that were computed independently.
+
+    For a slightly smaller deviation it stays.
+    """
     box = observer.box
     assert box is not None
     d = 0.599 / box.largest * CORNER

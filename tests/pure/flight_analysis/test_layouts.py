@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The layouts of Foxglove and PlotJuggler that ship: every curve is a channel of a flight.
+"""Test the shipped layouts of Foxglove and PlotJuggler: each curve is a channel of a flight.
 
-The formats follow the sources of the two programs. Neither program runs here.
+The formats follow the sources of the two programs. Neither program is run here.
 """
 
 import json
@@ -29,12 +29,12 @@ TABS = ["guidance", "tracking", "error", "input", "integrals", "controller", "wi
 
 @pytest.fixture(scope="module", params=["osprey_route", "osprey_servo", "osprey_vanes"])
 def tape(request: pytest.FixtureRequest) -> Tape:
-    """A flight with guidance, one without, and one whose observer has more channels."""
+    """Return a flight with guidance, one without, and one whose observer has more channels."""
     return simulate(find_scenario(request.param, 0.1))
 
 
 def foxglove_curves() -> Iterator[tuple[str, int, str]]:
-    """Topic, index in `position`, and label of each curve of Foxglove."""
+    """Yield the topic, the index in `position`, and the label of each curve of Foxglove."""
     for panel in FOXGLOVE["configById"].values():
         for path in panel.get("paths", ()):
             parts = re.fullmatch(r"/(\w+)\.position\[(\d+)\]", path["value"])
@@ -43,7 +43,7 @@ def foxglove_curves() -> Iterator[tuple[str, int, str]]:
 
 
 def plotjuggler_curves() -> Iterator[tuple[str, str]]:
-    """Topic and channel of each curve of PlotJuggler."""
+    """Yield the topic and the channel of each curve of PlotJuggler."""
     for curve in PLOTJUGGLER.iter("curve"):
         root, topic, channel, field = curve.attrib["name"].split("/")
         assert (root, field) == ("", "position")
@@ -51,7 +51,10 @@ def plotjuggler_curves() -> Iterator[tuple[str, str]]:
 
 
 def panels_of(tree: Any) -> Iterator[str]:
-    """Panels of a tree of splits (react-mosaic): a name, or a direction with two parts."""
+    """Yield the panels of a tree of splits (react-mosaic).
+
+    A tree is a name, or a direction with two parts.
+    """
     if isinstance(tree, str):
         yield tree
         return
@@ -97,7 +100,7 @@ def test_every_panel_of_foxglove_stands_in_one_tab() -> None:
 
 
 def test_map_of_foxglove_shows_recorded_topics() -> None:
-    """The frame `map` is that of REP 105."""
+    """The frame `map` is the one of REP 105."""
     panel = FOXGLOVE["configById"]["3D!map"]
     assert panel["followTf"] == "map"
     recorded = {f"/{topic.name}" for topic in TOPICS if LOG in topic.subscribers}

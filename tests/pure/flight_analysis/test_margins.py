@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of the sampled loop, and the worst of uncertain aircraft.
+"""Test the margins of the sampled loop, and the smallest ones of uncertain aircraft.
 
-They are checked by closed forms, and by python-control as an independent program.
+They are compared with closed forms and with python-control.
 """
 
 import math
@@ -45,7 +45,7 @@ INTEGRATOR = LinearPlant(np.zeros((1, 1)), np.eye(1), np.eye(1))
 
 
 def proportional(k: FloatArray) -> LinearLaw:
-    """The law u = -k y."""
+    """Return the law u = -k y."""
     m = len(k)
     return LinearLaw(np.zeros((0, 0)), np.zeros((0, m)), np.zeros((m, 0)), -k)
 
@@ -204,7 +204,7 @@ def test_scaled_norm_of_triangle_is_diagonal() -> None:
 
 
 def pi_of_python_control(scenario: Scenario) -> control.StateSpace:
-    """K(z) of RISE-DI inside its softened sign, from (20) to (22); u = -K e.
+    """Return K(z) of RISE-DI inside its softened sign, from (20) to (22), with u = -K e.
 
     The integrals are a trapezoid and backward Euler.
     """
@@ -230,7 +230,7 @@ def pi_of_python_control(scenario: Scenario) -> control.StateSpace:
 def loops_of_python_control(
     scenario: Scenario,
 ) -> tuple[list[control.StateSpace], control.StateSpace]:
-    """L_i with the other inputs closed, and the closed loop, in python-control.
+    """Return L_i with the other inputs closed, and the closed loop, from python-control.
 
     The delay is one period.
     """

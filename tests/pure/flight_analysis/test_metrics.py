@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a flight against numbers worked by hand."""
+"""Test the metrics of a flight against numbers by hand."""
 
 import math
 from dataclasses import asdict
@@ -31,7 +31,7 @@ from rise_di_controller.internals import Saturation
 
 
 def tape(**signals: Signal) -> Tape:
-    """A flight that begins at EPOCH."""
+    """Return a flight that begins at EPOCH."""
     return Tape(dict(signals), EPOCH)
 
 
@@ -103,9 +103,9 @@ def test_turn_and_capture_replace_commands_of_guided_flight() -> None:
 
 
 def guided(**channels: Any) -> list[Any]:
-    """Kind, start and stop of the transients of 20 s of guidance at 40 m/s.
+    """Return kind, start and stop of the transients of 20 s of guidance at 40 m/s.
 
-    The guidance has these channels from 5 to 8 s.
+    Guidance has the given channels from 5 to 8 s.
     """
     t = np.arange(0.0, 20_000.0, 20.0)
     level = {"phi_c": 0.0, "climb_c": 0.0, "xtrack": 0.0, "V_c": 40.0}

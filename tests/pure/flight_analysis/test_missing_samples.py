@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which missing samples of a log are a lack.
+"""Test which missing samples make a log incomplete.
 
-A topic alone is excused by what its own sensor drops, and a silence is named.
+Samples that a sensor drops excuse only its own topic, and a silence is named.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,10 @@ Kept = NDArray[np.bool_]
 
 
 def scenario(**aircraft: object) -> Scenario:
-    """The default scenario at 100 Hz, whose pose is at 50 Hz, with these values of the aircraft."""
+    """Return the default scenario at 100 Hz with other values of the aircraft.
+
+    Its pose is at 50 Hz.
+    """
     return find_scenario("osprey_gust").vary(
         aircraft={"rate": 100.0, "step": 0.01, **aircraft},
         reference_model={"rate": 100.0},
@@ -35,9 +38,9 @@ def scenario(**aircraft: object) -> Scenario:
 
 
 def lacks(flight: Scenario, duration: int, samples: Mapping[str, Kept]) -> tuple[str, ...]:
-    """What the log of a flight of whole seconds lacks.
+    """Return what the log of a flight of whole seconds lacks.
 
-    `samples`: which samples of a topic it has, (N,), all of the others.
+    `samples` says which samples of a topic the log has, (N,). Of all other topics it has all.
     """
     signals = {}
     for name, rate in RATES.items():
@@ -53,20 +56,26 @@ def lacks(flight: Scenario, duration: int, samples: Mapping[str, Kept]) -> tuple
 
 
 def dropped(name: str, duration: int, share: float) -> Kept:
-    """Samples that stay of a topic that loses a share at random, never the last one."""
+    """Return which samples of a topic are kept if a share is lost at random.
+
+    The last one is kept.
+    """
     keep = np.random.default_rng(1).random(duration * RATES[name] + 1) >= share
     keep[-1] = True
     return keep
 
 
 def silent(name: str, duration: int, begin: float, end: float) -> Kept:
-    """Samples that stay of a topic without a sample between two instants."""
+    """Return which samples of a topic are kept if it is silent between two instants."""
     t = np.arange(duration * RATES[name] + 1) / RATES[name]
     return np.asarray((t <= begin) | (t >= end))
 
 
 def test_samples_that_the_sensor_of_y_drops_are_no_lack() -> None:
-    """And more than that are: half as many again is above four deviations of their number."""
+    """The share that the sensor of y drops is not missing from the log, but half as much again is.
+
+    That is more than four deviations of the number of dropped samples.
+    """
     share = 0.3
     flight = scenario(sensors={"dropout": share})
     assert lacks(flight, 60, {"y": dropped("y", 60, share)}) == ()
@@ -75,7 +84,7 @@ def test_samples_that_the_sensor_of_y_drops_are_no_lack() -> None:
 
 @pytest.mark.parametrize("name", [name for name in RATES if name != "y"])
 def test_what_the_sensor_of_y_drops_excuses_no_other_topic(name: str) -> None:
-    """Half of what y may lose is missing of another topic."""
+    """Another topic lacks half of the share that y may lose, and this is not excused."""
     share = 0.3
     flight = scenario(sensors={"dropout": share})
     keep = dropped(name, 60, share / 2.0)
@@ -86,7 +95,7 @@ def test_what_the_sensor_of_y_drops_excuses_no_other_topic(name: str) -> None:
 @pytest.mark.parametrize("late", ["sensors", "pose"])
 @pytest.mark.parametrize("name", OF_AIRCRAFT)
 def test_delay_of_a_sensor_excuses_the_end_of_its_topic_alone(name: str, late: str) -> None:
-    """0.5 s of 20 s: more than the hundredth that a topic may lack."""
+    """A silence of 0.5 s at the end of 20 s is more than the hundredth that a topic may lack."""
     flight = scenario(**{late: {"delay": 0.5}})
     excused = {"sensors": "y", "pose": "pose"}[late]
     sentences = lacks(
@@ -104,7 +113,7 @@ def test_delay_of_a_sensor_excuses_the_end_of_its_topic_alone(name: str, late: s
 def test_silence_of_a_steady_topic_is_named_by_its_times(
     name: str, duration: int, length: float
 ) -> None:
-    """Of the long flight also a silence that leaves more than 99 % of the samples."""
+    """In the long flight, a silence is named even if more than 99 % of the samples are there."""
     sentences = lacks(scenario(), duration, {name: silent(name, duration, 30.0, 30.0 + length)})
     assert len(sentences) == 1
     assert sentences[0].startswith(f"{name} ")
@@ -114,7 +123,7 @@ def test_silence_of_a_steady_topic_is_named_by_its_times(
 @pytest.mark.parametrize("end, named", [(598.0, True), (598.9, True), (599.1, False)])
 @pytest.mark.parametrize("name", ["y", "truth"])
 def test_topic_that_ends_a_second_early_is_named(name: str, end: float, named: bool) -> None:
-    """Of a long flight, where the share of the missing samples is below a hundredth."""
+    """In a long flight, the samples missing at the end are less than a hundredth of all."""
     sentences = lacks(scenario(), 600, {name: silent(name, 600, end, 601.0)})
     assert [lack.endswith(f"ends at t = {end:.3f} of 600.000 s") for lack in sentences] == [
         True
@@ -122,7 +131,7 @@ def test_topic_that_ends_a_second_early_is_named(name: str, end: float, named: b
 
 
 def test_late_beginning_is_told_of_a_topic_that_also_stopped_early() -> None:
-    """A flight in real time whose publisher of y_m sends again after the end.
+    """The publisher of y_m stops early and sends again after the end of a flight in real time.
 
     The numbers of the messages show that it sent nothing in the last second of the flight.
     """
@@ -145,7 +154,7 @@ def test_late_beginning_is_told_of_a_topic_that_also_stopped_early() -> None:
 
 @cache
 def flown(share: float, rate: float) -> tuple[Scenario, Tape]:
-    """A flight whose sensor drops a share of y."""
+    """Return a flight whose sensor drops a share of y."""
     flight = scenario(rate=rate, step=1.0 / rate, sensors={"dropout": share})
     flight = flight.vary(flight={"duration": 20.0})
     return flight, simulate(flight)
@@ -158,7 +167,7 @@ SHARES = pytest.mark.parametrize(
 
 @SHARES
 def test_flight_whose_sensor_drops_samples_has_a_whole_log(share: float, rate: float) -> None:
-    """Each u that was sent is in the log: none is due without a new y."""
+    """The log has each u that was sent, and no u is due without a new y."""
     flight, tape = flown(share, rate)
     assert account(tape, flight).lacks == ()
 
@@ -181,7 +190,7 @@ def test_declared_dropout_excuses_no_lost_u(
 
 
 def test_y_that_is_lost_beyond_the_declared_dropout_is_named() -> None:
-    """A log without a stretch of y and of u does not excuse itself: y has a number of its own."""
+    """A stretch without y and u is named, because the samples of y have numbers of their own."""
     flight, tape = flown(0.5, 100.0)
     signals = {}
     for name in ("y", "u", "internals"):

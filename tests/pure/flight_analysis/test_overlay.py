@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The difference of two logs is that of their signals, whatever their rates and gaps are."""
+"""Test that the difference of two logs is the one of their signals, at any rates and with gaps."""
 
 import numpy as np
 import pytest
@@ -18,9 +18,9 @@ def tape(topic: str, t: FloatArray, values: FloatArray, start: float = 0.0) -> T
 
 
 def test_difference_of_sines_is_the_closed_form() -> None:
-    """Sin t - 0.9 sin t has the rms 0.1 / sqrt 2, and its largest value 0.1 at pi / 2.
+    """The difference of sin t and 0.9 sin t has the rms 0.1 / sqrt 2 and a maximum of 0.1.
 
-    The logs have other rates and begin at other times of day.
+    The maximum is at pi / 2. The logs have other rates and begin at other times of day.
     """
     t, finer = np.linspace(0.0, 2.0 * np.pi, 2001), np.linspace(0.0, 2.0 * np.pi, 7001)
     found = difference(
@@ -36,7 +36,7 @@ def test_difference_of_sines_is_the_closed_form() -> None:
 
 
 def test_tolerance_of_a_channel_replaces_that_of_its_size() -> None:
-    """abs(0.1 sin t) > 0.05 in all but 4 asin(0.5) of 2 pi, which leaves two thirds."""
+    """abs(0.1 sin t) is above 0.05 in all but 4 asin(0.5) of 2 pi, which leaves two thirds."""
     t = np.linspace(0.0, 2.0 * np.pi, 2001)
     logs = (tape("y", t, np.sin(t)), tape("y", t, 0.9 * np.sin(t)))
     found = difference(*logs, "y", "phi", tolerance=0.05)
@@ -46,7 +46,10 @@ def test_tolerance_of_a_channel_replaces_that_of_its_size() -> None:
 
 
 def test_gap_and_values_that_are_no_number_are_not_compared_and_that_is_said() -> None:
-    """The second log has nothing from 4 to 8 s, and the first no number in its last tenth."""
+    """The second log has no samples from 4 to 8 s.
+
+    The first log has no numbers in its last tenth.
+    """
     t = np.linspace(0.0, 10.0, 1001)
     values = np.where(t > 9.0, np.nan, 1.0)
     kept = t[(t <= 4.0) | (t >= 8.0)]
@@ -57,7 +60,7 @@ def test_gap_and_values_that_are_no_number_are_not_compared_and_that_is_said() -
 
 
 def test_angle_between_two_samples_goes_the_short_way() -> None:
-    """Halfway from 179 to -179 deg is 180 deg, and not 0."""
+    """The angle halfway between 179 and -179 deg is 180 deg, and not 0."""
     ends = np.array([0.0, 1.0])
     second = tape("pose", ends, np.radians([179.0, -179.0]))
     found = difference(tape("pose", np.array([0.5]), np.array([np.pi])), second, "pose", "phi")
@@ -66,7 +69,7 @@ def test_angle_between_two_samples_goes_the_short_way() -> None:
 
 
 def test_input_is_held_between_samples_and_output_is_linear() -> None:
-    """At 0.5 s a step from 0 to 1 at 1 s is still 0 if held, and 0.5 if linear."""
+    """At 0.5 s, a step from 0 to 1 at 1 s is still 0 if it is held, and 0.5 if it is linear."""
     first = {topic: tape(topic, np.array([0.5]), np.array([1.0])) for topic in ("y", "u")}
     second = {
         topic: tape(topic, np.array([0.0, 1.0]), np.array([0.0, 1.0])) for topic in ("y", "u")
@@ -76,7 +79,7 @@ def test_input_is_held_between_samples_and_output_is_linear() -> None:
 
 
 def test_angle_over_the_turn_differs_by_the_short_way() -> None:
-    """From 179 to -179 deg are 2 deg."""
+    """The difference between 179 and -179 deg is 2 deg."""
     t = np.array([0.0, 1.0])
     first, second = (tape("pose", t, np.radians(np.full(2, angle))) for angle in (179.0, -179.0))
     found = difference(first, second, "pose", "phi")
@@ -85,7 +88,7 @@ def test_angle_over_the_turn_differs_by_the_short_way() -> None:
 
 
 def test_logs_without_a_common_time_have_no_difference() -> None:
-    """The times are those since the start of each log."""
+    """Times are counted from the start of each log."""
     early, late = np.array([0.0, 1.0]), np.array([2.0, 3.0])
     assert difference(tape("y", early, early), tape("y", late, late), "y", "phi") is None
     empty = np.array([np.nan, np.nan])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures for a paper, read back with independent readers."""
+"""Test the figures for a paper, which independent readers read back."""
 
 import re
 import xml.etree.ElementTree as ET
@@ -16,9 +16,9 @@ from flight_analysis.report.summary import RecordedFlight
 
 
 def test_pdf_has_the_width_and_vectors(flight: RecordedFlight, tmp_path: Path) -> None:
-    """88 mm are 249.4 points of 1/72 inch.
+    """A width of 88 mm is 249.4 points of 1/72 inch.
 
-    Paths are operators l and S in the stream; there is no image, no Type 3 font.
+    Paths are the operators l and S in the stream. There is no image and no Type 3 font.
     """
     write_figure(tmp_path / "fig.pdf", [flight], "88mm", "q,V")
     content = (tmp_path / "fig.pdf").read_bytes()

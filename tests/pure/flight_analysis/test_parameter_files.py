@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario files as rcl reads ROS parameter files.
+"""Test that scenario files are read as rcl reads ROS parameter files.
 
-The expected values were read by nodes of rclpy 7.1 from the same sections: a later section of a
-node replaces what an earlier one says, whatever the names are, and keeps the rest.
+The expected values were read by nodes of rclpy 7.1 from the same sections. A later section of a
+node replaces the values that it has in common with an earlier one, whatever the names are, and
+keeps the rest.
 """
 
 import re
@@ -25,7 +26,7 @@ from flight_bringup.fleet import is_fleet
 
 
 def with_sections(scenario: Scenario, named: str, further: str = "", first: str = "") -> str:
-    """The text of a scenario with other names of its sections, and further sections."""
+    """Return the text of a scenario with other names of its sections, and with further sections."""
     text = re.sub(
         r"^/\*\*/(\w+):$",
         lambda match: named.replace("NODE", match[1]),
@@ -87,7 +88,7 @@ def test_form_of_parameter_file_is_a_scenario(
 def test_nodes_read_from_file_of_flight_what_was_validated(
     form: str, namespace: str, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    """A node of rclpy with this file has the values of the scenario."""
+    """With this file, a node of rclpy has the same values as the scenario."""
     named, first, further, k_g = FORMS[form]
     path = tmp_path / "form.yaml"
     path.write_text(with_sections(osprey_gust, named, further, first))
@@ -105,7 +106,7 @@ def test_nodes_read_from_file_of_flight_what_was_validated(
 
 
 def as_read_by_ros(path: Path, namespace: str) -> dict[str, Any]:
-    """The parameters that rclpy gives to the controller, by dotted name."""
+    """Return the parameters that rclpy gives to the controller, by dotted name."""
     words = [sys.argv[0], "--ros-args", "--params-file", str(path)]
     words += ["-r", f"__ns:={namespace}"] if namespace else []
     context = Context()
@@ -155,7 +156,7 @@ def test_sections_that_no_node_can_take_are_refused(
 
 
 def test_defaults_are_those_of_the_shipped_scenarios(osprey_gust: Scenario) -> None:
-    """A controller needs only what differs from aircraft to aircraft."""
+    """A controller only needs the values that differ from aircraft to aircraft."""
     values = osprey_gust.controller.model_dump()
     obvious = ("hold", "ramp", "max_age", "sign", "softening", "delay")
     bare = {name: value for name, value in values.items() if name not in (*obvious, "omega")}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Random sequences of samples, losses, faults of y and changes through the controller.
+"""Test the controller with random sequences of samples, losses, faults of y and changes.
 
-They check what u may do, and the replay of the log.
+The tests check what u may do, and that the replay of the log is equal.
 """
 
 from typing import Any, NamedTuple
@@ -52,11 +52,14 @@ class Sequence:
         self._jump = np.zeros_like(self._y)
 
     def happens(self, share: float) -> bool:
-        """Whether something happens in this tick that does so in a share of them."""
+        """Return whether an event with this probability per tick happens now."""
         return bool(self.rng.random() < share)
 
     def receive(self) -> None:
-        """A y and a y_m: late, lost, repeated, of a y that jumps, stands still or is no number."""
+        """Receive a y and a y_m.
+
+        They may be late, lost or repeated, and y may jump, stand still or not be a number.
+        """
         rng = self.rng
         period_ns = self.controller.period_ns
         if self.happens(0.005):
@@ -94,7 +97,7 @@ class Sequence:
                 continue
 
     def change(self) -> None:
-        """Now and then new parameters, which move no u, a restart or a deactivation."""
+        """Sometimes change parameters without a jump of u, restart, or deactivate."""
         rng = self.rng
         if self.happens(0.004):
             self.active = not self.active
@@ -121,7 +124,10 @@ class Sequence:
         assert np.array_equal(before, self.controller.state.command)
 
     def tick(self) -> None:
-        """A tick; u is finite, within limits and rates, and an engagement moves no u."""
+        """Run a tick.
+
+        u must be finite and within its limits and rates, and must not jump at an engagement.
+        """
         controller = self.controller
         state = controller.state
         limits = self.parameters.effector_limits()
@@ -145,7 +151,10 @@ class Sequence:
                 self.rows["internals"].append(Sample(output.stamp_ns, output.internals.copy()))
 
     def run(self, ticks: int) -> None:
-        """Ticks with what comes before each; a fiftieth of them late by up to 30 periods."""
+        """Run ticks with the events before each.
+
+        A fiftieth of them are late by up to 30 periods.
+        """
         for _ in range(ticks):
             overrun = int(self.rng.integers(1, 30)) if self.happens(0.02) else 1
             self.now_ns += overrun * self.controller.period_ns
@@ -154,7 +163,7 @@ class Sequence:
             self.tick()
 
     def tape(self) -> Tape:
-        """What the recorder would have stored."""
+        """Return what the recorder would have stored."""
         parameters = self.parameters
         names = {
             "y": parameters.measured,
@@ -201,7 +210,7 @@ def test_random_sequence_keeps_u_in_its_limits_and_is_replayed_to_the_bit(
 
 
 def test_replay_is_equal_where_a_vane_reads_beyond_pi_and_the_law_engages_again() -> None:
-    """The reading of the tick before stands in for such a one, over the engagement too."""
+    """For an impossible reading the last one is used, also over an engagement."""
     parameters = find_scenario("osprey_vanes").controller
     sequence = Sequence(parameters, 3)
     controller = sequence.controller

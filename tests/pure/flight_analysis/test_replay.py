@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of recorded flights is equal to the last bit.
+"""Test that a replay equals the recorded flight to the last bit.
 
-That holds through failsafes and lost samples, and a single changed bit is found.
+This is true through failsafes and lost samples, and a single changed bit is found.
 """
 
 import contextlib
@@ -73,13 +73,13 @@ SCENARIOS = {
 
 @cache
 def flown(name: str) -> Tape:
-    """The flight of one of SCENARIOS, flown once for all tests that read it."""
+    """Return the flight of one of SCENARIOS, which is flown once for all tests."""
     return simulate(SCENARIOS[name])
 
 
 @cache
 def busy_flown(name: str) -> Tape:
-    """The same with the commands of BUSY."""
+    """Return the same flight with the commands of BUSY."""
     return simulate(SCENARIOS[name].vary(reference_model={"pulses": BUSY}))
 
 
@@ -106,7 +106,7 @@ def test_replay_equals_flight_in_every_bit(name: str) -> None:
 
 
 class Tick(NamedTuple):
-    """Events before a tick and at it."""
+    """The events before a tick and in it."""
 
     y_age: int | None = 2  # ms, of the y that arrived; None without one
     y_m_age: int | None = 0
@@ -117,7 +117,7 @@ class Tick(NamedTuple):
 
 
 def driven(parameters: ControllerConfig, ticks: Sequence[Tick], start_ns: int = EPOCH) -> Tape:
-    """The tape of a controller that meets these events."""
+    """Return the log of a controller with these events."""
     outputs = parameters.outputs
     controller = Controller(parameters)
     rows: dict[str, list[tuple[int, FloatArray]]] = {"y": [], "y_m": [], "u": [], "internals": []}
@@ -156,7 +156,7 @@ def driven(parameters: ControllerConfig, ticks: Sequence[Tick], start_ns: int = 
 
 
 def signal(names: Sequence[str], samples: Sequence[tuple[int, FloatArray]]) -> Signal:
-    """Samples sorted by stamp, as the reader of logs returns them."""
+    """Return samples sorted by stamp, as the reader of logs does."""
     stamps = np.array([stamp for stamp, _ in samples], dtype=np.int64)
     order = np.argsort(stamps, kind="stable")
     return Signal(stamps[order], tuple(names), np.array([value for _, value in samples])[order])
@@ -218,7 +218,7 @@ def test_a_replay_passes_the_same_modes(events: list[Tick], modes: list[Mode]) -
 
 
 def flipped(value: float) -> float:
-    """The float64 with the lowest bit of its fraction changed."""
+    """Return a float64 with the lowest bit of its fraction changed."""
     return float((np.array([value]).view(np.int64) ^ 1).view(np.float64)[0])
 
 
@@ -322,7 +322,10 @@ def test_differences_counted_in_units_in_last_place() -> None:
 
 
 def without(tape: Tape, keep: Callable[[FloatArray], Any]) -> Tape:
-    """The tape with those samples of `internals` and `u` whose numbers `keep` accepts."""
+    """Return the log without some ticks.
+
+    Only those samples of `internals` and `u` are kept whose numbers `keep` accepts.
+    """
     kept = np.asarray(keep(tape["internals"]["number"]), dtype=bool)
     pair = {name: tape[name] for name in ("internals", "u")}
     signals = {
@@ -372,7 +375,7 @@ def test_gains_changed_in_flight_differ_from_tick_of_change() -> None:
 
 
 def test_changes_of_the_same_parameters_are_one_note() -> None:
-    """As those of a module whose limits follow the airspeed, a thousand in a flight."""
+    """A module whose limits follow the airspeed changes them a thousand times in a flight."""
     limits = [{"upper": [0.02 + 0.001 * k] * 4} for k in range(25)]
     ticks = [Tick(changes=(change,)) for change in limits]
     tape = driven(GUST.controller, [FLY] * 30 + ticks + [Tick(changes=({"k_g": 2.0},)), FLY])
@@ -458,7 +461,7 @@ def test_change_to_same_value_changes_no_bit() -> None:
 
 
 def busy_scenario(folder: Path, **controller: object) -> Path:
-    """The default scenario with changes to the controller and commands on all channels, 2 s."""
+    """Return the default scenario for 2 s, with commands on all channels and changed parameters."""
     flight = {"duration": 2.0}
     reference_model = {"pulses": BUSY}
     path = folder / "busy.yaml"

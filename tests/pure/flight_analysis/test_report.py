@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report: its figures, shaded intervals, tables and events, and the size of the page."""
+"""Test the report: figures, shaded intervals, tables, events, and the size of the page."""
 
 import base64
 import colorsys
@@ -60,7 +60,7 @@ def servo() -> Scenario:
 
 
 def held(count: int = 101, /, **channels: Any) -> Signal:
-    """Channels at 100 Hz, of which most hold a value; `__` in a name stands for a dot."""
+    """Return channels at 100 Hz, most of which are constant. In a name, `__` stands for a dot."""
     return signal(
         [10.0 * k for k in range(count)],
         **{name.replace("__", "."): value for name, value in channels.items()},
@@ -68,9 +68,9 @@ def held(count: int = 101, /, **channels: Any) -> Signal:
 
 
 def ticks(count: int = 101, /, **channels: Any) -> Signal:
-    """Internals of a controller at 100 Hz that was on time and never saturated.
+    """Return the internals of a controller at 100 Hz that was on time and never saturated.
 
-    `channels` replace channels.
+    `channels` replaces some of them.
     """
     limits = {f"limited.{name}": Saturation.NO for name in INPUTS}
     integrals = {f"{group}.{name}": 0.0 for group in ("integral_e", "Pi") for name in OUTPUTS}
@@ -86,14 +86,14 @@ def ticks(count: int = 101, /, **channels: Any) -> Signal:
 
 
 def flight(count: int = 101, **signals: Signal) -> Tape:
-    """A flight at 100 Hz whose outputs are zero, with the signals given."""
+    """Return a flight at 100 Hz whose outputs are zero, with the given signals."""
     zero = held(count, **dict.fromkeys(OUTPUTS, 0.0))
     return Tape({"y": zero, "y_m": zero, **signals}, EPOCH)
 
 
 @pytest.fixture
 def complete() -> Tape:
-    """A flight with all signals of a simulation."""
+    """Return a flight with all signals of a simulation."""
     states = dict.fromkeys(("x__q", "x__V", "x__p", "x__r", "actuator__elevator"), 0.0)
     truth = held(**states, gust__vertical=2.0, noise__q=1e-3)
     return flight(u=held(**dict.fromkeys(INPUTS, 0.1)), internals=ticks(late=1e-3), truth=truth)
@@ -109,7 +109,7 @@ def traces(figure: Figure | None, name: str) -> list[Any]:
 
 
 def titles(figure: Figure | None) -> list[str]:
-    """Titles of the rows from top to bottom."""
+    """Return the titles of the rows from top to bottom."""
     return [axis.title.text for axis in drawn(figure).select_yaxes()]
 
 
@@ -126,15 +126,15 @@ def recorded(
 
 
 def headings(page: str) -> list[str]:
-    """The headings of the blocks, in their order; those of tiles have no place of their own."""
+    """Return the headings of the blocks in their order, without those of the tiles."""
     return re.findall(r'<h2 id="[^"]*">([^<]*)</h2>', page)
 
 
 @pytest.mark.parametrize("columns", [2, 3, 4])
 def test_labels_of_a_column_fit_beside_its_neighbour(columns: int) -> None:
-    """The title of an axis and the longest labels, as -0.025, take 65 pixels at 12 pixels a line.
+    """An axis title and the longest labels, such as -0.025, take 65 pixels at 12 pixels per line.
 
-    A sheet of 1100 pixels with its padding of 2 x 16 holds the figure.
+    The figure fits into a sheet of 1100 pixels with a padding of 16 on each side.
     """
     figure = plotting.set_layout(Figure(columns, columns, 100))
     left = [x["domain"][0] for x in figure.x]
@@ -305,7 +305,7 @@ def test_spectrum_of_commanded_sine_has_peak_there() -> None:
 
 @pytest.fixture(scope="module")
 def pair(servo: Scenario) -> list[RecordedFlight]:
-    """Two flights: the second has half the error in q, and no p."""
+    """Return two flights, the second with half the error in q and without p."""
     y_m = signal([0, 1000], **dict.fromkeys(OUTPUTS, 1.0))
     first = flight(y=signal([0, 1000], q=1.2, V=1.0, p=1.0, r=1.0), y_m=y_m)
     second = flight(y=signal([0, 1000], r=1.0, V=1.0, q=1.1), y_m=y_m)
@@ -341,7 +341,10 @@ def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> N
 
 
 def test_figures_of_a_comparison_are_those_of_the_report(pair: list[RecordedFlight]) -> None:
-    """The flights have one reference, which is drawn once. A flight has one colour everywhere."""
+    """Both flights have the same reference, which is drawn once.
+
+    A flight has the same colour in all figures.
+    """
     context_of_pair = figures.plot_context(pair)
     q = {trace.name: trace for trace in drawn(figures.tracking_figure(context_of_pair)).data[:3]}
     assert list(q) == ["y_m", "a", "b"]
@@ -353,7 +356,10 @@ def test_figures_of_a_comparison_are_those_of_the_report(pair: list[RecordedFlig
 
 
 def test_colour_of_the_reference_is_that_of_no_flight() -> None:
-    """On light and dark pages 20 deg apart on the circle of hues: red and orange are 30 deg."""
+    """The hues differ by more than 20 deg, on light and dark pages.
+
+    Red and orange differ by 30 deg.
+    """
 
     def hue(colour: str) -> float:
         return colorsys.rgb_to_hsv(*(int(colour[k : k + 2], 16) for k in (1, 3, 5)))[0] * 360.0
@@ -365,7 +371,7 @@ def test_colour_of_the_reference_is_that_of_no_flight() -> None:
 
 
 def test_every_time_of_the_summary_has_a_heading() -> None:
-    """A metric is declared once, and no metric of the timing is left out of the tables."""
+    """Each metric is declared once, and the tables leave out no metric of the timing."""
     kinds: dict[str, Any] = {
         "ticks": TickMetrics,
         "latency": LatencyMetrics,
@@ -403,7 +409,10 @@ def test_part_without_command_and_gust_is_named_by_what_was_in_the_air(
 
 
 def test_wind_of_an_aircraft_of_another_maker_is_not_known(servo: Scenario) -> None:
-    """The log has no truth: the gusts of the scenario were not flown, and the air has no name."""
+    """Without truth in the log, the gusts of the scenario were not flown.
+
+    The air has no name then.
+    """
     y_m = signal([0, 1000], **dict.fromkeys(OUTPUTS, 1.0))
     tape = flight(y=y_m, y_m=y_m)
     assert summarise(tape, servo)["air"] == "other"
@@ -424,7 +433,7 @@ def test_gust_that_comes_again_is_a_gust_each_time(servo: Scenario) -> None:
 
 @pytest.fixture(scope="module")
 def unlike(servo: Scenario) -> list[RecordedFlight]:
-    """A flight in a gust, one in turbulence, and one in the gust under other gains."""
+    """Return a flight in a gust, one in turbulence, and one in the gust with other gains."""
     gust = {"vertical": {"start": 1.0, "speed": 4.0, "length": 15.0}}
     gusts = servo.vary(aircraft={"gusts": gust}, flight={"duration": 3.0})
     turbulence = servo.vary(aircraft=WINDS["turbulence"], flight={"duration": 3.0})
@@ -438,9 +447,10 @@ def unlike(servo: Scenario) -> list[RecordedFlight]:
 def test_comparison_of_unlike_flights_begins_with_what_differs(
     unlike: list[RecordedFlight], tmp_path: Path
 ) -> None:
-    """The parameters are by hand those of the three scenarios.
+    """The listed parameters are those in which the three scenarios differ.
 
-    A ratio beside other wind is neither better nor worse; one under other gains is.
+    A ratio between flights in different wind is neither better nor worse. One between different
+    gains is.
     """
     listed = {each.key: each.texts for each in comparison.conditions(unlike)}
     assert listed["aircraft.turbulence.wind"] == ("none", "8", "none")
@@ -464,7 +474,7 @@ def test_gusts_of_one_flight_are_not_drawn_over_another(unlike: list[RecordedFli
 
 
 def test_ticks_of_another_time_are_neither_better_nor_worse(unlike: list[RecordedFlight]) -> None:
-    """A flight in one process has no late tick, and says nothing of a host in real time."""
+    """A flight in one process has no late tick, and tells nothing about a host in real time."""
     first = unlike[0]
     later = replace(first.tape, start_ns=EPOCH)
     pair = [first._replace(tape=later), first._replace(name="in one process")]
@@ -474,7 +484,7 @@ def test_ticks_of_another_time_are_neither_better_nor_worse(unlike: list[Recorde
 
 
 def test_channels_of_page_and_tables_are_in_order_of_the_controller(servo: Scenario) -> None:
-    """Y of the osprey has the order q, V, p, r, the controller q, p, r, V."""
+    """The y of the osprey has the order q, V, p, r, and the controller has q, p, r, V."""
     tape = simulate(servo.vary(flight={"duration": 1.0}))
     one = recorded("run", servo, tape)
     order = list(servo.controller.outputs)
@@ -534,7 +544,10 @@ def test_states_have_units_and_angles_are_in_degrees(servo: Scenario) -> None:
 
 
 def test_sentence_on_the_sign_stands_at_the_law(tmp_path: Path, servo: Scenario) -> None:
-    """The first line is of the flight: aircraft and time flown."""
+    """The sentence on the sign is in the section of the law, and not in the head of the page.
+
+    The head has the aircraft and the flown time.
+    """
     page = page_of(tmp_path, servo, simulate(servo.vary(flight={"duration": 1.0})))
     head, _, following = page.partition("<nav")
     assert "softened sign" not in head
@@ -553,7 +566,7 @@ def test_curve_is_broken_at_gap_and_u_held() -> None:
 
 
 def unpacked(text: str, kind: str) -> FloatArray:
-    """Unpack samples as the page's script does."""
+    """Unpack samples as the script of the page does."""
     shuffled = np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype=np.uint8)
     return np.ascontiguousarray(shuffled.reshape(np.dtype(kind).itemsize, -1).T).view(kind)[:, 0]
 
@@ -581,7 +594,11 @@ def test_all_samples_of_long_curves_stored_once() -> None:
 
 
 def test_page_has_extremes_of_bins_of_very_long_curve(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of an hour the page had 141 MB. Bins of four samples, with a gap in the third."""
+    """A very long curve is stored as the extremes of bins.
+
+    With all samples, the page of an hour had 141 MB. Here a bin has four samples, and the third has
+    a gap.
+    """
     monkeypatch.setattr(plotting, "MAX_STORED", 6)
     monkeypatch.setattr(plotting, "BINS", 3)
     stamps = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 100, 101], dtype=np.int64)
@@ -597,7 +614,7 @@ def test_page_has_extremes_of_bins_of_very_long_curve(monkeypatch: pytest.Monkey
 
 
 def test_page_of_long_flight_does_not_grow_with_it() -> None:
-    """Noise does not compress in 80 min at 100 Hz."""
+    """The flight is 80 min of noise at 100 Hz, which cannot be compressed."""
     stamps = np.arange(480_000, dtype=np.int64) * 10 * MS
     u = Signal(stamps, ("u",), np.random.default_rng(1).standard_normal((480_000, 1)))
     shared = context(Tape({"u": u}))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The head of a page says how the flight went: a verdict in its colour, and a tile an output."""
+"""Test the head of a page: a verdict in its colour, and a tile for each output."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def flown(scenario: Scenario, tape: Tape, outcome: Outcome = COMPLETED) -> Recor
 def test_healthy_flight_is_green_and_each_tile_is_the_error_over_ten_seconds(
     servo: Scenario, tape: Tape
 ) -> None:
-    """The rms is computed here from y - y_m of the truth, over the ten seconds of the tile."""
+    """The expected rms is computed from y - y_m of the truth, over the ten seconds of the tile."""
     flight = flown(servo, tape)
     verdict = verdict_of(flight, servo)
     assert verdict.colour is Colour.GOOD
@@ -55,7 +55,7 @@ def test_healthy_flight_is_green_and_each_tile_is_the_error_over_ten_seconds(
 
 
 def test_output_that_is_off_is_red_first_and_over_its_limit(servo: Scenario, tape: Tape) -> None:
-    """A y of r that is off by 0.3 rad/s, as no gust of the scenario does it."""
+    """The y of r is off by 0.3 rad/s, which is more than a gust of the scenario causes."""
     channels = tape["truth"].names
     values = tape["truth"].values.copy()
     values[:, channels.index("x.r")] += 0.3
@@ -122,7 +122,7 @@ def test_injected_fault_is_in_the_head(servo: Scenario, tape: Tape) -> None:
 
 
 def test_head_names_no_aircraft_that_did_not_fly(servo: Scenario, tape: Tape) -> None:
-    """In a log without a truth, y came from an aircraft that is not the simulator's."""
+    """In a log without truth, y came from another aircraft than the simulator's."""
     signals = {name: each for name, each in tape.signals.items() if name != "truth"}
     behind = replace(tape, signals=signals, scenario=None)
     described, run = meta_lines(flown(servo, behind), servo)
@@ -132,7 +132,7 @@ def test_head_names_no_aircraft_that_did_not_fly(servo: Scenario, tape: Tape) ->
 
 
 def test_time_without_a_sample_of_y_is_shaded(servo: Scenario, tape: Tape) -> None:
-    """Half a second is missing; a gap of some periods is not."""
+    """Half a second without samples is shaded, and a gap of a few periods is not."""
     t = tape.time("y")
     kept = ~((t > 3.0) & (t < 3.5)) & ~((t > 5.0) & (t < 5.01))
     y = replace(tape["y"], stamp_ns=tape["y"].stamp_ns[kept], values=tape["y"].values[kept])

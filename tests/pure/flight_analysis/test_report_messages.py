@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of a log and the parameters of a flight on its report page."""
+"""Test the messages of a log and the parameters of a flight on the report page."""
 
 from pathlib import Path
 
@@ -20,7 +20,10 @@ SECOND = 1_000_000_000
 
 
 def line(level: int, text: str) -> bytes:
-    """A line of rcl_interfaces/msg/Log: 20 is information, 30 a warning, 40 an error."""
+    """Return a line of rcl_interfaces/msg/Log.
+
+    Level 20 is information, 30 a warning, and 40 an error.
+    """
     store = typestore()
     stamp = store.types["builtin_interfaces/msg/Time"](5, 0)
     message = store.types[LOG](stamp, level, "controller", text, "", "", 0)
@@ -80,7 +83,7 @@ def test_page_has_messages_beside_figures(tmp_path: Path) -> None:
 
 
 def test_parameters_other_than_default_come_first_with_both_values() -> None:
-    """The defaults are those of docs/reference/parameters.md."""
+    """The defaults are the ones of docs/reference/parameters.md."""
     rows = parameter_rows(find_scenario("osprey_route"))
     assert ("aircraft.kinematics", "euler", "linear") in rows
     assert ("aircraft.wind", "[3, 0]", "[0, 0]") in rows

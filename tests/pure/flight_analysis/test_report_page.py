@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report page in a browser draws without errors, in light and dark.
+"""Test that the report page draws in a browser without errors, in light and dark.
 
 A zoom shows all samples.
 """
@@ -37,9 +37,9 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def servo() -> RecordedFlight:
-    """Seven seconds with noise and commands from 2 s on.
+    """Return seven seconds with noise, and with commands from 2 s on.
 
-    These are more samples than are drawn before a zoom.
+    They have more samples than are drawn before a zoom.
     """
     scenario = find_scenario("osprey_servo", 7.0)
     return recorded("servo", scenario, simulate(scenario))
@@ -65,7 +65,7 @@ def open_page(browser: Browser, path: Path, scheme: str = "light") -> None:
 
 
 def zoom(browser: Browser, start: float, stop: float, plot: int = 0) -> None:
-    """Zoom one figure, as a drag of the mouse does, and wait for all figures."""
+    """Zoom one figure, as dragging the mouse does, and wait for all figures."""
     before = browser.run(DRAWN)
     browser.run(
         f"Plotly.relayout({PLOTS}[{plot}], {{'xaxis.range': [{start}, {stop}]}}).then(() => 0)"
@@ -76,7 +76,7 @@ def zoom(browser: Browser, start: float, stop: float, plot: int = 0) -> None:
 def curve(
     browser: Browser, plot: int, name: str, channel: str = "q"
 ) -> tuple[list[float], list[float]]:
-    """Instants and values of a drawn curve, in the row of a channel."""
+    """Return the instants and values of a drawn curve in the row of a channel."""
     layout = f"{PLOTS}[{plot}]._fullLayout"
     axis = (
         f"Object.keys({layout}).find(key => /^yaxis/.test(key) && {layout}[key].title.text"
@@ -115,7 +115,7 @@ def test_the_page_draws_all_figures_without_errors(browser: Browser, page: Path)
 def test_page_of_guided_flight_in_wind_prints_without_errors(
     browser: Browser, tmp_path: Path
 ) -> None:
-    """Its track has arrows, which are annotations without a text."""
+    """The arrows of the track are annotations without a text."""
     scenario = find_scenario("osprey_route", 5.0)
     write_page(tmp_path / "report.html", [recorded("route", scenario, simulate(scenario))])
     open_page(browser, tmp_path / "report.html")
@@ -224,7 +224,7 @@ def test_whole_flight_comes_back_after_a_zoom(browser: Browser, page: Path) -> N
 def test_labels_of_intervals_are_apart_on_a_narrow_screen(
     browser: Browser, tmp_path: Path, servo: RecordedFlight
 ) -> None:
-    """Two gusts of the default flight are 6 s apart, of 60 s: a tenth of a phone's figure."""
+    """Two gusts are 6 s apart, which is a tenth of the width of the figure on a phone."""
     scenario = find_scenario("osprey_servo")
     tape = servo.tape["y"]
     stamps = np.arange(6000, dtype=np.int64) * 10_000_000

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How many samples a log should hold comes from what flew.
+"""Test how many samples a log should have, which depends on what flew.
 
-A publisher that is not of the stack has a rate of its own, as has /clock, and each publisher counts
-for itself.
+A publisher that does not belong to the stack has a rate of its own, and so has /clock. Each
+publisher is counted for itself.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ Instants = NDArray[np.float64]
 
 @pytest.fixture(scope="module")
 def servo() -> Scenario:
-    """Y and y_m at 500 Hz, u at 100 Hz, by the parameters."""
+    """Return osprey_servo, with y and y_m at 500 Hz and u at 100 Hz by its parameters."""
     return find_scenario("osprey_servo")
 
 
@@ -37,13 +37,13 @@ CHANNELS = {"u": ("elevator", "thrust", "aileron", "rudder")}
 
 
 def signal(name: str, t: Instants, start_ns: int) -> Signal:
-    """Samples of zeros of a topic at flight times in s."""
+    """Return samples of a topic that are zero, at flight times in s."""
     stamp_ns = start_ns + np.round(t * NANOSECONDS).astype(np.int64)
     return Signal(stamp_ns, CHANNELS.get(name, ("q", "V", "p", "r")), np.zeros((len(t), 4)))
 
 
 def internals(number: Instants, stamp_ns: NDArray[np.int64], age: float) -> Signal:
-    """Engaged ticks of one age, s."""
+    """Return engaged ticks with the same age, s."""
     values = np.column_stack(
         [number, np.full(len(number), age), np.full(len(number), float(Mode.ENGAGED))]
     )
@@ -58,7 +58,7 @@ def flight(
     lost: dict[str, int] | None = None,
     is_by_clock: bool = False,
 ) -> Tape:
-    """A log of topics, with ticks of the stack's controller where it is among the nodes."""
+    """Return a log of topics, with ticks of the stack's controller if it is among the nodes."""
     signals = {name: signal(name, t, start_ns) for name, t in topics.items()}
     if "controller" in nodes:
         u_ns = signals["u"].stamp_ns
@@ -82,25 +82,28 @@ def flight(
 
 
 def timer(rate: float, jitter: float = 3e-4) -> Instants:
-    """Instants of a timer of another maker, up to END, with a deviation in s."""
+    """Return the instants of a foreign timer up to END, with a jitter in s."""
     ideal = np.arange(0.0, END, 1.0 / rate)
     return np.sort(ideal + np.random.default_rng(5).normal(0.0, jitter, len(ideal)))
 
 
 def by_clock(step: float, period: float) -> Instants:
-    """Newest whole period at each message of /clock: what a node of the stack stamps."""
+    """Return the newest whole period at each message of /clock.
+
+    This is what a node of the stack stamps.
+    """
     clock = np.arange(0.0, END, step) + 1e-9
     return np.asarray(np.unique(np.floor(clock / period) * period))
 
 
 def whole(result: Account) -> bool:
-    """Whether an account tells of no loss."""
+    """Return whether an account tells of no loss."""
     return not (result.lacks or result.busy)
 
 
 @pytest.mark.parametrize("step", [0.001, 0.0025, 1.0 / 300.0, 0.004, 0.005, 0.007, 0.01])
 def test_clock_gives_the_rate_of_nodes_with_a_shorter_period(step: float, servo: Scenario) -> None:
-    """The flight of docs/ros.md has a step of 0.005 s. Nothing is lost at any step."""
+    """No sample is lost at any step of /clock. The flight of docs/ros.md has a step of 0.005 s."""
     topics = {
         "y": np.arange(0.0, END, 0.01),
         "y_m": by_clock(step, 0.002),
@@ -114,7 +117,7 @@ def test_clock_gives_the_rate_of_nodes_with_a_shorter_period(step: float, servo:
 
 
 def test_node_that_skips_messages_of_clock_is_on_a_busy_host(servo: Scenario) -> None:
-    """At ten times real time: of the messages of /clock each eighth, on average, came too late."""
+    """On average one in eight messages of /clock comes too late, at ten times real time."""
     keep = np.random.default_rng(2).random(6000) > 0.125
     y_m = np.unique(np.floor((np.arange(0.0, END, 0.005)[keep] + 1e-9) / 0.002) * 0.002)
     topics = {"y": np.arange(0.0, END, 0.01), "y_m": y_m, "u": np.arange(0.0, END, 0.01)}
@@ -130,7 +133,11 @@ def test_node_that_skips_messages_of_clock_is_on_a_busy_host(servo: Scenario) ->
 def test_foreign_publisher_has_the_rate_of_its_log(
     topic: str, rate: float, servo: Scenario
 ) -> None:
-    """An own aircraft, an own reference model and an own controller beside nodes of the stack."""
+    """A foreign publisher has the rate that its log shows.
+
+    The aircraft, the reference model or the controller is foreign, and the other nodes are from the
+    stack.
+    """
     of_stack = {"y": 500.0, "y_m": 500.0, "u": 100.0}
     topics = {name: np.arange(0.0, END, 1.0 / own) for name, own in of_stack.items()}
     topics[topic] = timer(rate)
@@ -166,10 +173,10 @@ LOSSES: dict[str, Callable[[Instants], NDArray[np.bool_]]] = {
 def test_loss_of_a_foreign_publisher_is_told(
     topic: str, loss: str, is_numbered: bool, servo: Scenario
 ) -> None:
-    """The publisher has 100 Hz.
+    """The foreign publisher sends at 100 Hz.
 
-    Messages that the recorder lost leave gaps in the numbers, and those never sent do not: of 60 %
-    never sent at random no run is whole, and nothing tells of the rate.
+    Messages that the recorder lost leave gaps in the numbers, and messages that were never sent do
+    not. If 60 % were never sent at random, no stretch is complete, and nothing shows the rate.
     """
     t = timer(100.0)
     keep = LOSSES[loss](t)
@@ -188,16 +195,16 @@ def test_loss_of_a_foreign_publisher_is_told(
 
 @pytest.mark.parametrize("period", [0.007, 0.008, 0.01, 0.012])
 def test_timer_by_a_coarse_clock_has_its_mean_period(period: float) -> None:
-    """A timer of rclpy by a /clock of 0.005 s: its intervals are one or two steps of the clock."""
+    """A timer of rclpy by a /clock of 0.005 s has intervals of one or two steps of the clock."""
     t = np.unique(np.ceil(np.arange(0.0, END, period) / 0.005 - 1e-9) * 0.005)
     stamp_ns = np.round(t * NANOSECONDS).astype(np.int64)
     assert period_of(stamp_ns, 0, 1) == pytest.approx(period * NANOSECONDS, rel=0.01)
 
 
 def test_two_senders_of_u_count_each_for_itself(servo: Scenario) -> None:
-    """Another controller sends 4 of its ticks amid those of the flight, numbered 1 to 4.
+    """Another controller sends four ticks, numbered 1 to 4, among those of the flight.
 
-    The flight's own u is whole.
+    The u of the flight is still complete.
     """
     t = np.arange(0.0, END, 0.01)
     tape = flight(
@@ -212,7 +219,10 @@ def test_two_senders_of_u_count_each_for_itself(servo: Scenario) -> None:
 
 
 def beside(tape: Tape, scenario: Scenario) -> Account:
-    """The account of a flight whose u has four samples of another controller in its midst."""
+    """Return the account of a flight whose u has four samples from another controller.
+
+    They are in the middle of the flight.
+    """
     other_ns = EPOCH + round(15.001 * NANOSECONDS) + np.arange(4) * 10_000_000
     merged = {}
     other = {
@@ -230,7 +240,10 @@ def beside(tape: Tape, scenario: Scenario) -> Account:
 
 
 def test_next_publisher_counts_from_the_end_of_the_first() -> None:
-    """Two publishers at 100 Hz: the second is refused until the first ends at 1 s."""
+    """There are two publishers at 100 Hz.
+
+    The second one is refused until the first one ends at 1 s.
+    """
     stamp_ns = np.repeat(np.arange(0, 3 * NANOSECONDS, 10_000_000), 2)
     sender = np.tile(np.array([0, 1], np.int16), len(stamp_ns) // 2)
     keep = (sender == 1) | (stamp_ns < NANOSECONDS)
@@ -246,7 +259,10 @@ def test_next_publisher_counts_from_the_end_of_the_first() -> None:
 def test_ticks_before_t_0_are_neither_expected_nor_found(
     duration: float | None, servo: Scenario
 ) -> None:
-    """With y and y_m of a user's nodes the law can engage 1 s before t = 0: no tick is lost."""
+    """With y and y_m from a user's nodes, the law can engage 1 s before t = 0.
+
+    No tick is lost then.
+    """
     topics = {"y": timer(100.0) - 1.0, "y_m": timer(500.0), "u": np.arange(-1.0, END, 0.01)}
     tape = replace(flight(topics, ("controller",)), duration=duration)
     result = account(tape, servo)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guarantees with any limits of one input: what their certificates prove, and what is refused."""
+"""Test guarantees in which one input has any limits: what they prove, and what is refused."""
 
 import copy
 import hashlib
@@ -47,18 +47,24 @@ def certified(name: str, limited: str, uncertainty: float) -> Content:
 
 @pytest.fixture(scope="module")
 def rudder() -> Content:
-    """Every aircraft within 10 % settles."""
+    """Return a certificate that every aircraft within 10 % settles."""
     return certified("osprey_servo", "rudder", 0.1)
 
 
 @pytest.fixture(scope="module")
 def throttle() -> Content:
-    """No aircraft within 20 % has a periodic motion: its integrator unwinds at a limited rate."""
+    """Return a certificate that no aircraft within 20 % has a periodic motion.
+
+    The integrator of the throttle unwinds at a limited rate.
+    """
     return certified("jsbsim_c172p", "throttle", 0.2)
 
 
 def checked(content: Content, folder: Path) -> str:
-    """What the checker says of a content, signed again. Raises ValueError if it refuses it."""
+    """Return what the checker says about a content that is signed again.
+
+    Raises ValueError if the checker refuses it.
+    """
     module = _checker()
     rest = {key: value for key, value in content.items() if key != "digest"}
     text = json.dumps(rest, sort_keys=True)
@@ -87,12 +93,12 @@ def _limit(**members: Any) -> Alter:
 
 
 def _steps(content: Content) -> list[dict[str, Any]]:
-    """The steps of the part with the limit."""
+    """Return the steps of the part with the limit."""
     return next(part["steps"] for part in content["parts"] if "s" in str(part["steps"][0].keys()))
 
 
 def _each_step(**members: float) -> Alter:
-    """Add a number to members of the steps with a limit."""
+    """Return an alteration that adds a number to members of the steps with a limit."""
 
     def alter(content: Content) -> None:
         for step in _steps(content):
@@ -186,9 +192,9 @@ def test_limit_of_an_integrator_is_not_proved_to_settle(
 
 
 def test_weighted_sum_over_any_rising_curve_is_not_negative() -> None:
-    """For w = u - phi(u) and taps before and after: the sum of rho^-2k w (a - h * a).
+    """The sum of rho^-2k w (a - h * a) is not negative, for w = u - phi(u) and taps on both sides.
 
-    phi is a limit that is not symmetric, or a stair of slopes of 0 to 1 through 0.
+    phi is an asymmetric limit, or a stair with slopes between 0 and 1 through 0.
     """
     generator = np.random.default_rng(11)
     least = np.inf
@@ -209,7 +215,7 @@ def test_weighted_sum_over_any_rising_curve_is_not_negative() -> None:
 
 
 def test_taps_leave_phase_to_aircraft_of_the_box(rudder: Content) -> None:
-    """Re(m S) > 0 at corners, with an S that is computed from the numbers of the file alone."""
+    """Re(m S) > 0 at corners, with an S computed from the numbers of the file alone."""
     d = rudder["size"] * np.random.default_rng(4).choice([-1.0, 1.0], (12, len(rudder["part"])))
     F, W, K = flown_loop(rudder, d)
     turn = np.r_[1e-4, np.geomspace(1e-3, math.pi, 60)]
@@ -239,7 +245,7 @@ SPIRAL = {
 def test_aileron_at_its_limit_lets_the_spiral_of_an_aircraft_grow(
     deviation: float, *, grows: bool, rudder: Content
 ) -> None:
-    """Why no proof with limits of the aileron goes beyond 11.2 %."""
+    """This is why no proof with limits of the aileron goes beyond 11.2 %."""
     held = copy.deepcopy(rudder)
     held["limit"]["input"] = "aileron"
     corner = np.array([SPIRAL.get(name, 0.0) for name in held["names"]])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How near the aircraft of a fleet came to each other, against distances by hand."""
+"""Test how close the aircraft of a fleet came to each other, against distances by hand."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -38,21 +38,21 @@ def path(
     end: float = 20.0,
     since_ns: int = EPOCH,
 ) -> Signal:
-    """The places of an aircraft over time in s."""
+    """Return the places of an aircraft over time in s."""
     t = np.arange(round((end - begin) * rate) + 1) / rate + begin
     values = np.array([place(instant) for instant in t.tolist()], dtype=float)
     return Signal(since_ns + np.round(t * NANOSECONDS).astype(np.int64), PLACE, values)
 
 
 def north(t: float) -> Sequence[float]:
-    """To the north at 25 m/s."""
+    """Return the place of an aircraft that flies to the north at 25 m/s."""
     return 25.0 * t - 250.0, 0.0, 100.0
 
 
 @pytest.mark.parametrize("rate", [50.0, 10.0, 1.0, 0.7])
 @pytest.mark.parametrize("miss", [0.0, 5.0, 30.0])
 def test_two_aircraft_that_cross_are_nearest_between_two_samples(rate: float, miss: float) -> None:
-    """Head on at 50 m/s: they are beside each other at t = 10 s, whatever the rates."""
+    """Two aircraft approach each other at 50 m/s and pass at t = 10 s, whatever the rates are."""
     second = path(lambda t: (250.0 - 25.0 * t, miss, 100.0), rate)
     found = approach(path(north), second)
     assert found is not None
@@ -77,7 +77,7 @@ def test_aircraft_are_compared_while_both_fly(begin: float, end: float, near: bo
 
 
 def tracks(*places: Signal, **origins: tuple[float, ...]) -> dict[str, Track]:
-    """Tracks named a, b, ... that began at EPOCH."""
+    """Return tracks named a, b, ... that begin at EPOCH."""
     return {
         name: Track(EPOCH, place, origins.get(name))
         for name, place in zip("abcdef", places, strict=False)
@@ -149,7 +149,7 @@ def test_fleet_with_two_aircraft_in_one_place_has_status_4(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Also the page and the summary of each say so, and its report written again."""
+    """The page and the summary of each flight say so, too, and a report that is written again."""
 
     def scenario(east: float) -> Scenario:
         return find_scenario("osprey_gust").vary(

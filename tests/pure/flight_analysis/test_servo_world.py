@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The osprey with servos agrees with a prototype of this law to 10 %.
+"""Test that the osprey with servos agrees with a prototype of this law to 10 %.
 
-The prototype is another program with the same equations.
-
-y, y_m and the law share 100 Hz, topics take no time, and the softened sign is three total lags
-wide. The prototype's figures have two or three digits, so rounding takes up to 5 % of the 10 %.
-Errors are true errors over 60 s, q, V, p, r in mrad/s, m/s.
+The prototype is another program with the same equations. y, y_m and the law run at 100 Hz, topics
+take no time, and the softened sign is three total lags wide. The prototype's figures have two or
+three digits, so rounding takes up to 5 % of the 10 %. Errors are true errors over 60 s, q, V, p, r
+in mrad/s, m/s.
 """
 
 from typing import Any
@@ -35,7 +34,7 @@ FINE = {"step": 0.001}
 def servo_scenario(
     aircraft: dict[str, Any], controller: dict[str, Any], duration: float
 ) -> Scenario:
-    """Scenario osprey_servo with the gains and under the conditions of the prototype."""
+    """Return osprey_servo with the gains and under the conditions of the prototype."""
     return PROTOTYPE_SERVO.vary(
         flight={"duration": duration},
         aircraft={"rate": 100.0, "step": 0.005, "sensors": {}} | aircraft,

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight succeeds where it shows what is asked for.
+"""Test that a flight succeeds only if it shows what was asked for.
 
-Faults are injected, and 0 is returned only for errors as those of the flight without the fault.
+Faults are injected, and status 0 is only allowed for errors like those of the flight without the
+fault.
 """
 
 from collections.abc import Callable
@@ -37,7 +38,7 @@ LEAST_RATE = 0.02  # rad/s, the same: 1 deg/s
 
 @cache
 def servo() -> Scenario:
-    """osprey_servo at 100 Hz: commands, gusts and noise."""
+    """Return osprey_servo at 100 Hz, with commands, gusts and noise."""
     return find_scenario("osprey_servo").vary(
         flight={"duration": T},
         aircraft={"rate": 100.0, "step": 0.005},
@@ -56,7 +57,7 @@ def with_faults(scenario: Scenario, *faults: str) -> Scenario:
 
 
 def worst_rms(tape: Tape) -> dict[str, float]:
-    """Largest rms error over 10 s, by output."""
+    """Return the largest rms error over 10 s for each output."""
     _, error = best_error(tape)
     count = round(10.0 / float(np.median(np.diff(error.stamp_ns))) * 1e9)
     worst = {}
@@ -67,7 +68,10 @@ def worst_rms(tape: Tape) -> dict[str, float]:
 
 
 def times_healthy(tape: Tape) -> float:
-    """Largest error over that of the flight without a fault, of the outputs that a user sees."""
+    """Return the largest ratio of an error to the error of the flight without a fault.
+
+    It is taken over the outputs that a user sees.
+    """
     largest = worst_rms(healthy())
     ratios = []
     for name, rms in worst_rms(tape).items():
@@ -88,7 +92,10 @@ EFFECTOR_FAULTS = (
 
 @pytest.mark.parametrize("fault", EFFECTOR_FAULTS)
 def test_effector_fault_is_told_by_its_error(fault: str) -> None:
-    """Between 1.5 and 3 times the error of a healthy flight either is right."""
+    """A fault with more than 3 times the healthy error must be told.
+
+    One with less than 1.5 times must not, and in between both are right.
+    """
     tape = rise_di.simulate(with_faults(servo(), fault))
     times = times_healthy(tape)
     if tape.outcome.status == 0:
@@ -99,7 +106,7 @@ def test_effector_fault_is_told_by_its_error(fault: str) -> None:
 
 
 def test_effector_without_a_task_may_be_stuck() -> None:
-    """Without commands, gusts and noise of p and r the aileron has nothing to do."""
+    """Without commands, gusts and noise of p and r, the aileron has nothing to do."""
     calm = servo().vary(
         reference_model={"pulses": {}}, aircraft={"gusts": {}, "sensors": {"noise": [0.0] * 4}}
     )
@@ -107,10 +114,10 @@ def test_effector_without_a_task_may_be_stuck() -> None:
 
 
 def test_airspeed_of_another_simulator_is_told() -> None:
-    """After 10 s the elevator sticks at its trim.
+    """The elevator sticks at its trim after 10 s, which shows in V.
 
-    The aircraft then climbs by 5 deg where nobody asks it to, and V, whose command stands still, is
-    off by 0.6 m/s: 0.1 m/s without the fault.
+    The aircraft then climbs by 5 deg without a command. V, whose command is constant, is off by 0.6
+    m/s. Without the fault it is off by 0.1 m/s.
     """
     c172p = find_scenario("jsbsim_c172p", duration=30.0)
     (shortfall,) = rise_di.simulate(with_faults(c172p, "elevator stuck 10")).outcome.shortfalls
@@ -118,7 +125,10 @@ def test_airspeed_of_another_simulator_is_told() -> None:
 
 
 def test_airspeed_in_turbulence_of_another_simulator_is_allowed_for() -> None:
-    """Turbulence of sigma = 2 m/s moves V by as much: the engine is too slow for it."""
+    """Turbulence of sigma = 2 m/s changes V as much.
+
+    The engine is too slow to prevent it.
+    """
     turbulence = {"altitude": 1219.2, "sigma": 2.0, "seed": 4}
     rough = find_scenario("jsbsim_c172p", duration=20.0).vary(aircraft={"turbulence": turbulence})
     outcome = rise_di.simulate(rough).outcome
@@ -130,14 +140,20 @@ def test_airspeed_in_turbulence_of_another_simulator_is_allowed_for() -> None:
 
 
 def test_unknown_drag_in_wind_is_allowed_for() -> None:
-    """The wind changes V, and so a drag that is not known: 0.7 m/s rms in the last second."""
+    """The wind changes V, and thereby an unknown drag.
+
+    This leaves 0.7 m/s rms in the last second.
+    """
     turbulence = {"altitude": 1219.2, "sigma": 0.85, "seed": 6}
     light = find_scenario("jsbsim_c172p", duration=15.0).vary(aircraft={"turbulence": turbulence})
     assert rise_di.simulate(light).outcome == COMPLETED
 
 
 def test_noise_beyond_that_of_the_file_is_a_fault() -> None:
-    """Somebody sets the noise of p in flight: the log has it, the sensor is not declared to."""
+    """The noise of p is increased in flight.
+
+    The log has this noise, and the sensor is not declared to have it.
+    """
     noises = list(servo().aircraft.sensors.noise)
     noises[2] = 0.15
     louder = servo().vary(aircraft={"sensors": {"noise": noises}})
@@ -161,13 +177,16 @@ STORMS: dict[str, dict[str, object]] = {
 
 @pytest.mark.parametrize("storm", STORMS.values(), ids=STORMS)
 def test_aircraft_that_noise_or_wind_shakes_is_told(storm: dict[str, object]) -> None:
-    """By more than 3 deg/s rms, twice what severe turbulence leaves, or V by more than 2 m/s."""
+    """More than 3 deg/s rms is twice what severe turbulence leaves.
+
+    For V, the bound is 2 m/s.
+    """
     outcome = rise_di.simulate(servo().vary(aircraft=storm)).outcome
     assert {shortfall.aim for shortfall in outcome.shortfalls} == {Aim.ERROR}
 
 
 def test_severe_turbulence_is_allowed_for_and_said() -> None:
-    """45 kt at 20 ft by MIL-F-8785C."""
+    """The turbulence is 45 kt at 20 ft by MIL-F-8785C."""
     turbulence = {"altitude": 100.0, "wind": 23.0, "seed": 1}
     outcome = rise_di.simulate(servo().vary(aircraft={"turbulence": turbulence})).outcome
     assert outcome.status == 0
@@ -176,7 +195,10 @@ def test_severe_turbulence_is_allowed_for_and_said() -> None:
 
 
 def test_wind_that_the_end_stops_cannot_hold_is_no_excuse() -> None:
-    """The same turbulence, and an elevator that has a degree: q is off by 3.2 deg/s rms."""
+    """In the same turbulence, an elevator with a range of one degree cannot control q.
+
+    It is off by 3.2 deg/s rms.
+    """
     actuators = servo().aircraft.actuators
     degree = [0.02, *actuators.upper[1:]]
     short = {"lower": [-limit for limit in degree], "upper": degree}
@@ -193,7 +215,10 @@ def test_wind_that_the_end_stops_cannot_hold_is_no_excuse() -> None:
 
 
 def test_noise_of_a_measured_error_counts_twice() -> None:
-    """Without the truth 0.1 rad/s, twice the rms of the noise, and what the commands leave."""
+    """Without truth, the bound of an error includes twice the rms of the noise.
+
+    It also includes 0.1 rad/s, and what the commands leave.
+    """
     calm = servo().vary(reference_model={"pulses": {}}, aircraft={"gusts": {}})
     tape = rise_di.simulate(calm)
     noise = 0.005 * np.random.default_rng(2).standard_normal(len(tape["y"].stamp_ns))
@@ -212,7 +237,7 @@ Sample = Callable[[float, StampedVector], StampedVector | None]
 
 
 def value(change: Callable[[FloatArray], FloatArray]) -> Sample:
-    """A fault of the values of y from FAULT on."""
+    """Return a fault that changes the values of y from FAULT on."""
 
     def sample(t: float, y: StampedVector) -> StampedVector:
         return y._replace(value=change(y.value.copy())) if t >= FAULT else y
@@ -221,12 +246,12 @@ def value(change: Callable[[FloatArray], FloatArray]) -> Sample:
 
 
 def ahead(t: float, y: StampedVector) -> StampedVector:
-    """A step of the clock of y by 1 s at FAULT."""
+    """Return y with its stamp 1 s ahead from FAULT on."""
     return y._replace(stamp_ns=y.stamp_ns + 10**9) if t >= FAULT else y
 
 
 def swapped(y: FloatArray) -> FloatArray:
-    """V and p, r and q, each in place of the other."""
+    """Exchange V with p, and r with q."""
     return y[[3, 2, 1, 0]]
 
 
@@ -260,7 +285,7 @@ def test_law_that_gets_no_y_in_time_never_flew() -> None:
 
 
 def test_bounds_of_y_that_keep_the_law_from_flying_are_told() -> None:
-    """Y beyond its bounds most of the time: the aircraft flies in trim."""
+    """Most of the time y is beyond its bounds, so the aircraft flies in trim."""
     narrow = servo().vary(controller={"y_max": [0.004, 0.004, 0.004, 0.08]})
     outcome = rise_di.simulate(narrow).outcome
     assert Aim.ENGAGEMENT in {shortfall.aim for shortfall in outcome.shortfalls}
@@ -288,7 +313,7 @@ def off_by_1_rad_per_s(tape: Tape, first: int, stop: int) -> Tape:
 
 @pytest.mark.parametrize("switch", ["autostart", "start_active"])
 def test_law_that_was_not_asked_to_fly_is_no_shortfall(switch: str) -> None:
-    """A dry run: whoever activates the controller decides when it flies."""
+    """In a dry run, whoever activates the controller decides when it flies."""
     asleep = with_modes(Mode.INACTIVE, 0, 2001)
     manual = servo().vary(controller={switch: False})
     assert judge(COMPLETED, asleep, manual, WHOLE) == COMPLETED
@@ -298,7 +323,10 @@ def test_law_that_was_not_asked_to_fly_is_no_shortfall(switch: str) -> None:
 
 @pytest.mark.parametrize("first", [0, 50, 1700])
 def test_law_that_somebody_deactivates_is_told(first: int) -> None:
-    """The scenario starts it active: the commands were to be flown from the first u to the end."""
+    """The scenario starts the law active.
+
+    So its commands should be flown from the first u to the end.
+    """
     (shortfall,) = judge(
         COMPLETED, with_modes(Mode.INACTIVE, first, 2001), servo(), WHOLE
     ).shortfalls
@@ -307,14 +335,14 @@ def test_law_that_somebody_deactivates_is_told(first: int) -> None:
 
 
 def test_error_while_somebody_has_deactivated_the_law_is_told() -> None:
-    """1 s is no tenth of the flight; the aircraft was off all the same."""
+    """One second is less than a tenth of the flight, but the aircraft was off in it."""
     paused = off_by_1_rad_per_s(with_modes(Mode.INACTIVE, 800, 900), 800, 900)
     (shortfall,) = judge(COMPLETED, paused, servo(), WHOLE).shortfalls
     assert (shortfall.aim, shortfall.figures["output"]) == (Aim.ERROR, "p")
 
 
 def test_error_before_the_law_engaged_is_none_of_the_law() -> None:
-    """It engages 1.5 s after its first u."""
+    """The law engages 1.5 s after its first u."""
     late = off_by_1_rad_per_s(with_modes(Mode.TRIM, 0, 150), 0, 150)
     assert judge(COMPLETED, late, servo(), WHOLE) == COMPLETED
     after = off_by_1_rad_per_s(with_modes(Mode.TRIM, 0, 150), 150, 300)
@@ -322,7 +350,10 @@ def test_error_before_the_law_engaged_is_none_of_the_law() -> None:
 
 
 def test_late_loop_is_told_with_its_cycle() -> None:
-    """U late by 80 ms beyond the margin of 47 ms: the rates of the servos bound the oscillation."""
+    """The u is late by 80 ms, and the margin is 47 ms.
+
+    The rates of the servos bound the oscillation.
+    """
     late = servo().vary(aircraft={"actuators": {"delay": 0.08}})
     assert rise_di.margins(late).delay < 0.08
     outcome = rise_di.simulate(late).outcome
@@ -332,7 +363,7 @@ def test_late_loop_is_told_with_its_cycle() -> None:
 
 @cache
 def on_first_leg() -> tuple[Tape, Scenario]:
-    """Five seconds of a route with a landing at its second waypoint, far from the zone."""
+    """Return five seconds of a route whose landing at the second waypoint is far from the zone."""
     route = {
         "north": [0.0, 1500.0, 3000.0, 4500.0, 6000.0],
         "east": [0.0, 300.0, 300.0, 300.0, 300.0],
@@ -344,7 +375,7 @@ def on_first_leg() -> tuple[Tape, Scenario]:
 
 
 def test_microburst_that_the_thrust_cannot_hold_is_told() -> None:
-    """A guided flight with nonlinear kinematics: V is off by 5 m/s."""
+    """The flight is guided, with nonlinear kinematics, and V is off by 5 m/s."""
     burst = find_scenario("osprey_microburst")
     section = burst.aircraft.microburst
     assert section is not None
@@ -356,7 +387,10 @@ def test_microburst_that_the_thrust_cannot_hold_is_told() -> None:
 
 
 def test_landing_does_not_swallow_what_else_was_short() -> None:
-    """A touch on the first leg, in a log of half of the flight, far from the zone."""
+    """A landing leaves the other shortfalls in the outcome.
+
+    The aircraft touches down on the first leg, far from the zone, and half of the log is missing.
+    """
     tape, scenario = on_first_leg()
     half = WHOLE._replace(lacks=("u 250 of 501 samples",))
     outcome = judge(Outcome(End.LANDED, "osprey landed at t = 5 s"), tape, scenario, half)
@@ -374,7 +408,10 @@ def test_landing_does_not_swallow_what_else_was_short() -> None:
 def shortfall_on_leg(
     aim: Aim, topic: str, name: str, value: float | FloatArray, **guidance: object
 ) -> Shortfall:
-    """The shortfall of one kind if `name` has other values for two seconds of the first leg."""
+    """Return the shortfall of one kind that other values of `name` cause.
+
+    They last for two seconds of the first leg.
+    """
     tape, scenario = on_first_leg()
     signal = tape[topic]
     values = signal.values.copy()
@@ -391,7 +428,7 @@ def shortfall_on_leg(
 
 
 def test_flight_below_its_ground_is_told() -> None:
-    """Two seconds at up to 70 m, 10 m below the touch-down of its landing."""
+    """The flight is up to 10 m below the touch-down point of its landing for two seconds."""
     heights = np.linspace(-61.0, -70.0, 200)
     below = shortfall_on_leg(Aim.GROUND, "truth", "pose.altitude", heights)
     assert below.figures == pytest.approx({"below_s": 2.0, "deepest_m": 10.0})
@@ -399,7 +436,7 @@ def test_flight_below_its_ground_is_told() -> None:
 
 @pytest.mark.parametrize("topic, name", [("truth", "x.V"), ("guidance", "y.V")])
 def test_flight_below_its_stall_speed_is_told(topic: str, name: str) -> None:
-    """Two seconds 13 m/s below the trim speed of 25 m/s, in truth or as measured."""
+    """V is 13 m/s below the trim speed of 25 m/s for two seconds, in truth or as measured."""
     slow = shortfall_on_leg(Aim.STALL, topic, name, -13.0, stall_speed=15.0, landing=None)
     assert slow.figures == pytest.approx(
         {"least": 12.0, "stall_speed": 15.0, "below_s": 2.0}, abs=0.05
@@ -408,7 +445,7 @@ def test_flight_below_its_stall_speed_is_told(topic: str, name: str) -> None:
 
 
 def test_flight_outside_of_its_fence_is_told() -> None:
-    """Two seconds 30 m east of a field that ends at 700 m."""
+    """The flight is 30 m east of a field that ends at 700 m, for two seconds."""
     field = {"north": [-900.0, 900.0, 900.0, -900.0], "east": [-700.0, -700.0, 700.0, 700.0]}
     route = {"north": [0.0, 300.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
     outside = shortfall_on_leg(
@@ -426,7 +463,7 @@ def test_flight_outside_of_its_fence_is_told() -> None:
 
 
 def test_guidance_that_the_log_lacks_is_left_to_the_account() -> None:
-    """The account says which topics a log lacks; the rest of the flight is judged."""
+    """The account says which topics a log lacks, and the rest of the flight is judged."""
     tape, scenario = on_first_leg()
     signals = {name: signal for name, signal in tape.signals.items() if name != "guidance"}
     assert judge(COMPLETED, replace(tape, signals=signals), scenario, WHOLE) == COMPLETED
@@ -447,7 +484,10 @@ def test_leg_that_ends_before_the_aircraft_was_on_it_is_told() -> None:
 
 
 def test_part_of_u_that_the_actuators_can_follow() -> None:
-    """Sines of 1 Hz, with an rms of 0.5, 0.5 and 1: three of them are 1.5, 1.5 and 3."""
+    """The inputs are sines of 1 Hz with an rms of 0.5, 0.5 and 1.
+
+    Three times the rms is 1.5, 1.5 and 3.
+    """
     t = np.arange(0.0, 10.0, 0.01)
     u = np.sin(2.0 * np.pi * t)[:, None] * np.sqrt(2.0) * [0.5, 0.5, 1.0]
     slow = 3.0 * 2.0 * np.pi * 0.5
@@ -469,7 +509,10 @@ def test_input_behind_an_allocation_reaches_as_far_as_its_first_effector() -> No
 
 
 def test_error_before_a_late_engagement_hides_nothing() -> None:
-    """The law engages 0.2 s late, and the flight is hardly longer than the part that is judged."""
+    """An error before a late engagement does not hide later errors.
+
+    The law engages 0.2 s late, and the flight is hardly longer than the part that is judged.
+    """
 
     class Late(Controller):
         def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
@@ -496,14 +539,14 @@ def test_lost_samples_of_a_sensor_are_no_shortfall() -> None:
 
 
 def test_law_that_is_too_weak_for_its_commands_is_told() -> None:
-    """A thousandth of the gain: the linear loop does not follow the commands either."""
+    """With a thousandth of the gain, the linear loop does not follow the commands either."""
     scale = np.array(servo().controller.input_scale) / 1000.0
     weak = servo().vary(controller={"input_scale": scale.tolist()})
     assert rise_di.simulate(weak).outcome.status == 4
 
 
 def test_truth_of_another_simulator_tells_no_wind() -> None:
-    """It has the outputs alone: the floor is that of an unknown wind."""
+    """The truth has only the outputs, so the floor is the one of an unknown wind."""
     truth = healthy()["truth"]
     names = tuple(f"x.{name}" for name in servo().controller.outputs)
     values = np.stack([truth[name] for name in names], axis=1)
@@ -532,7 +575,7 @@ TIME = STAMPS / 1e9
 
 
 def of_input(u_free: FloatArray) -> Tape:
-    """A flight whose controller limited an input to 1."""
+    """Return a flight whose controller limited an input to 1."""
     u = np.clip(u_free, -1.0, 1.0)
     names = ("limited.rudder", "u_free.rudder", "u.rudder")
     values = np.stack([(u != u_free).astype(float), u_free, u], axis=1)
@@ -540,7 +583,7 @@ def of_input(u_free: FloatArray) -> Tape:
 
 
 def test_input_from_limit_to_limit_is_a_note() -> None:
-    """A sine of twice the limit is beyond it in two thirds of the time."""
+    """A sine of twice the limit is beyond it for two thirds of the time."""
     (note,) = saturation_notes(of_input(2.0 * np.sin(7.0 * TIME)))
     assert note.startswith("rudder went from limit to limit in 67 % of 10 s")
 
@@ -558,7 +601,7 @@ def test_saturation_of_a_sound_loop_is_no_note(u_free: FloatArray) -> None:
 
 
 def test_plant_that_the_law_loses_is_told() -> None:
-    """A plant of a user whose first input acts the other way round."""
+    """In the user's plant, the first input has the opposite effect."""
     scenario = find_scenario("osprey_servo")
     x = np.zeros(4)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop in one process.
+"""Test the closed loop in one process.
 
 The tests measure its tracking error, and the order of the error in the sampling period.
 """
@@ -33,10 +33,10 @@ Rms = Callable[..., FloatArray]
 
 @pytest.fixture(scope="module")
 def rms(osprey_gust: Scenario) -> Rms:
-    """Root mean square error over the whole flight by channel q, V, p, r.
+    """Return a function that gives the rms error of a flight by channel q, V, p, r.
 
-    The aircraft is sampled at 200 Hz, twice the rate of the controller; at 400 Hz the orders in dt
-    are measured.
+    The aircraft is sampled at 200 Hz, twice the rate of the controller. The orders in dt are
+    measured at 400 Hz.
     """
 
     @cache
@@ -99,7 +99,7 @@ def test_literal_sign_halving_dt_halves_the_error(rms: Rms) -> None:
 
 
 def test_flight_records_one_second_at_a_time(osprey_gust: Scenario) -> None:
-    """Memory of a flight does not grow with its duration: no part is longer than a second."""
+    """No part of a flight is longer than a second, so memory does not grow with its duration."""
     scenario = osprey_gust.vary(flight={"duration": 3.0})
     parts: list[Mapping[str, Signal]] = []
     assert fly(scenario, parts.append) == COMPLETED
@@ -113,7 +113,10 @@ def test_flight_records_one_second_at_a_time(osprey_gust: Scenario) -> None:
 
 
 def test_log_in_parts_equals_log_at_once(osprey_gust: Scenario, tmp_path: Path) -> None:
-    """Message by message, for samples of y that are 0.1 s late, so that parts overlap."""
+    """The logs are equal message by message.
+
+    The samples of y are 0.1 s late, so that the parts overlap.
+    """
     scenario = osprey_gust.vary(flight={"duration": 3.0}, aircraft={"sensors": {"delay": 0.1}})
     attachments = attachments_for(scenario, tmp_path)
     tape = simulate(scenario)

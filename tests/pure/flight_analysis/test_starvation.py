@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A starved host is known by what was never sent, and says nothing about the law.
+"""Test that a starved host is known by what was never sent, and says nothing about the law.
 
-Samples are left out of healthy and of faulty flights as a host leaves them out: no number of a
-message is missing. What the flight without the gaps falls short of, it still does.
+Samples are left out of healthy and of faulty flights in the way in which a host leaves them out, so
+that no number of a message is missing. Shortfalls of the flight without the gaps must remain.
 """
 
 from collections.abc import Mapping
@@ -53,7 +53,7 @@ def in_real_time(
     lost: Mapping[str, int] = {},
     start_ns: int = EPOCH,
 ) -> Tape:
-    """The flight by the time of day, without the samples of the topics in the spans."""
+    """Return the flight by the time of day, without samples of the topics within the spans."""
     signals = {}
     for name, signal in tape.signals.items():
         t = tape.time(name)
@@ -108,7 +108,7 @@ def test_fault_of_the_law_outside_of_the_starved_spans_is_told(spans: Spans) -> 
 
 
 def test_errors_of_a_starved_span_are_no_finding_about_the_law() -> None:
-    """Q is off by 30 deg/s in what is left of a second, and nowhere else."""
+    """During one second, q is off by 30 deg/s in the few samples that were sent."""
     spans = tuple((start, start + 0.09) for start in np.arange(9.0, 10.0, 0.1).tolist())
     tape = flown()
     truth = tape["truth"]
@@ -128,7 +128,7 @@ def test_hiccup_that_harms_nothing_is_no_outcome() -> None:
 
 
 def test_lost_messages_are_a_lack_of_the_log() -> None:
-    """Their numbers are missing: they were sent."""
+    """Lost messages leave gaps in the numbers, which shows that they were sent."""
     whole = in_real_time(flown(), ())
     starved = in_real_time(flown())
     lost = {name: len(whole[name].stamp_ns) - len(starved[name].stamp_ns) for name in SENT}
@@ -138,7 +138,7 @@ def test_lost_messages_are_a_lack_of_the_log() -> None:
 
 
 def test_law_that_computes_for_too_long_is_none_of_the_host() -> None:
-    """It leaves out ticks, and the other nodes send every sample."""
+    """The law leaves out ticks, while the other nodes send every sample."""
     tape = in_real_time(flown(), topics=("u", "internals"))
     assert summarise(tape, servo())["account"]["starved"] == []
     assert outcome(tape)["end"] == "completed"

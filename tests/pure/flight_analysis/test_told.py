@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is claimed of a flight is of what flew, not of what the controller was told."""
+"""Test that claims about a flight are about what flew, and not about what the controller knew."""
 
 import math
 from dataclasses import replace
@@ -53,7 +53,7 @@ TOLD_OTHERWISE = {"osprey_learn_speeds"}
 
 
 def with_aircraft(scenario: Scenario, section: str, **values: Any) -> Scenario:
-    """A scenario with keys of a section of the aircraft changed, its others as they are."""
+    """Return a scenario with some keys of a section of the aircraft changed."""
     before = getattr(scenario.aircraft, section).model_dump()
     return scenario.vary(aircraft={section: before | values})
 
@@ -64,13 +64,16 @@ def sentences(scenario: Scenario, flight: FlightFacts | None = None) -> list[str
 
 
 def test_every_key_of_the_aircraft_is_in_one_set() -> None:
-    """A new key of the aircraft is named, and leaves the guarantee unstated, until it is placed."""
+    """A new key of the aircraft must be placed in one of the sets.
+
+    Until then it is named, and no guarantee is stated.
+    """
     assert sorted([*IN_LOOP, *OUTSIDE_LOOP, *BEYOND]) == sorted(keys_of(AircraftConfig))
 
 
 @pytest.mark.parametrize("name", sorted({*scenarios()} - TOLD_OTHERWISE))
 def test_a_healthy_scenario_has_the_loop_that_its_controller_was_told(name: str) -> None:
-    """To the last bit: their margins and certificates stay."""
+    """The loops are equal to the last bit, so that margins and certificates stay."""
     scenario = find_scenario(name)
     comparison = compare(scenario, scenario.controller)
     assert not comparison.differences
@@ -79,7 +82,10 @@ def test_a_healthy_scenario_has_the_loop_that_its_controller_was_told(name: str)
 
 
 def test_lags_and_delay_that_were_not_told_are_those_of_the_margins() -> None:
-    """The loop of the declared lags keeps 28 ms. The aircraft of the file diverges in flight."""
+    """With the declared lags the loop has a margin of 28 ms.
+
+    The aircraft of the file has other lags, and diverges in flight.
+    """
     slow = with_aircraft(OBSERVER, "actuators", lag=[0.1, 0.1, 0.1, 0.1])
     slow = with_aircraft(slow, "sensors", delay=0.02)
     found = sentences(slow)
@@ -167,7 +173,10 @@ def test_signs_and_rates_of_the_controller_are_compared() -> None:
 
 
 def test_lags_behind_an_allocation_are_those_of_its_effectors() -> None:
-    """The twin yaws by its rudder, 20 ms, and by its engines, 100 ms, here both slower."""
+    """The twin yaws by its rudder with 20 ms and by its engines with 100 ms.
+
+    In the second part both are slower.
+    """
     assert flown_lag(TWIN.aircraft, TWIN.controller) == approx(TWIN.controller.lag, rel=1e-4)
     lag = np.array(TWIN.aircraft.actuators.lag)
     slow = with_aircraft(TWIN, "actuators", lag=(2.0 * lag).tolist())
@@ -199,7 +208,7 @@ def test_an_allocation_for_other_effectors_is_named() -> None:
 
 
 def test_jsbsim_has_lags_of_its_own_beside_those_of_the_file() -> None:
-    """1.08 s of the c172p's engine stand in no key, 0.1 s of a slow elevator do."""
+    """No key has the 1.08 s of the c172p's engine, but one has the 0.1 s of a slow elevator."""
     c172p = find_scenario("jsbsim_c172p")
     slow = with_aircraft(c172p, "actuators", lag=[0.0, 0.0, 0.1, 0.0])
     texts = [text for text in sentences(slow) if text.startswith("aircraft.actuators.lag")]
@@ -211,7 +220,7 @@ def test_jsbsim_has_lags_of_its_own_beside_those_of_the_file() -> None:
 
 
 def guarantee_of(loop: Any, stable: float = 0.5) -> Guarantee:
-    """A guarantee as if one had been computed."""
+    """Return a guarantee as if it had been computed."""
     return Guarantee(
         uncertainty=0.3,
         stable=stable,
@@ -289,12 +298,15 @@ def test_a_log_as_planned_names_nothing(facts: FlightFacts) -> None:
 
 @cache
 def as_planned() -> Tape:
-    """The flight of SERVO."""
+    """Return the flight of SERVO."""
     return simulate(SERVO)
 
 
 def test_an_aircraft_that_is_not_simulated_is_not_compared() -> None:
-    """The aircraft of the scenario does not fly behind a bridge: the loop is as told."""
+    """Behind a bridge, the aircraft of the scenario does not fly.
+
+    So the loop is the one that the controller was told.
+    """
     slow = with_aircraft(SERVO, "actuators", lag=[0.1] * 4, faults=["elevator stuck 1"])
     assert not sentences(slow, FlightFacts(is_simulated=False))
     tape = as_planned()

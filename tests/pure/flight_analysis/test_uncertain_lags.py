@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lags of actuators as entries of a box: the closed form of an integrator, and exact loops."""
+"""Test lags of actuators as entries of a box.
+
+They are compared with the closed form of an integrator, and with exact loops.
+"""
 
 import json
 import re
@@ -37,12 +40,12 @@ ENTRIES = {"1/lag[elevator]": 0.3, "1/lag[aileron]": 0.3}
 
 
 def behind_actuator(k: float, lag: float, delay: float = 0.0) -> LinearLoop:
-    """U = -k y around y_dot = u_a with lag u_a_dot = u - u_a, an exact lag."""
+    """Return the loop u = -k y around y_dot = u_a, with the exact lag u_a_dot = (u - u_a) / lag."""
     return integrator(k, 0.0)._replace(loop=LoopTiming(np.array([lag]), delay, PERIOD))
 
 
 def uncertain(exact: LinearLoop, part: float) -> LinearLoop:
-    """The loop with a box of its lag."""
+    """Return the loop with a box of its lag."""
     assert exact.box is not None
     linear, box = with_lags_pulled_out(exact, exact.box, {0: part}, 1, UNIFORM)
     return linear._replace(box=box)
@@ -50,9 +53,11 @@ def uncertain(exact: LinearLoop, part: float) -> LinearLoop:
 
 @pytest.mark.parametrize(("gain", "lag"), [(2.05, 0.02), (2.1, 0.025)])
 def test_lag_of_integrator_may_rise_to_the_closed_form(gain: float, lag: float) -> None:
-    """y+ = y - k y (T - lag g) + lag g u_a, u_a+ = e u_a - k y g, e = exp(-T / lag), g = 1 - e.
+    """The lag may rise up to the closed form of the sampled loop.
 
-    Above 2 / T a gain is stable behind the actuator alone, and the determinant is 1 at the slowest.
+    It is y+ = y - k y (T - lag g) + lag g u_a and u_a+ = e u_a - k y g, with e = exp(-T / lag) and
+    g = 1 - e. A gain above 2 / T is only stable behind the actuator. At the slowest one, the
+    determinant is 1.
     """
 
     def room(d: float) -> float:
@@ -73,7 +78,7 @@ def test_lag_of_integrator_may_rise_to_the_closed_form(gain: float, lag: float) 
 
 @pytest.mark.parametrize(("periods", "holds"), [(LEAST_LAG, True), (1.0, False)])
 def test_two_coefficients_hold_a_lag_of_two_periods(periods: float, holds: bool) -> None:
-    """The pole of an actuator is exp(-T (1 + d) / lag): d is off by less than its thousandth."""
+    """The pole of an actuator is exp(-T (1 + d) / lag), and d is accurate to a thousandth."""
     linear = uncertain(behind_actuator(0.0, periods * PERIOD), 1.0)
     assert linear.box is not None
     loop = uncertain_loop(linear.nominal, linear.law, linear.loop, linear.box)
@@ -87,9 +92,9 @@ def test_two_coefficients_hold_a_lag_of_two_periods(periods: float, holds: bool)
 
 
 def test_late_input_behind_an_uncertain_actuator() -> None:
-    """Each constant delay within is stable up to 5 ms; up to 10 ms an aircraft is unstable.
+    """Each constant delay is stable up to 5 ms, and up to 10 ms an aircraft is unstable.
 
-    No aircraft within 99 % is, but two coefficients hold a lag up to 80 % alone.
+    No aircraft within 99 % is unstable, but two coefficients describe a lag only up to 80 %.
     """
     guarantee = loop_guarantee(uncertain(behind_actuator(80.0, 0.03), 0.3), 0.005)
     assert guarantee.unstable is None
@@ -106,7 +111,10 @@ def test_late_input_behind_an_uncertain_actuator() -> None:
 
 
 def exact_radii(linear: LinearLoop, deviations: FloatArray) -> FloatArray:
-    """The spectral radii of loops with exact lags, of deviations (N, k) by entry, lags last."""
+    """Return the spectral radii of loops with exact lags.
+
+    The deviations, (N, k), are given by entry, and the lags come last.
+    """
     plain = scenario_loop(OSPREY, OSPREY.controller, 1, 0.3)
     assert plain.box is not None
     assert linear.box is not None
@@ -128,7 +136,7 @@ def lags() -> LinearLoop:
 
 @pytest.fixture(scope="module")
 def guarantee(lags: LinearLoop) -> Guarantee:
-    """What is proved of stability, without disks."""
+    """Return what is proved about stability, without disks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(guarantee_module, "FEWER_BOXES", 2)
         return loop_guarantee(lags)
@@ -163,7 +171,10 @@ def test_checker_proves_lags_and_refuses_other_ones(
 
 
 def test_no_corner_with_exact_lags_is_unstable(lags: LinearLoop, guarantee: Guarantee) -> None:
-    """500 corners of A, B and the lags at the guarantee; the first unstable one beyond is one."""
+    """None of 500 corners of A, B and the lags at the size of the guarantee is unstable.
+
+    The first unstable corner that was found outside is unstable.
+    """
     assert lags.box is not None
     assert guarantee.unstable is not None
     # without the lags it is 0.742
@@ -215,7 +226,7 @@ def test_unknown_entry_is_refused(entries: dict[str, float], sentence: str) -> N
 
 @pytest.mark.parametrize("lag", [0.0, 0.019])
 def test_lag_below_two_periods_is_refused(lag: float) -> None:
-    """Within a period it moves more than two coefficients hold."""
+    """Such a lag moves more within a period than two coefficients can describe."""
     actuators = OSPREY.aircraft.actuators.model_dump() | {"lag": [lag, 0.1, 0.02, 0.02]}
     faster = OSPREY.vary(
         controller={"lag": [lag, 0.02, 0.02, 0.1]}, aircraft={"actuators": actuators}

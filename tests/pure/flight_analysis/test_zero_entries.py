@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Entries that are 0 in the file: their rows, their box, their guarantee and their certificate."""
+"""Test entries that are 0 in the file: their rows, their box, guarantee and certificate."""
 
 import json
 from pathlib import Path
@@ -56,7 +56,10 @@ ONE_CHANNEL = FRAME | {
 
 
 def with_zero(part: float = 0.3, zero: float = 0.1) -> LinearLoop:
-    """y_dot = a y + (1 + d) u, u = -K y, where a is 0 in the file and within `zero` of ROW."""
+    """Return y_dot = a y + (1 + d) u with u = -K y.
+
+    The entry a is 0 in the file, and uncertain by `zero` of ROW.
+    """
     linear = integrator(K, part)
     assert linear.box is not None
     box = linear.box._replace(
@@ -78,7 +81,7 @@ def content() -> Content:
 
 
 def test_row_is_what_the_largest_entry_of_a_row_does_at_the_sizes() -> None:
-    """Row V: 0.4 N^-1 times a fifth of 5 N; row q: 7 1/s^2 times 0.1 rad."""
+    """Row V has 0.4 N^-1 times a fifth of 5 N, and row q has 7 1/s^2 times 0.1 rad."""
     frame = Airframe.validate_mapping(FRAME, "frame")
     sizes = row_sizes(frame)
     V, q = 0.4 * 1.0, 7.0 * 0.1
@@ -87,7 +90,10 @@ def test_row_is_what_the_largest_entry_of_a_row_does_at_the_sizes() -> None:
 
 
 def test_input_of_unknown_size_has_no_part_in_a_row() -> None:
-    """Without `no_thrust` a newton has no size: its own 0 stays 0, and row V is that of A."""
+    """Without `no_thrust` a newton has no size.
+
+    Then the zero of this input stays 0, and row V is the one of A.
+    """
     thrust = {key: value for key, value in FRAME["inputs"]["thrust"].items() if key != "no_thrust"}
     inputs = FRAME["inputs"] | {"thrust": thrust}
     sizes = row_sizes(Airframe.validate_mapping(FRAME | {"inputs": inputs}, "frame"))
@@ -96,7 +102,7 @@ def test_input_of_unknown_size_has_no_part_in_a_row() -> None:
 
 
 def test_aircraft_of_a_corner_is_the_one_of_the_same_deviations() -> None:
-    """Box, file and draw agree on what a part of a row is."""
+    """The box, a file and a random draw agree on what a part of a row is."""
     frame, scenario = load_airframe("osprey"), find_scenario("osprey_servo")
     spread = Spread({"B[q,thrust]": 0.3}, "corners", zeros=0.2)
     box = box_of(frame, scenario.controller, 0.1, spread)
@@ -123,7 +129,7 @@ def test_aircraft_of_a_corner_is_the_one_of_the_same_deviations() -> None:
 
 
 def test_zero_alone_goes_up_to_the_closed_form() -> None:
-    """y_dot = a y - K y held is unstable from a = K on: half of the row."""
+    """With a held u, y_dot = a y - K y is unstable from a = K on, which is half of the row."""
     alone = zeros_alone(with_zero(part=0.0, zero=1.0))
     assert alone is not None
     limit = K / ROW
@@ -148,7 +154,10 @@ def test_kept_guarantee_says_how_far_zeros_go_alone() -> None:
 
 
 def test_zero_and_entry_go_in_proportion() -> None:
-    """Unstable from a = K (1 - d) on, with d = 0.3 s and a = 4 s: s = 20 / 10."""
+    """The loop is unstable from a = K (1 - d) on.
+
+    With d = 0.3 s and a = 4 s, this is at s = 20 / 10.
+    """
     guarantee = loop_guarantee(with_zero())
     size = K / (0.1 * ROW + 0.3 * K)
     assert guarantee.stable == approx(0.3 * size, rel=0.02)
@@ -160,7 +169,10 @@ def test_zero_and_entry_go_in_proportion() -> None:
 
 
 def test_unstable_aircraft_of_the_issue_by_another_exponential() -> None:
-    """With all others exact, B[q,thrust] at 19 % of its row; this loop is written out here."""
+    """With all others exact, the loop is unstable for B[q,thrust] at 19 % of its row.
+
+    The loop is written out here with another exponential.
+    """
     frame, scenario = load_airframe("osprey"), find_scenario("osprey_observer")
     linear = scenario_loop(scenario, scenario.controller)
     radii = []
@@ -186,7 +198,10 @@ def test_unstable_aircraft_of_the_issue_by_another_exponential() -> None:
 
 
 def test_checker_proves_zeros_and_says_them_as_numbers(content: Content, tmp_path: Path) -> None:
-    """Its rows with a large g need a smaller rest: without this weight the checker refused it."""
+    """The rows with a large g need a smaller remainder.
+
+    Without this weight the checker had refused the certificate.
+    """
     done = run(content, tmp_path)
     assert done.returncode == 0, done.stderr
     assert "B[y,u] (B 0, 0) 59." in done.stdout
