@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of fleets: what each aircraft flies, and what is refused."""
+"""Test the files of fleets: what each aircraft flies, and what is refused."""
 
 import json
 from collections.abc import Sequence

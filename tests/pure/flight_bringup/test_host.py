@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a flight in real time needs of a host, and what the host gives."""
+"""Test what a flight in real time needs from a host, and what the host can give."""
 
 import os
 
@@ -32,9 +32,9 @@ def test_as_many_processes_spin_as_compute_all_the_time(
 
 
 def test_two_idle_cores_are_enough_for_four_processes_and_half_a_core_is_not() -> None:
-    """Two idle cores flew 60 s of osprey_servo with 79 s of processor, 1.3 cores.
+    """On two idle cores, 60 s of osprey_servo took 79 s of processor, which is 1.3 cores.
 
-    On a host that gave 0.44 to 0.52 of a core four flights of four lost samples.
+    On a host that gave 0.44 to 0.52 of a core, four flights out of four lost samples.
     """
     scenario = find_scenario("osprey_servo")
     assert shortage([scenario], lambda _: 1.9) is None

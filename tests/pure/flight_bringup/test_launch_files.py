@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The launch files with a stand-in for `launch` (tests/launch_stand_in.py).
+"""Test the launch files with a stand-in for `launch` (tests/launch_stand_in.py).
 
-Checked: the arguments, the start order of the processes by their `node_state`, their parameters,
-and the effect of their end.
+The tests cover the arguments, the order in which processes start by their `node_state`, their
+parameters, and the effect of their end.
 """
 
 import re
@@ -77,7 +77,7 @@ Case = tuple[list[Any], LaunchContext, tuple[str, ...], tuple[str, ...]]
 
 @pytest.fixture(autouse=True)
 def launch(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The stand-in in the place of launch, also for the shared code of the launch files."""
+    """Put the stand-in in the place of launch, also for the shared code of the launch files."""
     for name in (PROFILE_VARIABLE, DISCOVERY_VARIABLE):
         monkeypatch.setenv(name, "")  # restored afterwards
         monkeypatch.delenv(name)
@@ -106,7 +106,7 @@ def described(name: str) -> Sequence[Any]:
 
 
 def started(name: str, pushed: str = "", **given: object) -> tuple[list[Any], LaunchContext]:
-    """The actions of a launch with arguments once the domain is known, and its context.
+    """Return the actions of a launch after the domain is known, and its context.
 
     `pushed` is the namespace of a launch file that includes it.
     """
@@ -116,7 +116,10 @@ def started(name: str, pushed: str = "", **given: object) -> tuple[list[Any], La
 
 
 def discovered(actions: Sequence[Any], context: LaunchContext) -> list[Any]:
-    """The actions with those that follow half a second later, when other flights are known."""
+    """Return the actions, with those that follow half a second later.
+
+    By then, other flights of the domain are known.
+    """
     follow = list(actions)
     for timer in every(TimerAction, actions):
         assert timer.period == 0.5
@@ -127,7 +130,7 @@ def discovered(actions: Sequence[Any], context: LaunchContext) -> list[Any]:
 
 
 def begun(name: str, pushed: str = "", **given: object) -> tuple[list[Any], LaunchContext]:
-    """The first actions of a launch, and its context."""
+    """Return the first actions of a launch, and its context."""
     context = LaunchContext()
     return included(name, context, pushed, **given), context
 
@@ -140,9 +143,9 @@ def included(
     /,
     **given: object,
 ) -> list[Any]:
-    """The first actions of a launch file that another one includes, with its arguments alone.
+    """Return the first actions of a launch file that another one includes with these arguments.
 
-    `scope` is what actions of launch_ros have left in the launch configurations.
+    `scope` has what actions of launch_ros left in the launch configurations.
     """
     entities = described(name)
     declared = {
@@ -163,12 +166,12 @@ def included(
 
 
 def nodes(actions: Sequence[Any]) -> dict[str, Node]:
-    """The nodes among actions, by their executables."""
+    """Return the nodes among actions, by their executables."""
     return {node.executable: node for node in every(Node, actions)}
 
 
 def overrides(node: Node) -> dict[str, Any]:
-    """The parameters of a node beside its section of the scenario."""
+    """Return the parameters that a node has besides its section of the scenario."""
     values: dict[str, Any] = node.parameters[1]
     return values
 
@@ -180,13 +183,16 @@ def publish(
     state: str = "ready",
     topic: str = "/node_state",
 ) -> list[Any]:
-    """The actions that follow a message on `node_state`."""
+    """Return the actions that follow a message on `node_state`."""
     context.ros_node.subscriptions[topic](KeyValue(key=key, value=state))
     return context.handle(actions)
 
 
 def all_ready(actions: Sequence[Any], context: LaunchContext, namespace: str = "") -> list[Any]:
-    """The actions once all nodes are ready; none before, and none for a second message."""
+    """Return the actions that follow when all nodes are ready.
+
+    No action follows before that, or after a second message.
+    """
     topic = f"{namespace}/node_state"
     *others, last = (f"{namespace}/{name}#{PID}" for name in nodes(actions))
     for key in others:
@@ -198,7 +204,7 @@ def all_ready(actions: Sequence[Any], context: LaunchContext, namespace: str = "
 
 
 def ends(actions: Sequence[Any], *processes: Any) -> bool:
-    """Whether actions stop the processes, and a process of another launch goes on."""
+    """Return whether actions stop the processes of this launch, and only these."""
     matchers = [
         action.event.process_matcher
         for action in every(stand_in.EmitEvent, actions)
@@ -210,7 +216,7 @@ def ends(actions: Sequence[Any], *processes: Any) -> bool:
 
 
 def restored(actions: Sequence[Any], context: LaunchContext) -> dict[str, Any]:
-    """The launch configurations that hold for a process among actions."""
+    """Return the launch configurations that a process among actions is started with."""
     kinds = [type(action) for action in actions]
     push = kinds.index(stand_in.PushLaunchConfigurations)
     assert stand_in.PopLaunchConfigurations in kinds[push:]
@@ -228,7 +234,7 @@ def every(kind: type[T], actions: Sequence[Any]) -> list[T]:
 
 @pytest.fixture(scope="module")
 def short(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recorded flight of half a second."""
+    """Return a recorded flight of half a second."""
     tape = simulate(osprey_gust.vary(flight={"duration": 0.5}))
     folder = tmp_path_factory.mktemp("short") / "log"
     return write_run(tape, folder, LogAttachments(osprey_gust.path)).parent
@@ -318,7 +324,10 @@ def test_later_set_parameter_of_launch_reaches_no_node_of_flight(tmp_path: Path)
 def test_node_that_is_matched_before_the_others_are_ready_does_not_hold_up_the_flight(
     tmp_path: Path,
 ) -> None:
-    """Aircraft and reference model are the user's, and have published before the controller."""
+    """The aircraft and the reference model are the user's.
+
+    They published before the controller started.
+    """
     actions, context = started(
         "fly", aircraft="false", reference_model="false", runs=tmp_path / "runs"
     )
@@ -363,7 +372,7 @@ def test_fleet_is_a_process_and_its_end_ends_launch(tmp_path: Path) -> None:
 
 @pytest.fixture(params=CASES, ids=lambda case: "-".join((case[0], *case[1])))
 def case(request: pytest.FixtureRequest, short: Path, tmp_path: Path) -> Case:
-    """A launch: its actions, its context, and the nodes of its first and its second stage."""
+    """Return a launch: actions, context, and the nodes of its first and its second stage."""
     name, given, first, then = request.param
     log = {"run": str(short)} if name == "replay" else {}
     return (*started(name, **given, **log, runs=tmp_path / "runs"), first, then)
@@ -394,7 +403,7 @@ def test_nodes_start_in_order_with_parameters_that_they_have(case: Case) -> None
 
 @pytest.mark.parametrize("number", [0, -1], ids=["first stage", "last stage"])
 def test_end_of_any_node_ends_launch_with_error(number: int, case: Case, tmp_path: Path) -> None:
-    """With status 0 too: no node ends before the flight does."""
+    """Status 0 is an error, too, because no node may end before the flight."""
     actions, context, first, _ = case
     left = [file.read_text() for file in tmp_path.glob("runs/2*/outcome")]
     assert left == ([INTERRUPTED.text()] if "recorder" in first else [])  # the outcome of Ctrl-C
@@ -480,7 +489,7 @@ def test_launch_flies_beside_another_namespace_and_plays_beside_a_reference_mode
 
 
 def flown_to(context: LaunchContext, actions: Sequence[Any], instant: float) -> list[Any]:
-    """The actions that follow when the log holds y, y_m and u up to an instant.
+    """Return the actions that follow when the log has y, y_m and u up to an instant.
 
     The instant is in s of the system clock.
     """
@@ -495,9 +504,9 @@ FLYING = ("recorder", "controller", "aircraft", "reference_model")
 def all_matched(
     follow: Sequence[Any], context: LaunchContext, names: Sequence[str] = FLYING
 ) -> list[Any]:
-    """The actions once these nodes are matched.
+    """Return the actions that follow when these nodes are matched.
 
-    A node may be flying before this launch has discovered it.
+    A node may already fly before this launch has discovered it.
     """
     states = {"aircraft": NodeState.FLYING}
     return [
@@ -570,7 +579,7 @@ TWO: dict[str, tuple[dict[str, object], dict[str, object]]] = {
 def test_each_of_two_includes_has_its_own_arguments(
     name: str, short: Path, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    """Launch calls what comes later when another include has replaced the configurations."""
+    """Launch runs later actions when another include has replaced the configurations."""
     more: dict[str, object] = {"scenario": osprey_gust.path}
     more |= {"run": short} if name == "replay" else {}
     one, other = ({**more, **given, "runs": tmp_path / "runs"} for given in TWO[name])
@@ -709,7 +718,7 @@ def test_bridge_with_flipped_sign_refused_before_anything_starts(tmp_path: Path)
 
 
 def test_limits_beyond_those_of_map_refused_before_anything_sent(tmp_path: Path) -> None:
-    """The bridge clips u, which the anti-windup of the law does not know."""
+    """The bridge clips u, and the anti-windup of the law does not know about this."""
     # Thrust from -0.4 to 0.4, the map from -0.2 to 0.3.
     scenario = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
     sentence = (
@@ -729,7 +738,7 @@ def player(actions: Sequence[Any]) -> ExecuteProcess:
 
 
 def options(process: ExecuteProcess) -> dict[str, Any]:
-    """The options of `rise-di play` on its command line."""
+    """Return the options of `rise-di play` on its command line."""
     executable, command, *words = process.cmd
     assert executable == stand_in.ExecutableInPackage(package="flight_cli", executable="rise-di")
     assert (

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded command lies beside the scenario, and its values in the log."""
+"""Test that a recorded command is found beside the scenario, and its values in the log."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ STICK = "time,value\n0,0\n0.5,0.02\n0.8,0.02\n1.1,-0.01\n"
 
 @pytest.fixture
 def scenario_file(tmp_path: Path) -> Path:
-    """A scenario with the file stick.csv beside it, in a folder that is not the working one."""
+    """Return a scenario with the file stick.csv beside it, outside of the working folder."""
     content = yaml.safe_load((LIBRARY / "osprey_servo.yaml").read_text())
     commands = content["/**/reference_model"]["ros__parameters"]
     commands.pop("pulses")

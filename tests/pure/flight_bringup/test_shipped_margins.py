@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of scenarios that ship and of examples.
+"""Test the margins of the shipped scenarios and examples.
 
-Behind servos the requirement holds, or a line of the first comment says why not.
+Behind servos the requirement must be met, or a line of the first comment must say why not.
 """
 
 import math
@@ -42,12 +42,12 @@ def _example(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def of_loops() -> dict[str, LoopMargins]:
-    """The margins found so far, by the digest of the loop: several files share one."""
+    """Return the margins found so far, by the digest of the loop, which several files share."""
     return {}
 
 
 def states(path: Path, begin: str) -> bool:
-    """Return whether a line of the comments at the margin begins so."""
+    """Return whether a line of the comments begins with this text."""
     return any(line.startswith(f"# {begin}") for line in path.read_text().splitlines())
 
 

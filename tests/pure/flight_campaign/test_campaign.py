@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo campaigns: statistics of constant size.
+"""Test Monte Carlo campaigns: their statistics have a constant size.
 
-Chunks do not depend on engine or order; kill and resume are tested too.
+Chunks do not depend on the engine or on their order. A campaign that is killed can be resumed.
 """
 
 import io
@@ -82,7 +82,7 @@ def fly_campaign(folder: Path, of: Definition) -> MonteCarlo:
 
 
 def test_meaning_of_the_score_has_the_units_of_the_tables() -> None:
-    """10 mrad/s is 0.573 deg/s."""
+    """The unit of the tables is deg/s, and 10 mrad/s is 0.573 deg/s."""
     sentence = score_meaning(find_scenario("osprey_servo"), {"r": 0.05})
     assert sentence.endswith("r 2.86 deg/s, 0.573 deg/s (p: 1.15) and 0.1 m/s")
 
@@ -147,10 +147,7 @@ def test_a_score_counts_errors_in_their_units() -> None:
 
 
 def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: Path) -> None:
-    """One entry has its own limits, the others theirs, and a score has a unit of its own.
-
-    Lags, noise and u late are among them.
-    """
+    """Limits of single entries, of lags and noise, a late u and a unit of the score are kept."""
     units = {"V": 0.2}
     entries = {"B[V,thrust]": 0.6, "lag[thrust]": 0.2, "lag": 0.5, "noise[q]": 0.9, "delay": 0.035}
     of = define(
@@ -273,9 +270,9 @@ def test_figures_of_a_mission_are_those_of_its_flight_alone(
 
 
 def test_figures_of_a_mission_leave_out_what_is_no_leg() -> None:
-    """The last orbit begins at the centre, a radius beside its path.
+    """The last orbit begins at its centre, a radius away from its path.
 
-    Beyond a fence the aircraft flies home, away from its leg.
+    Outside of a fence the aircraft flies home, away from its leg.
     """
     route = {"north": [0.0, 100.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
     section = {"route": route, "home": {"north": -30.0}}
@@ -319,7 +316,7 @@ def test_scenario_that_campaign_cannot_fly_is_refused_before_its_folder(
 
 
 def learning(duration: float, **learn: object) -> Scenario:
-    """An osprey that learns, at few ticks."""
+    """Return an osprey that learns, with few ticks."""
     return find_scenario("osprey_learn").vary(
         flight={"duration": duration},
         aircraft={"rate": 100.0, "step": 0.005},
@@ -328,7 +325,7 @@ def learning(duration: float, **learn: object) -> Scenario:
 
 
 def proposing(*proposals: RiseDiConfig) -> Callable[[Scenario], Learn]:
-    """Learners that propose these models one after another, aircraft by aircraft."""
+    """Return learners that propose the given models, one for each aircraft."""
     each = iter(proposals)
 
     def learner(_: Scenario) -> Learn:
@@ -350,14 +347,17 @@ def flown_rows(folder: Path, scenario: Scenario, learner: Any, count: int) -> Mo
 
 
 def flown_alone(campaign: MonteCarlo, number: int, learner: Any) -> dict[str, float]:
-    """Figures of an aircraft of a campaign by the loop of `rise-di fly --in-process`."""
+    """Return figures of an aircraft of a campaign.
+
+    It is flown by the loop of `rise-di fly --in-process`.
+    """
     scenario = campaign.definition.aircraft_scenario(number)
     figures = single_flights.fly_single(scenario, learner).figures
     return {name: figures[name] for name in figures if name.startswith(("rms", "max", "slew"))}
 
 
 def test_aircraft_that_learn_fly_as_in_single_process_simulation(tmp_path: Path) -> None:
-    """The learner of the first one proposes a model, that of the second one without an observer."""
+    """The first learner proposes a model with an observer, and the second one without."""
     model = find_scenario("osprey_observer").rise_di()
     bare = model.model_copy(update={"observer": None})
     campaign = flown_rows(tmp_path / "learn", learning(2.0), proposing(model, bare), 2)
@@ -548,7 +548,7 @@ def test_results_have_margins_beside_score(tmp_path: Path) -> None:
 
 @pytest.fixture
 def flown(tmp_path: Path) -> MonteCarlo:
-    """A campaign of one chunk, whose figures are made up."""
+    """Return a campaign of one chunk with made-up figures."""
     campaign = MonteCarlo.begin(tmp_path, definition(20, 20))
     score = np.linspace(1.0, 2.0, 20)
     (tmp_path / CHUNKS / "0-000000.parquet").write_bytes(made_up(score))
@@ -556,7 +556,7 @@ def flown(tmp_path: Path) -> MonteCarlo:
 
 
 def made_up(score: FloatArray) -> bytes:
-    """The rows of a chunk with these scores."""
+    """Return the rows of a chunk with these scores."""
     return encode_chunk(
         Chunk(
             0, np.zeros(len(score)), {"score": score, "rms.q": score}, {"B[p,aileron]": 6.0 - score}
@@ -567,7 +567,7 @@ def made_up(score: FloatArray) -> bytes:
 
 
 def refusal(*words: str) -> str:
-    """The sentence with which the command ends."""
+    """Return the sentence with which the command ends."""
     result = invoke("campaign", *words)
     assert isinstance(result.exception, ParameterError), result.exception
     return str(result.exception)
@@ -629,7 +629,7 @@ def test_campaign_is_not_continued_with_another_definition(flown: MonteCarlo) ->
 
 
 def command(*arguments: str, cwd: Path, group: bool = False) -> "subprocess.Popen[str]":
-    """The command, with `group` in a group of processes of its own, as in a terminal."""
+    """Start the command. With `group` it has its own process group, as in a terminal."""
     program = [sys.executable, "-m", "flight_cli.cli", "campaign", *arguments, "--json"]
     return subprocess.Popen(
         program,
@@ -657,7 +657,7 @@ def new(aircraft: int, *more: str) -> tuple[str, ...]:
 
 
 def figures(output: str) -> list[object]:
-    """The figures of what the command prints."""
+    """Return the figures that the command prints."""
     cases = json.loads(output)["cases"]
     for case in cases:
         del case["fly_again"], case["influence"]["command"]  # name the folder
@@ -665,7 +665,7 @@ def figures(output: str) -> list[object]:
 
 
 def wait_for_chunks(runs: Path, count: int, process: "subprocess.Popen[str]") -> Path:
-    """Wait until so many chunks of the one campaign in `runs` are done; return its folder."""
+    """Wait until `count` chunks of the only campaign in `runs` are done, and return its folder."""
     while len(result := list(runs.glob(f"*/{CHUNKS}/*.parquet"))) < count:
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
@@ -674,13 +674,16 @@ def wait_for_chunks(runs: Path, count: int, process: "subprocess.Popen[str]") ->
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> list[object]:
-    """The figures of an uninterrupted campaign of 10 chunks."""
+    """Return the figures of an uninterrupted campaign of 10 chunks."""
     runs = tmp_path_factory.mktemp("whole")
     return figures(invoke("campaign", *new(200, "--runs", str(runs)), "--json").stdout)
 
 
 def part_of_campaign(folder: Path, number: signal.Signals) -> tuple[Path, int, str]:
-    """Folder, status and output of a campaign of 10 chunks that a signal ends after the first."""
+    """Return folder, status and output of a campaign of 10 chunks.
+
+    A signal ends it after the first chunk.
+    """
     stopped = command(*new(200, "--runs", "part", "--workers", "1"), cwd=folder)
     part = wait_for_chunks(folder / "part", 1, stopped)
     stopped.send_signal(number)
@@ -708,7 +711,7 @@ def test_killed_campaign_resumes_to_figures_of_uninterrupted_one(
 
 
 def test_ctrl_c_ends_the_processes_of_missions(tmp_path: Path) -> None:
-    """A terminal sends the signal to the workers too."""
+    """A terminal sends the signal to the workers, too."""
     short = ("osprey_route", "--duration", "1", "--aircraft", "400", "--chunk", "1")
     stopped = command(*short, "--runs", "part", "--workers", "1", cwd=tmp_path, group=True)
     wait_for_chunks(tmp_path / "part", 1, stopped)
@@ -754,9 +757,9 @@ def test_campaign_goes_on_with_scheduler_that_is_back() -> None:
 def test_chunk_beyond_memory_flies_in_halves_with_the_same_draws(
     error: Exception, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The second text is that of an error of JAX.
+    """The second text is from an error of JAX.
 
-    Figures may differ by the order of sums, which depends on the vector width of the CPU.
+    Figures may differ in the order of sums, which depends on the vector width of the CPU.
     """
     part = define(
         SHORT.vary(flight={"duration": 0.5}), aircraft=30, uncertainty=0.3, seed=7, chunk=20
@@ -838,7 +841,7 @@ def test_devices_of_a_process_are_shared_out(monkeypatch: pytest.MonkeyPatch) ->
 def test_chunks_of_a_device_are_equal_and_fit_into_its_memory(
     gibibytes: int, aircraft: int, chunk: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With 16 KiB an aircraft 1 GiB holds 65,536."""
+    """With 16 KiB for each aircraft, 1 GiB has room for 65,536."""
     holder = SimpleNamespace(memory_stats=lambda: {"bytes_limit": gibibytes * 2**30})
     monkeypatch.setattr(device, "is_cpu", lambda: False)
     monkeypatch.setattr("jax.devices", lambda: [holder])

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of control laws.
+"""Test the comparison of control laws.
 
-Tested are cost and score, repeatable tuning, delayed inputs, the shipped gains, the command.
+The tests cover cost and score, repeatable tuning, delayed inputs, the shipped gains and the
+command.
 """
 
 import json
@@ -51,18 +52,18 @@ SHIPPED = sorted(path.stem for path in tuned_gains.TUNED.glob("*.yaml"))
 
 @pytest.fixture(scope="module")
 def short() -> Benchmark:
-    """The first 4 s of osprey_servo, with its vertical gust brought forward into them."""
+    """Return a benchmark of 4 s of osprey_servo, whose vertical gust begins earlier."""
     return tuning.build_benchmark(first_seconds(find_scenario("osprey_servo")))
 
 
 def first_seconds(scenario: Scenario) -> Scenario:
-    """The first 4 s of a scenario, with a vertical gust in them."""
+    """Return the first 4 s of a scenario, with a vertical gust."""
     gust = {"vertical": {"start": 2.0, "speed": 10.12, "length": 15.24}}
     return scenario.vary(flight={"duration": 4.0}, aircraft={"gusts": gust})
 
 
 def tuning_result(gains: Gains, **changes: Any) -> TuningResult:
-    """A tuning result with these gains."""
+    """Return a tuning result with these gains."""
     return TuningResult(
         gains={name: value[:, 0].tolist() for name, value in gains.items()},
         cost=1.0,
@@ -73,7 +74,7 @@ def tuning_result(gains: Gains, **changes: Any) -> TuningResult:
 
 
 def initial_result(name: str, benchmark: Benchmark, **changes: Any) -> TuningResult:
-    """A tuning result with the initial gains of a law."""
+    """Return a tuning result with the initial gains of a law."""
     return tuning_result(initial_gains(LAWS[name], benchmark.model), **changes)
 
 
@@ -192,7 +193,7 @@ def test_bad_input_is_one_sentence(arguments: list[str], words: str) -> None:
 
 @pytest.fixture(scope="module")
 def gains_file(short: Benchmark, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file with gains of three laws."""
+    """Return a file with gains of three laws."""
     path = tmp_path_factory.mktemp("gains") / "gains.yaml"
     tuned = {
         name: {"gust": initial_result(name, short, cost=7.25, costs=[7.375, 7.25])}
@@ -204,7 +205,7 @@ def gains_file(short: Benchmark, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.fixture(scope="module")
 def brief_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scenario file with the first 4 s of osprey_servo."""
+    """Return a scenario file with the first 4 s of osprey_servo."""
     path = tmp_path_factory.mktemp("brief") / "brief.yaml"
     text = find_scenario("osprey_servo").path.read_text()
     path.write_text(text.replace("duration: 60.0 ", "duration: 4.0 "))
@@ -268,7 +269,7 @@ def test_registered_law_flies_as_that_of_catalogue(short: Benchmark) -> None:
 
 
 class ComparingError(Exception):
-    """All laws are tuned, and their comparison begins."""
+    """Raised when all laws are tuned and their comparison begins."""
 
 
 def test_interrupted_tuning_resumes_with_missing_laws(

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Vectorised flights of N aircraft.
+"""Test vectorised flights of N aircraft.
 
-Each is the single-process simulation, independent of the others.
+Each is equal to the simulation in one process, and independent of the others.
 """
 
 from dataclasses import replace
@@ -50,7 +50,7 @@ PARAMS = batch.shared(PARAMS)
 def sampled(
     part: float, seed: int, count: int, airframe: str = "osprey"
 ) -> tuple[FloatArray, FloatArray]:
-    """A and B of the first aircraft of a seed."""
+    """Return A and B of the first aircraft of a seed."""
     return sampled_matrices(load_airframe(airframe), part, part, seed, 0, count)
 
 
@@ -74,7 +74,7 @@ def fly(
 
 
 def alone(scenario: Scenario, number: int) -> dict[str, FloatArray]:
-    """One of them in the single-process simulation, evaluated at the ticks.
+    """Fly one of the aircraft in the simulation in one process, and evaluate it at the ticks.
 
     The figures are those of `FleetResult`, (m,).
     """
@@ -174,9 +174,9 @@ def test_each_aircraft_with_column_limits_flies_as_in_single_process_simulation(
 
 
 def test_an_allocation_at_its_stops_flies_as_in_single_process_simulation() -> None:
-    """Limits bind in a tenth of the ticks (p, r) to two fifths (V).
+    """The limits are reached in a tenth of the ticks for p and r, and in two fifths for V.
 
-    The bound is that of the flights above.
+    The tolerance is the same as for the flights above.
     """
     twin = find_scenario("osprey_twin")
     stop = [0.01 if "aileron" in name else 0.5 for name in twin.controller.effectors]
@@ -195,7 +195,7 @@ def test_an_allocation_at_its_stops_flies_as_in_single_process_simulation() -> N
 
 
 def test_an_allocation_of_a_fleet_is_that_of_each_aircraft() -> None:
-    """A tick from drawn effectors, with demands inside the stops and up to 30 times beyond."""
+    """A tick begins with random effectors, and demands up to 30 times what the stops allow."""
     generator = np.random.default_rng(1)
     stops = np.linspace(0.2, 1.0, 7)
     effect = generator.normal(size=(4, 7))
@@ -246,7 +246,7 @@ LOSSY = SERVO.vary(aircraft={"sensors": {"dropout": 0.02, "seed": 3}})
 def test_loop_without_branches_gives_the_bits_of_the_loop_with_branches(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Engagement, gusts, a late y, and dropouts in some of the runs."""
+    """The course has an engagement, gusts, a late y, and dropouts in some of its runs."""
     monkeypatch.setattr(batch_schedule, "UNROLL", 2)  # each tick unrolled compiles for a second
     sensors = {"dropout": 0.003, "seed": 4, "delay": 0.02}
     # 3 ticks until it is engaged, and runs of equal lengths, which share their loops
@@ -326,7 +326,7 @@ def test_wind_acts_on_x_dot_by_own_directions_of_each_aircraft() -> None:
 
 
 def _pulse(delay: int) -> ControlLaw:
-    """An open-loop control law: one pulse of the elevator, delayed by so many ticks."""
+    """Return an open-loop control law that sends one pulse of the elevator, `delay` ticks late."""
 
     def engage(measured: Measurements, params: Any) -> Ticks:
         return Ticks(0.0 * measured.y[:1] + 1.0)

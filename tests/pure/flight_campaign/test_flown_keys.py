@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A campaign and an environment compute the aircraft on a path of their own.
+"""Test that a campaign and an environment know each key that they compute.
 
-They know the keys that they take. A key is placed here when it is added to a parameter set.
+They compute the aircraft in their own way. A key must be placed here when it is added to a
+parameter set.
 """
 
 from typing import Any
@@ -58,7 +59,7 @@ BEYOND_CONTROLLER = (
     ],
 )
 def test_every_key_is_in_one_set(schema: type[Config], sets: tuple[set[str], ...]) -> None:
-    """A campaign flies a key, needs none, or refuses it: a new key has to be placed."""
+    """A campaign flies a key, does not need it, or refuses it, so a new key must be placed."""
     placed = [key for part in sets for key in part]
     assert sorted(placed) == sorted(keys_of(schema))
 
@@ -97,7 +98,10 @@ def test_a_campaign_refuses_what_it_does_not_fly(
 
 
 def test_a_campaign_refuses_a_key_that_is_new(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only what is placed flies: here the quantisation, as if it had been added today."""
+    """Only placed keys are flown.
+
+    The quantisation stands for a key that was added today.
+    """
     require_flyable(SERVO)
     new = SERVO.vary(aircraft={"sensors": {"quantisation": [0.01] * 4}})
     require_flyable(new)

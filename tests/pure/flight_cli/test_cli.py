@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: exit status, sentences, files."""
+"""Test the command line: exit status, sentences and files."""
 
 import gc
 import json
@@ -38,7 +38,7 @@ def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 
 class Said(NamedTuple):
-    """What a command ended with and printed."""
+    """The status with which a command ended, and what it printed."""
 
     returncode: int
     stdout: str
@@ -46,7 +46,7 @@ class Said(NamedTuple):
 
 
 def said(*arguments: str) -> Said:
-    """Run the entry point of `rise-di` in this process, which keeps its own settings."""
+    """Run the entry point of `rise-di` in this process, and restore the settings of the process."""
     threshold, handler = gc.get_threshold(), signal.getsignal(signal.SIGINT)
     try:
         with (
@@ -113,7 +113,10 @@ def test_summary_holds_what_was_flown(flown: tuple[Path, subprocess.CompletedPro
 def test_log_has_the_scenario_that_flew(
     flown: tuple[Path, subprocess.CompletedProcess[str]],
 ) -> None:
-    """With the duration of the command, so that it can be flown again beside its log."""
+    """The log has the scenario with the duration of the command.
+
+    So it can be flown again with the scenario beside the log.
+    """
     run = flown[0] / "runs" / "latest"
     assert scenario_yaml(recorded_scenario(run)) == scenario_yaml(find_scenario("osprey_gust", 4.0))
 
@@ -219,7 +222,10 @@ def test_command_whose_python_package_is_missing_says_what_installs_it(tmp_path:
 def test_device_that_jax_lacks_is_one_sentence_without_a_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """JAX says so in a process that has not found its devices yet; `compare` asks it too."""
+    """JAX refuses a device in a process that has not found its devices yet.
+
+    `compare` asks JAX as well.
+    """
     words = [sys.executable, "-m", "flight_cli.cli", "campaign", "osprey_servo", "--aircraft", "1"]
     environment = {**os.environ, "JAX_PLATFORMS": "nonsense"}
     process = subprocess.run(
@@ -265,7 +271,7 @@ def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
 
 
 def command_of(*words: str) -> Any:
-    """A command, or the verb of one."""
+    """Return a command, or a verb of it."""
     command: Any = typer.main.get_command(application(words[:1]))
     for word in words:
         command = command.commands[word]
@@ -273,7 +279,7 @@ def command_of(*words: str) -> Any:
 
 
 def options_of(*words: str) -> list[Any]:
-    """The options of a command or of a verb."""
+    """Return the options of a command or of a verb."""
     return [each for each in command_of(*words).params if each.param_type_name == "option"]
 
 
@@ -288,9 +294,9 @@ def test_commands_are_few_and_so_are_options_beside_the_panel_of_rare_ones() -> 
 
 
 def test_option_is_a_name_in_small_letters_joined_by_hyphens() -> None:
-    """--set alone takes keys; Ixx and the like are the letters of the field.
+    """An option has lower-case letters and hyphens, except for Ixx and the like.
 
-    Two have a letter too, as in other tools.
+    Those are the symbols of the field. Two options also have a short form, as in other tools.
     """
     for words in EVERY_COMMAND:
         spellings = [spelling for each in options_of(*words) for spelling in each.opts]
@@ -299,7 +305,7 @@ def test_option_is_a_name_in_small_letters_joined_by_hyphens() -> None:
 
 
 def test_what_a_command_writes_is_its_output() -> None:
-    """A user who knows one command guesses --output in the next."""
+    """A user who knows one command expects --output in the next one, too."""
     for name in (
         "airframes",
         "compare",
@@ -448,7 +454,10 @@ def test_no_sentence_of_a_shipped_scenario_breaks_off() -> None:
 def test_number_of_runs_is_no_folder(
     words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It made a folder of this name and flew the whole campaign."""
+    """A number in place of the folder for the logs is refused.
+
+    It had created a folder of this name, and had flown the whole campaign.
+    """
     monkeypatch.chdir(tmp_path)
     assert "expected the folder for the logs" in str(invoke(*words.split()).exception)
     assert list(tmp_path.iterdir()) == []
@@ -530,7 +539,7 @@ def test_shell_completes_after_each_option(
 
 
 def test_failing_plugin_of_jax_is_one_sentence(tmp_path: Path) -> None:
-    """As that of a GPU on a host without one: JAX logs its traceback."""
+    """A plugin for GPUs fails on a host without one, and JAX logs its traceback."""
     plugin = tmp_path / "jax_plugins" / "xla_broken" / "__init__.py"
     plugin.parent.mkdir(parents=True)
     plugin.write_text("def initialize():\n    raise RuntimeError('no library')\n")
@@ -557,7 +566,7 @@ def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:
 
 
 def test_help_shows_the_names_of_entries_whole() -> None:
-    """Brackets are markup to Rich: A[q,alpha] was shown as A."""
+    """Rich takes brackets for markup, and A[q,alpha] was shown as A."""
     words = " ".join(invoke("gains", "check", "--help").output.replace("│", " ").split())
     assert "'A[q,alpha]=0.6', or of an actuator '1/lag[elevator]=0.3'" in words
 
@@ -603,10 +612,10 @@ cli.main()
 def test_interrupt_in_a_module_in_c_ends_command_without_traceback(
     error: str, cause: str, status: int, words: str
 ) -> None:
-    """pybind11, and with it rclpy, makes other errors of a KeyboardInterrupt.
+    """pybind11, and with it rclpy, turns a KeyboardInterrupt into other errors.
 
-    It makes an ImportError of it while it loads, and a TypeError in a callback. An error with
-    another cause is told.
+    It becomes an ImportError while a module loads, and a TypeError in a callback. An error with
+    another cause is printed.
     """
     code = f"""
 from flight_cli import cli

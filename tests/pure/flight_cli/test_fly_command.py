@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di fly`: what a flight has to say comes before what cannot be written after it."""
+"""Test `rise-di fly`: the result of a flight is printed even if nothing can be written after it."""
 
 import errno
 import os
@@ -24,12 +24,12 @@ Then = Callable[[Path], object]
 
 
 def full(*_: object, **__: object) -> NoReturn:
-    """A disk without space."""
+    """Raise the error of a disk without space."""
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def flown(folder: Path, monkeypatch: pytest.MonkeyPatch, then: Then = lambda run: None) -> Any:
-    """A flight after which the disk is full. `then` is called with its folder."""
+    """Fly until the disk is full. Then call `then` with the folder of the flight."""
 
     def fly_and_fill(scenario: Scenario, run: Path, *rest: Any) -> Outcome:
         outcome = fly_in_process(scenario, run, *rest)
@@ -97,7 +97,7 @@ def test_log_that_cannot_be_read_is_no_outcome(
 def test_small_host_is_warned_of_a_browser_beside_the_flight(
     cores: int, is_warned: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On two cores a browser without a GPU took samples from the flight, on 16 none."""
+    """On two cores a browser without a GPU makes the flight lose samples, and on 16 it does not."""
 
     @contextmanager
     def watched(*runs: Path, fleet: bool) -> Iterator[list[str]]:
@@ -112,7 +112,7 @@ def test_small_host_is_warned_of_a_browser_beside_the_flight(
 
 @pytest.fixture
 def modes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, bool]]:
-    """Whether each flight was in lockstep and in one process; nothing flies over topics."""
+    """Return whether each flight was in lockstep and in one process. No flight uses topics."""
     flights: list[tuple[bool, bool]] = []
 
     def fly_topics(

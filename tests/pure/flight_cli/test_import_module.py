@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di import --scenario`: a log of the exported module replays to the bit.
+"""Test `rise-di import --scenario`: a log of the exported module replays to the bit.
 
 The log was recorded in PX4 SITL.
 """
@@ -19,7 +19,10 @@ app = application(["import", "replay"])
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    """The log, of rise_di_status alone, and its scenario: a take-over and a second of flight."""
+    """Return a log with the topic rise_di_status alone, and its scenario.
+
+    It has a take-over and a second of flight.
+    """
     pytest.importorskip("pyulog", reason="pyulog is not installed: make autopilot")
     archive = REPOSITORY / "tests" / "recorded" / "px4_module.tar.xz"
     shutil.unpack_archive(archive, tmp_path, filter="data")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A value of the command line that is refused: one sentence, of what was found and expected."""
+"""Test that a refused value of the command line gives one sentence with what was expected."""
 
 import json
 import re
@@ -67,7 +67,10 @@ def test_unknown_entry_is_one_of_the_option_that_gave_it() -> None:
 
 
 def test_notes_of_a_plan_are_sentences_and_advise_nothing_that_is_given(tmp_path: Path) -> None:
-    """A plan with its own fence, flown with it and without; the home has no north of a mapping."""
+    """A plan with a fence of its own is flown with it and without it.
+
+    The home is a mapping without `north`.
+    """
     mission = {
         "plannedHomePosition": [47.0, 8.0, 0.0],
         "items": [

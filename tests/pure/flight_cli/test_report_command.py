@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di report`: one run or several, as page, figure, table and JSON."""
+"""Test `rise-di report` for one or several runs, as page, figure, table and JSON."""
 
 import json
 import shutil
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two flights of two seconds, of different scenarios."""
+    """Return two flights of two seconds with different scenarios."""
     folder = tmp_path_factory.mktemp("runs")
     runs = []
     for name in ("osprey_gust", "osprey_servo"):
@@ -158,7 +158,10 @@ def test_two_runs_are_compared(
 def test_flight_that_hung_before_y_m_is_told_with_its_cause(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As of nodes started by hand, whose log has no outcome: `rise-di runs` knows it from then."""
+    """Nodes that were started by hand have a log without an outcome.
+
+    `rise-di runs` then knows the outcome from the log.
+    """
     log = read_run(run)
     waits = "uav7.controller: waiting for /uav7/y_m: no sample of its publisher arrives"
     messages = (

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""No figure of a table is cut, at any width of the terminal and in a pipe."""
+"""Test that no figure of a table is cut, at any width of a terminal and in a pipe."""
 
 import io
 import re
@@ -18,14 +18,17 @@ WIDTHS = [10, 40, 80, 120, 300]
 
 
 def printed(width: int) -> tuple[Console, io.StringIO]:
-    """A console of a width, and what is printed on it."""
+    """Return a console of a width, and the text that is printed on it."""
     output = io.StringIO()
     return Console(file=output, width=width), output
 
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_every_cell_is_printed_whole(width: int) -> None:
-    """Cells as those of a comparison of laws, of which the last lost their digits in a pipe."""
+    """The cells are those of a comparison of laws.
+
+    In a pipe, the last columns had lost their digits.
+    """
     cells = [
         "rise_observer",
         "1.60 (1.98)",
@@ -67,7 +70,7 @@ def test_figures_of_a_flight_and_of_a_comparison_are_whole(
 
 
 def test_commands_print_no_table_past_the_width() -> None:
-    """`console.print` of a table cuts what a terminal has no room for."""
+    """`console.print` cuts a table if the terminal has no room for it."""
     for path in (REPOSITORY / "ros_ws/src/flight_cli/flight_cli").glob("*.py"):
         calls = re.findall(r"console\.print\(\s*\w*table\w*", path.read_text())
         assert len(calls) == (path.name == "output.py"), path.name  # in `print_table`

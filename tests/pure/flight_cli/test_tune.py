@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di tune`: from the log of an autopilot to its module.
+"""Test `rise-di tune`, from the log of an autopilot to its module.
 
 The logs are of simulated aircraft whose A and B differ from the airframes of the scenarios by 10 to
-15 %, under a rate controller of PX4's form, in doublets of each rate.
+15 %. They fly doublets of each rate under a rate controller in PX4's form.
 """
 
 import math
@@ -45,7 +45,7 @@ APART = 3.0  # s, from a doublet to the next, which lasts 1 s
 
 
 class Gains(NamedTuple):
-    """Of the autopilot, by output of the airframe: torque a rad/s, rad/s, rad."""
+    """Gains of the autopilot by output of the airframe: torque per rad/s, rad/s, rad."""
 
     FF: tuple[float, ...]
     P: tuple[float, ...]
@@ -53,7 +53,7 @@ class Gains(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """y, rad/s, and the torque, rows as stamps."""
+    """The y, rad/s, and the torque of a flight, one row for each stamp."""
 
     stamp_us: list[int]
     y: FloatArray
@@ -69,9 +69,10 @@ def flown(
     cutoff: float,
     **effects: float,
 ) -> Flight:
-    """A flight with doublets of these sizes, rad/s; the gyro has a filter of a cut-off, Hz.
+    """Return a flight with doublets of the given sizes, rad/s.
 
-    The row of B of a rate is `effects` times the nominal one, EFFECT if it is not named.
+    The gyro is behind a filter with the cut-off frequency, Hz. The row of B of a rate is `effects`
+    times the nominal one, and EFFECT times it if the rate is not named.
     """
     flight = find_scenario(str(scenario))
     airframe = banking(load_airframe(flight.aircraft.airframe))
@@ -130,10 +131,10 @@ def px4_log(
     every: int = 1,
     **effects: float,
 ) -> Path:
-    """A ULog at 250 Hz; the noise of the gyro is in rad/s before its filter.
+    """Return a ULog at 250 Hz. The noise of the gyro, rad/s, is added before its filter.
 
-    PX4 does not control the rate of the number `still`. The log lacks the samples `lost`, and has
-    the torque of `every` so many of them.
+    PX4 does not control the rate with the number `still`. The log lacks the samples `lost`, and has
+    every `every`-th torque.
     """
     own = PX4_GAINS
     if still is not None:
@@ -165,7 +166,7 @@ def px4_log(
 
 
 def ardupilot_log(path: Path, length: float) -> Path:
-    """A DataFlash log: servos 1 and 2 are aileron and elevator, 1000 to 2000 us.
+    """Write a DataFlash log whose servos 1 and 2 are aileron and elevator, 1000 to 2000 us.
 
     ArduPlane logs the gyro at the rate of its loop, 200 Hz, and the servos at 25 Hz.
     """
@@ -197,12 +198,12 @@ def ardupilot_log(path: Path, length: float) -> Path:
 
 @pytest.fixture(autouse=True)
 def _in_repository(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The scenarios name their airframes from there."""
+    """Change to the folder from which the scenarios name their airframes."""
     monkeypatch.chdir(REPOSITORY)
 
 
 def brief(scenario: Path, folder: Path, **size: float) -> Path:
-    """A scenario with one doublet of each output, of these sizes, in 4 or 5 s in place of 20 s."""
+    """Return a scenario with one doublet of each output, in 4 or 5 s in place of 20 s."""
     doublets = {
         name: {"start": [0.5 + 1.5 * number], "width": [0.5], "value": [value]}
         for number, (name, value) in enumerate(size.items())
@@ -217,20 +218,23 @@ def brief(scenario: Path, folder: Path, **size: float) -> Path:
 
 
 def errors(output: str, air: str, name: str) -> FloatArray:
-    """The errors of a controller in an air, in a table of `tune`, mrad/s."""
+    """Return the errors of a controller in an air, from a table of `tune`, mrad/s."""
     lines = [line for line in output.splitlines() if f"{air}: " in line and name in line]
     (row,) = [line.split()[-3:] for line in lines]
     return np.array([float(cell) for cell in row])
 
 
 class StoppedError(Exception):
-    """The part of the command that is tested has ended."""
+    """Raised at the end of the part of the command that is tested."""
 
 
 def test_log_of_px4_becomes_a_module_and_the_next_log_another_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The effects are those that flew, 15 % less than in the scenario, and so the errors fall."""
+    """The effects are those of the simulated aircraft, 15 % less than in the scenario.
+
+    So the errors fall with the new gains.
+    """
     pytest.importorskip("pyulog", reason="pyulog is not installed: make autopilot")
     log = px4_log(tmp_path / "flight.ulg", (0.3, 0.6, 0.2), 36.0)
     folder = tmp_path / "first"
@@ -285,7 +289,7 @@ def test_log_of_px4_becomes_a_module_and_the_next_log_another_one(
 def test_part_that_the_log_does_not_improve_stays_nominal_and_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the noise of PX4's simulator doublets of q of 0.15 rad/s do not show 10 % of B."""
+    """In the noise of PX4's simulator, doublets of q of 0.15 rad/s do not show 10 % of B."""
     pytest.importorskip("pyulog", reason="pyulog is not installed: make autopilot")
     monkeypatch.setattr("flight_cli.tune.candidates", Mock(side_effect=StoppedError))
     log = px4_log(tmp_path / "flight.ulg", (0.15, 0.6, 0.2), 36.0, (0.07, 0.14, 0.028), q=0.9)
@@ -316,7 +320,10 @@ def test_log_without_motion_names_the_doublets_to_fly(tmp_path: Path) -> None:
 
 
 def test_log_without_yaw_control_names_the_parameter_before_any_search(tmp_path: Path) -> None:
-    """As with PX4's own FW_ACRO_YAW_EN: doublets of p and q alone, no torque about yaw."""
+    """The log has doublets of p and q but no torque about yaw.
+
+    This is so with PX4's default of FW_ACRO_YAW_EN.
+    """
     pytest.importorskip("pyulog", reason="pyulog is not installed: make autopilot")
     log = px4_log(tmp_path / "flight.ulg", (0.3, 0.6, 0.0), 30.0, still=2)
     words = ["tune", str(log), "--px4", str(tmp_path / "module"), "--scenario", str(PX4)]
@@ -329,7 +336,7 @@ def test_log_without_yaw_control_names_the_parameter_before_any_search(tmp_path:
 
 
 def test_log_with_rare_torques_names_the_profile_before_any_search(tmp_path: Path) -> None:
-    """As by PX4's own SDLOG_PROFILE."""
+    """The torques are as rare as with PX4's default of SDLOG_PROFILE."""
     pytest.importorskip("pyulog", reason="pyulog is not installed: make autopilot")
     log = px4_log(tmp_path / "flight.ulg", (0.3, 0.6, 0.2), 20.0, every=5)
     words = ["tune", str(log), "--px4", str(tmp_path / "module"), "--scenario", str(PX4)]
@@ -352,7 +359,10 @@ def test_log_with_holes_is_told_as_one(tmp_path: Path) -> None:
 
 
 def test_controller_of_the_scenario_is_kept_where_it_is_better() -> None:
-    """The candidate of least error wins; one without the margins is named, but not taken."""
+    """The candidate with the least error wins.
+
+    A candidate without the margins is named, but not taken.
+    """
     scenario = find_scenario(str(PX4))
     calm, gusty = np.array([10.0, 10.0]), np.array([100.0, 100.0])
 
@@ -371,7 +381,7 @@ def test_controller_of_the_scenario_is_kept_where_it_is_better() -> None:
 
 
 def test_airframe_without_effect_of_wind_is_tuned_without_an_observer(tmp_path: Path) -> None:
-    """As of a multicopter: the observer would have no wind to estimate."""
+    """A multicopter has no effects of wind, so an observer would have no wind to estimate."""
     airframe = (REPOSITORY / "examples/px4_airplane/rates_airframe.yaml").read_text("utf-8")
     (tmp_path / "airframe.yaml").write_text(airframe.partition("gusts:")[0])
     scenario = find_scenario(str(PX4)).vary(aircraft={"airframe": str(tmp_path / "airframe.yaml")})
@@ -425,7 +435,10 @@ def test_one_autopilot_is_named(tmp_path: Path, options: list[str]) -> None:
 
 @pytest.mark.parametrize("ratio", [1.0, 2.0])
 def test_gains_of_arduplane_are_an_angle_of_45_deg_at_full_torque(ratio: float) -> None:
-    """P and I follow the square of SCALING_SPEED over the trim speed, FF the ratio."""
+    """P and I follow the square of SCALING_SPEED over the trim speed, and FF follows the ratio.
+
+    The gains give full torque for an angle of 45 deg.
+    """
     scenario = find_scenario(str(PLANE))
     parameters = {"SCALING_SPEED": ratio * 23.9}
     for axis in ("PTCH", "RLL"):
@@ -441,7 +454,7 @@ def test_gains_of_arduplane_are_an_angle_of_45_deg_at_full_torque(ratio: float) 
 
 
 def test_deviations_that_are_covered_are_rounded_down() -> None:
-    """1.98 of 2 standard deviations are no 2 that are proved."""
+    """A proof that covers 1.98 standard deviations does not cover 2."""
     guarantee = Guarantee(
         uncertainty=0.5, stable=0.495, unstable=None, disk={}, disk_all=0.0, loop=""
     )

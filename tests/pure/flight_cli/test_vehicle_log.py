@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di import`: a flight in each format of logs gives its y and u.
+"""Test `rise-di import`: a flight in each format of logs gives its y and u.
 
 It also gives Omega of the aircraft.
 """
@@ -53,7 +53,10 @@ LAG = 0.05  # s, of the servos
 
 
 class Flight(NamedTuple):
-    """A flight by known equations: stamps, us, y with the airspeed of trim taken off, and u."""
+    """A flight by known equations.
+
+    It has stamps, us, y with V as the deviation from the trim speed, and u.
+    """
 
     stamp_us: list[int]
     y: FloatArray  # (N, 4)
@@ -62,24 +65,27 @@ class Flight(NamedTuple):
 
 @pytest.fixture(autouse=True)
 def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Decode logs in this process; test_foreign_logs.py has the process of their own."""
+    """Decode logs in this process.
+
+    test_foreign_logs.py tests the process of their own.
+    """
     monkeypatch.setattr(isolated, "call", lambda function, *arguments, **_: function(*arguments))
 
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    """A flight of DURATION."""
+    """Return a flight of DURATION."""
     return flown(DURATION)
 
 
 @pytest.fixture(scope="module")
 def long_flight() -> Flight:
-    """A flight that shows Omega, in 20 s."""
+    """Return a flight of 20 s, which is long enough to show Omega."""
     return flown(24.0)
 
 
 def flown(duration: float) -> Flight:
-    """First-order channels y_dot = -damping y + Omega v behind held random inputs.
+    """Return first-order channels y_dot = -damping y + Omega v with held random inputs.
 
     The servos are v_dot = (u - v) / lag.
     """
@@ -98,7 +104,7 @@ def flown(duration: float) -> Flight:
 
 
 def sticks(u: FloatArray) -> FloatArray:
-    """Pulses of roll, pitch, throttle and yaw, us, those of the map ardupilot.
+    """Return the pulses of roll, pitch, throttle and yaw, us, as the map ardupilot has them.
 
     They are between RCn_MIN 1000 and RCn_MAX 2000.
     """
@@ -109,7 +115,7 @@ def sticks(u: FloatArray) -> FloatArray:
 
 
 def on_ground(flight: Flight) -> Flight:
-    """Still time before the flight, at the same rate."""
+    """Return a time at rest before the flight, at the same rate."""
     count = round(GROUND * RATE)
     still = np.zeros((count, 4))
     still[:, 1] = -SPEED
@@ -144,7 +150,7 @@ def dataflash(
     parameters: Mapping[str, float] = PARAMETERS,
     changes: Changes = (),
 ) -> Path:
-    """A log of ArduPlane.
+    """Write a log of ArduPlane.
 
     The servos follow the sticks as RCn_REVERSED and SERVOn_REVERSED of the first parameters say.
     """
@@ -177,9 +183,9 @@ def dataflash(
 
 
 def multicopter(path: Path, flight: Flight, firmware: str = "ArduCopter V4.5.7 (2a3dc4b7)") -> Path:
-    """The channels of the flight as those of a multicopter, in STABILIZE.
+    """Write the flight as a log of a multicopter in STABILIZE.
 
-    This mode has the number of MANUAL of a plane.
+    This mode has the same number as MANUAL of a plane.
     """
     parts = (on_ground(flight), flight)
     stamps = [stamp for part in parts for stamp in part.stamp_us]
@@ -236,10 +242,10 @@ def stamped(flight: Flight, values: FloatArray) -> list[tuple[int, FloatArray]]:
 
 
 def ulog(path: Path, flight: Flight, changes: Changes = (), *, vtol: bool = False) -> Path:
-    """A log of PX4.
+    """Write a log of PX4.
 
-    A VTOL flies the first half on its rotors, whose torques in instance 0 oppose the rates to the
-    end.
+    A VTOL flies the first half on its rotors. Their torques, in instance 0, oppose the rates until
+    the end.
     """
     elevator, thrust, aileron, rudder = flight.u.T
     still = np.zeros(len(thrust))
@@ -275,7 +281,10 @@ def ulog(path: Path, flight: Flight, changes: Changes = (), *, vtol: bool = Fals
 
 
 def packets_of(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """Stamps, us, and packets of a tlog: MAVLink 2, 12 bytes beside the payload."""
+    """Yield the stamps, us, and packets of a tlog.
+
+    A packet of MAVLink 2 has 12 bytes besides the payload.
+    """
     start = 0
     while start < len(content):
         end = start + 8 + 12 + int(content[start + 9])
@@ -284,13 +293,16 @@ def packets_of(content: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def in_order(packets: Iterable[tuple[int, bytes]]) -> bytes:
-    """A tlog of packets in the order of their stamps."""
+    """Return a tlog of packets in the order of their stamps."""
     ordered = sorted(packets, key=lambda packet: packet[0])
     return b"".join(struct.pack(">Q", stamp) + packet for stamp, packet in ordered)
 
 
 def ulog_of_2020(path: Path, flight: Flight) -> Path:
-    """As PX4 1.9 logs: actuator_controls_0, airspeed and the gyro in sensor_combined."""
+    """Write a log as PX4 1.9 does.
+
+    It has actuator_controls_0, airspeed, and the gyro in sensor_combined.
+    """
     elevator, thrust, aileron, rudder = flight.u.T
     controls = np.column_stack([aileron / FULL, elevator / FULL, rudder / FULL, THROTTLE + thrust])
     topics = {
@@ -303,12 +315,12 @@ def ulog_of_2020(path: Path, flight: Flight) -> Path:
 
 
 def imported(log: Path, bag: Path, *options: str, map_name: str = "ardupilot") -> Result:
-    """`rise-di import`."""
+    """Run `rise-di import`."""
     return invoke("import", log, "--map", map_name, "--output", bag, *options)
 
 
 def imported_bag(folder: Path, flight: Flight) -> Path:
-    """The bag of a flight in a log of ArduPlane."""
+    """Return the bag of a flight that was imported from a log of ArduPlane."""
     bag = folder / "bag"
     assert imported(dataflash(folder / "flight.bin", flight), bag).exit_code == 0
     return bag
@@ -343,7 +355,7 @@ def test_flight_in_each_format_gives_y_and_u(name: str, flight: Flight, tmp_path
 
 
 def test_ulog_with_a_cut_message_of_an_unknown_type_is_refused(tmp_path: Path) -> None:
-    """Pyulog goes back from the end of such a file to its begin, for ever."""
+    """Pyulog would go back from the end of such a file to its beginning without an end."""
     path = tmp_path / "cut.ulg"
     path.write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8) + struct.pack("<HB", 17, 0))
     with refusing(r"found a ULog of PX4 that cannot be decoded \(a damaged message has no end\)"):
@@ -375,7 +387,7 @@ def test_sticks_outside_of_manual_are_no_commands(flight: Flight, tmp_path: Path
 def test_servos_give_u_of_the_stick_that_moved_them(
     stick_reversed: float, servo_reversed: float, flight: Flight, tmp_path: Path
 ) -> None:
-    """With RC2_REVERSED a larger pulse is nose down, and so it is in the map of such an aircraft.
+    """With RC2_REVERSED a longer pulse is nose down, as in the map of such an aircraft.
 
     u follows the pulse.
     """
@@ -440,9 +452,9 @@ def test_tlog_is_compared_with_the_map_too_and_says_what_it_lacks(
 def test_parameters_of_the_samples_count_and_not_the_last_ones(
     flight: Flight, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A servo was reversed in flight and is not after it.
+    """A servo was reversed in flight, and is not reversed afterwards.
 
-    So it is on an aircraft that is built otherwise on the ground.
+    This happens if the aircraft is changed on the ground.
     """
     bag = tmp_path / "bag"
     end = flight.stamp_us[-1]
@@ -490,9 +502,9 @@ def test_log_without_the_mode_is_not_taken_for_manual(flight: Flight, tmp_path: 
 def test_imported_log_is_read_with_the_map_of_its_import_alone(
     flight: Flight, tmp_path: Path
 ) -> None:
-    """The bag has the u of the map of the import.
+    """The bag has the u of the map with which it was imported.
 
-    Signs and effects by another map would be those of another u.
+    Signs and effects with another map would belong to another u.
     """
     bag = imported_bag(tmp_path, flight)
     content = named_map("ardupilot").model_dump(mode="json", exclude_unset=True)
@@ -530,9 +542,9 @@ def test_gains_from_imported_log_state_for_which_link_they_are(
 def test_multicopter_gives_outputs_of_its_rate_controllers_in_any_mode(
     flight: Flight, tmp_path: Path
 ) -> None:
-    """Mode 0 of ArduCopter is STABILIZE, whose sticks command angles.
+    """Mode 0 of ArduCopter is STABILIZE, in which the sticks command angles.
 
-    In the air is more than half of the usual thrust.
+    The multicopter is in the air if it has more than half of its usual thrust.
     """
     quadrotor = str(REPOSITORY / "examples" / "px4_quadrotor" / "map.yaml")
     bag = tmp_path / "bag"
@@ -665,7 +677,10 @@ def test_log_cut_in_the_middle_gives_what_it_has(flight: Flight, tmp_path: Path)
 
 
 def two_systems(folder: Path, flight: Flight, second: Flight) -> tuple[Path, Path]:
-    """A tlog of the systems 1 and 7, whose RC2 is reversed, and that of the system 1 alone."""
+    """Write a tlog of the systems 1 and 7, and one of the system 1 alone.
+
+    RC2 of system 7 is reversed.
+    """
     single = tlog(folder / "one.tlog", flight, {"RC2_REVERSED": 0.0})
     other = tlog(folder / "other.tlog", second, {"RC2_REVERSED": 1.0}, system=7)
     (folder / "both.tlog").write_bytes(
@@ -675,7 +690,10 @@ def two_systems(folder: Path, flight: Flight, second: Flight) -> tuple[Path, Pat
 
 
 def test_system_of_a_tlog_that_flew_is_taken_and_named(flight: Flight, tmp_path: Path) -> None:
-    """The other one stands, half a sample later: its gyroscopes have noise alone."""
+    """The other system stands, and its gyroscopes have only noise.
+
+    Its samples are half a period later.
+    """
     still = Flight([stamp + 10_000 for stamp in flight.stamp_us], 0.01 * flight.y, flight.u)
     path, single = two_systems(tmp_path, flight, still)
     both = read_vehicle_log(path)
@@ -719,9 +737,9 @@ def test_two_systems_that_flew_are_refused_but_for_the_one_that_the_user_names(
 def arrivals(
     path: Path, arrival: Callable[[int], int], *, copies: Callable[[int], int] | None = None
 ) -> Path:
-    """A tlog with other times of arrival, us.
+    """Give a tlog other times of arrival, us.
 
-    With `copies` a second link brings each message again at its own time.
+    With `copies`, a second link delivers each message again at its own time.
     """
     clocks = [clock for clock in (arrival, copies) if clock is not None]
     packets = packets_of(path.read_bytes())
@@ -777,9 +795,9 @@ def sensors(
     *instances: FloatArray,
     **flags: Any,
 ) -> Path:
-    """A log of ArduPlane with several sensors.
+    """Write a log of ArduPlane with several sensors.
 
-    The values are by instance, shape (N, fields), the flags by field, a value for each.
+    The values are given by instance, (N, fields). A flag has a value for each instance.
     """
     fields = {"ARSP": ("Airspeed",), "IMU": ("GyrX", "GyrY", "GyrZ")}[name]
     rows = []
@@ -932,7 +950,7 @@ def test_log_of_px4_before_2017_is_named(flight: Flight, tmp_path: Path) -> None
 def test_second_flight_of_a_log_is_told_and_taken_by_its_window(
     flight: Flight, tmp_path: Path
 ) -> None:
-    """The second is shorter: half of the first, after 5 s on the ground."""
+    """The second flight has half the length of the first, and begins after 5 s on the ground."""
     ground, half = on_ground(flight), len(flight.stamp_us) // 2
     pause_us = flight.stamp_us[-1] + 10_000
     both = Flight(
@@ -993,7 +1011,7 @@ def test_log_without_what_the_map_needs_is_one_sentence(flight: Flight, tmp_path
 
 
 def as_text(path: Path, flight: Flight) -> Path:
-    """A log of ArduPlane as the text that Mission Planner makes of it."""
+    """Return a log of ArduPlane as the text that Mission Planner makes of it."""
     reader = DFReader.DFReader_binary(str(dataflash(path.with_suffix(".bin"), flight)))
     lines = []
     while (message := reader.recv_msg()) is not None:
@@ -1045,9 +1063,9 @@ LOSSES: Mapping[str, tuple[Callable[[bytes, Sequence[int], bytes], bytes], int, 
 def test_log_with_lost_bytes_is_read_on_and_gives_the_aircraft(
     name: str, loss: str, long_flight: Flight, tmp_path: Path
 ) -> None:
-    """What is left are samples of the flight, and Omega behind the largest holes is its own.
+    """The remaining samples are those of the flight, and Omega is right in spite of the holes.
 
-    A DataFlash log has no checksum: a message whose values the loss overwrites has wrong ones.
+    A DataFlash log has no checksum, so a message whose values are overwritten has wrong values.
     """
     write, map_name = {**WRITERS, "flight.log": (as_text, "ardupilot")}[name]
     damage, count, filling = LOSSES[loss]
@@ -1100,7 +1118,7 @@ def test_refusal_of_an_incomplete_log_tells_the_loss(flight: Flight, tmp_path: P
 
 
 def test_dropouts_of_a_logger_are_told(flight: Flight, tmp_path: Path) -> None:
-    """PX4 guide, ULog file format: the message O has the duration, ms."""
+    """The message O has the duration of a dropout, ms (PX4 guide, ULog file format)."""
     path = ulog(tmp_path / "a.ulg", flight)
     content = path.read_bytes()
     sample = content.index(b"D", len(content) // 2) - 2
@@ -1116,7 +1134,7 @@ def test_dropouts_of_a_logger_are_told(flight: Flight, tmp_path: Path) -> None:
 
 
 def test_sample_of_no_airspeed_does_not_end_the_flight(flight: Flight, tmp_path: Path) -> None:
-    """An aircraft does not land and take off within a second; behind a longer time it may."""
+    """An aircraft does not land and take off again within a second, but it may in a longer time."""
     for samples, expected in ((RATE // 2, len(flight.y)), (3 * RATE, len(flight.y) * 3 // 4)):
         y = flight.y.copy()
         y[len(y) // 4 - samples : len(y) // 4, 1] = -SPEED

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Arguments of public functions: what is converted, and the sentence about what is not."""
+"""Test how arguments of public functions are converted, and how a wrong one is refused."""
 
 from pathlib import Path
 

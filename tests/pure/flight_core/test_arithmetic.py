@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The stated arithmetic: order of sums, sine and inverse, against exact fractions and decimals."""
+"""Test the arithmetic that is promised: order of sums, sine and inverse.
+
+It is compared with exact fractions and decimals.
+"""
 
 import math
 from decimal import Decimal, localcontext
@@ -27,7 +30,7 @@ PI = Fraction("3.14159265358979323846264338327950288419716939937510582097494")
 
 
 def exact_sine(x: float) -> float:
-    """The Taylor series in 80 decimal digits."""
+    """Return the Taylor series with 80 decimal digits."""
     with localcontext() as context:
         context.prec = 80
         angle = Decimal(x) - 2 * round(Fraction(x) / (2 * PI)) * Decimal(PI.numerator) / Decimal(
@@ -89,10 +92,7 @@ def test_inverse_pivots() -> None:
 
 
 def test_jax_is_near() -> None:
-    """XLA may contract products and sums.
-
-    So the bound is a rounding per term, and not every bit.
-    """
+    """XLA may contract products and sums, so the bound is one rounding error per term."""
     rng = np.random.default_rng(5)
     with jax.enable_x64(True):
         for _ in range(20):

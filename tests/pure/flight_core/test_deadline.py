@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A deadline ends a process with its own exit status, whatever holds the interpreter."""
+"""Test that a deadline ends a process with its exit status, whatever holds the interpreter."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ LIMIT = 30.0  # s, half of the sleep: the host may be busy
 
 
 def end_of(code: str) -> tuple[int, str, str]:
-    """Exit status and output of a program."""
+    """Return the exit status and the output of a program."""
     process = subprocess.run(
         [sys.executable, "-c", BEGIN + code],
         check=False,
@@ -45,6 +45,6 @@ def test_cancelled_deadline_ends_nothing() -> None:
 
 
 def test_deadline_holds_beside_threads_of_python() -> None:
-    """A thread that waits for the interpreter is none that ends the process."""
+    """A thread that waits for the interpreter does not delay the deadline."""
     code = "threading.Thread(target=time.sleep, args=(60,)).start()\nDeadline(0.3, 3)\n"
     assert end_of(f"{code}{HOLDS_THE_INTERPRETER}\n")[0] == 3

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Environments in which no node can start.
+"""Test environments in which no node can start.
 
-Each is one sentence with the mend, from every command and from a node.
+Every command and every node says this in one sentence, with the mend.
 """
 
 import resource
@@ -32,7 +32,7 @@ STARTS = {
 
 @pytest.fixture(autouse=True)
 def plain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A right environment."""
+    """Set up an environment in which nodes can start."""
     for name in (
         "ROS_LOG_DIR",
         "ROS_HOME",
@@ -45,7 +45,7 @@ def plain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def test_right_environment_passes_in_a_millisecond() -> None:
-    """Best of 5 means of 20: the host may be busy."""
+    """The time is the best of 5 means of 20 calls, because the host may be busy."""
     assert min(timeit.repeat(require_ros_environment, number=20, repeat=5)) / 20 < 1e-3
 
 
@@ -84,7 +84,7 @@ def test_variable_without_use_is_named(
 def test_clock_beyond_the_stamps_of_ros_is_named(
     date: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """2^31 s is 2038-01-19T03:14:08 UTC. The middleware reports that it "cannot publish data"."""
+    """2^31 s is 2038-01-19T03:14:08 UTC, and the middleware then "cannot publish data"."""
     at = datetime.fromisoformat(f"{date}+00:00").timestamp()
     monkeypatch.setattr(time, "time", lambda: at)
     with refusing(rf"^system clock: found {date[:10]} .* to 2038-01-18 03:14 UTC.* --in-process$"):

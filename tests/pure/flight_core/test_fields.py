@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the annotations of a parameter set permit.
+"""Test what the annotations of a parameter set permit.
 
-They are held against pydantic's strict types, which were not written here.
+They are compared with pydantic's strict types, which were not written here.
 """
 
 import math
@@ -65,7 +65,7 @@ PAIRS = [
 def test_field_agrees_with_strict_pydantic(
     kind: Kind, adapter: pydantic.TypeAdapter[Any], value: object
 ) -> None:
-    """A field takes the values that strict pydantic takes, and holds the same."""
+    """A field accepts the values that strict pydantic accepts, and stores the same."""
     problems = Problems()
     held = kind.read(value, "key", problems)
     try:
@@ -155,7 +155,7 @@ def test_set_is_frozen_and_reads_back() -> None:
     [Annotated[str, Field(gt=0)], Annotated[float, Field(min_length=1)], list[int], complex],
 )
 def test_unknown_rule_or_type_raises(annotation: Any) -> None:
-    """A rule or a type that no parameter has is an error of the declaration."""
+    """A rule or a type that no parameter has is an error in the declaration."""
     with pytest.raises(TypeError):
         kind_of(annotation)
 
@@ -174,7 +174,7 @@ def test_unknown_rule_or_type_raises(annotation: Any) -> None:
     ],
 )
 def test_numbers_are_those_of_yaml_1_2(text: str, value: float) -> None:
-    """Values by hand, from the core schema of YAML 1.2.2, section 10.3.2."""
+    """The expected values are by hand, from the core schema of YAML 1.2.2, section 10.3.2."""
     read = parse_yaml(f"a: {text}", "file", "a mapping")["a"]
     assert (type(read), read) == (type(value), value)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writing files: the old content or the new, never a part, never through a link."""
+"""Test that writing a file leaves the old content or the new, and never follows a link."""
 
 import ast
 import errno
@@ -44,7 +44,7 @@ def files_in(folder: Path) -> dict[str, bytes]:
 
 
 def test_no_module_writes_by_itself() -> None:
-    """Every writer is `flight_core.files`, but for the modules of OWN_WRITERS."""
+    """All files are written by `flight_core.files`, except by the modules of OWN_WRITERS."""
     writers = set()
     for path in SOURCES.glob("*/*/**/*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -120,9 +120,9 @@ CALLS: dict[str, Callable[..., Any]] = {
 
 @pytest.mark.parametrize("name", CALLS)
 def test_dying_report_loses_no_file(run: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """A full disk at the n-th write of a report.
+    """The disk is full at the n-th write of a report.
 
-    Each file has the old or the new content, and the outcome survives.
+    Each file has its old or its new content, and the outcome is kept.
     """
     write_report(run, COMPLETED)
     (run / REPORT).write_text("an older page")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sentences on missing packages, in a checkout and with the wheel."""
+"""Test the sentences about missing packages, in a checkout and with the wheel."""
 
 import re
 import tomllib
@@ -25,7 +25,7 @@ class Installed(NamedTuple):
     origin: str | None
 
     def read_text(self, name: str) -> str | None:
-        """The origin."""
+        """Return the origin."""
         assert name == "direct_url.json"
         return self.origin
 
@@ -45,9 +45,9 @@ class Installed(NamedTuple):
 def test_installed_stack_names_what_it_came_from(
     origin: str | None, command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Not a package of an index from which it did not come.
+    """The sentence names the source of the installation, and not a package of an index.
 
-    A foreign package may have that name.
+    In an index, a foreign package may have this name.
     """
     monkeypatch.setattr(installation, "CHECKOUT", tmp_path)
     monkeypatch.setattr(installation, "distribution", lambda name: Installed(origin))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Keys of a parameter set that a computation knows: what is new is refused by name."""
+"""Test which keys of a parameter set a computation knows, and that it refuses a new one by name."""
 
 import math
 

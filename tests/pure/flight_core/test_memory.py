@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The limit of a node's memory, in processes of their own: a limit lasts."""
+"""Test the limit of a node's memory.
+
+Each test has a process of its own, because a limit cannot be undone.
+"""
 
 import subprocess
 import sys

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The outcome of a flight: its sentence, its exit status, and the record of a log."""
+"""Test the outcome of a flight: its sentence, its exit status, and its record in a log."""
 
 import json
 
@@ -57,7 +57,10 @@ WORDS = st.sampled_from(
 @pytest.mark.parametrize("end", End)
 @given(reason=st.lists(st.one_of(WORDS, st.text(max_size=20))).map("".join))
 def test_status_depends_on_the_end_and_the_shortfalls_alone(end: End, reason: str) -> None:
-    """A name of the user may say "has landed softly"."""
+    """The reason is text of the user, such as "has landed softly".
+
+    It does not change the status.
+    """
     assert (Outcome(end, reason).status, Outcome(end, reason, (SHORT,)).status) == STATUSES[end]
 
 
@@ -122,7 +125,7 @@ def test_headline_fits_a_line_and_the_details_have_the_rest(
 
 
 def test_node_ends_with_a_status_of_its_own() -> None:
-    """A landing and a lost peer are told apart without their sentences."""
+    """A landing and a lost peer have statuses of their own, whatever their sentences are."""
     ends = (FlightEnded("diverged"), FlightEnded("landed", End.LANDED), LostContact("lost"))
     assert [ended.status for ended in ends] == [3, 5, 6]
     assert [ended.outcome.end for ended in ends] == [End.ENDED_EARLY, End.LANDED, End.ENDED_EARLY]

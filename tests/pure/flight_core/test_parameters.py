@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Invalid parameters: one sentence that names the key, what was found and what is expected."""
+"""Test invalid parameters: one sentence has the key, what was found and what is expected."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -283,7 +283,7 @@ EXAMPLES = sorted((REPOSITORY / "examples" / "scenarios").glob("*.yaml"))
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=[path.stem for path in EXAMPLES])
 def test_example_scenario_flies(path: Path) -> None:
-    """Two seconds show that each section is accepted by what flies it."""
+    """In two seconds, each section of the scenario reaches the node that uses it."""
     scenario = load_scenario(path).vary(flight={"duration": 2.0})
     assert simulate(scenario).outcome == COMPLETED
 
@@ -330,7 +330,7 @@ def test_every_key_is_in_a_file() -> None:
 
 
 def scenario_keys(tree: Any) -> Iterator[str]:
-    """The dotted keys of a scenario file and of their groups; none of another file."""
+    """Yield the dotted keys of a scenario file and of their groups. Another file has none."""
     for name, value in tree.items() if isinstance(tree, dict) else ():
         if isinstance(value, dict) and "ros__parameters" in value:
             yield from _keys(value["ros__parameters"], f"{name.removeprefix('/**/')}.")
@@ -391,7 +391,7 @@ RESULTS = {"flight_campaign.statistics"}  # modules with sets that only the stac
 
 
 def schemas(base: type[Config] = Config) -> Iterator[type[Config]]:
-    """The parameter sets of files, nodes and laws."""
+    """Yield the parameter sets of files, nodes and laws."""
     yield from (*SECTIONS.values(), Airframe, Definition)
     for name in laws.names():
         with suppress(ParameterError):  # loaded, but of the full state
@@ -405,7 +405,7 @@ def schemas(base: type[Config] = Config) -> Iterator[type[Config]]:
 
 
 def rules_of_numbers(annotation: Any, rules: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """The rules of each number in a type, those in lists and tables included."""
+    """Yield the rules of each number in a type, also within lists and tables."""
     origin = get_origin(annotation)
     parts = get_args(annotation)
     if origin is Annotated:
@@ -422,7 +422,10 @@ def rules_of_numbers(annotation: Any, rules: Mapping[str, Any]) -> Iterator[Mapp
     "schema", sorted(set(schemas()), key=repr), ids=lambda schema: schema.__name__
 )
 def test_each_number_has_lower_and_upper_bound(schema: type[Config]) -> None:
-    """Only a type that allows .inf and NaN has none: no end stop, never, no value."""
+    """Only a type that allows .inf and NaN may lack bounds.
+
+    There they mean no end stop, never, or no value.
+    """
     for name, field in schema.model_fields.items():
         for rules in rules_of_numbers(field.annotation, field.rules):
             if not rules.get("allow_inf_nan"):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The publisher lock of a topic, and the samples that a controller uses while y_m is delayed."""
+"""Test the publisher lock of a topic, and which samples a controller uses while y_m is late."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ MAX_AGE, TAKEOVER = 100, 1000
 
 
 def locked(*senders: tuple[str, int]) -> PublisherLock:
-    """A lock after samples of these publishers at these instants."""
+    """Return a lock after samples of these publishers at these instants."""
     lock = PublisherLock(lambda: (MAX_AGE, TAKEOVER))
     for sender, now_ns in senders:
         lock.check(sender, now_ns)
@@ -25,7 +25,7 @@ def locked(*senders: tuple[str, int]) -> PublisherLock:
 
 
 def test_conflicting_publisher_ignored_until_timeout() -> None:
-    """Samples of a second publisher are ignored until the first publisher times out."""
+    """Samples of a second publisher are ignored until the first one has timed out."""
     lock = locked(("/aircraft#1", 0), ("/aircraft#1", 90))
     for publisher in ("/aircraft#2", "/foreign", ""):
         sentence = f"conflicting publisher {publisher} ignored: already receiving from /aircraft#1"
@@ -36,7 +36,7 @@ def test_conflicting_publisher_ignored_until_timeout() -> None:
 
 
 def test_restarted_node_takes_over_earlier() -> None:
-    """A restarted node takes over after the age limit, a different node later."""
+    """A restarted node may take over after the age limit, and another node only later."""
     lock = locked(("/aircraft#1", 0))
     lock.check("/aircraft#2", MAX_AGE + 1)
     with pytest.raises(ChannelError):
@@ -47,7 +47,10 @@ def test_restarted_node_takes_over_earlier() -> None:
 
 
 def refused(lock: PublisherLock, now_ns: int, sequence: int, sender: str = "/aircraft#1") -> bool:
-    """Whether a message is refused as one of two publishers under a name; a valid one is taken."""
+    """Return whether a message is refused because two publishers share a name.
+
+    A valid one is taken.
+    """
     lock.check(sender, now_ns)
     try:
         lock.require_alone(sender, sequence, now_ns)
@@ -58,7 +61,7 @@ def refused(lock: PublisherLock, now_ns: int, sequence: int, sender: str = "/air
 
 
 def test_two_publishers_under_one_name_are_both_refused_until_one_is_left() -> None:
-    """Either may be the forged one, so y or u times out, and the failsafe begins."""
+    """Either of the two may be the forged one, so y or u times out and the failsafe begins."""
     lock = locked(("/aircraft#1", 0))
     assert not any(refused(lock, 10 * k, sequence=1000 + k) for k in range(10))
     own, forged = 2000, 1
@@ -81,7 +84,7 @@ def test_forged_message_with_a_larger_number_is_told_by_the_next_true_one() -> N
 
 
 def test_publisher_that_begins_again_under_its_name_is_one() -> None:
-    """An aircraft of one's own has no process in its name. It was silent meanwhile."""
+    """A user's aircraft has no process id in its name. It was silent before it began again."""
     lock = locked(("/aircraft#1", 0))
     assert not refused(lock, 10, 50)
     assert not refused(lock, 11 + MAX_AGE, 1)
@@ -122,9 +125,9 @@ def test_a_change_of_publisher_is_returned_once() -> None:
 def test_delayed_reference_awaited_up_to_age_limit(
     late: float, modes: set[Mode], osprey_gust: Scenario
 ) -> None:
-    """Y and y_m at 100 Hz, where y_m has a delay from 1 s on.
+    """Y and y_m have 100 Hz, and y_m is late from 1 s on.
 
-    It is once below the age limit of 0.1 s and once above it.
+    The delay is below the age limit of 0.1 s in one case, and above it in the other.
     """
     controller = Controller(osprey_gust.controller)
     period_ns = 10_000_000

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a node asks of Linux's scheduler, read from /proc by a process of its own: settings last."""
+"""Test what a node asks of Linux's scheduler.
+
+Each test has a process of its own, because the settings last, and reads /proc.
+"""
 
 import os
 import platform
@@ -16,7 +19,7 @@ from flight_core.scheduling import SLICE_NS, THREADS, TIMER_SLACK
 
 
 def output(code: str, within: Sequence[str] = ()) -> str:
-    """What a Python process prints, started by `within`."""
+    """Return what a Python process prints that is started by the words `within`."""
     return subprocess.run(
         [*within, sys.executable, "-c", code], check=True, capture_output=True, text=True
     ).stdout
@@ -80,7 +83,7 @@ thread.join()
     "policy", [("--fifo", "50"), ("--batch", "0")], ids=["FIFO", "no real-time priority"]
 )
 def test_command_leaves_real_time_priority(policy: tuple[str, str]) -> None:
-    """Every thread leaves the real-time priority; a different policy stays."""
+    """Every thread gives up the real-time priority, and another policy stays."""
     code = """
 import os, threading
 from flight_core.scheduling import *
@@ -100,7 +103,7 @@ ends.set()
 def test_command_computes_in_one_thread_unless_the_user_chose(
     chosen: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """OpenBLAS starts its threads when NumPy is imported, those of SciPy's copy with SciPy."""
+    """OpenBLAS starts its threads when NumPy is imported, and SciPy has a copy of its own."""
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     if chosen is not None:
         monkeypatch.setenv("OPENBLAS_NUM_THREADS", chosen)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Text from samples, scenarios and folders: no terminal control code reaches a user."""
+"""Test that no terminal control code in samples, scenarios or folders reaches a user."""
 
 from pathlib import Path
 

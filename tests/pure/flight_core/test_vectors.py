@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Named vectors are matched by name; an invalid sample is rejected with a reason."""
+"""Test that vectors are matched by name, and an invalid sample is rejected with a reason."""
 
 import math
 
@@ -56,7 +56,7 @@ def test_array_namespace_is_that_of_library_of_array() -> None:
 
 
 def test_float_functions_equal_array_functions() -> None:
-    """The functions of a Python float give the values of the array functions."""
+    """The functions for a Python float give the same values as those for arrays."""
     xp = array_namespace(0.5)
     for name in ("acos", "asin", "atan", "sin", "cos", "tan", "sqrt"):
         # JAX in 32 bit
@@ -71,7 +71,7 @@ def test_float_functions_equal_array_functions() -> None:
 
 
 def test_stamps_misordered_or_ahead_rejected() -> None:
-    """Stamps out of order are rejected, and stamps ahead of the clock."""
+    """A stamp out of order is rejected, and so is a stamp ahead of the clock."""
     require_newer(1, 0)
     require_not_future(12, 10, 2)
     with pytest.raises(ChannelError, match="V: stamp 1 s before the last one") as rejected:

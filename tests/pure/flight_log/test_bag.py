@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writing and reading bags.
+"""Test writing and reading bags.
 
-Independent readers read them. Truncated and damaged files and bags of other recorders are read.
+Independent readers read what was written. Truncated and damaged files and bags of other recorders
+are read.
 """
 
 import math
@@ -240,7 +241,7 @@ def test_definitions_include_all_referenced_types() -> None:
 def test_definitions_need_no_ros_package(
     type_name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Rosbags has the fields and the hash of the installed definition, without comments."""
+    """Rosbags finds the fields and the hash of the installed definition, without its comments."""
     installed = definition(type_name)
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
@@ -256,7 +257,7 @@ def record(
     topics: dict[str, list[bytes]],
     compression: CompressionMode = CompressionMode.NONE,
 ) -> None:
-    """Write a bag with rosbags: the messages of each topic 1 ms apart.
+    """Write a bag with rosbags, with the messages of each topic 1 ms apart.
 
     A further topic has another type.
     """
@@ -281,7 +282,7 @@ SAMPLES = [vector(2_000_000 * k, ("q", "V"), (0.1 * k, -k)) for k in range(50)]
 def test_flight_that_rosbag2_recorded_read_with_scenario_beside_it(
     osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    """As the launch files leave it: a log without messages, and the bag in a folder of its own."""
+    """The launch files leave a log without messages, and the bag in a folder of its own."""
     with BagWriter(tmp_path / "run") as bag:
         bag.add_attachments(LogAttachments(osprey_gust.path), 1)
     record(tmp_path / "run" / ROSBAG2, {"/y": SAMPLES})
@@ -384,14 +385,14 @@ MIXTURES = {
 
 
 def index_of(places: Sequence[int]) -> bytes:
-    """A message index with messages at `places`."""
+    """Return a message index with messages at `places`."""
     return MESSAGE_INDEX.pack(1, 16 * len(places)) + b"".join(
         struct.pack("<Qq", 0, place) for place in places
     )
 
 
 def messages_of(chunk: bytes, index: bytes) -> list[tuple[int, bytes, int, int]]:
-    """Channel, content and times of the messages of a chunk with this message index."""
+    """Return channel, content and times of the messages of a chunk with this message index."""
     return [
         (batch.channel_id, bytes(message), int(log_ns), int(publish_ns))
         for batch in decode_batches([FilePart(Opcode.CHUNK, chunk, [index], 0)])
@@ -403,7 +404,7 @@ def messages_of(chunk: bytes, index: bytes) -> list[tuple[int, bytes, int, int]]
 
 
 def first_chunk(log: bytes) -> tuple[bytes, list[int]]:
-    """The content of the first chunk of a log, and the places of its messages."""
+    """Return the content of the first chunk of a log, and the places of its messages."""
     place = len(MCAP0_MAGIC)
     chunk = b""
     places = list[int]()
@@ -459,7 +460,7 @@ def test_other_types_have_no_decoder_and_malformed_messages_counted() -> None:
 
 
 def test_engagements_of_log_begin_with_phase_engaged_and_end_with_reason(tmp_path: Path) -> None:
-    """Reports come at each change and once a second.
+    """Reports are sent at each change and once a second.
 
     The messages are written by the library rosbags.
     """
@@ -510,7 +511,7 @@ def test_publisher_with_channels_in_another_order_read_by_names(tmp_path: Path) 
 
 
 def test_samples_that_nodes_refuse_are_left_out_and_noted(tmp_path: Path) -> None:
-    """Values that are not finite, and a name twice."""
+    """The refused samples have values that are not finite, or a name twice."""
     with BagWriter(tmp_path) as bag:
         channel = bag.add_topic("/y", JOINT_STATE, "")
         only = bag.add_topic("/u", JOINT_STATE, "")
@@ -529,7 +530,10 @@ def test_samples_that_nodes_refuse_are_left_out_and_noted(tmp_path: Path) -> Non
 def test_lost_messages_are_known_of_one_publisher_alone(
     numbers: list[int], lost: int | None, tmp_path: Path
 ) -> None:
-    """A restarted publisher counts from the begin again: what was not sent between is unknown."""
+    """A restarted publisher counts from the beginning again.
+
+    What was not sent in between is unknown.
+    """
     with BagWriter(tmp_path) as bag:
         channel = bag.add_topic("/y", JOINT_STATE, "")
         for k, number in enumerate(numbers):
@@ -569,7 +573,10 @@ def test_samples_of_two_publishers_at_same_time_noted(tmp_path: Path) -> None:
 
 
 def test_without_truth_flight_time_counts_from_first_y_m(tmp_path: Path) -> None:
-    """A bridge publishes y before the reference model starts, and commands count from its start."""
+    """A bridge publishes y before the reference model starts.
+
+    Commands are timed from the start of the reference model.
+    """
     bag = BagWriter(tmp_path / "run")
     for name, first in (("y", 3), ("y_m", 5)):
         channel = bag.add_topic(f"/{name}", JOINT_STATE, "")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Following a log that grows: the same values as reading it whole.
+"""Test that following a log that grows gives the same values as reading it whole.
 
 The pieces have any size, and the log may be hostile.
 """
@@ -37,7 +37,7 @@ def all_of(topic: str, type_name: str) -> float:
 
 
 def vectors(found: list[Messages], topic: str) -> tuple[NDArray[np.int64], FloatArray]:
-    """Stamps and values of a topic."""
+    """Return the stamps and values of a topic."""
     decode = decoder(JOINT_STATE)
     assert decode is not None
     parts = [
@@ -178,7 +178,10 @@ def test_endless_record_is_fault_and_chunk_in_progress_awaited(
 
 
 def counts(path: Path) -> tuple[int, int, bool]:
-    """Messages, damaged parts and the end of a file, by a scan and, equal to it, by a follower."""
+    """Return the number of messages and damaged parts, and whether the file has an end.
+
+    A scan of the file and a follower must agree.
+    """
     scan = Scan(path)
     messages = sum(isinstance(record, Message) for record in scan.records())
     follower = Follower(path, all_of)
@@ -206,9 +209,9 @@ def test_index_that_points_outside_messages_changes_nothing(recorded: Path, tmp_
 def test_follower_reads_past_damage_what_a_scan_of_the_file_reads(
     offset: int, size: int, run: Path
 ) -> None:
-    """Bytes are inverted in the head and in the content of a chunk, beside an intact index.
+    """Bytes are inverted in the head and in the content of a chunk, while the index is intact.
 
-    Then these bytes are cut out, and the file is cut there.
+    Then these bytes are removed, and after that the file is cut there.
     """
     path = run / "run_0.mcap"
     content = path.read_bytes()

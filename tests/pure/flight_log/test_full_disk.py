@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A full disk: the log is finished from the reserve.
+"""Test that a log is finished from its reserve when the disk is full.
 
-Else it stays readable up to its last complete chunk.
+Otherwise it stays readable up to its last complete chunk.
 """
 
 import errno
@@ -38,9 +38,9 @@ RANDOM = np.random.default_rng(1)
 
 
 def write(bag: BagWriter, channel: BagChannel, count: int) -> None:
-    """Write messages of 40 noisy channels, which do not compress.
+    """Write messages of 40 noisy channels, which cannot be compressed.
 
-    Every tenth ends a chunk, as at 1 kHz and 0.1 s.
+    Every tenth message ends a chunk, as at 1 kHz and 0.1 s.
     """
     for _ in range(count):
         stamp_ns = 1_000_000 * (channel.messages + 1)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The attachments, metadata and provenance of a log.
+"""Test the attachments, metadata and provenance of a log.
 
-They suffice to repeat the flight from the file alone.
+They are sufficient to repeat the flight from the file alone.
 """
 
 import math
@@ -42,7 +42,10 @@ from flight_log.tape_writer import write_run
 
 @pytest.fixture(scope="module")
 def recorded(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
-    """A flight in one process, read back. Its duration differs from the scenario file's."""
+    """Return a flight in one process, read back.
+
+    Its duration is not the one of the scenario file.
+    """
     scenario = osprey_gust.vary(flight={"duration": 0.5})
     run = tmp_path_factory.mktemp("recorded")
     write_run(simulate(scenario), run, attachments_for(scenario, run))
@@ -50,7 +53,7 @@ def recorded(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def stored(files: LogAttachments | RecordedRun, name: str, folder: Path) -> Path:
-    """An attachment as a file."""
+    """Return an attachment as a file."""
     if isinstance(files, RecordedRun):
         (folder / name).write_bytes(
             next(attachment.content for attachment in files.attachments if attachment.name == name)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Logs of all kinds under every command.
+"""Test logs of all kinds with every command.
 
-Each is read with the figures of the flight, or refused with what is there.
+Each log gives the figures of the flight, or is refused with what it contains.
 """
 
 from pathlib import Path
@@ -48,13 +48,13 @@ TICKS = 201  # of two seconds at 100 Hz, both ends included
 
 @pytest.fixture(scope="module")
 def messages(recorded: Path) -> list[Recorded]:
-    """The messages of two seconds of flight, as a recorder stores them."""
+    """Return the messages of two seconds of flight, as a recorder stores them."""
     return flight_messages(recorded / "run_0.mcap")
 
 
 @pytest.fixture(scope="module")
 def figures(recorded: Path) -> dict[str, Any]:
-    """The errors and inputs of the flight in the log of the stack."""
+    """Return the errors and inputs of the flight in the log of the stack."""
     return figures_of(read_flight(recorded).summary)
 
 
@@ -64,7 +64,10 @@ def figures_of(summary: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.fixture(params=WHOLE)
 def whole(request: pytest.FixtureRequest, messages: list[Recorded], tmp_path: Path) -> Path:
-    """A bag with the whole flight; a file where only its path can name it."""
+    """Return a bag with the whole flight.
+
+    For a file that only its path can name, return the file.
+    """
     WHOLE[request.param](tmp_path / "bag", messages)
     single = tmp_path / "bag" / "flight.log"
     return single if single.exists() else tmp_path / "bag"
@@ -73,9 +76,9 @@ def whole(request: pytest.FixtureRequest, messages: list[Recorded], tmp_path: Pa
 def test_whole_flight_is_read_replayed_shown_and_played(
     whole: Path, messages: list[Recorded], figures: dict[str, Any], osprey_gust: Scenario
 ) -> None:
-    """The scenario comes from its file, as `--scenario` gives it.
+    """The scenario is given with `--scenario`, because the bag has none.
 
-    The bag has none, like those of `ros2 bag record`.
+    Bags of `ros2 bag record` have none either.
     """
     with refusing(r"a log without its scenario, expected .* --scenario FILE"):
         read_flight(whole)
@@ -116,7 +119,7 @@ COMMANDS = {
 
 
 def refusal(command: str, *words: str) -> str:
-    """The sentence of a command that refuses."""
+    """Return the sentence of a command that refuses."""
     line = [*COMMANDS[command], *words]
     result = invoke(*line)
     assert isinstance(result.exception, ParameterError), (result.output, result.exception)
@@ -318,7 +321,7 @@ def test_truncated_packed_file_read_to_end(messages: list[Recorded], tmp_path: P
 
 
 def test_rosbags_reads_what_the_generator_writes(messages: list[Recorded], tmp_path: Path) -> None:
-    """The bags of this test are right by another reader, where that reads the kind."""
+    """Rosbags reads the bags of these tests, if it can read their kind."""
     for name in ("chunks_zstd", "unchunked", "namespace"):
         WHOLE[name](tmp_path / name, messages)
         with Reader(tmp_path / name / "bag_0.mcap") as reader:

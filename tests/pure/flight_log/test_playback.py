@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Playback schedule of a log: the messages, their order and their due times."""
+"""Test the playback schedule of a log: the messages, their order and their due times."""
 
 from pathlib import Path
 
@@ -22,9 +22,9 @@ from flight_log.tape_writer import write_run
 
 @pytest.fixture(scope="module")
 def run(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One second in one process, from t = 0 to 1 s.
+    """Return one second in one process, from t = 0 to 1 s.
 
-    y, y_m and truth come at 500 Hz, u and internals at 100 Hz, pose at 50 Hz.
+    y, y_m and truth have 500 Hz, u and internals 100 Hz, and pose 50 Hz.
     """
     tape = simulate(osprey_gust.vary(flight={"duration": 1.0}))
     return write_run(
@@ -79,7 +79,7 @@ def test_a_log_without_messages_is_rejected(tmp_path: Path) -> None:
 
 
 def bag_of(folder: Path, sent: list[tuple[str, int, int, float]]) -> Path:
-    """A log of (topic, time of sending, stamp, value) in the order of receipt.
+    """Return a log of (topic, time of sending, stamp, value) in the order of receipt.
 
     `truth` has the channel t.
     """
@@ -112,7 +112,7 @@ def test_in_real_time_message_is_due_when_it_was_sent_not_when_it_was_received(
 
 
 def test_message_without_stamp_is_due_when_it_was_sent(tmp_path: Path) -> None:
-    """Of a driver that forgets the header: no sample has a stamp."""
+    """A driver forgot the header, so no sample has a stamp."""
     messages = [
         (topic, EPOCH + k * NANOSECONDS, 0, 0.0) for k in range(3) for topic in ("/truth", "/y_m")
     ]

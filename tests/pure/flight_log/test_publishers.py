@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whose messages a log holds, and which clock they tell of.
+"""Test whose messages a log has, and which clock they show.
 
-The flight counts by its own publishers, and a time is asked of two clocks.
+A flight is timed by its own publishers, and a time is checked by two clocks.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,7 +40,7 @@ def flight(
     stamp: Callable[[str, int], int] = lambda topic, ns: ns,
     log: Callable[[int], int] = lambda ns: ns,
 ) -> list[Sent]:
-    """Whole topics at 100 Hz; `stamp` and `log` move the times since the start, ns."""
+    """Return whole topics at 100 Hz. `stamp` and `log` move the times since the start, ns."""
     sent = []
     for k in range(100 * duration + 1):
         for topic, sender in OWN.items():
@@ -52,7 +52,7 @@ def flight(
 
 
 def written(folder: Path, messages: Sequence[Sent]) -> Tape:
-    """The tape of a log of these messages."""
+    """Return the tape of a log with these messages."""
     with BagWriter(folder / "run") as bag:
         channels = {name: bag.add_topic(f"/{name}", JOINT_STATE, "") for name in OWN}
         for message in sorted(messages, key=lambda each: each.log_ns):
@@ -62,7 +62,10 @@ def written(folder: Path, messages: Sequence[Sent]) -> Tape:
 
 
 def foreign(topic: str, now_ns: int, number: int) -> list[bytes]:
-    """Messages of foreign publishers: bytes, other channels, old, zero and future stamps."""
+    """Return messages of foreign publishers.
+
+    They have wrong bytes, other channels, and old, zero or future stamps.
+    """
     nan = [float("nan")] * 4
     return [
         b"\x00",
@@ -106,7 +109,7 @@ def test_messages_of_foreign_publishers_count_for_no_topic_of_the_flight(
 
 
 def test_own_messages_without_a_usable_stamp_still_count(tmp_path: Path) -> None:
-    """Beside a foreign publisher: the fault is the publisher's own."""
+    """There is a foreign publisher, but the fault is in the flight's own publisher."""
     own = flight()
     damaged = [
         sent._replace(data=vector(0, NAMES, [0.0] * 4, OWN["y"]))
@@ -127,7 +130,7 @@ def test_own_messages_without_a_usable_stamp_still_count(tmp_path: Path) -> None
 def test_sensor_that_drops_samples_in_lockstep_is_no_step_of_the_clock(
     lost: float, tmp_path: Path
 ) -> None:
-    """An instant without a sample has a message without channels, which is shorter.
+    """An instant without a sample has a shorter message, without channels.
 
     The flight is ten times as fast as the reception.
     """
@@ -145,9 +148,9 @@ def test_sensor_that_drops_samples_in_lockstep_is_no_step_of_the_clock(
 @pytest.mark.parametrize("late", [0.106, 0.25, 0.6])
 @pytest.mark.parametrize("topic", ["u", "y"])
 def test_late_samples_are_no_step_of_the_clock(topic: str, late: float, tmp_path: Path) -> None:
-    """Amid the flight the stamps of a topic go back; reception and numbers go on.
+    """The stamps of a topic go back during the flight, while reception and numbers go on.
 
-    They were sent late, and catch up within a second.
+    The samples were sent late, and catch up within a second.
     """
     behind = round(late * 1000) * MS
 
@@ -164,7 +167,7 @@ def test_late_samples_are_no_step_of_the_clock(topic: str, late: float, tmp_path
 @pytest.mark.parametrize("by", [0.15, 0.3, 0.7, 2.0, 100.0])
 @pytest.mark.parametrize("topic", ["u", "y"])
 def test_clock_of_a_topic_that_is_set_back_is_a_step(topic: str, by: float, tmp_path: Path) -> None:
-    """Its stamps stay behind the reception."""
+    """The stamps of the topic stay behind the reception."""
     step_ns = round(by * 1000) * MS
 
     def stamp(name: str, ns: int) -> int:
@@ -199,7 +202,10 @@ def test_pause_of_the_host_is_no_leap_of_the_clock(
 def test_leap_of_all_stamps_beside_the_reception_is_told(
     leap: float, pause: float, tmp_path: Path
 ) -> None:
-    """The reception goes on, or pauses for less: later times are by the clock before the leap."""
+    """The reception goes on, or pauses for a shorter time than the leap.
+
+    Later times are counted by the clock before the leap.
+    """
     leap_ns = round(leap * NANOSECONDS)
     pause_ns = round(pause * NANOSECONDS) if pause < leap - 0.3 else 0
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rate and delay of the body rates from the parameters of PX4."""
+"""Test rate and delay of the body rates from the parameters of PX4."""
 
 import math
 from pathlib import Path
@@ -26,7 +26,7 @@ def written(path: Path, **values: float) -> Path:
 
 
 def filter_delay(cutoff: float, notches: dict[float, float]) -> float:
-    """The phase of the digital filters of PX4 at 1 Hz over its angle, of filters at 8 kHz."""
+    """Return the delay of PX4's digital filters at 8 kHz, from their phase at 1 Hz."""
     sampling = 8000.0
     filters = [butter(2, cutoff, fs=sampling)]
     filters += [iirnotch(f, f / width, fs=sampling) for f, width in notches.items()]
@@ -38,7 +38,7 @@ def filter_delay(cutoff: float, notches: dict[float, float]) -> float:
 def test_delay_is_the_phase_of_the_filters_and_a_period(
     tmp_path: Path, notches: dict[float, float]
 ) -> None:
-    """The phase of SciPy's filters at low frequency is that of a delay."""
+    """At low frequencies, the phase of SciPy's filters is the phase of a delay."""
     values = {"IMU_GYRO_RATEMAX": 250.0, "IMU_GYRO_CUTOFF": 40.0}
     for k, (frequency, width) in enumerate(notches.items()):
         values |= {f"IMU_GYRO_NF{k}_FRQ": frequency, f"IMU_GYRO_NF{k}_BW": width}
@@ -48,7 +48,7 @@ def test_delay_is_the_phase_of_the_filters_and_a_period(
 
 
 def test_defaults_are_those_of_px4(tmp_path: Path) -> None:
-    """Of IMU_GYRO_CUTOFF at 40 Hz and 400 Hz; of a lower rate of the law."""
+    """The cut-off is 40 Hz, and the rate 400 Hz. A law with a lower rate waits longer."""
     path = written(tmp_path / "plane.params", IMU_GYRO_NF0_FRQ=0.0)
     assert rate_loop(path).rate == 400.0
     assert rate_loop(path).delay == approx(0.0056 + 0.0025, abs=5e-5)
@@ -112,7 +112,7 @@ def test_refuses_a_file_of_another_kind(tmp_path: Path) -> None:
 def test_gains_take_the_loop_of_a_parameter_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Rate and delay reach the selection; a delay beside the file is refused."""
+    """Rate and delay reach the selection. A delay that is given as well is refused."""
     path = written(tmp_path / "plane.params", IMU_GYRO_RATEMAX=250.0, IMU_GYRO_CUTOFF=40.0)
     asked: list[dict[str, object]] = []
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A log of an earlier revision in tests/recorded.
+"""Test a log of an earlier revision in tests/recorded.
 
 Every sample is read, and every bit of u is computed again.
 """
@@ -23,7 +23,7 @@ TOPICS = {"y", "y_m", "u", "internals", "truth"}
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """A copy of a run of osprey_servo in lockstep."""
+    """Return a copy of a run of osprey_servo in lockstep."""
     shutil.unpack_archive(
         REPOSITORY / "tests" / "recorded" / "osprey_servo.tar.xz", tmp_path, filter="data"
     )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Repair of truncated and damaged logs: the kept messages, the printed result, intact logs."""
+"""Test the repair of truncated and damaged logs: kept messages, printed result, intact logs."""
 
 import fcntl
 import os
@@ -42,7 +42,7 @@ def unchanged(folder: Path) -> Iterator[None]:
 
 
 def last(run: Path) -> float:
-    """Flight time of the last sample on any topic."""
+    """Return the flight time of the last sample on any topic."""
     tape = read_run(run).tape
     return float(max(tape.time(name)[-1] for name in tape.signals))
 
@@ -169,9 +169,9 @@ def test_changed_bytes_never_cause_traceback_or_false_messages(recorded: Path, r
 
 
 def test_link_in_folder_is_not_followed(run: Path, tmp_path: Path) -> None:
-    """A folder from elsewhere may hold links, also to nothing.
+    """A folder from elsewhere may contain links, some of them to nothing.
 
-    Such a link may stand in the place of the copy of the damaged file.
+    Such a link may have the name of the copy of the damaged file.
     """
     target = tmp_path / "target"
     precious = tmp_path / "precious"

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The live page without a browser.
+"""Test the live page without a browser.
 
-A flight is followed, the server answers, and it refuses some clients.
+The tests follow a flight, and check the answers of the server and which clients it refuses.
 """
 
 import asyncio
@@ -65,7 +65,7 @@ INTACT = {"zstd_of_fifty_thousand_messages"}
 def decoded(
     content: bytes,
 ) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np.float64], NDArray[np.float32]]]]:
-    """Head of an answer, and times (N,) and values (N, k) of its topics."""
+    """Return the head of an answer, and times (N,) and values (N, k) of its topics."""
     (size,) = struct.unpack_from("<I", content)
     head = json.loads(content[4 : 4 + size])
     place = 4 + size
@@ -87,7 +87,7 @@ def decoded(
 def followed(
     flight: Flight,
 ) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np.float64], NDArray[np.float32]]]]:
-    """All that a browser gets, request by request."""
+    """Return all that a browser gets, request by request."""
     known: dict[str, str] = {}
     parts: dict[str, list[tuple[NDArray[np.float64], NDArray[np.float32]]]] = {}
     while True:
@@ -182,7 +182,7 @@ def test_state_tells_slow_recorder_from_killed_one(recorded: Path, tmp_path: Pat
 def test_long_logs_read_in_slices(
     backlog: int, state: str, recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A short backlog counts as live."""
+    """A short backlog still counts as live."""
     monkeypatch.setattr(followed_flight, "LIVE_BACKLOG", backlog)
     flight = Flight(recorded)
     slices = 0
@@ -199,7 +199,7 @@ def test_long_logs_read_in_slices(
 
 
 def test_late_row_kept_and_old_row_refused() -> None:
-    """A row of a recovered overrun is kept in order, a row of a different time refused."""
+    """A row of a recovered overrun is kept in order, and a row from another time is refused."""
     samples = Series(("a",))
     for stamps in ([0, 50_000_000], [47_000_000, 60_000_000], [-3_000_000_000, 70_000_000]):
         samples.append(np.array(stamps, dtype=np.int64), np.ones((2, 1)))
@@ -229,7 +229,10 @@ def test_long_flight_becomes_coarser_in_place() -> None:
 def test_settling_bands_grow_with_a_flight_that_became_coarser(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The rows are halved near their limit, so their number does not tell how long it flies."""
+    """The number of rows does not show the duration of a flight.
+
+    The rows are halved when they reach a limit.
+    """
     ends = []
 
     def bands(tape: Tape) -> dict[str, float]:
@@ -456,7 +459,7 @@ async def get(
 
 
 async def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
-    """The page asks no other host."""
+    """The page loads nothing from another host."""
     async with serving(recorded) as server:
         # A browser sends no header with the address of a page.
         page = await get(server, "/", token="")
@@ -509,9 +512,9 @@ async def test_foreign_host_another_path_and_another_method_refused(
 async def test_no_sample_served_without_token(
     path: str, headers: dict[str, str], recorded: Path
 ) -> None:
-    """Neither the query nor a cookie has the token.
+    """Neither a query nor a cookie may carry the token.
 
-    A log of addresses may keep the query, and a cookie goes to all ports of a host.
+    The query can appear in a log of addresses, and a cookie goes to all ports of a host.
     """
     async with serving(recorded) as server:
         response = await get(server, path, token="", **headers)
@@ -524,7 +527,7 @@ Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 async def connect(
     server: Server, request: bytes = b"", count: int = http.MAX_CONNECTIONS
 ) -> list[Connection]:
-    """Connections to a server, with what each sends."""
+    """Open connections to a server, each of which sends the request."""
     connections = [
         await asyncio.open_connection("127.0.0.1", server.port, limit=1024) for _ in range(count)
     ]
@@ -541,7 +544,7 @@ def end(*connections: Connection) -> None:
 async def test_connections_without_token_leave_place(recorded: Path) -> None:
     """A new connection takes the place of the oldest connection without the token.
 
-    The page is served throughout.
+    The page is served at all times.
     """
     async with serving(recorded) as server:
         idle = await connect(server, count=1000)
@@ -554,9 +557,9 @@ async def test_connections_without_token_leave_place(recorded: Path) -> None:
 
 
 async def rest_of(reader: asyncio.StreamReader) -> bytes:
-    """What arrives until the server closes.
+    """Return what arrives until the server closes.
 
-    The server resets a connection of which it leaves bytes unread.
+    The server resets a connection if it leaves bytes unread.
     """
     try:
         return await reader.read()
@@ -607,7 +610,7 @@ async def test_browser_waits_for_next_samples(
 
 
 async def stream(server: Server, token: str | bytes = TOKEN) -> WebSocketClientConnection:
-    """A WebSocket as the page opens it."""
+    """Open a WebSocket as the page does."""
     address = f"127.0.0.1:{server.port}"
     opened = await websocket_connect(
         HTTPRequest(f"ws://{address}/news/0", headers={"Origin": f"http://{address}"})
@@ -637,7 +640,7 @@ UPGRADE |= {"Sec-WebSocket-Version": "13"}  # RFC 6455, 4.1
 
 
 async def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
-    """A message is answered as a request by HTTP."""
+    """A message is answered in the same way as a request by HTTP."""
     async with serving(recorded) as server:
         await whole_log(server)  # else the second answer may have more rows than the first
         socket = await stream(server)
@@ -671,7 +674,7 @@ async def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
 async def test_foreign_websocket_refused(
     path: str, headers: dict[str, str], expected: int, recorded: Path
 ) -> None:
-    """A WebSocket of a foreign page or host is refused, and of an unknown flight."""
+    """A WebSocket from a foreign page or host, or for an unknown flight, is refused."""
     async with serving(recorded) as server:
         given = UPGRADE | {"Origin": f"http://127.0.0.1:{server.port}"} | headers
         assert (
@@ -694,7 +697,7 @@ async def test_websocket_whose_first_message_is_not_the_token_closed(
 async def test_idle_or_surplus_websockets_closed(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """WebSockets without a request are closed, and WebSockets beyond the limit."""
+    """WebSockets without a request are closed, and so are WebSockets beyond the limit."""
     async with serving(recorded) as server:
         sockets = [await stream(server) for _ in range(http.MAX_CONNECTIONS)]
         surplus = await stream(server)
@@ -714,9 +717,9 @@ async def test_idle_or_surplus_websockets_closed(
 async def test_websocket_without_reader_gets_few_answers(
     recorded: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A WebSocket asks and reads no answer.
+    """A WebSocket sends requests and reads no answer.
 
-    The server makes few answers, ends the WebSocket, and ends quietly.
+    The server makes few answers, closes the WebSocket, and ends quietly.
     """
     made: list[bytes] = []
 
@@ -766,7 +769,7 @@ async def test_the_server_listens_on_this_host_alone(recorded: Path) -> None:
 
 
 def test_recording_run_is_chosen_first(recorded: Path, tmp_path: Path) -> None:
-    """Without a run in recording the last run is chosen."""
+    """If no run is being recorded, the last run is chosen."""
     for name in ("20260101T000000Z-a", "20260102T000000Z-b", "20260103T000000Z-c"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "run_0.mcap").write_bytes(b"")
@@ -782,7 +785,7 @@ def test_recording_run_is_chosen_first(recorded: Path, tmp_path: Path) -> None:
 
 
 def test_run_in_recording_counts_once_beside_its_link(tmp_path: Path) -> None:
-    """The recorder of nodes that were started one by one links `latest` at its start."""
+    """The recorder of nodes that were started one by one links `latest` when it starts."""
     run = tmp_path / "20260101T000000Z-recording"
     run.mkdir()
     (run / "run_0.mcap").write_bytes(b"")
@@ -793,9 +796,9 @@ def test_run_in_recording_counts_once_beside_its_link(tmp_path: Path) -> None:
 
 
 def test_aircraft_of_one_log_are_a_fleet(tmp_path: Path) -> None:
-    """The places of both are topics of one answer.
+    """One answer has the places of both aircraft.
 
-    The page of the second shows its samples alone, without a note.
+    The page of the second one shows only its own samples, without a note.
     """
     with BagWriter(tmp_path) as bag:
         for name, east in (("uav1", 1.0), ("uav2", 2.0)):

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Control from the page without ROS.
+"""Test control from the page without ROS.
 
-Tested are who is refused, what is bounded, compare and set, undo, and the lease.
+The tests cover who is refused, what is bounded, compare and set, undo, and the lease.
 """
 
 import asyncio
@@ -31,7 +31,7 @@ ALL = ("aircraft", "controller", "guidance")
 
 
 class Desk:
-    """A control of a recorded flight, with its nodes in memory, at a time that a test sets."""
+    """The control of a recorded flight, with nodes in memory and a time that the test sets."""
 
     def __init__(
         self, run: Path, scenario: Scenario, *names: str, dry_run: bool = True, real: bool = False
@@ -50,7 +50,7 @@ class Desk:
     async def ask(
         self, do: str, key: str = KEY, lease: str | None = None, **request: Any
     ) -> dict[str, Any]:
-        """The answer to a request, a second after the one before."""
+        """Return the answer to a request, one second after the last one."""
         self.time += 1.0
         result = await self.control.answer(
             {"do": do, **request}, key, self.lease if lease is None else lease
@@ -59,7 +59,7 @@ class Desk:
         return result
 
     async def refused(self, do: str, **request: Any) -> tuple[int, str]:
-        """Status and sentence of a refusal."""
+        """Return the status and the sentence of a refusal."""
         with pytest.raises(RefusedError) as caught:
             await self.ask(do, **request)
         return int(caught.value.status), caught.value.sentence
@@ -105,7 +105,7 @@ async def test_gains_set_together_seen_in_log_and_undone(desk: Desk, osprey_gust
 
 
 async def test_set_after_foreign_change_refused(desk: Desk) -> None:
-    """A set after a change by a different program is refused."""
+    """Values cannot be set after another program has changed them."""
     digest = (await desk.ask("state"))["digest"]
     desk.nodes.values["controller"]["k_g"] *= 1.1
     status, sentence = await desk.refused("gains", digest=digest, values={"k_g": [1.0]})
@@ -119,7 +119,7 @@ async def test_set_after_foreign_change_refused(desk: Desk) -> None:
 
 
 async def test_invalid_gain_refused(desk: Desk, osprey_gust: Scenario) -> None:
-    """A gain beyond the range is refused, an unknown name, and a value that is no number."""
+    """A gain beyond the range, an unknown name and a value that is not a number are refused."""
     k_g = gains_of(osprey_gust.controller)["k_g"]
 
     digest = (await desk.ask("state"))["digest"]
@@ -159,7 +159,7 @@ async def test_one_page_controls_until_its_lease_ends(desk: Desk) -> None:
 
 
 async def test_commands_reach_guidance(desk: Desk) -> None:
-    """Targets, routes and services reach guidance, and refusals come back."""
+    """Targets, routes and services reach guidance, and its refusals come back."""
     await desk.ask("target", values={"heading": 1.5, "altitude": 60})
     await desk.ask("route", points=[[0, 0, 50], [500, 0, 60.5]])
     await desk.ask("hold")
@@ -233,7 +233,7 @@ def test_gains_of_bridge_that_sends_need_further_option(
 
 
 def test_bridge_engages_by_map_name(recorded: Path, osprey_gust: Scenario) -> None:
-    """The bridge disengages while a request to engage waits."""
+    """A request to engage can be withdrawn while it waits."""
 
     async def steps(desk: Desk) -> None:
         await desk.ask("state")
@@ -297,7 +297,7 @@ NOTHING_TO_DO = ("undo", "skip")  # 422: no change to undo, no further leg
 async def test_action_by_key_lease_rate_and_state(
     state: str, action: str, recorded: Path, osprey_gust: Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each cell of the table: who asks for which action in which state of the flight."""
+    """The table has a cell for who asks, for which action, in which state of the flight."""
     desk = Desk(
         recorded,
         osprey_gust,
@@ -340,7 +340,7 @@ async def test_action_by_key_lease_rate_and_state(
 
 
 async def post(server: Server, body: object, **headers: str) -> HTTPResponse:
-    """A request of the page, with some headers changed; one that is empty is left out."""
+    """Send a request of the page with some changed headers. An empty one is left out."""
     own = {
         TOKEN_HEADER: TOKEN,
         "Origin": f"http://127.0.0.1:{server.port}",

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The log of a flight over the Foxglove protocol, against a client of another library.
+"""Test the log of a flight over the Foxglove protocol, with a client of another library.
 
-The extra may be missing.
+The extra may not be installed.
 """
 
 import asyncio
@@ -54,7 +54,7 @@ def test_viewer_gets_messages_of_log_with_definitions(
             return dict(json.loads(await connection.read_message() or "{}"))
 
         async def take() -> bool:
-            """Receive once; False at the end of the connection."""
+            """Receive once, and return False at the end of the connection."""
             data = await connection.read_message()
             if isinstance(data, bytes) and data[0] == MESSAGE_DATA:
                 _, number, sent_ns = HEAD.unpack_from(data)

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The live page in a browser.
+"""Test the live page in a browser.
 
-A flight grows and is replayed. The signs of the scene, the states, hostile names, a phone and the
-dark scheme are tested.
+A flight grows and is replayed. The tests cover signs of the scene, states, hostile names, a phone
+and the dark scheme.
 """
 
 import math
@@ -47,7 +47,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 def colours_of(browser: Browser, selector: str) -> int:
-    """Number of different colours on a canvas."""
+    """Return the number of different colours on a canvas."""
     script = f"""(canvas => {{
         const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d', {{willReadFrequently: true}});
         copy.drawImage(canvas, 0, 0);
@@ -74,7 +74,7 @@ PIXELS = """((selector, name) => {
 
 
 def pixels_of(browser: Browser, selector: str, name: str) -> int:
-    """Number of pixels of a canvas that have nearly the colour of that name.
+    """Return the number of pixels of a canvas that nearly have a named colour.
 
     The middle of a line has it.
     """
@@ -194,9 +194,9 @@ def test_names_that_are_html_shown_as_text(browser: Browser, tmp_path: Path) -> 
 
 
 def seen(browser: Browser, expression: str) -> Any:
-    """An expression with scene.js as `m`, and `at`.
+    """Return the value of an expression with scene.js as `m`, and `at`.
 
-    `at` is the place on the screen of a body point of a pose, seen from behind.
+    `at` is the place on the screen of a point of the body in a pose, seen from behind.
     """
     at = """const at = (point, phi, theta, psi) => m.project(m.camera([-10, 0, -3], [10, 0, 3]),
         m.toWorld(m.rotation(phi, theta, psi), point), 500, 400, 400).slice(0, 2);"""
@@ -257,9 +257,9 @@ def test_horizon_moves_against_aircraft(page: Browser) -> None:
     """The horizon falls when the nose rises, and turns left in a roll to the right."""
 
     def sky(pose: str, x: float, y: float) -> bool:
-        """Whether a point of the instrument shows the sky.
+        """Return whether a point of the instrument shows the sky.
 
-        x and y are in fractions of its radius from its centre.
+        x and y are fractions of the radius, measured from the centre.
         """
         script = f"""import('./scene.js').then(m => {{
             const canvas = document.createElement('canvas');

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a pilot does on the live page.
+"""Test what a pilot does on the live page.
 
-The header, the map that takes targets, and the choice of charts are tested.
+The tests cover the header, the map that takes targets, and the choice of charts.
 """
 
 from collections.abc import Iterator
@@ -68,7 +68,7 @@ def wide(browser: Browser, width: int) -> None:
 
 
 def texts(browser: Browser, canvas: str) -> list[str]:
-    """What the next picture writes on a canvas."""
+    """Return the texts that the next picture writes on a canvas."""
     before = browser.run(DRAWN)
     browser.run("texts.length = 0; void dispatchEvent(new Event('resize'))")
     browser.wait_for(f"{DRAWN} > {before}")
@@ -120,7 +120,10 @@ def test_all_values_are_above_the_fold_of_a_small_laptop(browser: Browser, route
 
 
 def test_height_of_waypoints_at_one_place_is_written_once(browser: Browser, routed: Path) -> None:
-    """The waypoints of osprey_route are 0, 0, 30, 30 and 0 m high; the last is at the first."""
+    """The waypoints of osprey_route are 0, 0, 30, 30 and 0 m high.
+
+    The last one is at the place of the first.
+    """
     with shown(browser, routed):
         browser.run(TEXTS)
         browser.run("document.querySelector('[data-camera=map]').click()")
@@ -189,7 +192,7 @@ def test_click_on_the_map_sends_a_target_at_once(
 
 
 def written(run: Path, modes: np.ndarray, stamps: np.ndarray) -> Path:
-    """A log of ticks with a mode, y and a y_m that is 0 but for the last bits."""
+    """Return a log of ticks with a mode, y, and a y_m that is 0 except for its last bits."""
     y = np.sin(stamps / 1e9)
     values = np.column_stack([modes, y, 1e-33 * y])
     write_run(Tape({"internals": Signal(stamps, ("mode", "y.q", "y_m.q"), values)}), run, SCENARIO)
@@ -220,7 +223,7 @@ def test_failsafe_fills_the_header(browser: Browser, tmp_path: Path) -> None:
 
 
 def test_readouts_and_gaps(browser: Browser, tmp_path: Path) -> None:
-    """A number below the noise reads 0, both cursors are read out, and a gap is left blank."""
+    """A number below the noise reads 0, both cursors are read out, and a gap stays blank."""
     stamps = np.arange(4000, dtype=np.int64) * 10_000_000
     kept = (stamps < 10_000_000_000) | (stamps > 20_000_000_000)
     run = written(tmp_path / "run", np.ones(kept.sum()), stamps[kept])
