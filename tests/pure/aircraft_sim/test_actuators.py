@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Actuators and their faults against closed forms.
+"""Test actuators and their faults against closed forms.
 
-The flights have dead zones, lags, rate and position saturation.
+The actuators have dead zones, lags, and saturation of rate and position.
 """
 
 import math
@@ -130,9 +130,9 @@ def test_dead_zone_has_no_jump_and_never_reverses_command(
 
 
 def position_history(times_ms: range, command: float, **actuators: Any) -> FloatArray:
-    """Positions of the four actuators 10 ms after each of the given instants.
+    """Return the positions of the four actuators 10 ms after each of the given instants.
 
-    One command is for all four.
+    All four have the same command.
     """
     params = osprey(10.0, **actuators)
     state = plant.initial_state(params)
@@ -194,7 +194,7 @@ def test_lost_aileron_acts_like_zero_column_of_b() -> None:
 
 @pytest.mark.parametrize("part, thrust", [(0.5, 0.35), (0.0, 0.0), (1.0, 0.7), (-1.0, -0.7)])
 def test_weak_engine_gives_a_part_of_its_whole_thrust(part: float, thrust: float) -> None:
-    """0.5 in trim and 0.2 above it; without any effect it is an engine that is lost."""
+    """Thrust is 0.5 in trim, and the command adds 0.2. Without any effect, the engine is lost."""
     params = osprey(faults=[f"thrust weak 0 {part}"]).actuators
     _, mean = move(0.0, np.zeros(4), np.array([0.0, 0.2, 0.0, 0.0]), 0.01, params)
     assert 0.5 + mean[1] == approx(thrust, abs=1e-15)
@@ -214,9 +214,10 @@ def test_slow_surface_has_lag_of_fault_from_instant_on() -> None:
 
 
 def test_runaway_takes_travel_over_rate_to_its_stop_whatever_is_commanded() -> None:
-    """From 0.1 rad at 0.02 s to the lower stop of -0.3 rad at 2 rad/s.
+    """The elevator moves at 2 rad/s from 0.1 rad at 0.02 s to the lower stop of -0.3 rad.
 
-    It takes 0.4 / 2 = 0.2 s, behind any lag. The mean of a step of this motion is that of its ends.
+    This takes 0.4 / 2 = 0.2 s behind any lag. The mean over a step of this motion is the mean of
+    its ends.
     """
     params = osprey(
         lag=[0.05] * 4,
@@ -308,9 +309,9 @@ def test_scenario_without_actuators_integrates_command_to_last_bit() -> None:
 
 @pytest.mark.parametrize("every", [1, 2])
 def test_late_command_acts_as_that_command_given_later(every: int) -> None:
-    """It does to the last bit, also where every second sample is left out.
+    """A late command is equal to the last bit to the same command given later.
 
-    u is then held over two periods.
+    Every second sample may be left out. u is then held over two periods.
     """
     scenario = find_scenario("osprey_servo")
     periods = 3
@@ -332,9 +333,9 @@ def test_late_command_acts_as_that_command_given_later(every: int) -> None:
 def continuous(
     commands: list[float], tick: float, lag: float, rate: float, stop: float
 ) -> FloatArray:
-    """Integral of the position of the continuous actuator at the ends of the ticks.
+    """Return the integral of the continuous actuator's position at the ends of the ticks.
 
-    SciPy's integrator gives it.
+    It is from SciPy's integrator.
     """
 
     def rates(_: float, state: FloatArray, command: float) -> list[float]:
@@ -357,7 +358,7 @@ def continuous(
 
 
 def travelled(commands: list[float], tick: float, dt: float, params: Actuators) -> FloatArray:
-    """The same integral by mean positions over steps of dt."""
+    """Return the same integral from mean positions over steps of dt."""
     position = np.zeros(1)
     total = 0.0
     history = []
@@ -438,7 +439,7 @@ def servo() -> Scenario:
 
 @pytest.fixture(scope="module")
 def gusty(servo: Scenario) -> Tape:
-    """The whole flight, with gusts."""
+    """Return the whole flight, with gusts."""
     return simulate(servo)
 
 

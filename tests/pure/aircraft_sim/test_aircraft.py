@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated aircraft against exact solutions, independent integrators and its definition."""
+"""Test the simulated aircraft by exact solutions, independent integrators and its definition."""
 
 import math
 from functools import partial
@@ -34,7 +34,7 @@ def osprey(**gusts: dict[str, float]) -> Aircraft:
 def final_state(
     x: FloatArray, u: FloatArray, duration_ns: int, step_ns: int, aircraft: Aircraft
 ) -> FloatArray:
-    """State x after `duration_ns` with u held and ideal actuators."""
+    """Return the state x after `duration_ns` with a held u and ideal actuators."""
     params = aircraft_parameters().plant()._replace(aircraft=aircraft, step_ns=step_ns)
     return np.asarray(advance(0, AircraftState(x, np.zeros_like(u)), u, duration_ns, params).x)
 

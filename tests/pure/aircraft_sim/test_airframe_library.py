@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The airframe library against published modes.
+"""Test the airframe library against published modes.
 
 Remark 1 ("D = I for every model tried") is a table.
 """
@@ -33,7 +33,7 @@ NAMES = tuple(name for name in ALL if name not in SPLIT)
 
 
 class Published(NamedTuple):
-    """Properties by the signs and in the units of the source."""
+    """Properties with the signs and in the units of the source."""
 
     # A positive input may give a negative rate; outputs p, r or q, V (osprey q, V, p, r).
     D: tuple[float, ...]
@@ -153,9 +153,9 @@ def test_more_inputs_than_outputs_give_d_equal_to_one_through_the_pseudo_inverse
 
 
 def test_split_effectors_moved_together_are_those_of_the_osprey() -> None:
-    """Elevator, thrust, aileron and rudder are those of the twin and of the V-tail.
+    """Effectors that are split have the effects of the osprey's when they move together.
 
-    The geometry alone gives them.
+    They are those of the twin and of the V-tail, and follow from the geometry alone.
     """
     whole, twin, tail = (
         load_airframe(name).matrix_b() for name in ("osprey", "osprey_twin", "osprey_vtail")
@@ -173,7 +173,7 @@ def test_split_effectors_moved_together_are_those_of_the_osprey() -> None:
 def test_the_flying_wing_has_the_short_period_of_its_coefficients() -> None:
     """Z_alpha, M_alpha and M_q are by hand from the coefficients of Gryte et al. 2018 at 18 m/s.
 
-    See the source in the file.
+    The file names this source.
     """
     q_S = 0.5 * 1.225 * 18.0**2 * 0.75
     Z_alpha = -(q_S * 4.0203 + 3.459) / (3.364 * 18.0)
@@ -258,9 +258,9 @@ FIRST_EDITION = (
 
 
 def lateral_state_space(c: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
-    """Beard and McLain, Table 5.1, states v, p, r, phi.
+    """Return Beard and McLain's Table 5.1 as matrices, with the states v, p, r, phi.
 
-    The trim is from lift = weight and zero pitching moment.
+    In trim, lift equals weight, and the pitching moment is zero.
     """
     pressure = 0.5 * c["rho"] * c["V"] ** 2 * c["S"]
     lift = c["mass"] * c["g"] / pressure - c["CL0"]
@@ -310,9 +310,9 @@ def test_the_aerosondes_follow_from_their_published_coefficients(
 
 
 def toy(k: float) -> Airframe:
-    """y_dot = -y + z + u, z_dot = z + k u.
+    """Return y_dot = -y + z + u, z_dot = z + k u.
 
-    Holding y at zero takes u = -z, so the zero is at 1 - k.
+    If y is kept at zero, u is -z, so the zero is at 1 - k.
     """
     inputs = {"u": {"unit": "1", "positive": "more y"}}
     states = {"y": "1", "z": "1"}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An aircraft whose A, B and trim follow its airspeed.
+"""Test an aircraft whose A, B and trim follow its airspeed.
 
-At each speed it is the airframe of there.
+At each speed, it is the airframe at that speed.
 """
 
 import numpy as np
@@ -48,9 +48,10 @@ def test_small_motion_about_level_flight_is_that_of_the_airframe_of_the_speed(ra
 
 
 def test_slow_flight_needs_more_incidence_and_less_thrust() -> None:
-    """Lift of V^2 holds the weight.
+    """Lift grows with V^2 and equals the weight.
 
-    With A[alpha,V] = -2 g / V^2 the incidence of lift, alpha - alpha_0, grows with V^-2.
+    With A[alpha,V] = -2 g / V^2, the incidence alpha - alpha_0 that gives the lift is proportional
+    to V^-2.
     """
     (slow, at_slow), (fast, at_fast) = (
         level_flight(OSPREY, ratio, "thrust") for ratio in (0.8, 1.25)

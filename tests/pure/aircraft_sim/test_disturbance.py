@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gusts, biases, sines and inertial coupling: formulas, Assumption 2.
+"""Test gusts, biases, sines and inertial coupling: their formulas and Assumption 2.
 
-With amplitude 0 they have exactly no effect.
+With amplitude 0 they have no effect at all.
 """
 
 import math
@@ -39,7 +39,7 @@ V0 = 25.0
 
 
 def single(kind: Any, *values: float) -> Any:
-    """Arrays of one element each."""
+    """Return arrays of one element each."""
     return kind(*(np.array([value]) for value in values))
 
 
@@ -167,9 +167,9 @@ OUTSIDE: dict[str, dict[str, Any]] = {
 
 
 def largest(disturbed: dict[str, Any], rate: float, scenario: Scenario) -> FloatArray:
-    """The largest errors of q and r with the default law at a rate, mrad/s.
+    """Return the largest errors of q and r with the default law at a rate, mrad/s.
 
-    The flight takes 6 s without commands and gusts.
+    The flight lasts 6 s, without commands and gusts.
     """
     no_commands = scenario.vary(
         aircraft={"gusts": {}, "rate": 400.0, "step": 0.0025} | disturbed,
@@ -207,7 +207,7 @@ PQR = [5, 2, 6]  # indices of p, q, r in the state of the osprey
 
 
 def coupled(scale: float) -> Aircraft:
-    """The inertial coupling alone, without A, B and gravity."""
+    """Return the inertial coupling alone, without A, B and gravity."""
     whole = aircraft(inertial_coupling=scale)
     return whole._replace(A=0.0 * whole.A, B=0.0 * whole.B, gravity=0.0 * whole.gravity)
 
@@ -299,9 +299,9 @@ SECTIONS: dict[str, tuple[str, Any, Any]] = {  # section, off, on
 
 @pytest.fixture(scope="module")
 def baseline(osprey_gust: Scenario) -> Scenario:
-    """1.2 s of the default flight with servos, noise and two gusts.
+    """Return 1.2 s of the default flight with servos, noise and two gusts.
 
-    It is without the disturbances under test.
+    The disturbances under test are not in it.
     """
     slow = {"rate": 100.0, "step": 0.005}
     return osprey_gust.vary(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of the simulated aircraft that begin in flight.
+"""Test faults of the simulated aircraft that begin in flight.
 
 They are compared with an aircraft that has them in its scenario.
 """

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Aircraft of JSBSim as flight dynamics models.
+"""Test aircraft of JSBSim as flight dynamics models.
 
-Tested are trim, signs, wind, repeatability, process isolation, and every failure.
+The tests cover trim, signs, wind, repeatability, isolation in a process, and every failure.
 """
 
 import ctypes
@@ -62,7 +62,7 @@ def cessna(wind_model: WindModel = NO_WIND, condition: FlightCondition = CESSNA)
 
 
 def fly(model: JsbsimModel, u: FloatArray, duration: float) -> dict[str, FloatArray]:
-    """Truth by channel, one row a step, with u held."""
+    """Return truth by channel, one row for each step, with a held u."""
     rows = [model.truth(0)]
     for k in range(round(duration * 1e9) // STEP_NS):
         model.advance(k * STEP_NS, u, STEP_NS)
@@ -181,10 +181,10 @@ def thrusts(model: JsbsimModel) -> list[float]:
     ids=["a piston with a propeller", "two turbines"],
 )
 def test_lost_engines_give_no_thrust(condition: FlightCondition) -> None:
-    """The thrust is JSBSim's own.
+    """The thrust is computed by JSBSim.
 
-    At throttle 0 alone an engine of the 737 idles, with 1.1 kN. A propeller turned by the wind
-    brakes. The flight goes on: an engine that stops for another reason ends it.
+    At throttle 0, an engine of the 737 idles with 1.1 kN. A propeller that the wind turns brakes.
+    The flight goes on, although an engine that stops for another reason would end it.
     """
     model = cessna(condition=condition)
     model.retune(0, with_lost_throttle(0.5))

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Foreign models of JSBSim: the files that they name as JSBSim finds them.
+"""Test user models of JSBSim: the files that they name are found as JSBSim finds them.
 
-What they may not do to the user's host is tested too.
+The tests also cover what such a model may not do to the user's host.
 """
 
 import io
@@ -30,7 +30,7 @@ OUTPUT = '<output name="{}" type="CSV" rate="10"><simulation> ON </simulation></
 
 
 def write_model(folder: Path, line: str = "", text: str = CESSNA) -> Path:
-    """A c172p with a line before the end of its model."""
+    """Write a c172p with an additional line at the end of its model."""
     folder.mkdir(parents=True, exist_ok=True)
     model = folder / "plane.xml"
     model.write_text(text.replace("</fdm_config>", f"{line}\n</fdm_config>"))
@@ -38,7 +38,7 @@ def write_model(folder: Path, line: str = "", text: str = CESSNA) -> Path:
 
 
 def loaded(model: Path) -> jsbsim.FGFDMExec:
-    """The model, loaded for a flight in this process and run for a moment."""
+    """Load the model for a flight in this process, and run it for a moment."""
     fdm, _ = trimmed_fdm(
         FlightCondition(str(model), 46.3, 1219.2, 10_000_000), (0.0,) * 6 + (0.0, 0.0)
     )
@@ -49,7 +49,7 @@ def loaded(model: Path) -> jsbsim.FGFDMExec:
 
 
 def refused(model: Path) -> str:
-    """The sentence that refuses a model."""
+    """Return the sentence that refuses a model."""
     with pytest.raises(FlightEnded) as error:
         loaded(model)
     return str(error.value)
@@ -57,7 +57,7 @@ def refused(model: Path) -> str:
 
 @pytest.fixture
 def table(tmp_path: Path) -> Path:
-    """A file of the user."""
+    """Return a file of the user."""
     path = tmp_path / "table.csv"
     path.write_text("precious data of the user\n")
     return path
@@ -132,9 +132,9 @@ def test_model_opens_no_socket(line: str, tmp_path: Path) -> None:
 def test_property_that_writes_a_file_is_refused(
     name: str, place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """JSBSim writes NAME_lin.sce and initfile.TIME.xml where a model sets them.
+    """JSBSim writes NAME_lin.sce and initfile.TIME.xml if a model sets these properties.
 
-    NAME of the model may be a path.
+    The NAME of the model may be a path.
     """
     monkeypatch.chdir(tmp_path)
     switch = f'<property value="1">simulation/{name}</property>'
@@ -159,7 +159,7 @@ def test_property_that_writes_a_file_is_refused(
 
 
 def test_child_model_is_refused(tmp_path: Path) -> None:
-    """A child is loaded with its own outputs."""
+    """A child model would be loaded with its own outputs."""
     model = write_model(tmp_path / "plane", '<child name="c172p"><location unit="IN"/></child>')
     assert "found a child model, expected none" in refused(model)
 
@@ -200,7 +200,7 @@ def test_link_to_a_file_elsewhere_is_refused(linked: str, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("folder", ["Engines", "engine"])
 def test_engine_in_a_subfolder_is_the_users(folder: str, tmp_path: Path) -> None:
-    """The package has an engine of the same name, of 160 hp."""
+    """The package has an engine with the same name, of 160 hp."""
     text = CESSNA.replace('engine file="eng_io320"', 'engine file="180/eng_io320"')
     model = write_model(tmp_path / "plane", text=text)
     own = model.parent / folder / "180" / "eng_io320.xml"
@@ -230,14 +230,14 @@ def test_engine_that_an_included_propulsion_names_is_in_the_archive(tmp_path: Pa
 
 
 def test_engine_directly_beside_the_model_is_not_that_of_jsbsim(tmp_path: Path) -> None:
-    """JSBSim looks for an engine in the folders of engines alone."""
+    """JSBSim looks for an engine only in the folders of engines."""
     model = write_model(tmp_path / "plane")
     (model.parent / "eng_io320.xml").write_text(ENGINE.replace("160", "111"))
     assert model_files(model).members["engine/eng_io320.xml"].decode() == ENGINE
 
 
 def loads(root: Path, aircraft: Path) -> int | None:
-    """The number of engines of a model that JSBSim itself loads, else None."""
+    """Return the number of engines of a model, or None if JSBSim does not load it."""
     jsbsim.set_logger(jsbsim_trim._Log())
     fdm = jsbsim.FGFDMExec(str(root))
     fdm.set_debug_level(0)
@@ -255,7 +255,7 @@ def loads(root: Path, aircraft: Path) -> int | None:
 def test_copy_of_each_aircraft_of_the_package_loads_as_the_aircraft(
     name: str, tmp_path: Path
 ) -> None:
-    """With nothing but the files that `model_files` finds."""
+    """The copy has only the files that `model_files` finds."""
     path = PACKAGE / "aircraft" / name / f"{name}.xml"
     expected = loads(PACKAGE, path)
     if expected is not None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The linearisation of an aircraft of JSBSim, against JSBSim's own and against its flight."""
+"""Test the linearisation of an aircraft of JSBSim against JSBSim's own and against its flight."""
 
 import jsbsim
 import numpy as np
@@ -49,7 +49,7 @@ def linear(request: pytest.FixtureRequest) -> Linearization:
 
 
 def jacobian(linear: Linearization) -> FloatArray:
-    """A with gravity."""
+    """Return A with gravity."""
     return linear.airframe.matrix_a() + linear.airframe.matrix_gravity()
 
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Models of JSBSim of the user's own.
+"""Test JSBSim models of the user.
 
-They are found by path, with engines beside them or in a root, electric engines too.
+They are found by path, with engines beside them or in a root, and electric engines are possible.
 """
 
 import shutil
@@ -49,7 +49,7 @@ SECTION: dict[str, Any] = {"speed": 46.3, "altitude": 1219.2, "rate": 200.0, "st
 def write_model(
     folder: Path, engine: str, name: str = "plane.xml", engines: str = "Engines"
 ) -> Path:
-    """A c172p with an engine of the package, whose file is copied beside the model."""
+    """Write a c172p with an engine of the package, whose file is copied beside the model."""
     (folder / engines).mkdir(parents=True)
     (folder / engines / "own_engine.xml").write_bytes(
         (PACKAGE / "engine" / f"{engine}.xml").read_bytes()
@@ -60,15 +60,15 @@ def write_model(
 
 @pytest.fixture(scope="module")
 def electric(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The model of a c172p with an electric engine; its name is not that of its folder."""
+    """Return the model of a c172p with an electric engine and another name than its folder."""
     return write_model(tmp_path_factory.mktemp("my planes"), "electric147kW")
 
 
 @pytest.fixture
 def external(tmp_path: Path) -> Path:
-    """A c172p whose flight control reads the elevator in rad, half of the opposite.
+    """Return a c172p whose flight control reads the elevator in rad, with half of the opposite.
 
-    It reads ailerons by two properties.
+    It reads the ailerons from two properties.
     """
     declared = "".join(
         f'<property value="0.0">fcs/cmd{name}</property>'
@@ -129,9 +129,9 @@ def test_command_without_effect_is_named_with_what_the_model_reads(external: Pat
 
 
 def test_aircraft_flies_by_the_properties_that_the_user_names(external: Path) -> None:
-    """The same command as that of the c172p: -2 rad^-1 x -0.5 rad.
+    """The command is the same as the c172p's: -2 rad^-1 x -0.5 rad.
 
-    Half of the aileron goes to each side.
+    Each side gets half of the aileron.
     """
     commands = {
         "elevator": "fcs/cmdElev_ext_rad=-0.5",
@@ -154,7 +154,7 @@ def test_aircraft_flies_by_the_properties_that_the_user_names(external: Path) ->
 
 
 def test_aircraft_without_rudder_has_three_inputs() -> None:
-    """As the aircraft with its rudder at trim; r is still measured."""
+    """The aircraft flies as with its rudder at trim, and r is still measured."""
     section = aircraft_parameters(**SECTION, airframe=f"{PREFIX}c172p", commands={"rudder": "none"})
     assert [*section.channels().inputs] == ["elevator", "throttle", "aileron"]
     assert [*section.channels().outputs] == ["q", "V", "p", "r"]
@@ -170,7 +170,7 @@ def test_aircraft_without_rudder_has_three_inputs() -> None:
 
 @pytest.mark.parametrize("effect", [0.0, 0.1])
 def test_rudder_that_moves_nothing_is_seen(effect: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The linear aircraft has none then, and r is not commanded."""
+    """A rudder without an effect is not an input of the linear aircraft, and r is not commanded."""
 
     def response(_: FlightCondition, __: object, name: str, size: float) -> FloatArray:
         rows = np.zeros((20, len(AIRPLANE_STATES)))
@@ -218,7 +218,7 @@ def test_named_property_that_the_model_lacks_is_refused(external: Path) -> None:
 
 
 def throttle_step(airframe: str) -> FloatArray:
-    """V, deviation from trim, m/s, every step of two seconds at 0.1 more throttle."""
+    """Return V as the deviation from trim, m/s, for two seconds with 0.1 more throttle."""
     none = np.zeros(len(AXES))
     condition = FlightCondition(require_aircraft(airframe), 46.3, 1219.2, STEP_NS)
     model = JsbsimModel(condition, Actuators(), WindModel(Gusts(none, none, none + 1.0), None))
@@ -361,7 +361,7 @@ def test_missing_engine_named_with_folders_searched(electric: Path, tmp_path: Pa
 def test_nearest_trim_is_the_first_neighbour_that_trims(monkeypatch: pytest.MonkeyPatch) -> None:
     """The aircraft needs 27 m/s and flies up to 4,000 m.
 
-    A tenth faster is nearer than a third, and half of the altitude is tried where no speed helps.
+    A tenth more speed is nearer than a third. If no speed helps, half of the altitude is tried.
     """
     seconds = []
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a lost effector takes from an aircraft in trim.
+"""Test what an aircraft in trim loses with an effector.
 
-It takes the thrust of an engine or a rotor, and nothing of a surface.
+It loses the thrust of an engine or a rotor, and nothing of a surface.
 """
 
 import math
@@ -40,7 +40,7 @@ def configured(airframe: str, lost: str, *others: str, **actuators: Any) -> Airc
 
 
 def accelerations(airframe: str, lost: str) -> dict[str, float]:
-    """x_dot of the aircraft in trim by state, SI, with an effector lost.
+    """Return x_dot of the aircraft in trim by state, SI, with an effector lost.
 
     All commands are at trim.
     """
@@ -54,9 +54,10 @@ def accelerations(airframe: str, lost: str) -> dict[str, float]:
 def test_twin_yaws_toward_its_dead_engine_by_the_arm_times_the_remaining_thrust(
     lost: str, toward: float
 ) -> None:
-    """The figures are by hand, of the sources of the file.
+    """The yaw follows by hand from the sources of the file.
 
-    3 m/s^2 by 13.5 kg in trim, half of it an engine, at 0.2 m, J_z 1.759 kg m^2.
+    The thrust in trim is 3 m/s^2 times 13.5 kg, half of it from each engine, at an arm of 0.2 m.
+    J_z is 1.759 kg m^2.
     """
     thrust = 0.5 * 0.06 * 100.0 * 13.5 / 2.0
     result = accelerations("osprey_twin", lost)
@@ -70,7 +71,7 @@ def test_twin_yaws_toward_its_dead_engine_by_the_arm_times_the_remaining_thrust(
 def test_without_its_only_engine_the_osprey_slows_down_by_its_thrust(name: str) -> None:
     """The thrust is half of 0.6 times the weight, as the airframe file says.
 
-    0.06 m/s^2 per % rounds it by 2 %.
+    The 0.06 m/s^2 per % of the file are rounded by 2 %.
     """
     result = accelerations(name, "thrust")
     assert result["V"] == approx(-0.5 * 0.6 * GRAVITY, rel=0.02)
@@ -78,9 +79,9 @@ def test_without_its_only_engine_the_osprey_slows_down_by_its_thrust(name: str) 
 
 
 def test_thrust_of_flying_wing_in_trim_is_its_drag() -> None:
-    """Drag of V^2 at constant alpha: m V0 abs(A[V,V]) / 2.
+    """At constant alpha, drag grows with V^2 and is m V0 abs(A[V,V]) / 2.
 
-    The column is that of the file in which no thrust has a part.
+    The thrust is not part of this column of the file.
     """
     result = accelerations("x8_elevons", "thrust")
     assert result["V"] == approx(-0.1142 * 18.0 / 2.0, rel=2e-3)
@@ -88,10 +89,10 @@ def test_thrust_of_flying_wing_in_trim_is_its_drag() -> None:
 
 @pytest.mark.parametrize("number", range(1, 7))
 def test_hexarotor_loses_a_sixth_of_its_lift_and_the_moments_of_the_rotor(number: int) -> None:
-    """Newton and Euler with the geometry in the file.
+    """The values follow from Newton and Euler with the geometry of the file.
 
-    It is 1.5 kg, 0.275 m, 0.02, 0.02, 0.035 kg m^2, 0.016 m of torque a newton. The trim thrust of
-    the file has three figures, 2.45 of 2.4525 N.
+    The mass is 1.5 kg, the arm 0.275 m, the inertia 0.02, 0.02, 0.035 kg m^2, and a rotor has 0.016
+    m of torque per newton. The trim thrust of the file has three digits, 2.45 of 2.4525 N.
     """
     thrust = 1.5 * GRAVITY / 6.0
     angle = math.radians(30.0 + 60.0 * (number - 1))  # from the nose to the right
@@ -126,9 +127,9 @@ def positions(params: AircraftConfig, commands: list[float]) -> FloatArray:
 def test_no_command_and_no_other_fault_gives_a_lost_engine_thrust(
     airframe: str, effector: str
 ) -> None:
-    """Its position is that of no thrust in each step.
+    """In each step, the lost engine is at the position without thrust.
 
-    It is behind lag, rate and stops, and beside the other faults.
+    This is so whatever its lag, rate and stops are, and also with the other faults.
     """
     frame = load_airframe(airframe)
     place = list(frame.inputs).index(effector)
@@ -158,7 +159,7 @@ def test_no_command_and_no_other_fault_gives_a_lost_engine_thrust(
 
 
 def refusal(airframe: str, *faults: str, **actuators: Any) -> str:
-    """The sentence that refuses these faults; empty for possible ones."""
+    """Return the sentence that refuses these faults, or "" if they are possible."""
     values = {"airframe": airframe, "rate": 100.0, "step": 0.01}
     try:
         section = actuators | {"faults": list(faults)}
@@ -169,7 +170,7 @@ def refusal(airframe: str, *faults: str, **actuators: Any) -> str:
 
 
 def test_loss_of_an_unknown_thrust_is_refused_with_the_way_out() -> None:
-    """An input that is no angle may be a thrust: where it gives none is not guessed."""
+    """An input that is no angle may be a thrust, and the value without thrust is not guessed."""
     unknown = (
         "faults[0]: found thrust {} at 5 s, expected no_thrust of thrust in the airframe "
         "navion_longitudinal: its value without thrust, from trim; 0 for a surface"

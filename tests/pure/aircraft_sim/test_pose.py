@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Pose of the simulated aircraft, Euler's kinematics and the steady wind."""
+"""Test the pose of the simulated aircraft, Euler's kinematics, and the steady wind."""
 
 import math
 from typing import Any, cast
@@ -75,7 +75,7 @@ def test_a_start_elsewhere_turns_and_moves_the_flight() -> None:
 
 
 def euler_rates(x: dict[str, float]) -> dict[str, float]:
-    """Derivatives of equation (1) for the osprey with kinematics euler, without input."""
+    """Return the derivatives of equation (1) for the osprey with kinematics euler and no input."""
     airframe, aircraft = aircraft_parameters(kinematics="euler").load()
     state = np.array([x.get(name, 0.0) for name in airframe.states])
     return dict(
@@ -127,7 +127,7 @@ def test_kinematics_and_wind_that_aircraft_cannot_have_refused(
 
 
 def test_pose_of_airframe_agrees_with_another_integrator() -> None:
-    """From an aileron step on, SciPy's integrator gives heading and position.
+    """Heading and position after an aileron step agree with SciPy's integrator.
 
     The rotations are SciPy's, too.
     """
@@ -219,7 +219,7 @@ def test_pose_of_jsbsim_is_absolute_and_consistent() -> None:
 
 
 def test_place_of_jsbsim_is_that_of_own_latitude_and_longitude() -> None:
-    """60 s in still air, with a turn after an aileron pulse."""
+    """The flight lasts 60 s in still air, with a turn after an aileron pulse."""
     aircraft = C172P.vary(aircraft=QUIET).aircraft
     simulator = Simulator(aircraft)
     model = cast(JsbsimModel, simulator._model)  # its properties are not in the pose
@@ -248,9 +248,9 @@ POOR = {
 
 
 def test_poor_pose_is_late_rare_and_off_as_specified() -> None:
-    """The flight takes 100 s.
+    """In 100 s there are 500 samples.
 
-    The noise of 500 samples has a standard deviation within 4 / sqrt(2 N) of that specified.
+    The standard deviation of their noise must be within 4 / sqrt(2 N) of the specified one.
     """
     simulator = Simulator(aircraft_parameters(pose=POOR, rate=100.0))
     truth = {}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Draws by counter, held against NumPy's Philox at the same counter."""
+"""Test draws by counter against NumPy's Philox with the same counter."""
 
 from threading import Barrier, Thread
 
@@ -17,7 +17,10 @@ def draw(number: int, stream: int, seed: int) -> FloatArray:
 
 
 def test_draw_depends_on_seed_stream_and_number_alone() -> None:
-    """Five numbers leave a part of the last four numbers of Philox over, for no later draw."""
+    """With five numbers, some of the last four numbers of Philox are left.
+
+    No later draw may use them.
+    """
     for number, stream, seed in [(7, NOISE, 1), (7, DRIFT, 1), (3, NOISE, 2), (7, NOISE, 1)]:
         assert_array_equal(
             generator(number, stream, seed).standard_normal(5), draw(number, stream, seed)

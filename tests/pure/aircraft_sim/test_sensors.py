@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sensor noise, bias, drift, quantisation, dropout and transport delay.
+"""Test noise, bias, drift, quantisation, dropout and transport delay of sensors.
 
-Tested are statistics, repeatability, effect on a flight.
+The tests cover statistics, repeatability, and the effect on a flight.
 """
 
 from typing import Any
@@ -41,7 +41,7 @@ def sensors(std: list[float], delay_ms: int = 0, dropout: float = 0.0, seed: int
 
 @pytest.fixture(scope="module")
 def samples() -> FloatArray:
-    """COUNT samples of four channels of standard deviation 1."""
+    """Return COUNT samples of four channels with a standard deviation of 1."""
     return np.array([noise(k, sensors([1.0] * 4)) for k in range(COUNT)])
 
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Dryden turbulence against the published spectra.
+"""Test Dryden turbulence against the published spectra.
 
-Tested are lengths, intensities, filters, ensemble statistics, repeatability.
+The tests cover lengths, intensities, filters, ensemble statistics and repeatability.
 """
 
 import math
@@ -38,7 +38,7 @@ TURBULENCE = {"altitude": 30.0, "wind": 7.7}
 
 
 def spectrum(omega: FloatArray, axis: int, model: Dryden) -> FloatArray:
-    """The published spectrum, one-sided in omega, m^2/s^2 per rad/s.
+    """Return the published spectrum, one-sided in omega, m^2/s^2 per rad/s.
 
     Source: MIL-F-8785C, 3.7.1.2, in Omega = omega / V0.
     """
@@ -53,16 +53,16 @@ def spectrum(omega: FloatArray, axis: int, model: Dryden) -> FloatArray:
 
 
 def correlation(lag: FloatArray, axis: int, model: Dryden) -> FloatArray:
-    """Dryden's correlation at a distance d = V0 lag.
+    """Return Dryden's correlation at a distance d = V0 lag.
 
-    It is sigma^2 exp(-d/L) along the flight, (1 - d/2L) times that across it.
+    It is sigma^2 exp(-d/L) along the flight, and (1 - d/2L) times this across it.
     """
     d = V0 * np.abs(lag) / model.length[axis]
     return np.asarray(model.sigma[axis] ** 2 * np.exp(-d) * (1.0 if axis == 0 else 1.0 - d / 2.0))
 
 
 def ensemble(model: Dryden, dt: float, seeds: int, steps: int) -> FloatArray:
-    """Winds of many seeds at multiples of dt, shape (3, seeds, steps)."""
+    """Return the winds of many seeds at multiples of dt, (3, seeds, steps)."""
     params = [filters(model, V0, dt, ALL, seed) for seed in range(seeds)]
     z = np.array([turbulence.initial_state(filter_params) for filter_params in params]).T
     numbers = np.array([turbulence.normals(0, steps, each) for each in params])
@@ -103,7 +103,7 @@ def test_lengths_and_intensities_are_those_published(
 
 
 def continuous(model: Dryden) -> tuple[FloatArray, FloatArray]:
-    """F and G of the docstring's z_dot = F z + G n."""
+    """Return F and G of the docstring's z_dot = F z + G n."""
     a = V0 / model.length
     F = np.zeros((5, 5))
     G = np.zeros((5, 3))

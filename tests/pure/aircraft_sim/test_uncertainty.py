@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Uncertain aircraft of Monte Carlo campaigns.
+"""Test the uncertain aircraft of Monte Carlo campaigns.
 
-Tested are the distribution around the published airframe and repeatability by seed.
+The tests cover the distribution around the published airframe, and repeatability by seed.
 """
 
 from pathlib import Path
@@ -28,7 +28,7 @@ OSPREY = load_airframe("osprey")
 
 
 def relative_change(sampled: FloatArray, published: FloatArray) -> FloatArray:
-    """The factor d of each entry that is not zero."""
+    """Return the factor d of each entry that is not zero."""
     return np.asarray(sampled[published != 0.0] / published[published != 0.0] - 1.0)
 
 
@@ -47,9 +47,9 @@ def test_entries_are_uniform_and_independent() -> None:
 
 
 def test_normal_deviations_have_limit_at_three_standard_deviations() -> None:
-    """Of 2000 samples the standard deviation is known to 1/sqrt(4000) = 1.6 %.
+    """With 2000 samples, the standard deviation is known to 1/sqrt(4000) = 1.6 %.
 
-    The limit is four of these.
+    The limit is four times this.
     """
     A, _ = nominal_and_sampled(OSPREY, 0.3, 2000, seed=3, spread=Spread(distribution="normal"))
     q = OSPREY.index("q")

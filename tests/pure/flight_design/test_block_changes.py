@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Deviations from the blocks of a log, beside sums by hand and regressions whose truth is known."""
+"""Test the deviations that the blocks of a log give.
+
+They are compared with sums by hand, and with regressions whose truth is known.
+"""
 
 from types import SimpleNamespace
 from typing import Any
@@ -28,7 +31,7 @@ PLACES = np.repeat(np.arange(4), 10)  # blocks of 40 samples
 def regression(seed: int, colour: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return J, (2, samples), the errors of a regression, and those of theta.
 
-    The share `colour` of the variance of the errors is the same for all samples of a block.
+    The share `colour` of the variance of the errors is common to all samples of a block.
     """
     rng = np.random.default_rng(seed)
     J = np.vstack([np.ones(40), rng.normal(size=40) + rng.normal(size=4)[PLACES]])
@@ -47,9 +50,10 @@ def inverted(hessian: FloatArray) -> FloatArray:
 
 
 def test_deviation_of_a_mean_is_that_of_the_means_of_its_blocks_by_students_t() -> None:
-    """The four blocks have the means 1, -1, 2 and -2: their variance is 10 / 3, that of e 5 / 6.
+    """The deviation of a mean is found from the means of the blocks by Student's t.
 
-    t(0.93) of three degrees of freedom is 1.9950, and 1.4758 in a normal distribution.
+    The four blocks have the means 1, -1, 2 and -2. Their variance is 10 / 3, and the one of e is 5
+    / 6. t(0.93) is 1.9950 with three degrees of freedom, and 1.4758 in a normal distribution.
     """
     means = np.array([1.0, -1.0, 2.0, -2.0])
     J = np.ones((1, 40))
@@ -82,7 +86,7 @@ def test_entry_that_moves_nothing_keeps_the_variance_of_its_prior() -> None:
 def test_few_blocks_cover_a_true_value_as_often_as_deviations_should(
     colour: float, share: float
 ) -> None:
-    """Of normal errors 14 % are above 1.476 deviations, and 28 % or more by a plain sum."""
+    """With normal errors, 14 % are above 1.476 deviations, and 28 % or more by a plain sum."""
     beyond = []
     for seed in range(2000):
         J, e, off = regression(seed, colour)
@@ -97,7 +101,7 @@ def test_few_blocks_cover_a_true_value_as_often_as_deviations_should(
 
 
 class Line(Search):
-    """A search whose innovations are linear in theta. They differ with the level of the wind."""
+    """A search whose innovations are linear in theta, and depend on the level of the wind."""
 
     def __init__(self, J: FloatArray, e: FloatArray) -> None:
         self.prior = np.array([0.3, 0.3])
@@ -114,7 +118,7 @@ class Line(Search):
 
 
 def test_change_with_gusts_in_every_span_is_that_of_a_fit_with_them() -> None:
-    """The level of the gusts is that of most spans with gusts: 12, not the calm 0."""
+    """The level is the one that most spans with gusts have. This is 12, and not the calm 0."""
     J, e, _ = regression(3, colour=0.5)
     e += 0.3 * J[1]
     theta = np.array([0.1, -0.2])

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a channel map to gains without a model.
+"""Test the way from a channel map to gains without a model.
 
-The steps are an experiment, the response, and a scenario that flies the aircraft.
+Its steps are an experiment, the response, and a scenario that flies the aircraft.
 """
 
 from dataclasses import replace
@@ -55,9 +55,9 @@ OSPREY = load_airframe("osprey")
 
 
 def aircraft() -> AircraftConfig:
-    """The osprey with servos and noise, and y late by DELAY.
+    """Return the osprey with servos and noise, and with y late by DELAY.
 
-    The map does not know so much of its aircraft.
+    The map knows none of this.
     """
     servo = find_scenario("osprey_servo")
     sensors = servo.aircraft.sensors.model_dump() | {"delay": DELAY}
@@ -67,9 +67,9 @@ def aircraft() -> AircraftConfig:
 
 
 def loaded(folder: Path, name: str, airframe: str, scenario: str) -> Scenario:
-    """A scenario and its airframe as files, as the command writes them.
+    """Return a scenario whose airframe file is written as the command writes it.
 
-    The real aircraft stands in the airframe's place.
+    The real aircraft replaces the airframe.
     """
     (folder / f"{name}_airframe.yaml").write_text(airframe)
     (folder / f"{name}.yaml").write_text(scenario)
@@ -77,7 +77,7 @@ def loaded(folder: Path, name: str, airframe: str, scenario: str) -> Scenario:
 
 
 class Identified(NamedTuple):
-    """What a flight of the experiment told."""
+    """What a flight of the experiment showed."""
 
     response: Response
     models: list[ChannelModel | None]
@@ -151,7 +151,7 @@ def test_gains_from_log_of_the_board_are_for_the_delay_of_the_link_too(
 
 @pytest.fixture(scope="module")
 def of_second_order(tmp_path_factory: pytest.TempPathFactory) -> tuple[IdentifiedChannels, Flyable]:
-    """Channels that are known, and their flight.
+    """Return known channels and their flight.
 
     q is stiff, r and V are damped, and p has y_dot = Omega u.
     """
@@ -216,9 +216,9 @@ def test_channel_of_which_nothing_is_certain_refused(identified: Identified) -> 
 
 
 class Known(NamedTuple):
-    """y'' + damping y' + stiffness y = Omega v', v with a lag, y late by a delay.
+    """A channel y'' + damping y' + stiffness y = Omega v', by default of first order.
 
-    By default it is a channel of first order.
+    v has a lag, and y is late by a delay.
     """
 
     Omega: float = 80.0
@@ -228,7 +228,7 @@ class Known(NamedTuple):
     delay: float = 0.08  # s
 
     def measured(self, noise: float) -> tuple[Signal, Signal]:
-        """Output and input of an experiment, in steps of 1 ms, with noise."""
+        """Return output and input of an experiment in steps of 1 ms, with noise."""
         params = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller
         t = np.arange(0.0, 14.0, 0.001)
         arrays = params.law_params()
@@ -293,14 +293,13 @@ def test_fast_oscillation_of_light_airplane_found() -> None:
 
 
 def thrust_with_phugoid(amplitude: float) -> Tape:
-    """V by thrust in Lanchester's phugoid, behind a servo of 0.1 s, and the climb of the pose.
+    """Return V by thrust in Lanchester's phugoid, and the climb of the pose.
 
-    The noise is that of an airspeed sensor.
+    The thrust is behind a servo of 0.1 s, and the noise is the one of an airspeed sensor.
 
-    V_dot = -0.5 V + 14 v - g gamma,
-        gamma_dot = 2 g V / SPEED^2: weight is lift at SPEED, and lift grows with its square.
-    Source: F. W. Lanchester, "Aerodonetics", 1908; undamped, its frequency is sqrt(2) g / SPEED,
-    here 0.09 Hz.
+    V_dot = -0.5 V + 14 v - g gamma and gamma_dot = 2 g V / SPEED^2, because the weight is the lift
+    at SPEED, and lift grows with its square. Without damping, the frequency is sqrt(2) g / SPEED,
+    here 0.09 Hz. Source: F. W. Lanchester, "Aerodonetics", 1908.
     """
     params = experiment(MAP, SPEED, amplitude, "airframe.yaml").controller
     arrays = params.law_params()
@@ -399,7 +398,7 @@ HOVER_MAP = load_map(str(QUADROTOR / "map.yaml"))
 
 
 def test_quadrotor_identified_and_flown_without_a_name_of_a_fixed_wing(tmp_path: Path) -> None:
-    """The airframe of the example by an experiment without an airspeed.
+    """The airframe of the example is found by an experiment without an airspeed.
 
     Its channels are q, p, r and a vertical speed.
     """

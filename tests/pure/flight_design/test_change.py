@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The test for a loss of effect in a flight with damage.
+"""Test how a loss of effect is found in a flight with damage.
 
-Channels of a damaged part keep the initial law.
+The channels of a damaged part keep the initial law.
 """
 
 from functools import cache
@@ -32,9 +32,9 @@ FAULTS = ["elevator lost 0", "aileron weak 0"]
 
 @pytest.fixture(scope="module")
 def damaged() -> tuple[FlightData, Airframe]:
-    """A flight without elevator and with half of the aileron, and the aircraft before.
+    """Return a flight without elevator and with half of the aileron, and the undamaged aircraft.
 
-    8 s in light turbulence, with a bank.
+    The flight lasts 8 s in light turbulence, with a bank.
     """
     scenario = find_scenario("osprey_servo").vary(
         aircraft={
@@ -73,7 +73,10 @@ def test_lost_elevator_is_dead_and_weak_aileron_changed(
 def test_loss_within_what_a_model_may_err_is_no_change(
     damaged: tuple[FlightData, Airframe], model: float, *, found: bool
 ) -> None:
-    """Half of the effect beside a model that has most of the loss: 17 and 31 % are left."""
+    """Half of the effect is left, and the model has most of the loss.
+
+    Compared with the model, 17 and 31 % are missing.
+    """
     recorded, airframe = damaged
     B = airframe.matrix_b() * np.array([1.0, 1.0, model, 1.0])
     flown = airframe.with_matrices(airframe.matrix_a(), B, np.ones((len(B), len(airframe.gusts))))
@@ -83,7 +86,7 @@ def test_loss_within_what_a_model_may_err_is_no_change(
 
 @cache
 def cessna() -> Airframe:
-    """JSBSim's own linearisation of the c172p."""
+    """Return JSBSim's own linearisation of the c172p."""
     return linearize(FlightCondition("c172p", 46.3, 1219.2, nanoseconds(0.005))).airframe
 
 
@@ -91,9 +94,9 @@ def cessna() -> Airframe:
 def test_surface_of_jsbsim_is_dead_beside_the_disturbances_of_its_learner(
     fault: str, dead: str
 ) -> None:
-    """The model is JSBSim's own linearisation, and the air moderate turbulence.
+    """The model is JSBSim's own linearisation, and the turbulence is moderate.
 
-    The disturbances that stand for what a sketch leaves out hide no lost surface.
+    The disturbances that stand for the errors of a sketch must not hide a lost surface.
     """
     linear = cessna()
     scenario = find_scenario("jsbsim_c172p").vary(
@@ -121,7 +124,10 @@ def test_surface_of_jsbsim_is_dead_beside_the_disturbances_of_its_learner(
     "fault, dead", [("aileron hard_over 1 upper", "aileron"), ("aileron weak 1 -0.5", "")]
 )
 def test_surface_jammed_off_centre_is_dead_and_a_reversed_one_is_not(fault: str, dead: str) -> None:
-    """At 5 deg, while u goes to its stop of 30 deg, as a reversed effect of their ratio would."""
+    """A surface jammed at 5 deg is dead, although u goes to its stop of 30 deg.
+
+    A reversed effect with the ratio of these angles looks alike, and is not dead.
+    """
     jam, stop = np.radians(5.0), np.radians(30.0)
     stops = {"lower": [-stop] * 4, "upper": [stop, stop, jam if dead else stop, stop]}
     scenario = find_scenario("osprey_servo").vary(
@@ -145,7 +151,10 @@ def test_surface_jammed_off_centre_is_dead_and_a_reversed_one_is_not(fault: str,
 
 
 def test_reversed_aileron_is_no_dead_one(damaged: tuple[FlightData, Airframe]) -> None:
-    """A model with the aileron the other way round: it has -100 % of that effect, and moves p."""
+    """The model has the aileron the wrong way round.
+
+    So the aileron has -100 % of the model's effect, and it moves p.
+    """
     recorded, airframe = damaged
     B = airframe.matrix_b() * np.array([1.0, 1.0, -0.5, 1.0])
     flown = airframe.with_matrices(airframe.matrix_a(), B, np.ones((len(B), len(airframe.gusts))))
@@ -166,9 +175,9 @@ def law_of(controller: RiseDiConfig) -> tuple[np.ndarray, ...]:
 
 
 def test_channels_keep_the_law_of_the_start() -> None:
-    """Gains from e, its integral and the sign to u are those of each.
+    """Each channel has the gains from e, its integral and the sign to u of its own law.
 
-    u_o and u_ff are 0 in the others.
+    u_o and u_ff are 0 in the channels of the initial law.
     """
     start, designed = (
         find_scenario(name).rise_di() for name in ("osprey_servo", "osprey_observer")

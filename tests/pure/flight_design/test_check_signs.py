@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di check`: a map with a wrong sign is refused before anything is sent."""
+"""Test `rise-di check`: a map with a wrong sign is refused before anything is sent."""
 
 import json
 from dataclasses import replace
@@ -146,7 +146,10 @@ EXCITATION = {  # half a minute in all
 
 @pytest.fixture(scope="module")
 def experiment() -> Tape:
-    """The osprey in an experiment, y stamped when it arrives and u when it is computed."""
+    """Return the osprey in an experiment.
+
+    y is stamped when it arrives, and u when it is computed.
+    """
     base = find_scenario("osprey_servo")
     shared = {
         key: getattr(base.controller, key)
@@ -178,7 +181,7 @@ def response(tape: Tape, excitation: Signal | None) -> Response:
 
 
 def turned(signal: Signal, name: str) -> Signal:
-    """A signal with one channel of the opposite sign, as a wrong row of a map would record it."""
+    """Return a signal with one channel reversed, as a wrong row of a map would record it."""
     return Signal(
         signal.stamp_ns,
         signal.names,

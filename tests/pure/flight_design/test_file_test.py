@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner tests the deviations of an airframe file against the record of a flight.
+"""Test how the learner tests the deviations of an airframe file against a flight.
 
-The files are the osprey's, with entries of A off by factors exp(0.6 N), where 29 % are believed.
+The files are the osprey's, with entries of A multiplied by factors exp(0.6 N), where 29 % are
+believed.
 """
 
 from functools import cache, partial
@@ -46,7 +47,10 @@ NAMES = ("p", "r")
 
 
 def rough_file(seed: int) -> Airframe:
-    """Return the osprey with each entry of A off by a factor of its own, but for the kinematics."""
+    """Return the osprey with each entry of A multiplied by a random factor.
+
+    The kinematics stay.
+    """
     rng = np.random.default_rng(seed)
     A = OSPREY.matrix_a()
     factors = np.exp(ROUGH * rng.standard_normal(A.shape))
@@ -60,7 +64,7 @@ def rough_file(seed: int) -> Airframe:
 
 @cache
 def learned(seed: int | None, uncertainty: float = 0.3) -> tuple[Identification, Unknown]:
-    """Identify a flight in moderate turbulence about a rough file, or about the osprey's own."""
+    """Identify a flight in moderate turbulence, from a rough file or from the osprey's own."""
     recorded = innovation_filters.recording(flight("turbulence", uncertainty), OSPREY)
     file = OSPREY if seed is None else rough_file(seed)
     identify = partial(identify_model, recorded, file, ACTUATORS, bound_count=AT_BOUND)
@@ -128,7 +132,10 @@ def lateral(*errors: float, whiteness: float = 1.0, aileron: float = 0.0) -> Ide
 
 
 def test_chi_square_of_the_errors_has_its_limit_at_a_probability_of_a_thousandth() -> None:
-    """Chi-square of 3.9 degrees: three entries, two effects, less what the record leaves open."""
+    """Chi-square has 3.9 degrees of freedom.
+
+    There are three entries and two effects, and part of them is left open by the record.
+    """
     degrees = 3.0 * (1.0 - (0.05 / PRIOR) ** 2) + 2.0 * (1.0 - (0.02 / PRIOR) ** 2)
     limit = PRIOR * np.sqrt(stats.chi2.isf(1e-3, degrees) / 3.0)
     assert not is_contradicted(lateral(*[0.99 * limit] * 3), KNOWN)
@@ -136,7 +143,7 @@ def test_chi_square_of_the_errors_has_its_limit_at_a_probability_of_a_thousandth
 
 
 def test_errors_of_a_rough_file_count_as_logarithms_of_factors() -> None:
-    """An entry at a third of its value is as far off as one at three times its value."""
+    """An entry at a third of its value is as far off as an entry at three times its value."""
     rough = Unknown(error=0.5, effect=0.5)
     for factor in (1.0 / 3.0, 3.0):
         model = lateral(*[factor - 1.0] * 4)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The commands of a first flight, by one rule for every aircraft, and the text of the scenario."""
+"""Test the commands of a first flight, which follow one rule, and the text of the scenario."""
 
 import itertools
 import math
@@ -127,7 +127,7 @@ def test_text_reads_back_with_units_beside_the_keys() -> None:
 
 
 def test_scenario_without_gains_has_those_of_the_scenario_with_gains(tmp_path: Path) -> None:
-    """Selected are the same: none of the gains of a section counts."""
+    """The selection does not depend on the gains in the section."""
     example = REPOSITORY / "examples" / "arduplane" / "rates.yaml"
     text = example.read_text("utf-8").replace("examples/arduplane", str(example.parent))
     keys = "|".join([*GAINS, "sign", "softening"])

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: N802 - D and U are the paper's names
-"""Gains: Theorem 1 worked by hand, and the engineering procedure on the osprey.
+"""Test gains: Theorem 1 by hand, and the engineering procedure on the osprey.
 
-Further tests are of refusals, and of the predicted delay margin.
+Further tests are about refusals, and about the predicted delay margin.
 """
 
 import json
@@ -59,9 +59,9 @@ HAND = Bounds(
 
 @pytest.fixture(scope="module")
 def osprey() -> Study:
-    """The osprey and twenty airframes around it along the manoeuvre of the default scenario.
+    """Return the osprey and twenty airframes around it along the manoeuvre of the default scenario.
 
-    Its gusts blow.
+    The manoeuvre includes the gusts.
     """
     scenario = find_scenario("osprey_gust")
     return ideal_control.study_airframe(
@@ -71,7 +71,7 @@ def osprey() -> Study:
 
 @pytest.fixture(scope="module")
 def selected(osprey: Study) -> selection.Selection:
-    """Both gain sets for the osprey behind servos."""
+    """Return both gain sets for the osprey behind servos."""
     return selection.gain_sets(osprey, SERVOS)
 
 
@@ -232,7 +232,7 @@ def osprey_channels(
     inputs: tuple[str, ...] = ("elevator", "thrust", "aileron", "rudder"),
     flipped: tuple[str, ...] = (),
 ) -> tuple[FloatArray, ChannelPairing]:
-    """Omega of the osprey with its inputs in some order, some of them counted the other way."""
+    """Return Omega of the osprey with its inputs in some order, some of them reversed."""
     columns = [list(AIRFRAME.inputs).index(name) for name in inputs]
     signs = np.array([-1.0 if name in flipped else 1.0 for name in inputs])
     return (AIRFRAME.matrix_c() @ AIRFRAME.matrix_b())[:, columns] * signs, ChannelPairing(
@@ -287,9 +287,9 @@ def osprey_loop(
     K: tuple[float, ...] = (18.0, 2.0, 18.0, 9.0),
     Lambda: tuple[float, ...] = (5.0, 0.5, 5.0, 3.0),
 ) -> tuple[LinearPlant, LinearLaw]:
-    """The osprey with gains in the order q, V, p, r.
+    """Return the osprey with gains in the order q, V, p, r.
 
-    `factor`: width of the softened sign in total lags.
+    `factor` is the width of the softened sign in total lags.
     """
     A = AIRFRAME.matrix_a() + AIRFRAME.matrix_gravity()
     B = AIRFRAME.matrix_b()
@@ -329,12 +329,10 @@ def scalar(omega: float, T_eps: float) -> LawParams:
 
 
 def grows(params: LawParams, omega: float, lag: float, delay: float) -> bool:
-    """Whether y_dot = omega u_a behind a servo and a delay diverges under `law.step`.
+    """Return whether y_dot = omega u_a behind a servo and a delay diverges under `law.step`.
 
-    u is delayed by whole quarter milliseconds.
-
-    Between these instants plant and servo are solved exactly. e stays within 1e-3 eps, inside the
-    width of the sign.
+    u is delayed by whole quarter milliseconds, and between these instants plant and servo are
+    solved exactly. e stays within 1e-3 eps, inside the width of the sign.
     """
     dt, ticks, period = 0.00025, 40, 0.01
     fading = math.exp(-dt / lag)
@@ -429,7 +427,7 @@ def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
 
 
 def test_check_of_the_default_flight_succeeds_by_its_loop_and_tells_the_theorem_apart() -> None:
-    """No gains behind servos meet (29) and step 2, and the loop is as good as its margins."""
+    """No gains behind servos meet (29) and step 2, and still the loop has its margins."""
     words = ("gains", "check", "osprey", "--samples", "4")
     told = rise_di(*words)
     assert told.exit_code == 0, told.output
@@ -445,7 +443,7 @@ def test_check_of_the_default_flight_succeeds_by_its_loop_and_tells_the_theorem_
 def test_check_fails_by_a_loop_without_its_margins_although_the_theorem_holds(
     tmp_path: Path,
 ) -> None:
-    """Behind the servos of the osprey the gains of Theorem 1 make the loop grow."""
+    """Behind the servos of the osprey, the gains of Theorem 1 make the loop unstable."""
     gains, flight = tmp_path / "gains.yaml", tmp_path / "theorem_gains.yaml"
     ideal = ("--lag", "0", "--delay", "0", "--theorem", "--accept")
     written = rise_di("gains", "select", "osprey", "--samples", "2", *ideal, "--write", str(gains))
@@ -459,11 +457,10 @@ def test_check_fails_by_a_loop_without_its_margins_although_the_theorem_holds(
 
 
 def test_y_that_is_slower_than_law_counts_as_delay_and_may_be_three_messages_old() -> None:
-    """1.5 periods of 1 / 9.9 Hz, the airspeed of PX4, less 1.5 of 1 / 50 Hz are 121.515 ms.
+    """A slow y adds 1.5 periods to the delay, and its age limit is three periods.
 
-    A faster y changes nothing.
-
-    An age limit of 0.1 s would be over before the next message of such a y.
+    1.5 periods of 1 / 9.9 Hz, the airspeed of PX4, minus 1.5 of 1 / 50 Hz are 121.515 ms. A faster
+    y changes nothing. An age limit of 0.1 s would pass before the next message of such a y.
     """
     servo = find_scenario("osprey_servo").vary(flight={"duration": 1.0})
     slow, fast = (
@@ -497,9 +494,9 @@ def test_an_invalid_loop_is_refused(option: str, value: str, expected: str) -> N
 
 
 def test_command_shows_the_airframe_of_a_file(tmp_path: Path) -> None:
-    """The poles are those that Nelson prints for the Navion.
+    """The poles are those that Nelson prints for the Navion on p. 158.
 
-    They are -2.51 +-2.59j and -0.017 +-0.213j, p. 158.
+    They are -2.51 +-2.59j and -0.017 +-0.213j.
     """
     path = tmp_path / "own.yaml"
     path.write_text(
@@ -520,7 +517,7 @@ def test_gains_for_actuators_without_lag_say_from_which_delay_on_they_chatter() 
     fastest = {"rate": 1000.0, "step": 0.0005, "gusts": {}, "sensors": {}}
 
     def reversals(delay: float) -> float:
-        """Part of the steps of thrust that go back on the step before."""
+        """Return the fraction of the steps of thrust that reverse the step before."""
         actuators = {"lag": lags, "delay": delay}
         flight = simulate(
             find_scenario("osprey_servo", duration=2.5).vary(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The ideal control along a manoeuvre, and of an airframe whose hidden motion overflows."""
+"""Test the ideal control along a manoeuvre, also for an airframe whose hidden motion overflows."""
 
 import warnings
 
@@ -20,7 +20,7 @@ OSPREY = load_airframe("osprey")
 
 
 def with_alpha_pole(pole: float) -> Airframe:
-    """The osprey with another damping of alpha, whose zero is then near this pole, 1/s."""
+    """Return the osprey with another damping of alpha, which moves a zero close to `pole`, 1/s."""
     alpha = list(OSPREY.states).index("alpha")
     rows = [list(row) for row in OSPREY.A]
     rows[alpha][alpha] = pole

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification of an aircraft of JSBSim from end to end."""
+"""Test the identification of an aircraft of JSBSim from end to end."""
 
 import math
 import subprocess
@@ -38,7 +38,7 @@ Progress = Callable[[str], None]
 
 @pytest.fixture(scope="module")
 def cessna() -> IdentifiedAircraft:
-    """The c172p, with 20 s of each of its three flights of a minute."""
+    """Return the c172p, identified with 20 s of each of its three flights of a minute."""
 
     def fly_briefly(scenario: Scenario, progress: Progress) -> dict[str, ManoeuvreResult]:
         return fly_all(scenario.vary(flight={"duration": 20.0}), progress)
@@ -75,7 +75,7 @@ def test_margins_are_those_of_the_linear_aircraft(cessna: IdentifiedAircraft) ->
 def test_aircraft_whose_sideslip_diverges_has_gains(monkeypatch: pytest.MonkeyPatch) -> None:
     # sideslip of the f15 grows while p and r are held, outside Assumption 3: guidance flies it
     def calm(scenario: Scenario, progress: Progress) -> dict[str, ManoeuvreResult]:
-        """20 s of the first of the three flights of a minute."""
+        """Return 20 s of the first of the three flights of a minute."""
         brief = scenario.vary(flight={"duration": 20.0}, aircraft={"gusts": {}})
         return {"calm": manoeuvre_result(simulate(brief))}
 
@@ -132,7 +132,7 @@ def test_guidance_turns_and_climbs(cessna: IdentifiedAircraft) -> None:
 
 
 def rise_di(*arguments: str) -> Result:
-    """`rise-di identify jsbsim` in this process."""
+    """Run `rise-di identify jsbsim` in this process."""
     return invoke("identify", "jsbsim", *arguments)
 
 
@@ -157,7 +157,7 @@ def test_airframe_that_is_none_of_jsbsim_refused_with_one_sentence(
 
 
 def test_aircraft_that_does_not_trim_gives_one_sentence(tmp_path: Path) -> None:
-    """In a process of its own: JSBSim itself prints nothing either."""
+    """The command runs in its own process, to show that JSBSim itself prints nothing either."""
     words = [
         sys.executable,
         "-m",

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in the air: a flight that learns beside the law alone, and its replay.
+"""Test learning in the air: a flight that learns, compared with the law alone, and its replay.
 
-Proposals that are wrong, damage, and the fallback.
+Further tests are about wrong proposals, damage and the fallback.
 """
 
 import copy
@@ -82,7 +82,10 @@ NAMES = ("q", "V", "p", "r")
 
 
 def scenario(**changed: Any) -> Scenario:
-    """osprey_learn at 100 Hz, 25 s, with a model of 11 s that 7 s more have to prove."""
+    """Return osprey_learn at 100 Hz for 25 s.
+
+    A model is identified after 11 s, and 7 s more must confirm it.
+    """
     return find_scenario("osprey_learn").vary(
         flight={"duration": END},
         aircraft={"rate": 100.0, "step": 0.005},
@@ -113,7 +116,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 
 
 class Taught(NamedTuple):
-    """What `rise-di learn` makes of the log of that flight."""
+    """What `rise-di learn` makes from the log of this flight."""
 
     output: str
     model: Path
@@ -131,7 +134,7 @@ def taught(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> Taught:
 
 @cache
 def maker(text: str) -> Learn:
-    """What makes the learners of a scenario: they share the design for the rough model."""
+    """Return what makes the learners of a scenario. They share the design for the rough model."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "scenario.yaml"
         path.write_text(text)
@@ -147,18 +150,18 @@ def made_learner(chosen: Scenario) -> Learner:
 
 
 def found(*parts: Part) -> Any:
-    """An identification with these parts."""
+    """Return an identification with these parts."""
     return SimpleNamespace(parts=parts, remarks=(), airframe=load_airframe("osprey"))
 
 
 def record_rest(made: Learner) -> None:
-    """10 s at rest, with the initial law."""
+    """Record 10 s at rest with the initial law."""
     for k in range(1001):
         made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
 
 
 def error(tape: Tape, first: float, last: float) -> FloatArray:
-    """True rms error of q, V, p, r between two flight times, s."""
+    """Return the true rms error of q, V, p, r between two flight times, s."""
     truth = tape["truth"]
     y_m = tape["y_m"]
     within = (tape.time("y_m") >= first) & (tape.time("y_m") < last)
@@ -168,7 +171,7 @@ def error(tape: Tape, first: float, last: float) -> FloatArray:
 
 
 def plant_of(airframe: Airframe, controller: RiseDiConfig) -> LinearPlant:
-    """An airframe in the order of a controller; gravity is in A."""
+    """Return an airframe in the order of a controller, with gravity in A."""
     rows = [airframe.outputs.index(name) for name in controller.outputs]
     columns = [list(airframe.inputs).index(name) for name in controller.inputs]
     A = airframe.matrix_a() + airframe.matrix_gravity()
@@ -182,10 +185,10 @@ class Fixed:
         self._proposals = list(proposals)
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
-        """Nothing is learned."""
+        """Learn nothing."""
 
     def propose(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
-        """The next one."""
+        """Return the next given proposal."""
         return LearnerResult(self._proposals.pop(0), "given")
 
 
@@ -221,9 +224,9 @@ def test_learned_model_lowers_errors_without_jump_of_u(flown: Flown) -> None:
 
 
 def test_feedforward_goes_on_in_the_turn_that_was_commanded_before_the_switch(flown: Flown) -> None:
-    """The model flies in a turn from 18 s on.
+    """The model flies from 18 s on, which is during a turn.
 
-    The reference is a flight in which it flew before the turn, too.
+    The reference is a flight in which it already flew before the turn.
     """
     model = scenario().rise_di()
     for change in parameter_changes(flown.run, "/controller", RiseDiConfig.model_fields):
@@ -256,7 +259,7 @@ def test_log_teaches_what_flight_taught_and_model_starts_next_flight(
 
 
 def test_log_has_the_guarantee_of_the_model_that_flies(flown: Flown) -> None:
-    """Corners of the box at its size are stable, by the exact loop of each aircraft."""
+    """Corners of the box at the logged size are stable, by the exact loop of each aircraft."""
     run, _, made = flown
     tape = read_run(run).tape
     rows = tape["learned"]
@@ -294,7 +297,7 @@ def test_log_has_the_guarantee_of_the_model_that_flies(flown: Flown) -> None:
 def test_certificate_of_the_learned_model_is_proved_and_an_altered_one_is_refused(
     flown: Flown, taught: Taught, tmp_path: Path
 ) -> None:
-    """Its loop is the one that the log names, and its constants are those of an export."""
+    """The log names the loop of the certificate, and its constants are those of an export."""
     rows = read_run(flown.run).tape["learned"]
     within = f"{np.floor(10.0 * rows[GUARANTEE[1]][1]) / 10.0:.1f} stated deviations of the model"
     assert f"stable for every aircraft within {within}" in taught.output
@@ -332,9 +335,9 @@ def test_page_says_within_which_deviations_the_last_model_is_stable(
 
 
 def test_log_teaches_with_other_settings(flown: Flown, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The flight has other parameters than what this learner proposes.
+    """The flight has other parameters than the ones this learner proposes.
 
-    The learner knows no refusal, and identifies once a window.
+    The learner knows no refusal, and identifies once per window.
     """
     proven = flown.learner.identification
     assert proven is not None
@@ -440,7 +443,10 @@ def test_identification_is_due_where_last_proposal_does_not_fly(
 
 
 def test_the_rough_model_flies_until_it_fell_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Designed for a model that errs, beside parts that are learned; then the initial law."""
+    """A rough model is designed for errors, and flies together with learned parts.
+
+    After a fallback, the initial law flies.
+    """
     made = made_learner(scenario())
     start = scenario().rise_di()
     rough = made.propose(start.digest()).controller
@@ -479,7 +485,10 @@ def test_the_rough_model_flies_until_it_fell_back(monkeypatch: pytest.MonkeyPatc
 def test_first_model_about_a_sketch_waits_for_later_seconds(
     advantage: float, flies: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """0: no model was there to test. The limit is 1.645 standard deviations, 5 % by chance."""
+    """An advantage of 0 means that there was no model to test.
+
+    The limit is 1.645 standard deviations, which chance exceeds in 5 % of cases.
+    """
     made = learner_that_finds(lateral()._replace(advantage=advantage), monkeypatch)
     made._is_sketch = True
     assert (made.propose(0).controller is not None) is flies
@@ -489,7 +498,10 @@ def test_first_model_about_a_sketch_waits_for_later_seconds(
 def test_refused_part_goes_back_to_the_file_that_predicts_better(
     advantage: float, is_back: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beyond 1.645 standard deviations, 5 % by chance; else the model of before stays."""
+    """The file must predict better by 1.645 standard deviations, 5 % by chance.
+
+    Otherwise the last model stays.
+    """
     made = learner_that_finds(lateral(), monkeypatch)
     first = made.propose(0)
     assert first.controller is not None
@@ -523,7 +535,10 @@ def test_advantage_has_the_probability_of_the_t_test_of_the_spans(begin: int) ->
 
 
 def test_entry_that_the_record_shows_at_its_bound_is_refused() -> None:
-    """One that hardly shows, with half of its deviation before or more, may lie there."""
+    """An entry that the record hardly shows may be at its bound.
+
+    Such an entry has at least half of its deviation before the flight.
+    """
     hidden = Entry("B", "p", "rudder", 1.0, -0.6, 0.2, 1.0)
     assert reason_against_airframe([hidden], "osprey", allowed=1) is None
     shown = hidden._replace(deviation=0.06)
@@ -636,7 +651,7 @@ WEAK_AILERON = Change(("p", "r"), 20.0, {"aileron": 0.5, "rudder": 1.0}, "")
 
 
 def learned_part(monkeypatch: pytest.MonkeyPatch, change: Change) -> tuple[Learner, int]:
-    """A learner whose p and r are learned and then change, and the digest of what flies."""
+    """Return a learner whose p and r are learned and then change, and the digest of what flies."""
     made = learner_that_finds(lateral(), monkeypatch)
     proposed = made.propose(0).controller
     assert proposed is not None
@@ -672,7 +687,10 @@ def test_output_with_a_whole_input_keeps_the_design_for_the_file(
 
 
 def test_part_without_elevator_or_without_the_file_flies_by_the_law() -> None:
-    """The observer of V presupposes the pitch; a design for the file flies only if it is one."""
+    """The observer of V needs a controlled pitch.
+
+    A design for the file may fly only if there is one.
+    """
     start = scenario().rise_di()
     dead: dict[tuple[str, ...], str] = {("q", "V"): "elevator", ("p", "r"): "aileron"}
     assert by_law_of_start(start, dead, has_file=True) == {"q", "V", "p"}
@@ -684,7 +702,7 @@ def test_part_without_elevator_or_without_the_file_flies_by_the_law() -> None:
 def test_part_without_an_input_states_the_margin_of_its_own_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Output r flies by the initial law, with another delay margin than the design has."""
+    """Output r flies by the initial law, which has another delay margin than the design."""
     made, flown = learned_part(monkeypatch, DEAD_RUDDER)
     proposed = made.propose(flown).controller
     assert proposed is not None
@@ -744,7 +762,7 @@ def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
 def test_part_with_coloured_innovations_is_refused_from_the_limit_on(
     whiteness: float, refused: bool
 ) -> None:
-    """The limit is 3: a factor of 1.2 beyond it is refused as well."""
+    """The limit is 3, and a model above it is refused, even by a factor of 1.2."""
     refusal = reason_against_innovations(lateral(whiteness=whiteness))
     assert (refusal is not None) is refused
     assert not refused or str(refusal) == (
@@ -763,7 +781,7 @@ rudder 20 % less."""
 
 
 def lateral(*, whiteness: float = 1.0, latest: float = 0.0) -> Part:
-    """The part of p and r as identified."""
+    """Return the part of p and r as identified."""
     before = Prediction(np.ones(2), np.full(2, 9.0), 1.0)
     after = Prediction(np.ones(2), np.array([1.0, whiteness]), 2.0)
     inputs = ("aileron", "rudder")
@@ -771,7 +789,7 @@ def lateral(*, whiteness: float = 1.0, latest: float = 0.0) -> Part:
 
 
 def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch, **learn: Any) -> Learner:
-    """A learner with a record of 10 s, whose search finds a part."""
+    """Return a learner with a record of 10 s, whose search finds a part."""
     made = made_learner(scenario(learn={"updates": [10.0]} | learn))
     monkeypatch.setattr(design_learner, "identify_model", lambda *_, **__: found(part))
     record_rest(made)
@@ -781,7 +799,10 @@ def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch, **learn: Any
 def test_guidance_gets_effects_less_two_deviations_of_what_was_learned(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """B exp(-2 s) times the limit of 0.523599 rad, with s relative to the value that was found."""
+    """The effect is B exp(-2 s) times the limit of 0.523599 rad.
+
+    s is relative to the value that was found.
+    """
     proposed = learner_that_finds(lateral(), monkeypatch).propose(0).controller
     assert proposed is not None
     least = dict(
@@ -826,9 +847,9 @@ def test_delay_margin_counts_the_delay_that_was_found(
 
 
 def test_learned_part_keeps_the_margin_of_the_file_and_the_other_part_its_gains() -> None:
-    """An elevator with 1.4 of its effect makes the loop of the file faster.
+    """With 1.4 of its effect, the elevator makes the loop of the file faster.
 
-    It keeps less than the 30 ms that it was designed for.
+    The loop then has less than the 30 ms that it was designed for.
     """
     start = scenario().rise_di()
     plain = start.model_copy(update={"learn": None})
@@ -909,7 +930,10 @@ def test_margin_that_is_asked_for_flies_where_that_of_the_file_has_no_design(
 def test_late_thrust_costs_the_elevator_no_margin(
     latest: tuple[float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The loop of V is slow: thrust may be 60 ms late where all inputs may be 30 ms late."""
+    """A late thrust does not reduce the margin of the elevator.
+
+    The loop of V is slow. Thrust may be 60 ms late, while all inputs together may be 30 ms late.
+    """
     entry = Entry("B", "q", "elevator", 56.15, 0.1, 0.01, 56.15)
     part = lateral()._replace(
         inputs=("elevator", "thrust"), outputs=("q", "V"), entries=(entry, THRUST), latest=latest
@@ -930,7 +954,7 @@ def test_late_thrust_costs_the_elevator_no_margin(
 def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_law_alone() -> None:
     """No file says that u is 40 ms late.
 
-    With the margin of the start alone the loop is unstable from the first model on.
+    With the margin of the initial design, the loop would be unstable from the first model on.
     """
     actuators = scenario().aircraft.actuators.model_dump() | {"delay": 0.04}
     learn = {"updates": [11.0, 16.0, 21.0], "latency": 0.0, "check": 20.0}
@@ -985,7 +1009,7 @@ def test_damage_counts_by_its_gain_beside_a_fallback_and_not_in_an_oscillation(
     told: list[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """In a q oscillation of 2.2 Hz a healthy engine had no effect by this test."""
+    """In an oscillation of q of 2.2 Hz, the test had found a healthy engine to be dead."""
     made = made_learner(scenario(learn={"updates": [10.0]}))
     monkeypatch.setattr(design_learner, "change_test", Mock(return_value=(change,)))
     if is_learned:
@@ -1002,7 +1026,7 @@ def test_damage_counts_by_its_gain_beside_a_fallback_and_not_in_an_oscillation(
 def test_input_without_effect_in_two_tests_in_a_row_is_dead(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """In one lateral gust of 10 min a healthy rudder had a gain of 47, and 2 s later none."""
+    """In one lateral gust of 10 min, a healthy rudder had a gain of 47, and 2 s later none."""
     made = made_learner(scenario(learn={"updates": [10.0]}))
     made._known = {("p", "r"): Known({}, {}, (0.0, 0.0))}
     noise = np.random.default_rng(1).normal(size=(RECORDED, 4))
@@ -1044,9 +1068,9 @@ def test_flight_without_learner_is_refused() -> None:
 
 
 def test_law_with_wrong_model_falls_back_and_replay_is_equal() -> None:
-    """A model without the delay of the aircraft, and a feedback five times too strong.
+    """The model does not have the delay of the aircraft, and the feedback is five times too strong.
 
-    The model alone is certified.
+    Only the model is certified.
     """
     margin = {"observer": scenario().rise_di().model_dump()["observer"] | {"margin": 0.0}}
     late = scenario(learn={"updates": [6.0], "check": 10.0, "latency": 0.0}, **margin).vary(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The table of what refuses the section `learn`, beside the code that refuses."""
+"""Test that the page's table of what refuses the section `learn` agrees with the code."""
 
 import re
 from collections.abc import Callable
@@ -24,7 +24,7 @@ PAGE = REPOSITORY / "docs" / "learning.md"
 
 
 def learning() -> dict[str, Any]:
-    """The section learn of a scenario."""
+    """Return the section `learn` of a scenario."""
     section = find_scenario("osprey_learn").rise_di().learn
     assert section is not None
     return section.model_dump()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The response of a linear loop to wind and noise, beside closed forms of a loop of first order."""
+"""Test the response of a linear loop to wind and noise, against closed forms of first order."""
 
 import math
 
@@ -24,7 +24,10 @@ ONE = np.ones((1, 1))
 
 
 def response(sigma: float = 0.0, noise: float = 0.0, gust: float = 0.0) -> AirResponse:
-    """y_dot = u + w, u = -GAIN (y + v), with turbulence of 2 s and a gust of 5 s."""
+    """Return the response of y_dot = u + w with u = -GAIN (y + v).
+
+    The turbulence has a time of 2 s, and the gust lasts 5 s.
+    """
     law = LinearLaw(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), -GAIN * ONE)
     loop = LoopTiming(np.zeros(1), 0.0, PERIOD)
     air = Air(
@@ -70,7 +73,10 @@ def test_error_in_a_gust_is_that_of_a_fine_integration() -> None:
     "speed, peak, length", [(25.0, 12.32, 15.0), (10.0, 11.33, 9.1), (250.0, 17.07, 106.7)]
 )
 def test_gust_is_that_of_the_certification(speed: float, peak: float, length: float) -> None:
-    """CS 25.341 (a): 17.07 m/s (H / 350 ft)^(1/6), H from 30 to 350 ft."""
+    """The gust is the one of CS 25.341 (a).
+
+    It has 17.07 m/s (H / 350 ft)^(1/6), for H from 30 to 350 ft.
+    """
     found, duration = discrete_gust(speed)
     assert found == approx(peak, rel=1e-3)
     assert duration * speed / 2.0 == approx(length)

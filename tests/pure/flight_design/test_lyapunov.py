@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: N802 - V1, V2, P, K are the paper's names
-"""The theorem's Lyapunov functions along flights of the law as it is sampled.
+"""Test the Lyapunov functions of the theorem along flights of the sampled law.
 
-In continuous time V2_dot = -z'Qz exactly, so V2 falls if `decay_matrix` is positive definite, for
-any beta. beta determines P: P stays above zero, and V2 bounds e and r, only if (29), (30) hold.
+In continuous time V2_dot = -z'Qz exactly, so V2 falls for any beta if `decay_matrix` is positive
+definite. beta determines P. Only if (29) and (30) are met does P stay above zero, and does V2 bound
+e and r.
 """
 
 from dataclasses import replace
@@ -51,7 +52,7 @@ def fly_example(
     beta_factor: float = 1.0,
     sign: Sign | None = None,
 ) -> tuple[Example, LawParams, Evidence]:
-    """The example with gains of its own, or with these."""
+    """Fly the example with its own gains, or with these."""
     case = example(dt, duration)
     params = case.params
     params = params._replace(
@@ -71,7 +72,7 @@ def fly_example(
 def osprey(
     rate: float, beta_factor: float = 1.0, duration: float = 12.0
 ) -> tuple[Scenario, KnownPlant, Evidence]:
-    """The default scenario at another rate of the law.
+    """Return the default scenario at another rate of the law.
 
     Both gusts are in its first twelve seconds.
     """
@@ -93,12 +94,12 @@ def osprey(
 
 
 def tail(signal: np.ndarray[Any, Any], t: np.ndarray[Any, Any], after: float) -> float:
-    """The largest absolute value past an instant."""
+    """Return the largest absolute value after an instant."""
     return float(np.max(np.abs(signal[t > after])))
 
 
 def largest_rise(signal: FloatArray) -> float:
-    """max_(j<k) (s_k - s_j), 0 if the signal, (N,), never rises."""
+    """Return max_(j<k) (s_k - s_j), or 0 if the signal, (N,), never rises."""
     return float(np.max(signal - np.minimum.accumulate(signal)))
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification from a log.
+"""Test the identification from a log.
 
 The tests fly aircraft whose A and B are known, and systems whose innovations are known.
 """
@@ -74,7 +74,7 @@ and that with rotary gusts.
 
 
 def servo(air: str, uncertainty: float, duration: float = DURATION, **reference: Any) -> Scenario:
-    """osprey_servo at 100 Hz, with an uncertain aircraft."""
+    """Return osprey_servo at 100 Hz with an uncertain aircraft."""
     uncertainty_of_aircraft = {"A": uncertainty, "B": uncertainty, "seed": 7, "number": 2}
     return find_scenario("osprey_servo").vary(
         flight={"duration": duration},
@@ -96,7 +96,7 @@ def identified(air: str, uncertainty: float) -> Identification:
 
 
 def true_errors(aircraft: Airframe, entries: tuple[Entry, ...]) -> dict[str, float]:
-    """Relative errors of the nominal entries."""
+    """Return the relative errors of the nominal entries."""
     A = aircraft.matrix_a()
     B = aircraft.matrix_b()
     inputs = list(aircraft.inputs)
@@ -113,7 +113,7 @@ def true_errors(aircraft: Airframe, entries: tuple[Entry, ...]) -> dict[str, flo
 
 
 class Filter:
-    """A filter of first order through which the outputs reach the sensors, at 500 Hz."""
+    """A first-order filter at 500 Hz between the outputs and the sensors."""
 
     def __init__(self, lag: float) -> None:
         self._share = 1.0 - np.exp(-0.002 / lag)
@@ -121,7 +121,7 @@ class Filter:
         self._measure = sensors.measure
 
     def measure(self, number: int, y: FloatArray, *others: Any) -> sensors.Measured:
-        """Measure the filtered y, for every sample in order."""
+        """Measure the filtered y. It must be called for every sample in order."""
         self._y = y if self._y is None else self._y + self._share * (y - self._y)
         return self._measure(number, self._y, *others)
 
@@ -130,9 +130,9 @@ MOST_OFF = 3.0  # stated deviations that an entry may be off
 
 
 def test_filter_in_front_of_y_makes_no_effect_weaker(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Entries are within their stated deviations behind a filter of 20 ms.
+    """Behind a filter of 20 ms, the entries are within their stated deviations.
 
-    A model without the lag takes the filter for a delay of u, and its effects are too weak.
+    A model without the lag takes the filter for a delay of u, and finds effects that are too weak.
     """
     filtered = servo("turbulence", 0.3).vary(aircraft={"rate": 500.0, "step": 0.002})
     aircraft = filtered.aircraft.sampled_airframe()
@@ -168,7 +168,7 @@ MATTER = (
 
 
 def rough(matrix: str, row: str, column: str) -> Airframe:
-    """The airframe with an entry four times too large, beyond the bounds of a search."""
+    """Return the airframe with an entry four times too large, which is beyond a search's bounds."""
     A = OSPREY.matrix_a()
     B = OSPREY.matrix_b()
     if matrix == "A":
@@ -179,14 +179,17 @@ def rough(matrix: str, row: str, column: str) -> Airframe:
 
 
 def lateral_part(airframe: Airframe) -> Part:
-    """The part of p and r in moderate turbulence, about an airframe."""
+    """Return the part of p and r in moderate turbulence, identified from an airframe."""
     recorded = innovation_filters.recording(flight("turbulence", 0.3), OSPREY)
     result = identify_model(recorded, airframe, ACTUATORS, bound_count=1, searches_again=True)
     return result.parts[1]
 
 
 def test_rough_damping_is_searched_again_about_what_was_found() -> None:
-    """A[p, p] of the file is four times too large: at the bound of 0.4 the part is refused."""
+    """A[p, p] of the file is four times too large.
+
+    At its bound of 0.4, the part would be refused.
+    """
     file = rough("A", "p", "p")
     part = lateral_part(file)
     assert part.refusal is None
@@ -199,7 +202,7 @@ def test_rough_damping_is_searched_again_about_what_was_found() -> None:
 
 
 def test_rough_effect_of_an_input_is_refused() -> None:
-    """An aircraft that couples by 10 % looked as if its aileron had a fifth of its effect."""
+    """An aircraft whose parts couple by 10 % looked as if its aileron had a fifth of its effect."""
     part = lateral_part(rough("B", "p", "aileron"))
     assert "B[p, aileron]" in str(part.refusal)
     assert "at a bound of the search" in str(part.refusal)
@@ -231,11 +234,10 @@ def test_entries_that_matter_found_within_deviations(air: str, uncertainty: floa
 
 
 def test_effects_of_inputs_are_found_in_air_that_turns() -> None:
-    """Without a span the filter has no rotary gust.
+    """With rotary gusts in the filter, p and r are accepted.
 
-    p and r are refused, four entries at a bound.
-
-    The deviations are for the levels of the wind as found: the rudder is 3.4 of them off.
+    Without a span the filter has none, and they are refused with four entries at a bound. The
+    deviations are for the levels of the wind as found, so the rudder is 3.4 of them off.
     """
     model = identified("turning", 0.3)
     true = true_errors(servo("turning", 0.3).aircraft.sampled_airframe(), model.entries)
@@ -291,7 +293,7 @@ def test_flight_without_excitation_refused_with_channel_and_factor() -> None:
 
 
 def test_effect_that_is_just_known_too_little_has_figures_that_say_so() -> None:
-    """A log of PX4 was refused as known to 10 % where 10 % is expected."""
+    """A log of PX4 was refused with the sentence "known to 10 %, expected 10 %"."""
     effect = Entry(
         matrix="B",
         row="q",
@@ -307,7 +309,7 @@ def test_effect_that_is_just_known_too_little_has_figures_that_say_so() -> None:
 
 
 def test_flight_without_noise_that_is_mostly_at_rest_has_deviations() -> None:
-    """At rest the innovations are 0. The seconds that move are then no outliers."""
+    """At rest the innovations are 0, and the seconds with motion must not count as outliers."""
     scenario = find_scenario("osprey_gust").vary(
         flight={"duration": 15.0},  # p moves from 11 s on
         aircraft={"rate": 100.0, "step": 0.005},
@@ -322,7 +324,10 @@ def test_flight_without_noise_that_is_mostly_at_rest_has_deviations() -> None:
 
 
 def test_noise_of_a_rounded_y_is_at_least_the_error_of_rounding() -> None:
-    """A slow y mostly stays at a step, which its third differences take for no noise."""
+    """A slow y mostly stays at one value, and third differences would find no noise.
+
+    The noise is at least the error of rounding.
+    """
     slow = np.sin(np.linspace(0.0, 6.0, 2000))
     noise = 0.02 * np.random.default_rng(5).standard_normal(2000)
     still = np.zeros(2000)
@@ -337,10 +342,10 @@ def test_noise_of_a_rounded_y_is_at_least_the_error_of_rounding() -> None:
 def coupled_flight(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[FlightData, dict[str, float]]:
-    """A flight of an aircraft whose elevator rolls it with a tenth of the effect of the ailerons.
+    """Return a flight of an aircraft whose parts couple, and the entries that couple them.
 
-    Its roll pitches it. Alpha rolls it too, and so does the vertical wind. The entries that couple
-    are beside the flight.
+    The elevator rolls it with a tenth of the effect of the ailerons, and its roll pitches it. Alpha
+    rolls it, too, and so does the vertical wind.
     """
     A = OSPREY.matrix_a()
     B = OSPREY.matrix_b()
@@ -461,7 +466,7 @@ def test_y_taken_at_stamps_of_u() -> None:
 
 
 def test_log_that_shows_no_model_is_refused() -> None:
-    """An output never changes, and a gap has twelve days.
+    """One log has an output that never changes, and one has a gap of twelve days.
 
     The gap must not be filled with samples.
     """
@@ -570,7 +575,7 @@ def test_correlation_is_one_for_independent_noises_and_that_of_what_follows_late
 
 
 def run_folder(folder: Path) -> Path:
-    """A run with a turbulent flight."""
+    """Return a run with a turbulent flight."""
     run = folder / "run"
     run.mkdir()
     scenario = run / "turbulent.yaml"

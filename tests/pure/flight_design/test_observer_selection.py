@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Selection of an observer.
+"""Test the selection of an observer.
 
-The tests are of shipped scenarios, the delay margin, models that are refused, the observer without
+The tests cover shipped scenarios, the delay margin, models that are refused, the observer without
 A, and the command.
 """
 
@@ -68,7 +68,7 @@ FLOWN = SERVO.vary(
 
 
 def with_observer(controller: RiseDiConfig) -> Scenario:
-    """osprey_servo under another controller."""
+    """Return osprey_servo with another controller."""
     return FLOWN.vary(controller=controller.model_dump())
 
 
@@ -81,7 +81,7 @@ def by_rule(margin: float = 0.03) -> observer_search.SelectedObserver:
 
 @cache
 def rms_alone() -> FloatArray:
-    """The errors of osprey_servo without an observer."""
+    """Return the errors of osprey_servo without an observer."""
     return rms(simulate(FLOWN))
 
 
@@ -143,7 +143,10 @@ def test_search_finds_the_same_gains_from_faster_and_from_slower_ones(begin: flo
 
 
 def test_search_stays_at_the_earlier_loop_where_no_change_errs_less() -> None:
-    """An elevator with 0.9 of its effect: the loop of the file has its margins, and errs more."""
+    """The search keeps the earlier loop if no change has a smaller error.
+
+    With 0.9 of the elevator's effect, the loop of the file has its margins, but a larger error.
+    """
     B = OSPREY.matrix_b().copy()
     B[:, 0] *= 0.9
     same_wind = np.ones_like(OSPREY.matrix_gusts())
@@ -190,7 +193,10 @@ def test_observer_by_rule_halves_error_of_speed_roll_and_yaw() -> None:
 
 
 def test_activity_of_law_inputs_is_that_of_the_effectors_that_they_move() -> None:
-    """Halves of a surface cost as much as the surface: 60 deg/s of each, 600 %/s of a throttle."""
+    """The halves of a surface cost as much as the whole one.
+
+    A surface has 60 deg/s, and a throttle 600 %/s.
+    """
     osprey = SERVO.rise_di()
     twin = find_scenario("osprey_twin")
     controller = twin.rise_di()
@@ -208,7 +214,10 @@ def test_activity_of_law_inputs_is_that_of_the_effectors_that_they_move() -> Non
 
 
 def test_a_thrust_in_newtons_costs_by_the_thrust_in_trim() -> None:
-    """40 N in trim: 480 N/s; without `no_thrust` in the file there is no cost."""
+    """At a trim thrust of 40 N, a rate of 480 N/s has the cost 1.
+
+    In a file without `no_thrust`, thrust has no cost.
+    """
     values = OSPREY.model_dump()
     thrust = {"unit": "N", "positive": "more thrust", "no_thrust": -40.0}
     known = Airframe.validate_mapping(
@@ -265,9 +274,9 @@ def test_command_refuses_options_that_contradict_each_other(
 
 
 def test_aircraft_that_no_gains_hold_do_not_count() -> None:
-    """With q, p, r held alpha and beta move by A - B (C B)^-1 C A.
+    """If q, p and r are held, alpha and beta move by A - B (C B)^-1 C A.
 
-    Where it is unstable, no observer has a margin.
+    For an aircraft in which this motion is unstable, no observer has a margin.
     """
     folder = REPOSITORY / "examples" / "px4_airplane"
     airframe = load_airframe(str(folder / "rates_airframe.yaml"))
@@ -290,7 +299,10 @@ def test_aircraft_that_no_gains_hold_do_not_count() -> None:
 
 
 def test_gains_of_a_file_make_the_observer_of_the_example(tmp_path: Path) -> None:
-    """As the file has them, where any stable loop is enough; its digits are six."""
+    """The observer is the one of the file, to its six digits.
+
+    Any stable loop is accepted here.
+    """
     folder = REPOSITORY / "examples" / "px4_airplane"
     airframe = load_airframe(str(folder / "rates_airframe.yaml"))
     scenario = find_scenario(str(folder / "rates_observer.yaml"))

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: N802 - functions have the symbols of the page as names
-"""The observer of docs/theory.md in continuous time.
+"""Test the observer of docs/theory.md in continuous time.
 
-The tests are of the Proposition, Lemma A, Lemma B and the error inside the softened sign.
+The tests cover the Proposition, Lemma A, Lemma B, and the error inside the softened sign.
 
-Observers here are designed with the Riccati solver of scipy, in this file. Plants are random, with
+Observers here are designed in this file, with the Riccati solver of scipy. Plants are random, with
 stable zero dynamics, or the osprey. Loops are those of
-`flight_design.gains.lyapunov.fly_known_plant`: the extended plant is a plant (1), so it flies like
+`flight_design.gains.lyapunov.fly_known_plant`. The extended plant is a plant (1), so it flies like
 one.
 """
 
@@ -60,11 +60,11 @@ class Observer(NamedTuple):
 
     @property
     def error_matrix(self) -> FloatArray:
-        """A_z - L H, of the error of the estimates."""
+        """Return A_z - L H, the dynamics of the error of the estimates."""
         return self.A_z - self.L @ self.H
 
     def sensitivity(self, s: complex) -> FloatArray:
-        """S_o(s) = I + F (s I - A_z + L H)^-1 B_z, complex, shape (m, m)."""
+        """Return S_o(s) = I + F (s I - A_z + L H)^-1 B_z, complex, (m, m)."""
         return np.asarray(
             np.eye(len(self.H))
             + self.F @ np.linalg.solve(s * np.eye(len(self.A_z)) - self.error_matrix, self.B_z)
@@ -72,7 +72,7 @@ class Observer(NamedTuple):
 
 
 class Hidden(NamedTuple):
-    """The plant in y and in n - m coordinates eta = T x that B does not act on: T B = 0."""
+    """The plant in y and in n - m coordinates eta = T x on which B does not act: T B = 0."""
 
     T: FloatArray
     yy: FloatArray  # of y in y_dot
@@ -82,7 +82,7 @@ class Hidden(NamedTuple):
 
 
 def random_plant(seed: int, U_12: float = 0.0) -> Plant:
-    """Random plant with D = diag(1, -1) and U_12.
+    """Return a random plant with D = diag(1, -1) and the given U_12.
 
     Its zeros have a real part of at most -1.
     """
@@ -115,7 +115,7 @@ def linear_quadratic(
     process: FloatArray,
     noise: FloatArray,
 ) -> Observer:
-    """F of the cost z'Q z + u'R u, L of the intensities of process and measurement noise.
+    """Return F for the cost z'Q z + u'R u, and L for the given process and measurement noise.
 
     The model is (A_z, B_z, H).
     """
@@ -128,7 +128,7 @@ def linear_quadratic(
 
 
 def observer_of(plant: Plant) -> Observer:
-    """Observer of the states and of a disturbance of each output's derivative, zeta = [x, d]."""
+    """Return an observer of the states and of a disturbance of each y_dot, zeta = [x, d]."""
     A_z = np.block([[plant.A, plant.C.T], [np.zeros((M, N)), -ZERO_LEAK * np.eye(M)]])
     H = np.hstack([plant.C, np.zeros((M, M))])
     process = np.diag([0.01] * N + [4.0] * M)
@@ -137,7 +137,7 @@ def observer_of(plant: Plant) -> Observer:
 
 
 def extended(plant: Plant, observer: Observer) -> Plant:
-    """Aircraft and observer seen from u_law, x_e = [x, zeta]."""
+    """Return aircraft and observer as one plant with the input u_law, x_e = [x, zeta]."""
     A_z, B_z, H, F, L = observer
     A_e = np.block([[plant.A, -plant.B @ F], [L @ plant.C, A_z - L @ H - B_z @ F]])
     C_e = np.hstack([plant.C, np.zeros((len(H), len(A_z)))])
@@ -153,12 +153,10 @@ def osprey() -> tuple[Airframe, Plant]:
 
 
 def osprey_observer() -> Observer:
-    """Observer of states, wind along three axes and a disturbance of each output.
+    """Return an observer of states, wind along three axes, and a disturbance of each output.
 
-    zeta = [x, w, d], and the actuators are ideal.
-
-    Weights of q, V, p, r: effort in s, drift in units/s per root s. Of the wind: m/s per root s and
-    s.
+    zeta = [x, w, d], and the actuators are ideal. The weights of q, V, p, r are the effort in s,
+    and the drift in units/s per root s. Those of the wind are in m/s per root s and in s.
     """
     airframe, plant = osprey()
     unit = np.array([0.1, 1.0, 0.1, 0.1])
@@ -209,9 +207,9 @@ def test_observer_keeps_C_B_and_so_S_D_U_and_relative_degree(seed: int) -> None:
 
 
 def arbitrary_observer(rng: np.random.Generator) -> Observer:
-    """Random matrices with random stable poles of the filter.
+    """Return an observer of random matrices whose filter has random stable poles.
 
-    The model need not be that of the aircraft.
+    The model need not be the aircraft's.
     """
     s = N + M
     A_z = rng.normal(size=(s, s))
@@ -272,14 +270,17 @@ class Wave(NamedTuple):
 def ideal(
     plant: Plant, omega: float, f: FloatArray, y_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Phasors of the state and of the input that keep y on y_m."""
+    """Return the phasors of the state and of the input that keep y on y_m."""
     n = len(plant.A)
     solved = np.linalg.solve(rosenbrock(plant, 1j * omega), np.concatenate([-f, y_m]))
     return solved[:n], solved[n:]
 
 
 def slew_left(plant: Plant, wave: Wave, observer: Observer | None) -> FloatArray:
-    """Phasor of N_d on e = 0 by (c): -D U S_o j omega (u* - u_ff), S_o = I without observer."""
+    """Return the phasor of N_d at e = 0 by (c).
+
+    It is -D U S_o j omega (u* - u_ff), with S_o = I without an observer.
+    """
     u = ideal(plant, wave.omega, wave.f, wave.y_m)[1] - wave.u_ff
     remainder = u if observer is None else observer.sensitivity(1j * wave.omega) @ u
     return np.asarray(-plant.D * (plant.U @ (1j * wave.omega * remainder)))
@@ -303,7 +304,7 @@ def test_N_d_of_extended_plant_is_slew_that_feedforward_and_observer_leave(omega
 
 
 def short() -> Scenario:
-    """osprey_servo with one pulse a channel and both gusts within 8 s."""
+    """Return osprey_servo for 8 s, with one pulse on each channel and both gusts."""
     servo = find_scenario("osprey_servo")
     pulses = {
         "q": (1.0, 2.0, 0.1),
@@ -330,9 +331,9 @@ def short() -> Scenario:
 
 
 def slews_of_the_osprey() -> tuple[FloatArray, FloatArray]:
-    """Largest rates of u*, u* - u_ff and u_law* = S_o (u* - u_ff), rows, by input.
+    """Return the largest rates of u*, u* - u_ff and u_law* = S_o (u* - u_ff), rows, by input.
 
-    They are nominal, and the mean of 20 at +-30 %.
+    The first result is nominal, and the second is the mean of 20 aircraft at +-30 %.
     """
     airframe, _ = osprey()
     observer = osprey_observer()
@@ -382,7 +383,7 @@ def test_without_fade_in_observer_moves_inputs_at_once() -> None:
 
 
 class CrossTerms(NamedTuple):
-    """G, and W(s) = W_e + W_eta (s I - A_eta)^-1 B_eta of Lemma A.
+    """G and W(s) = W_e + W_eta (s I - A_eta)^-1 B_eta of Lemma A.
 
     They are in z = [e, r] and eta, with Lambda = I.
     """
@@ -394,7 +395,7 @@ class CrossTerms(NamedTuple):
     B_eta: FloatArray
 
     def at(self, omega: float) -> FloatArray:
-        """W(j omega), complex, shape (m, m)."""
+        """Return W(j omega), complex, (m, m)."""
         path = np.linalg.solve(1j * omega * np.eye(len(self.A_eta)) - self.A_eta, self.B_eta)
         return np.asarray(self.W_e + self.W_eta @ path)
 
@@ -414,9 +415,9 @@ def cross_terms(plant: Plant) -> CrossTerms:
 
 
 def least_gain(plant: Plant) -> float:
-    """k* of Lemma A for Lambda = I: lambda_max(G + G')/2 + max norm(W(j omega))^2 / 4.
+    """Return k* of Lemma A for Lambda = I.
 
-    The grid has 1e-3 to 1e4 rad/s.
+    It is lambda_max(G + G')/2 + max norm(W(j omega))^2 / 4, on a grid of 1e-3 to 1e4 rad/s.
     """
     terms = cross_terms(plant)
     size = max(
@@ -427,9 +428,9 @@ def least_gain(plant: Plant) -> float:
 
 
 def form_of(terms: CrossTerms, of_r: FloatArray, P: FloatArray) -> FloatArray:
-    """Q_w for w = [e, r, eta], Lambda = I.
+    """Return Q_w for w = [e, r, eta] and Lambda = I.
 
-    It is e'e + r'(of_r - G) r + r'(W_e e + W_eta eta) - eta'(A'P + P A) eta - 2 eta'P B e.
+    The form is e'e + r'(of_r - G) r + r'(W_e e + W_eta eta) - eta'(A'P + P A) eta - 2 eta'P B e.
     """
     m = len(terms.G)
     n = len(terms.A_eta)
@@ -466,7 +467,7 @@ def test_above_k_star_matrix_P_makes_form_of_lemma_A_positive(
 
 
 def waves(seed: int) -> tuple[Wave, Wave]:
-    """F of 0.5 rad/s and y_m of 0.8 rad/s."""
+    """Return an f of 0.5 rad/s and a y_m of 0.8 rad/s."""
     rng = np.random.default_rng(100 + seed)
     return Wave(0.5, rng.normal(size=N), np.zeros(M)), Wave(0.8, np.zeros(N), np.array([0.5, 0.4]))
 
@@ -474,9 +475,9 @@ def waves(seed: int) -> tuple[Wave, Wave]:
 def classical_beta(
     plant: Plant, seed: int, observer: Observer | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Bounds of abs(N_d) and of abs(N_d) + abs(N_d_dot) / Lambda by channel, Lambda = 1.
+    """Return the bounds of abs(N_d) and of abs(N_d) + abs(N_d_dot) / Lambda by channel.
 
-    They are sums of amplitudes.
+    Lambda is 1, and the bounds are sums of amplitudes.
     """
     sizes = [(wave.omega, np.abs(slew_left(plant, wave, observer))) for wave in waves(seed)]
     return np.sum([size for _, size in sizes], axis=0), np.sum(
@@ -487,9 +488,9 @@ def classical_beta(
 def flown_error(
     plant: Plant, seed: int, observer: Observer | None, params: LawParams, dt: float = 0.01
 ) -> tuple[FloatArray, FloatArray]:
-    """Times and e, shape (ticks, M), between 12 and 16 s.
+    """Return times and e, (ticks, M), between 12 and 16 s.
 
-    The law is sampled, plant and observer are in continuous time.
+    The law is sampled, and plant and observer are in continuous time.
     """
     push, reference = waves(seed)
     t: FloatArray = np.asarray(dt * np.arange(round(16.0 / dt) + 1), dtype=np.float64)
@@ -515,7 +516,7 @@ def flown_error(
 def largest_error(
     plant: Plant, seed: int, observer: Observer | None, params: LawParams, dt: float = 0.01
 ) -> FloatArray:
-    """The largest abs(e) by channel of `flown_error`."""
+    """Return the largest abs(e) of `flown_error` by channel."""
     return np.asarray(np.abs(flown_error(plant, seed, observer, params, dt)[1]).max(axis=0))
 
 
@@ -548,9 +549,9 @@ EPS = np.array([0.01, 0.01])
 
 
 def ultimate_bound(plant: Plant, K: FloatArray, zeta: float) -> float:
-    """The smallest bound of Lemma B over a grid of kappa and k_2.
+    """Return the smallest bound of Lemma B over a grid of kappa and k_2.
 
-    P is that of A_eta' P + P A_eta = -kappa I.
+    P solves A_eta' P + P A_eta = -kappa I.
     """
     U = np.abs(plant.U)
     terms = cross_terms(plant)
@@ -571,12 +572,11 @@ def ultimate_bound(plant: Plant, K: FloatArray, zeta: float) -> float:
 
 
 def largest_w(plant: Plant, K: FloatArray, kind: str) -> tuple[float, float]:
-    """Largest norm of w after 6 of 12 s under an adverse u_o, and the bound of abs(N_d).
+    """Return the largest norm of w after 6 of 12 s under a u_o, and the bound of abs(N_d).
 
-    abs(u_o_dot) = NU, and the sign is softened.
-
-    adverse: u_o_dot = NU sgn((D U)' r), which raises r' D U u_o_dot most; bounded: the same between
-    limits of 0.5; square: a sign that alternates every pi s.
+    abs(u_o_dot) = NU, and the sign is softened. An adverse u_o_dot is NU sgn((D U)' r), which
+    raises r' D U u_o_dot most. A bounded one is the same between limits of 0.5. A square one
+    alternates every pi s.
     """
     push = Wave(0.5, np.random.default_rng(50).normal(size=N), np.zeros(M))
     dt = 4e-3
@@ -645,14 +645,14 @@ def test_inside_softened_sign_error_is_N_d_over_integral_gain(seed: int) -> None
 
 @pytest.fixture(scope="module")
 def course() -> tuning.Benchmark:
-    """The 60 s of osprey_servo: servos, limits, noise, gusts."""
+    """Return the 60 s of osprey_servo, with servos, limits, noise and gusts."""
     return tuning.build_benchmark(find_scenario("osprey_servo"))
 
 
 def gain_set(
     K: str, Lambda: str, beta: str, softening: float, observer: dict[str, list[float]] | None = None
 ) -> TuningResult:
-    """Gains of q, p, r, V as a result of a search."""
+    """Return gains of q, p, r, V as the result of a search."""
     of_law = {
         name: [float(gain) for gain in text.split()]
         for name, text in (("K", K), ("Lambda", Lambda), ("beta", beta))
@@ -699,9 +699,9 @@ them; in the gusts alone."""
 
 
 def as_pi(course: tuning.Benchmark, law: str, objective: str, channels: int) -> FloatArray:
-    """Factors of the score if the softened sign is made linear in the first channels.
+    """Return factors of the score if the softened sign is linear in the first channels.
 
-    They are nominal, and the mean of four at +-30 %.
+    The first is nominal, and the second is the mean of four aircraft at +-30 %.
     """
     tuned = GAINS[law][objective]
     gains = {name: np.array(values) for name, values in tuned.gains.items()}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of ArduPilot against the channel maps.
+"""Test the parameters of ArduPilot against the channel maps.
 
-Expected values are by its formulas for channels and servos.
+Expected values follow from its formulas for channels and servos.
 """
 
 from collections.abc import Mapping
@@ -38,9 +38,9 @@ PARAMETERS = {
 def agreement(
     channel_map: ChannelMap, values: Mapping[str, float], later: Mapping[str, float] | None = None
 ) -> str | None:
-    """The sentence on absent parameters, if the parameters at the samples agree with the map.
+    """Return the sentence on absent parameters if the parameters at the samples agree with the map.
 
-    `later`: others that the log has after them.
+    `later` are other values that the log has after the samples.
     """
     sticks = [stick_of(channel_map, name) for name in channel_map.inputs]
     recorded = {name: (ParameterRecord(0, value),) for name, value in values.items()}
@@ -51,7 +51,7 @@ def agreement(
 
 
 def changed(name: str, section: str, **values: Any) -> ChannelMap:
-    """A shipped map with another row of the elevator."""
+    """Return a shipped map with another row of the elevator."""
     content = named_map(name).model_dump()
     content[section]["elevator"] |= values
     return ChannelMap.validate_mapping(content, "map")
@@ -104,9 +104,9 @@ def test_parameter_that_the_log_lacks_is_told_and_not_assumed() -> None:
 
 @pytest.mark.parametrize("name", MAPS)
 def test_map_of_a_reversed_channel_agrees_with_the_reversal_alone(name: str) -> None:
-    """With RC2_REVERSED a larger pulse is nose down.
+    """With RC2_REVERSED a longer pulse is nose down.
 
-    So is the motion of the row for an increasing raw value.
+    The row of the map has the same motion for an increasing raw value.
     """
     reversed_map = changed(name, "inputs", positive="nose down")
     assert agreement(reversed_map, PARAMETERS | {"RC2_REVERSED": 1.0}) is None
@@ -130,7 +130,7 @@ def elevator() -> Stick:
 
 @pytest.mark.parametrize("is_reversed, sign", [(0.0, 1.0), (1.0, -1.0)])
 def test_deflection_of_a_surface_is_that_about_its_trim(is_reversed: float, sign: float) -> None:
-    """SRV_Channel::pwm_from_angle: from the trim to either end, each with a slope of its own."""
+    """SRV_Channel::pwm_from_angle has a slope of its own from the trim to each end."""
     servo = servo_of(elevator(), "elevator", SURFACE | {"SERVO5_REVERSED": is_reversed})
     assert servo.output == 5
     np.testing.assert_allclose(
@@ -140,7 +140,7 @@ def test_deflection_of_a_surface_is_that_about_its_trim(is_reversed: float, sign
 
 @pytest.mark.parametrize("is_reversed, part", [(False, 0.25), (True, 0.75)])
 def test_deflection_of_a_throttle_is_that_from_its_end(is_reversed: bool, part: float) -> None:
-    """SRV_Channel::pwm_from_range: a reversed throttle is open at its lower end."""
+    """By SRV_Channel::pwm_from_range, a reversed throttle is open at its lower end."""
     stick = stick_of(named_map("ardupilot"), "thrust")
     servo = Servo(output=3, low=1000.0, trim=1000.0, high=2000.0, is_reversed=is_reversed)
     assert servo.deflection(np.array([1250.0]), stick) == pytest.approx([part])
@@ -187,7 +187,7 @@ SECOND = 1_000_000_000
 
 
 def test_changes_are_told_with_the_value_of_the_samples() -> None:
-    """The log begins at 10 s, the samples are from 30 to 60 s."""
+    """The log begins at 10 s, and the samples are from 30 to 60 s."""
     recorded = {
         "SERVO2_REVERSED": (
             ParameterRecord(0, 1.0),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rates of an autopilot's log as y and u of an identification."""
+"""Test the rates of an autopilot's log as y and u of an identification."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def recorded(y: FloatArray) -> FlightData:
 
 
 def filtered(y: FloatArray, cutoff: float) -> FloatArray:
-    """Y behind SciPy's Butterworth filter of second order."""
+    """Return y behind SciPy's Butterworth filter of second order."""
     b, a = signal.butter(2, cutoff, fs=RATE)
     return np.asarray(signal.lfilter(b, a, y, axis=0))
 
@@ -31,14 +31,17 @@ def correlation(y: FloatArray, lag: int) -> float:
 
 @pytest.mark.parametrize("cutoff", [20.0, 40.0, 60.0])
 def test_broadened_rates_are_those_behind_the_broad_filter(cutoff: float) -> None:
-    """After the transient of the first sample, 0.1 s, to rounding."""
+    """They agree to rounding after the transient of the first sample, 0.1 s."""
     y = np.random.default_rng(1).normal(size=(1000, 2))
     found, _ = broadened(recorded(filtered(y, cutoff)), cutoff)
     assert found.y[25:] == approx(filtered(y, BROAD)[25:], abs=1e-4)
 
 
 def test_noise_behind_the_gyro_filter_becomes_white() -> None:
-    """In means over 8 ms, as the identification takes them: 0.42 before, 0.01 after."""
+    """The noise behind the gyro's filter becomes white.
+
+    The identification uses means over 8 ms. Their correlation falls from 0.42 to 0.01.
+    """
     noise = recorded(filtered(np.random.default_rng(2).normal(size=(40_000, 1)), 40.0))
     found, _ = broadened(noise, 40.0)
     # 20,000 means show a correlation to 0.007
@@ -47,7 +50,7 @@ def test_noise_behind_the_gyro_filter_becomes_white() -> None:
 
 
 def test_broadened_rates_are_earlier_by_the_phase_of_both_filters() -> None:
-    """A slow sine comes earlier by the delay that is stated, by its phase."""
+    """A slow sine shows by its phase that y is earlier by the stated delay."""
     omega = 2.0 * np.pi * 0.5
     t = np.arange(5000) / RATE
     late = filtered(np.sin(omega * t)[:, None], 40.0)
@@ -73,7 +76,7 @@ def test_samples_that_a_lost_one_reaches_are_lost() -> None:
 
 
 def surfaces(**rows: tuple[float, ...]) -> dict[str, float]:
-    """The parameters of PX4's surfaces, with the effects of each of them on an axis."""
+    """Return the parameters of PX4's surfaces, with the effects of each of them on an axis."""
     parameters = {"CA_SV_CS_COUNT": float(max(map(len, rows.values())))}
     for axis, effects in rows.items():
         parameters |= {f"CA_SV_CS{k}_TRQ_{axis}": effect for k, effect in enumerate(effects)}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins as a requirement: gains whose measured margins meet it, and what a margin costs.
+"""Test margins as a requirement: gains that meet it, and what a margin costs.
 
-python-control checks them.
+The margins are measured with python-control.
 """
 
 import math
@@ -57,9 +57,9 @@ RESPONSE = {"elevator": -8.0, "throttle": 3.0}  # abs(Omega_ii)
 
 
 def integrators() -> Airframe:
-    """q_dot = -8 elevator, V_dot = 3 throttle.
+    """Return q_dot = -8 elevator, V_dot = 3 throttle.
 
-    It is a loop that python-control has channel by channel.
+    python-control can describe this loop channel by channel.
     """
     return Airframe.validate_mapping(
         {
@@ -100,9 +100,9 @@ def selected(phase_margin: float, V_product: float = 0.46) -> RiseDiConfig:
 
 
 def of_python_control(controller: RiseDiConfig, channel: int) -> tuple[float, float]:
-    """Phase margin, deg, and largest sensitivity, by python-control.
+    """Return the phase margin, deg, and the largest sensitivity, from python-control.
 
-    They are those of K (1 + integral dt z / (z - 1)) and the sampled lag and integrator.
+    The loop is K (1 + integral dt z / (z - 1)) with the sampled lag and integrator.
     """
     params = controller.law_params()
     name = controller.inputs[channel]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification of the input-output response, against the aircraft that made the log."""
+"""Test the identification of a response against the aircraft that made the log."""
 
 import numpy as np
 import pytest
@@ -24,11 +24,10 @@ STEP = 0.001  # s
 def flown(
     doublets: float, noise: float = 1e-3, seed: int = 1, seconds: float = 40.0
 ) -> tuple[Signal, Signal]:
-    """y_dot = -DAMPING y + OMEGA v behind lags and a delay, in coloured disturbances.
+    """Return a log of y_dot = -DAMPING y + OMEGA v behind lags and a delay.
 
-    y arrives 50 times a second, irregularly.
-
-    Exact at every millisecond for inputs that are held. The inputs are doublets in turn.
+    The inputs are doublets in turn, and there are coloured disturbances. y arrives 50 times a
+    second, irregularly. The motion is exact at every millisecond for inputs that are held.
     """
     generator = np.random.default_rng(seed)
     A = np.block([[-DAMPING, OMEGA], [np.zeros((2, 2)), -np.diag(1.0 / LAG)]])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification of aircraft whose servos are of second order, where the file has a lag."""
+"""Test the identification of aircraft with second-order servos, where the file has a lag."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -39,7 +39,7 @@ DAMPING = np.array([0.6, 0.75, 0.6, 0.6])
 
 
 class Servos:
-    """Servos of second order, which move from step to step in steps of 0.1 ms."""
+    """Second-order servos, which move in steps of 0.1 ms."""
 
     def __init__(self, frequency: FloatArray, damping: FloatArray) -> None:
         self._frequency = frequency
@@ -49,7 +49,10 @@ class Servos:
     def move(
         self, _: Any, position: FloatArray, command: FloatArray, dt: float, __: Any = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the positions at the end of a step, and the mean over it, as `actuators.move`."""
+        """Return the positions at the end of a step and their mean over it.
+
+        It replaces `actuators.move`.
+        """
         steps = round(dt / 1e-4)
         square = self._frequency**2
         total = np.zeros(len(position))
@@ -112,7 +115,7 @@ def test_each_model_and_input_has_a_delay_and_a_servo_of_its_own() -> None:
 def test_entries_are_within_their_deviations_behind_servos_of_second_order(
     number: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without the servos in the model, damping and effect of a fast roll come out wrong."""
+    """Without the servos in the model, damping and effect of a fast roll would come out wrong."""
     flown = servo("turbulence", 0.3).vary(aircraft={"uncertainty": {"number": number}})
     aircraft = flown.aircraft.sampled_airframe()
     monkeypatch.setattr(actuators, "move", Servos(FREQUENCY, DAMPING).move)
@@ -142,7 +145,7 @@ def test_actuator_without_a_lag_passes_u_on() -> None:
 def test_first_order_actuator_moves_as_a_servo_at_its_rate_limit(
     frequency: float, damping: float
 ) -> None:
-    """The reference is the servo in steps of 0.1 ms, at most at its rate."""
+    """The reference is the servo in steps of 0.1 ms, which may not exceed its rate."""
     lag, period, limit = 0.02, 0.01, 2.0
     u = np.repeat([0.0, 0.3, -0.3, 0.02], 20)
     expected = [0.0]
@@ -184,7 +187,10 @@ def test_learner_knows_the_actuators_of_its_scenario(monkeypatch: pytest.MonkeyP
 
 
 def test_search_of_the_whole_aircraft_begins_with_the_file_and_the_delays_of_the_parts() -> None:
-    """Behind the wrong model of a part that couples, a servo is wrong as well."""
+    """The separate model of a part that couples is wrong, and so are its servos.
+
+    So the search of the whole aircraft does not begin with them.
+    """
     count = 1000
     y, u = np.random.default_rng(6).standard_normal((2, count, 4))
     recorded = innovation_filters.FlightData(0.01, np.linspace(0.0, 9.99, count), y, u)

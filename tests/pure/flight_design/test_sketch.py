@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rough model of an aircraft without an airframe file, and the learner that begins with it."""
+"""Test the rough model without an airframe file, and the learner that begins with it."""
 
 import numpy as np
 import pytest
@@ -79,7 +79,10 @@ def test_sketch_of_other_channels_is_refused() -> None:
 
 
 def test_law_alone_learns_from_its_signs_and_sizes() -> None:
-    """Omega = diag(D omega / input_scale) of the law: no entry of the airframe file is read."""
+    """The rough model is Omega = diag(D omega / input_scale) of the law.
+
+    No entry of the airframe file is read.
+    """
     scenario = find_scenario("osprey_servo")
     learning = that_learns(scenario)
     law = scenario.rise_di()

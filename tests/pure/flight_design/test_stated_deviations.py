@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What an identification says of its own errors, beside aircraft whose A and B are known.
+"""Test the errors that an identification states, on aircraft whose A and B are known.
 
-The logs are of an aircraft that is integrated in steps of 0.5 ms, apart from the code under test,
-and that differs from the model in what the identification leaves out: a later input, noise that is
-not white, wind, samples of u that are rare or lost.
+The logs are of an aircraft that is integrated in steps of 0.5 ms, independently of the code under
+test. It differs from the model in what the identification leaves out: a later input, noise that is
+not white, wind, and samples of u that are rare or lost.
 """
 
 from functools import cache
@@ -75,9 +75,9 @@ def flown(
 ) -> tuple[FloatArray, FloatArray]:
     """Return y and u, (T,), of doublets under PI with feedforward.
 
-    For the first 20 s the elevator is `climb`, rad, off its trim, and no doublets are flown if it
-    is. u acts `late`, s. The noise of y follows e_k = `colour` e_(k-1) + white noise. The wind, m/s
-    rms, has a correlation of 0.3 s.
+    For the first 20 s the elevator is `climb`, rad, off its trim. If `climb` is not 0, no doublets
+    are flown in this time. u acts `late`, s. The noise of y follows e_k = `colour` e_(k-1) + white
+    noise. The wind, m/s rms, has a correlation time of 0.3 s.
     """
     A, B = NOMINAL.matrix_a(), NOMINAL.matrix_b()
     A[1] *= 1.0 + np.array([TRUE["A[q, alpha]"], TRUE["A[q, q]"]])
@@ -117,7 +117,7 @@ def flown(
 
 
 def recording(y: FloatArray, u: FloatArray) -> FlightData:
-    """The record of y and u, (T,) or (T, m)."""
+    """Return the record of y and u, (T,) or (T, m)."""
     t = np.arange(len(y), dtype=np.float64) * PERIOD
     return FlightData(PERIOD, t, y.reshape(len(t), -1), u.reshape(len(t), -1))
 
@@ -147,7 +147,7 @@ def by_rates(nominal: Airframe, y: FloatArray, u: FloatArray) -> Identification:
 def flown_in_turns(nominal: Airframe) -> tuple[FloatArray, FloatArray]:
     """Return y and u, (T, 3), of the nominal airplane in doublets of each rate.
 
-    It banks, and its autopilot, PI with feedforward, sets the r of a coordinated turn.
+    It banks, and its autopilot, PI with feedforward, commands the r of a coordinated turn.
     """
     rng = np.random.default_rng(5)
     plane = banking(nominal)
@@ -172,13 +172,13 @@ def flown_in_turns(nominal: Airframe) -> tuple[FloatArray, FloatArray]:
 
 
 def farthest(found: Identification) -> float:
-    """The largest error of an entry in its stated deviations."""
+    """Return the largest error of an entry in units of its stated deviation."""
     return max(abs(entry.error - TRUE[entry.name]) / entry.deviation for entry in found.entries)
 
 
 @pytest.mark.slow
 def test_log_of_gusts_has_a_warning() -> None:
-    """Their effect on the estimate is beyond the deviations."""
+    """The effect of the gusts on the estimate is larger than the deviations."""
     (part,) = identified(*flown(wind=1.0)).parts
     assert "fly the doublets in calm air" in gust_warning(part)
 
@@ -203,7 +203,10 @@ def test_no_entry_is_farther_off_than_stated(lacks: dict[str, float]) -> None:
 
 @pytest.mark.slow
 def test_deviations_of_a_right_model_alone_are_too_small_for_a_late_input() -> None:
-    """What the other deviations are for: 5 stated deviations here, without them."""
+    """This is why the other deviations are needed.
+
+    Without them, an entry would be 5 stated deviations off.
+    """
     y, u = flown(late=0.002)
     assert farthest(identified(y, u, timing=None)) > OFF
 
@@ -223,9 +226,9 @@ def test_trim_of_a_climb_is_no_effect_of_the_input() -> None:
 
 @pytest.mark.slow
 def test_gravity_in_a_bank_is_no_effect_of_the_rudder() -> None:
-    """The aircraft turns in a bank, and its rudder follows the turn, as an autopilot has it.
+    """The aircraft turns in a bank, and its autopilot lets the rudder follow the turn.
 
-    An estimator that does not know the bank takes the turn for an effect.
+    An estimator that does not know the bank takes the turn for an effect of the rudder.
     """
     nominal = load_airframe(str(REPOSITORY / "examples/px4_airplane/rates_airframe.yaml"))
     y, u = flown_in_turns(nominal)
@@ -237,7 +240,7 @@ def test_gravity_in_a_bank_is_no_effect_of_the_rudder() -> None:
 
 @pytest.mark.slow
 def test_log_with_rare_samples_of_u_is_refused_for_its_timing() -> None:
-    """PX4 logs the torque each 20 ms by default; the loop changes it each 4 ms."""
+    """By default PX4 logs the torque every 20 ms, while the loop changes it every 4 ms."""
     y, u = flown()
     held = np.repeat(u[::5], 5)[: len(u)]
     found = identified(y, held, timing=0.02 / np.sqrt(12.0))
@@ -246,7 +249,7 @@ def test_log_with_rare_samples_of_u_is_refused_for_its_timing() -> None:
 
 @pytest.mark.slow
 def test_lost_samples_do_not_move_an_entry_farther_than_stated() -> None:
-    """A tenth of the samples, and 8 s at once."""
+    """A tenth of the samples is lost, and 8 s at once."""
     y, u = flown()
     lost = np.random.default_rng(1).random(len(y)) < 0.1
     lost[5000:7000] = True
@@ -261,7 +264,7 @@ def test_lost_samples_do_not_move_an_entry_farther_than_stated() -> None:
     ],
 )
 def test_output_that_only_its_noise_moves_is_named(factor: int, reason: str) -> None:
-    """The elevator answers the noise of the gyro, and no doublets are flown."""
+    """The elevator responds to the noise of the gyro, and no doublets are flown."""
     y, u = flown(setpoint=0.0, length=20.0)
     (still,) = own_shares(coarser(recording(y, u), factor), NOMINAL, CHANNELS)
     assert still.is_still
@@ -269,7 +272,7 @@ def test_output_that_only_its_noise_moves_is_named(factor: int, reason: str) -> 
 
 
 def test_output_that_its_own_input_does_not_move_is_named() -> None:
-    """Wind moves q, and the elevator stands still."""
+    """The wind moves q, and the elevator stands still."""
     y, u = flown(setpoint=0.0, wind=0.5, length=20.0)
     (still,) = own_shares(recording(y, 0.0 * u), NOMINAL, CHANNELS)
     assert (still.output, still.input, still.share) == ("q", "elevator", 0.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Theorem 1 in flight: the F-4C of the tutorial in an ideal loop.
+"""Test Theorem 1 in flight, with the F-4C of the tutorial in an ideal loop.
 
 Its gains meet each condition.
 """
@@ -34,7 +34,7 @@ FILES = dict(re.findall(r"^cat > (\S+) <<'EOF'\n(.*?)^EOF$", PAGE, re.MULTILINE 
 
 @pytest.fixture(scope="module")
 def selection(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, gain_selection.Selection]:
-    """The files of the page, and both gain sets for the ideal loop."""
+    """Return the files of the page, and both gain sets for the ideal loop."""
     folder = tmp_path_factory.mktemp("theorem")
     for name, text in FILES.items():
         (folder / name).write_text(text)
@@ -44,7 +44,7 @@ def selection(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, gain_sele
 
 
 def flown(folder: Path, selected: gain_selection.Selection, rate: float) -> FloatArray:
-    """The largest errors, law's order, under the gains of Theorem 1 as written, at a rate in Hz."""
+    """Return the largest errors with the gains of Theorem 1 at a rate in Hz, in the law's order."""
     text = gain_yaml.selection_yaml(selected, theorem=True).replace(
         "rate: 100.0  # Hz", f"rate: {rate}  # Hz"
     )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A route that cannot be flown is refused with the value that would do, and that value does."""
+"""Test that the refusal of a route names a value with which it can be flown, and that it can."""
 
 import math
 import re
@@ -36,7 +36,7 @@ def refusal(
 
 
 def number(sentence: str) -> float:
-    """The number that a sentence says would do."""
+    """Return the number that a sentence says is sufficient."""
     result = re.search(r"at (?:least|most) ([\d.]+)", sentence)
     assert result
     return float(result[1])
@@ -81,9 +81,9 @@ def test_a_speed_below_the_floor_is_refused() -> None:
 
 @pytest.mark.parametrize("altitude, side, rate", [(1300.0, "above", 2.5), (700.0, "below", 4.0)])
 def test_altitude_beyond_climb_flown_on_circles(altitude: float, side: str, rate: float) -> None:
-    """A climb is flown before the leg, a descent after the leg.
+    """A climb is flown before the leg, and a descent after it.
 
-    So the aircraft is clear of what the higher waypoint was meant to clear.
+    So the aircraft stays above what the higher waypoint should avoid.
     """
     route = (
         CORNER[0],
@@ -115,9 +115,9 @@ def test_altitude_beyond_climb_flown_on_circles(altitude: float, side: str, rate
 
 
 def test_waypoint_of_short_leg_left_out_where_route_passes_near() -> None:
-    """Two corners are 300 m apart: the nearer one to the line of its neighbours goes.
+    """Two corners are 300 m apart, and the one nearer to the line of its neighbours is left out.
 
-    The note tells the distance.
+    The note has the distance.
     """
     near = (
         Waypoint(0, 0, 0),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fence: distances and predicted turns against closed forms, flights out of it, refusals."""
+"""Test the fence: distances and predicted turns by closed forms, flights out of it, refusals."""
 
 import math
 from typing import Any
@@ -71,9 +71,9 @@ def test_clearance_is_distance_from_border() -> None:
 
 
 def test_clearance_of_several_zones() -> None:
-    """An aircraft stays in one of the zones to stay in, and out of each excluded zone.
+    """An aircraft must stay in one of the zones that include, and outside of each excluded zone.
 
-    An edge inside the other is none.
+    An edge inside another zone is no border.
     """
     second = SQUARE._replace(north=tuple(value + 150.0 for value in SQUARE.north))
     assert at((SQUARE, second), (75.0, 0.0), (240.0, 0.0), (-90.0, 0.0)) == approx(
@@ -84,7 +84,7 @@ def test_clearance_of_several_zones() -> None:
 
 
 def motion(north: float, east: float, course: float = 0.0, phi: float = 0.0, **of: Any) -> Motion:
-    """Of an osprey in a bank `phi`, in calm air if `of` has no wind."""
+    """Return the motion of an osprey in a bank `phi`, in calm air if `of` has no wind."""
     x, y, bank = np.array([north, east, phi])
     calm_motion = Motion(
         north=x,
@@ -107,9 +107,9 @@ EDGE_EAST = Zone((-3000.0, 3000.0, 3000.0, -3000.0), (-2000.0, -2000.0, 500.0, 5
 @pytest.mark.parametrize("edge, course", [(EDGE_NORTH, 0.0), (EDGE_EAST, math.pi / 2.0)])
 @pytest.mark.parametrize("wind", [0.0, 7.5, -7.5])
 def test_predicted_turn_is_arc_with_drift(edge: Zone, course: float, wind: float) -> None:
-    """Head on to an edge, without roll time.
+    """The aircraft flies head on to an edge and needs no time to roll.
 
-    The way to the edge is R sin(w t) + W t at w t = acos(-W / V).
+    Its way to the edge is R sin(w t) + W t at w t = acos(-W / V).
     """
     speed = 25.0
     bank = math.radians(30.0)
@@ -129,9 +129,9 @@ def test_predicted_turn_is_arc_with_drift(edge: Zone, course: float, wind: float
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("wind", [5.0, -5.0])
 def test_predicted_turn_drifts_with_wind_across(side: float, wind: float) -> None:
-    """Along an edge, a turn towards the edge.
+    """The aircraft flies along an edge and turns towards it.
 
-    Nearest is R (1 - cos(w t)) + W t, where V sin(w t) = -W.
+    It is nearest at R (1 - cos(w t)) + W t, where V sin(w t) = -W.
     """
     speed = 25.0
     bank = math.radians(30.0)
@@ -152,10 +152,10 @@ def test_predicted_turn_drifts_with_wind_across(side: float, wind: float) -> Non
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("phi", [0.0, -0.3])
 def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None:
-    """The course points home all the time, 15 deg to the side.
+    """The course points home from the beginning, 15 deg to the side.
 
-    The turn is flown until the bank is there, no longer. That is the lag and the time of the roll,
-    in which a level aircraft turns by 7 deg, within a step of the prediction.
+    So the turn only lasts until the bank is reached, which takes the lag and the time of the roll.
+    A level aircraft turns by 7 deg in it, to within a step of the prediction.
     """
     speed = 25.0
     bank = math.radians(30.0)
@@ -214,7 +214,7 @@ def test_turn_in_wind_ends_by_the_course_over_the_ground(
 
 
 def test_turn_in_a_head_wind_ends_by_the_course_over_the_ground() -> None:
-    """Home is west. The wind from the north turns the course from -70 to -80 degrees."""
+    """Home is to the west, and wind from the north turns the course from -70 to -80 degrees."""
     fence = Fence((FIELD,), (0.0, -400.0))
     moving = motion(0.0, 350.0, math.radians(-70.0))
     assert float(last_safe_turn(fence, LEFT, moving).action) == LEFT
@@ -222,7 +222,7 @@ def test_turn_in_a_head_wind_ends_by_the_course_over_the_ground() -> None:
 
 
 def test_turn_is_predicted_from_the_end_of_a_roll() -> None:
-    """A roll of the reference model, second order, gains p 2 zeta / w once p = 0 is commanded."""
+    """A second-order roll of the reference model gains p 2 zeta / w after p = 0 is commanded."""
     scenario = find_scenario("osprey_route")
     assert scenario.guidance is not None
     params = scenario.guidance.params()
@@ -239,9 +239,9 @@ LEAST_RADIUS = 282.0
 
 @pytest.mark.parametrize("name", benchmark.OUTSIDE)
 def test_aircraft_outside_flies_home_in_wind(name: str) -> None:
-    """A point banks at 0.35 rad/s and turns by g tan(phi) / V.
+    """A point mass banks at 0.35 rad/s and turns by g tan(phi) / V.
 
-    The winds are of 0.4 V from four sides, and it heads four ways.
+    The winds have 0.4 V and come from four sides, and it begins on four headings.
     """
     scaled = benchmark.OUTSIDE[name]
     fence = Fence(
@@ -289,7 +289,7 @@ def test_aircraft_outside_flies_home_in_wind(name: str) -> None:
 
 
 def test_outside_is_a_state_of_its_own() -> None:
-    """Outside the aircraft flies the course of the shortest way inside.
+    """Outside of the fence, the aircraft flies the shortest way inside.
 
     It does so until it is half a second of flight inside.
     """
@@ -309,7 +309,7 @@ def test_outside_is_a_state_of_its_own() -> None:
 
 
 def test_on_the_way_home_no_turn_begins_that_keeps_the_clearance_of_now() -> None:
-    """A quarter of a second of flight from the border, away from it and across the way home.
+    """The aircraft is a quarter of a second from the border, and flies across the way home.
 
     The margin of a first turn would begin one.
     """
@@ -323,9 +323,10 @@ def test_on_the_way_home_no_turn_begins_that_keeps_the_clearance_of_now() -> Non
 
 
 def test_no_turn_begins_that_is_worse_than_the_way_home() -> None:
-    """A funnel of 80 to 18 m has home at its narrow end.
+    """Home is at the narrow end of a funnel that narrows from 80 to 18 m.
 
-    The way keeps 9 m, less than 12.5 m, and a turn leaves by 200 m.
+    The way home has a clearance of 9 m, which is less than 12.5 m. A turn would leave the funnel by
+    200 m.
     """
     funnel = Zone((-1000.0, 1600.0, 1600.0, -1000.0), (-40.0, -9.0, 9.0, 40.0))
     escape = last_safe_turn(Fence((funnel,), (1500.0, 0.0)), HOME, motion(0.0, 0.0))
@@ -334,9 +335,9 @@ def test_no_turn_begins_that_is_worse_than_the_way_home() -> None:
 
 
 def test_way_home_leads_round_a_zone() -> None:
-    """A slot of a U is between the aircraft and home.
+    """The slot of a U lies between the aircraft and home.
 
-    The way leads to the closed end, and has a turn's room there.
+    The way leads around the closed end, with enough room for a turn.
     """
     arms = Zone(
         (-600.0, 2600.0, 2600.0, -600.0, -600.0, 1600.0, 1600.0, -600.0),
@@ -363,7 +364,7 @@ def test_way_home_leads_round_a_zone() -> None:
 
 
 def test_aircraft_without_a_way_home_holds_over_the_roomiest_place() -> None:
-    """Two zones with a gap between: from the one without home no way leads out."""
+    """There is a gap between two zones, and no way home from the zone without it."""
     fence = Fence(
         (
             SQUARE,
@@ -385,7 +386,7 @@ def test_aircraft_without_a_way_home_holds_over_the_roomiest_place() -> None:
 
 
 def test_zones_that_touch_are_one_region() -> None:
-    """A shared edge is no border, where one zone is larger too; a gap is one."""
+    """A shared edge is no border, even if one zone is larger, but a gap is one."""
     north_of = SQUARE._replace(
         north=(100.0, 300.0, 300.0, 100.0), east=(-50.0, -50.0, 100.0, 100.0)
     )
@@ -403,7 +404,7 @@ def test_zones_that_touch_are_one_region() -> None:
 
 
 def test_aircraft_stays_inside_every_zone_of_one_group() -> None:
-    """MAVLink: inside all zones of a group, and of at least one group."""
+    """By MAVLink, an aircraft must be inside all zones of at least one group."""
     half = Zone((-100.0, 0.0, 0.0, -100.0), (-100.0, -100.0, 100.0, 100.0), group=0)
     both = (SQUARE._replace(group=0), half)
     assert at(both, (50.0, 0.0), (-50.0, 0.0), (-10.0, 0.0)) == approx([-50.0, 50.0, 10.0])
@@ -418,7 +419,7 @@ def commanded(course: float) -> dict[str, Any]:
 
 
 def distances(tape: Tape, scenario: Scenario) -> FloatArray:
-    """True distances from the fence, m."""
+    """Return the true distances from the fence, m."""
     assert scenario.guidance is not None
     fence = scenario.guidance.fence_zones()
     assert fence is not None
@@ -510,9 +511,9 @@ def test_start_outside_of_fence_refused() -> None:
 
 
 def test_lost_link_flies_home() -> None:
-    """Without a message of an operator the route ends after the limit.
+    """Without a message of an operator, the route ends after the limit.
 
-    Log, replay, notice and outcome know it.
+    The log, the replay, the notice and the outcome say so.
     """
     route = {"north": [0.0, 900.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
     scenario = calm(5.0, route=route, home={"east": 300.0, "link_timeout": 3.0})
@@ -530,10 +531,10 @@ def test_lost_link_flies_home() -> None:
 
 
 class Operated(Guidance):
-    """Guidance with a message of an operator each second."""
+    """Guidance that gets a message of an operator every second."""
 
     def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
-        """A step, and before the first of a second a message."""
+        """Make a step. The first one of each second has a message before it."""
         if t_ns % (1000 * MS) == 0:
             self.keep_link()
         return super().step(now_ns, t_ns)
@@ -582,7 +583,7 @@ def test_home_is_target_and_choice_after_loss() -> None:
 
 
 def square(half: float, wind: float = 0.0) -> dict[str, Any]:
-    """The osprey's section of guidance, with home in the middle of a square."""
+    """Return the osprey's section of guidance, with home in the middle of a square."""
     corners = {"north": [-half, half, half, -half], "east": [-half, -half, half, half]}
     limits = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": 25.0}
     return limits | {"wind": wind, "fence": {"field": corners}}
@@ -591,8 +592,8 @@ def square(half: float, wind: float = 0.0) -> dict[str, Any]:
 def test_fence_in_which_no_turn_onto_the_orbit_fits_is_refused_with_the_size() -> None:
     """The turn from home leaves home by more than the square allows.
 
-    It leaves by twice its radius, 137 m with the slip of the prediction, and by what the aircraft
-    flies meanwhile: the orbit of 144 m alone fits into the square.
+    It needs twice its radius, which is 137 m with the slip of the prediction, and what the aircraft
+    flies until it turns. The orbit of 144 m alone would fit into the square.
     """
     with pytest.raises(ParameterError) as error:
         GuidanceConfig.validate_mapping(square(200.0), "guidance")
@@ -608,7 +609,10 @@ def test_fence_in_which_no_turn_onto_the_orbit_fits_is_refused_with_the_size() -
 
 @pytest.mark.parametrize("wind", [8.0, 10.0])
 def test_room_at_home_is_that_in_the_worst_wind_of_all_sides(wind: float) -> None:
-    """A strip has the same room whichever way it lies, and less than the wind along it leaves."""
+    """A strip has the same room in every direction in which it may lie.
+
+    The room is less than with the wind along the strip.
+    """
     along = Zone((-3000.0, 3000.0, 3000.0, -3000.0), (-450.0, -450.0, 450.0, 450.0))
     across = Zone(along.east, along.north)
     of_strip, of_turned = (
@@ -622,7 +626,7 @@ def test_room_at_home_is_that_in_the_worst_wind_of_all_sides(wind: float) -> Non
 
 @pytest.mark.parametrize("cells, is_straight", [(0.5, False), (1.5, True)])
 def test_straight_way_home_has_a_cell_of_clearance(cells: float, is_straight: bool) -> None:
-    """A tower beside the line onto the orbit, at half a cell and at one and a half."""
+    """A tower is half a cell, and then one and a half cells, beside the line onto the orbit."""
     field = Zone((-1000.0, 1000.0, 1000.0, -1000.0), (-1000.0, -1000.0, 1000.0, 1000.0))
     home = (0.0, 0.0)
     empty = ways(Fence((field,), home, 100.0))
@@ -642,7 +646,7 @@ def test_straight_way_home_has_a_cell_of_clearance(cells: float, is_straight: bo
 
 
 def test_turn_onto_the_orbit_that_fits_to_one_side_is_enough() -> None:
-    """A slot beside home: the better turn goes away from it."""
+    """There is a slot beside home, and the better turn leads away from it."""
     section = square(400.0)
     section["fence"]["slot"] = {
         "north": [-400.0, 400.0, 400.0, -400.0],

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Equations of guidance against closed forms: attitude, altitude, course, paths, protection."""
+"""Test the equations of guidance by closed forms: attitude, altitude, course, paths, protection."""
 
 import math
 
@@ -48,13 +48,16 @@ FOLLOW = PathParams(period=20.0, damping=0.75, capture=math.radians(30.0))
 
 
 def loop_damping(gain: float, frequency: float, damping: float) -> float:
-    """Damping of the slow poles of phi_dot = p, p a second-order filter of gain (phi_c - phi)."""
+    """Return the damping of the slow poles of phi_dot = p.
+
+    p is a second-order filter of gain (phi_c - phi).
+    """
     poles = Polynomial([frequency**2 * gain, frequency**2, 2.0 * damping * frequency, 1.0]).roots()
     return float(np.min(-np.real(poles) / np.abs(poles)))
 
 
 def test_bank_loop_has_damping_0_74() -> None:
-    """The gain is a quarter of the bandwidth of p."""
+    """The gain is a quarter of the bandwidth of p, which gives a damping of 0.74."""
     # Known values of the same cubic: 0.48 with k = 2, 0.31 with 3, unstable from 2 zeta w = 9 on
     # (Hurwitz).
     assert loop_damping(5.0 / 4.0, 5.0, 0.9) == approx(0.74, abs=0.01)
@@ -106,7 +109,7 @@ def test_sideslip_to_right_turns_nose_right() -> None:
 
 
 def test_climb_rate_is_smooth_and_brakes() -> None:
-    """The climb rate is continuous in value and slope, and falls by half the acceleration."""
+    """The climb rate is continuous in value and slope, and decreases by half the acceleration."""
     free = CLIMB._replace(climb=1e3, sink=1e3)
     near = 1.0 / (2.0 * 0.2**2)
     step = 1e-6
@@ -123,7 +126,7 @@ def test_climb_rate_is_smooth_and_brakes() -> None:
 
 @pytest.mark.parametrize("stall_speed", [20.0, 60.0, 121.9, 133.0])
 def test_altitude_loop_keeps_margin(stall_speed: float) -> None:
-    """The altitude loop has a gain margin of 2.5 where the flight path lags the pitch."""
+    """The altitude loop has a gain margin of 2.5 although the flight path lags the pitch."""
     # theta = gamma_c + low-pass of (theta - gamma), T_L gamma_dot = theta - gamma, h_dot = V gamma.
     # JSBSim's f16 at 154 m/s and 12 km, V_s = 121.9 m/s, fell into a limit cycle of 22 s with k_h =
     # 0.2 and T = 2 s.
@@ -152,7 +155,7 @@ def test_pitch_settles_where_angle_of_attack_estimated() -> None:
 
 
 def test_course_approached_on_shorter_side() -> None:
-    """Beyond 90 degrees the turn is the largest turn."""
+    """The course turns to the shorter side, and beyond 90 degrees at the largest rate."""
     # To the right, over south.
     assert course_acceleration(math.radians(-170.0), math.radians(170.0), SPEED, 0.4) > 0.0
     assert course_acceleration(math.radians(135.0), 0.0, SPEED, 0.4) == 0.4 * SPEED
@@ -162,7 +165,7 @@ def test_course_approached_on_shorter_side() -> None:
 
 
 def cross_track(e_0: float, times: FloatArray) -> FloatArray:
-    """Cross-track error of a point with the acceleration of `path_acceleration`.
+    """Return the cross-track error of a point with the acceleration of `path_acceleration`.
 
     It flies beside a line to the north.
     """
@@ -202,7 +205,7 @@ def test_line_captured_from_far_at_capture_angle() -> None:
 
 @pytest.mark.parametrize("away", [180.0, 179.9, -179.0, 170.0])
 def test_opposite_course_gives_largest_turn(away: float) -> None:
-    """An aircraft on the course opposite to a line turns with the largest acceleration."""
+    """On the opposite course, an aircraft turns with the largest acceleration."""
     full = 4.0 * math.pi * FOLLOW.damping / FOLLOW.period * SPEED
     turn = path_acceleration(PathError(0.0, 0.0, 0.0), math.radians(away), SPEED, FOLLOW)
     # A sine would leave 0.2 % of it at 179.9 deg.
@@ -211,7 +214,7 @@ def test_opposite_course_gives_largest_turn(away: float) -> None:
 
 @pytest.mark.parametrize("radius", [300.0, -300.0])
 def test_acceleration_on_circle_is_centripetal(radius: float) -> None:
-    """On a circle the acceleration is centripetal, and drives an offset back."""
+    """On a circle the acceleration is centripetal, and it reduces an offset."""
     orbit = Arc((0.0, 0.0), radius)
     # To the north of the centre: east on a right turn, west on a left one.
     on = path.error(orbit, (300.0, 0.0))
@@ -223,9 +226,9 @@ def test_acceleration_on_circle_is_centripetal(radius: float) -> None:
 
 
 def offset_from_a_circle(*, estimated: bool) -> float:
-    """Radius of the orbit beyond that of the command, m, of an aircraft that slips.
+    """Return how much larger the flown radius is than the commanded one, m, with a slip.
 
-    A tenth of its bank's turn is missing.
+    The slip makes the aircraft turn by a tenth less than its bank would.
     """
     speed, radius, dt = 50.0, 800.0, 0.05
     north = 0.0
@@ -257,7 +260,7 @@ def test_aircraft_that_slips_flies_on_circle() -> None:
 
 
 def test_roll_is_no_sideslip() -> None:
-    """In a roll the turn lags the bank; the estimate of the sideslip stays."""
+    """In a roll the turn lags the bank, and the estimate of the sideslip is kept."""
     assert slip_estimate(0.5, 4.0, 0.0, 0.2, 0.02, 2.0) == 0.5
     assert slip_estimate(0.5, 4.0, 0.0, 0.1, 0.02, 2.0) == approx(
         0.5 + 0.5 * 3.5 * (1.0 - math.exp(-0.01)), rel=1e-12
@@ -265,7 +268,7 @@ def test_roll_is_no_sideslip() -> None:
 
 
 def test_gyro_bias_is_no_sideslip() -> None:
-    """In straight flight a bias of the gyro of r gives no sideslip."""
+    """In straight flight, a bias of the gyro of r causes no sideslip estimate."""
     # R reads 1 mrad/s too much at 154 m/s: unbounded, 0.15 m/s^2 would hold the aircraft 6.5 m
     # beside a leg.
     slip = 0.0
@@ -277,9 +280,10 @@ def test_gyro_bias_is_no_sideslip() -> None:
 
 
 def test_heading_is_smoothed_without_lag_across_180_deg() -> None:
-    """T = 2 s at 50 Hz.
+    """The time constant is 2 s, at 50 Hz.
 
-    A low-pass leaves of white noise sigma sqrt(g / (2 - g)), g = 1 - exp(-dt/T): 0.07 deg of 1.
+    A low-pass reduces the sigma of white noise by sqrt(g / (2 - g)) with g = 1 - exp(-dt/T), from 1
+    to 0.07 deg.
     """
     dt = 0.02
     noise = np.random.default_rng(1).normal(0.0, math.radians(1.0), 5000)
@@ -346,7 +350,7 @@ def test_a_fillet_touches_both_legs(side: float) -> None:
 def test_infeasible_route_refused_with_mend(
     waypoints: list[tuple[float, float]], radius: float, sentence: str
 ) -> None:
-    """The sentence names a value that would do."""
+    """The sentence names a value with which the route can be flown."""
     with refusing(sentence):
         path.route(waypoints, radius, 100.0)
 
@@ -372,7 +376,7 @@ def test_protection_follows_from_the_stall_speed() -> None:
 
 @pytest.mark.parametrize("command", [{"climb": 3.0}, {"theta": 0.2}, {"altitude": 300.0}])
 def test_ceiling_holds_in_every_vertical_mode(command: dict[str, float]) -> None:
-    """A point that climbs as commanded stays below the ceiling, and reaches it."""
+    """A point mass that climbs as commanded reaches the ceiling and stays below it."""
     section = GuidanceConfig(natural_frequency=(4.0, 1.2, 5.0, 4.0), speed=SPEED, ceiling=300.0)
     params = section.params()
     altitude = 250.0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance at the edge of its own limits: bank 0, speed 0, a wind above V; and steps that fail."""
+"""Test guidance at its limits: bank 0, speed 0, a wind above V, and steps that fail."""
 
 import math
 from collections.abc import Callable
@@ -55,7 +55,10 @@ NAMESPACES = pytest.mark.parametrize("asarray", [np.asarray, jnp.asarray], ids=[
 def test_wings_are_level_at_a_speed_without_room_for_a_bank(
     asarray: Callable[[Any], Array],
 ) -> None:
-    """Up to 1.1 V_s, at a standstill and with a flow from behind; floats as arrays."""
+    """There is no bank up to 1.1 V_s, at a standstill, or with a flow from behind.
+
+    Floats and arrays give the same.
+    """
     limits = np.asarray(bank_limit(0.5, STALL, asarray(SPEEDS)))
     assert limits == approx([float(bank_limit(0.5, STALL, speed)) for speed in SPEEDS], abs=1e-6)
     assert not limits[:6].any()
@@ -64,7 +67,7 @@ def test_wings_are_level_at_a_speed_without_room_for_a_bank(
 
 
 def motion(speed: Any, bank: Any, wind: tuple[float, float], phi: Any) -> Motion:
-    """An aircraft on the way to the north, 1,300 m before the border."""
+    """Return an aircraft that flies to the north, 1,300 m before the border."""
     zero = 0.0 * phi
     return Motion(
         north=zero,
@@ -81,7 +84,10 @@ def motion(speed: Any, bank: Any, wind: tuple[float, float], phi: Any) -> Motion
 
 @pytest.mark.parametrize("compiled", [lambda step: step, jax.jit], ids=["NumPy", "JAX"])
 def test_fence_has_a_number_at_every_edge(compiled: Callable[[Any], Any]) -> None:
-    """Every action before, bank, speed and wind, of a fleet of each; and of floats."""
+    """The fence gives finite numbers for every previous action, bank, speed and wind.
+
+    The inputs are arrays of a fleet, and also floats.
+    """
 
     def escapes(speed: Array, bank: Array, wind: Array, action: Array) -> Any:
         return last_safe_turn(FENCE, action, motion(speed, bank, (wind, -wind), 0.0 * bank))
@@ -96,9 +102,9 @@ def test_fence_has_a_number_at_every_edge(compiled: Callable[[Any], Any]) -> Non
 
 @pytest.mark.parametrize("wind", [0.0, 30.0])
 def test_turn_without_bank_is_the_straight_way(wind: float) -> None:
-    """Away from home to the north at 20 m/s with a wind from the west, over a square.
+    """The aircraft flies away from home to the north at 20 m/s, over a square, in a west wind.
 
-    The line ends at the farthest.
+    Without a bank, the prediction is a straight line, and its end is farthest from the square.
     """
     straight = motion(20.0, 0.0, (0.0, wind), np.float64(0.0))._replace(north=500.0)
     right, left = map(float, turn_clearance(FENCE, straight))
@@ -175,7 +181,7 @@ REACHES = st.sampled_from([UNKNOWN, 0.0, 1e-3, 0.5])
 def test_any_finite_y_and_pose_give_a_finite_u_m_and_no_failed_step(
     name: str, data: st.DataObject
 ) -> None:
-    """With learned authorities, and a pose or a y that is late or lost."""
+    """Authorities are learned, and the pose or y is late or lost."""
     section = FLIGHTS[name].guidance
     assert section is not None
     made = Guidance(section)
@@ -203,7 +209,7 @@ def test_any_finite_y_and_pose_give_a_finite_u_m_and_no_failed_step(
 
 
 def test_lost_speed_in_a_fence_ends_with_an_outcome_and_a_report() -> None:
-    """The airspeed falls below 1.1 V_s, where no bank is left for the turn at the fence."""
+    """The airspeed falls below 1.1 V_s, so that no bank is left for the turn at the fence."""
     scenario = calm(8.0, fence=WIDE)
     faults = ["thrust hard_over 3 lower"]
     actuators = scenario.aircraft.actuators.model_dump() | {"faults": faults}
@@ -227,7 +233,7 @@ def test_lost_speed_in_a_fence_ends_with_an_outcome_and_a_report() -> None:
 
 
 class _Failing:
-    """`guidance.step` that fails at instants: it raises, or gives NaN."""
+    """A `guidance.step` that fails at given instants. It raises an error, or returns NaN."""
 
     def __init__(self, kind: str, *failing_ns: range) -> None:
         self._kind = kind
@@ -250,7 +256,10 @@ CAUSE = "IndexError index -2147483648 is out of bounds"
 def test_step_that_fails_leaves_last_u_m_and_next_is_tried(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Three steps of a turn are not finite, and one 20 s later: said twice, and counted."""
+    """Three steps of a turn are not finite, and one step 20 s later.
+
+    Both failures are told and counted.
+    """
     scenario = calm(28.0, program={"course": {"start": [1.0], "value": [1.0]}})
     section = scenario.guidance
     assert section is not None
@@ -282,13 +291,13 @@ def test_step_that_fails_leaves_last_u_m_and_next_is_tried(
 
 
 def banked(section: dict[str, Any]) -> Guidance:
-    """Guidance of an osprey in a bank, before its first step."""
+    """Return guidance of an osprey in a bank, before its first step."""
     own = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": 25.0}
     return Guidance(GuidanceConfig.validate_mapping(own | section, "guidance"))
 
 
 def _feed(made: Guidance, t_ns: int) -> Any:
-    """A step with a pose and a y of its instant."""
+    """Make a step with a pose and a y of its instant."""
     pose = dict.fromkeys(POSE, 0.0) | {"north": 25e-9 * t_ns, "v_north": 25.0, "phi": 0.1}
     made.take_pose(StampedVector(t_ns, np.array([pose[name] for name in POSE])), t_ns)
     made.take_y(StampedVector(t_ns, np.zeros(4)), t_ns)
@@ -298,7 +307,10 @@ def _feed(made: Guidance, t_ns: int) -> Any:
 def test_steps_that_fail_for_longer_than_the_age_limit_leave_no_u_m(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The reference model then levels the wings. Guidance says why, and begins again."""
+    """Without u_m the reference model levels the wings.
+
+    Guidance says why, and begins again.
+    """
     made = banked({"max_age": 0.2})
     monkeypatch.setattr(module, "step", _Failing("raises", range(1000 * MS, 5000 * MS)))
     outputs = {k: _feed(made, 20 * k * MS) for k in range(300)}
@@ -316,7 +328,7 @@ def test_steps_that_fail_for_longer_than_the_age_limit_leave_no_u_m(
 def test_reason_of_failed_steps_is_said_where_no_u_m_comes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The first step fails already: there is no u_m to go on with."""
+    """The first step already fails, so there is no u_m that could be kept."""
     made = banked({})
     monkeypatch.setattr(module, "step", _Failing("raises", range(5000 * MS)))
     assert all(_feed(made, 20 * k * MS) is None for k in range(150))
@@ -352,7 +364,7 @@ MULTICOPTER = REPOSITORY / "examples" / "hexarotor" / "hexarotor_square.yaml"
 
 
 def _fly(made: Guidance, k: int, altitude: float = 0.0, north: float = 0.0) -> Any:
-    """A step of a slow motion, for airplane and multicopter."""
+    """Make a step of a slow motion, for an airplane or a multicopter."""
     t_ns = k * made.period_ns
     pose = dict.fromkeys(POSE, 1e-6 * k) | {"north": north, "altitude": altitude, "v_north": 3.0}
     made.take_pose(StampedVector(t_ns, np.array([pose[name] for name in POSE])), t_ns)
@@ -370,7 +382,10 @@ def _section(kind: str, **changes: Any) -> GuidanceConfig:
 @pytest.mark.parametrize("kind", ["multicopter", "airplane"])
 @pytest.mark.parametrize("authority", AUTHORITIES)
 def test_aircraft_flies_home_whatever_authority_is_learned(kind: str, authority: float) -> None:
-    """Also by itself once the link is lost, where an exception would fail each step."""
+    """The aircraft also flies home by itself when the link is lost.
+
+    An exception would make every step fail then.
+    """
     made = Guidance(_section(kind, home={"link_timeout": 0.5}))
     for k in range(5):
         _fly(made, k)
@@ -389,7 +404,10 @@ def test_aircraft_flies_home_whatever_authority_is_learned(kind: str, authority:
 def test_aircraft_beyond_its_altitudes_goes_to_the_nearest_permitted_one(
     kind: str, service: str, altitude: float, expected: float
 ) -> None:
-    """As after an updraught: the altitude of now is no command that guidance may take."""
+    """An updraught may carry the aircraft beyond its altitudes.
+
+    Then guidance may not command the present altitude.
+    """
     changes: dict[str, Any] = {"ceiling": 120.0, "altitude_floor": -20.0}
     changes["home"] = {"link_timeout": 0.5}
     made = Guidance(_section(kind, **changes))

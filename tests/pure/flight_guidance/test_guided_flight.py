@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guided flights in one process.
+"""Test guided flights in one process.
 
-Tested are holds, routes, protection, failsafe, refusals, and the log from which each step follows.
+The tests cover holds, routes, protection, the failsafe, refusals, and the log, from which each step
+can be computed.
 """
 
 import math
@@ -55,7 +56,7 @@ BANKED = (0.1, 0.05, 0.3, 0.0, 0.0, 100.0, 25.0 * math.cos(0.3), 25.0 * math.sin
 
 
 def program(**channels: float) -> dict[str, Any]:
-    """Commands from 1 s on."""
+    """Return commands that begin at 1 s."""
     return {name: {"start": [1.0], "value": [value]} for name, value in channels.items()}
 
 
@@ -83,7 +84,7 @@ def test_heading_altitude_and_airspeed_reached_and_held() -> None:
 
 
 def test_route_flown_and_ends_in_orbit() -> None:
-    """A short route is flown leg by leg."""
+    """A short route is flown leg by leg, and ends in an orbit."""
     points = {"north": [0.0, 300.0, 300.0], "east": [0.0, 0.0, 300.0], "altitude": [0.0, 0.0, 6.0]}
     tape = simulate(calm(30.0, route=points))
     leg, xtrack, altitude = channels(tape["guidance"], "leg", "xtrack", "pose.altitude")
@@ -102,7 +103,7 @@ def test_line_captured_without_overshoot() -> None:
 
 
 def test_flying_wing_without_rudder_flies_route() -> None:
-    """The X8 has elevons and a throttle: r follows the bank."""
+    """The X8 has elevons and a throttle, so r follows from the bank."""
     wing = find_scenario("x8_elevons").vary(
         flight={"duration": 32.0},
         aircraft={"kinematics": "euler", "gusts": {}, "rate": 100.0, "step": 0.005},
@@ -133,7 +134,7 @@ def test_lost_aileron_is_found_without_a_learner() -> None:
 
 
 def test_small_corner_flown_with_small_bank() -> None:
-    """A corner of half a degree takes a bank of about a degree."""
+    """A corner of half a degree needs a bank of about one degree."""
     # Its arc takes 0.07 s, the bank lags by 1.1 s. With the curvature of the arc all that time the
     # osprey banked by 17 deg.
     points = {
@@ -173,12 +174,12 @@ def test_each_step_follows_from_log_to_last_bit() -> None:
 
 
 def pose(stamp_ns: int) -> StampedVector:
-    """A pose in a bank of 0.1 rad, on the way to the north."""
+    """Return a pose in a bank of 0.1 rad, on the way to the north."""
     return StampedVector(stamp_ns, np.array([*BANKED[:3], 25e-9 * stamp_ns, *BANKED[4:]]))
 
 
 def flying(**section: Any) -> Guidance:
-    """Guidance after its first step, in a bank of 0.1 rad to the right."""
+    """Return guidance after its first step, in a bank of 0.1 rad to the right."""
     made = Guidance(GuidanceConfig.validate_mapping(SECTION | section, "guidance"))
     made.take_pose(pose(0), 0)
     made.take_y(StampedVector(0, np.zeros(4)), 0)
@@ -187,7 +188,10 @@ def flying(**section: Any) -> Guidance:
 
 
 def run(made: Guidance, first: int, last: int, rates: FloatArray | None = None) -> Signal:
-    """The log of steps with y alone; `rates` None: p and q of y follow u_m at once."""
+    """Return the log of steps with y and no pose.
+
+    If `rates` is None, p and q of y follow u_m at once.
+    """
     stamps = []
     rows = []
     y = np.zeros(4)
@@ -203,7 +207,7 @@ def run(made: Guidance, first: int, last: int, rates: FloatArray | None = None) 
 
 @pytest.mark.parametrize("y_too", [False, True], ids=["pose alone", "then y too"])
 def test_stale_pose_levels_wings(y_too: bool) -> None:
-    """Dead reckoning levels the wings; later all rates are 0."""
+    """Dead reckoning levels the wings first, and later all rates are 0."""
     made = flying(hold=4.0)
     signal = run(made, 1, 300)
     mode = signal["mode"]
@@ -225,7 +229,7 @@ def test_stale_pose_levels_wings(y_too: bool) -> None:
 
 
 def northwards(altitude: float = 100.0) -> Route:
-    """A line to the north that ends at an altitude, m, and the orbit."""
+    """Return a line to the north that ends at an altitude, m, with its orbit."""
     section = GuidanceConfig.validate_mapping(SECTION, "guidance")
     return section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, altitude)])
 
@@ -263,7 +267,7 @@ def switch(made: Guidance, by: str, *, on: bool) -> None:
 
 @SWITCHES
 def test_route_waits_for_engagement(by: str) -> None:
-    """A route sent while guidance is off is flown from the engagement on."""
+    """A route that is sent while guidance is off is flown when guidance engages."""
     made = flying()
     made.take_route(northwards())
     assert run(made, 1, 2)["mode.lateral"][0] == Lateral.ROUTE
@@ -282,7 +286,7 @@ def test_route_waits_for_engagement(by: str) -> None:
 
 @SWITCHES
 def test_commands_while_disengaged_are_void(by: str) -> None:
-    """Commands given while guidance did not fly are not flown afterwards."""
+    """Commands that are given while guidance is off are not flown afterwards."""
     made = flying(program={"heading": {"start": [0.05], "value": [2.0]}})
     made.take_target({"altitude": 300.0})
     switch(made, by, on=False)
@@ -300,7 +304,7 @@ def test_commands_while_disengaged_are_void(by: str) -> None:
 
 
 def test_stale_y_gives_no_command() -> None:
-    """Without a fresh y there is no u_m; a frozen pose is refused."""
+    """Without a fresh y there is no u_m, and a frozen pose is refused."""
     made = flying()
     assert made.step(400 * MS, 400 * MS) is None
     with pytest.raises(ChannelError, match="sample: stamp 0 s before the last one"):
@@ -312,7 +316,7 @@ def test_stale_y_gives_no_command() -> None:
 
 @pytest.mark.parametrize("gap, continues", [(5, True), (50, False)])
 def test_commands_continue_after_short_pause(gap: int, continues: bool) -> None:
-    """u_m goes on from the last u_m after a short pause, and starts again after a long pause."""
+    """u_m continues from its last value after a short pause, and starts again after a long one."""
     made = flying()
     made.take_target({"phi": 0.5})
     before = run(made, 1, 9, np.zeros(4))
@@ -330,7 +334,7 @@ def test_commands_continue_after_short_pause(gap: int, continues: bool) -> None:
 
 
 def test_new_command_bounds_slew() -> None:
-    """The commanded climb rate continues, and the slew of u_m is bounded."""
+    """The commanded climb rate is continuous, and the slew of u_m is bounded."""
     made = flying()
     made.take_target({"phi": 0.5, "climb": 2.0})
     signal = run(made, 1, 100, np.zeros(4))
@@ -402,7 +406,7 @@ def test_parameters_that_cannot_be_flown_are_refused(
 
 
 def test_omitted_numbers_follow_from_sections() -> None:
-    """Numbers left out follow from the remaining sections."""
+    """Numbers that are left out follow from the other sections."""
     section = ROUTE.guidance
     assert section is not None
     assert (section.speed, section.natural_frequency) == (25.0, (4.0, 1.2, 5.0, 4.0))
@@ -440,7 +444,7 @@ def test_sections_that_do_not_fit_guidance_refused(changes: dict[str, Any], sent
 
 
 def test_replay_names_first_different_step() -> None:
-    """Replay computes every step of guidance again."""
+    """A replay computes every step of guidance again."""
     scenario = calm(4.0, program=program(heading=0.5))
     tape = simulate(scenario)
     result = replay_guidance(tape, scenario.guidance)
@@ -457,14 +461,14 @@ def test_replay_names_first_different_step() -> None:
 
 
 class RoutedInFlight(Guidance):
-    """Guidance that takes a route at 1 s."""
+    """Guidance that receives a route at 1 s."""
 
     def __init__(self, parameters: GuidanceConfig) -> None:
         super().__init__(parameters)
         self._new = parameters.plan([Waypoint(*point) for point in WAYPOINTS])
 
     def step(self, now_ns: int, t_ns: int) -> guidance.GuidanceOutput | None:
-        """See Guidance."""
+        """Make a step. See Guidance."""
         if t_ns == 1000 * MS:
             self.take_route(self._new)
         return super().step(now_ns, t_ns)
@@ -474,7 +478,7 @@ WAYPOINTS = [(0.0, 0.0, 0.0), (800.0, 0.0, 10.0)]
 
 
 def test_route_received_in_flight_is_logged(tmp_path: Path) -> None:
-    """A route received in flight is read from the log, replayed and drawn."""
+    """A route that was received in flight is read from the log, replayed and drawn."""
     scenario = calm(3.0)
     section = scenario.guidance
     assert section is not None
@@ -498,7 +502,7 @@ def test_route_received_in_flight_is_logged(tmp_path: Path) -> None:
 
 
 def test_loiters_are_flown_on_their_side() -> None:
-    """Half a turn to the left, then a quarter of the last orbit to the right."""
+    """The route has half a turn to the left, and its last orbit turns to the right."""
     centres = [(350.0, 0.0), (150.0, -320.0)]
     waypoints = [Waypoint(0.0, 0.0, 0.0), *(Waypoint(*centre, 0.0) for centre in centres)]
     waypoints[1] = waypoints[1]._replace(turns=0.5, left=True)
@@ -559,7 +563,7 @@ def test_bad_words_of_command_line_are_one_sentence(words: list[str], sentence: 
 
 
 def test_steep_climb_slows_and_keeps_airspeed() -> None:
-    """A climb beyond the throttle becomes slower, and the airspeed stays."""
+    """A climb beyond the power of the throttle becomes slower, and the airspeed is kept."""
     # An engine that has lost most of its power gives 0.3 m/s^2 in place of 3.
     weak = calm(30.0, program=program(climb=2.5)).vary(
         aircraft={"actuators": {"upper": [0.5, 0.05, 0.5, 0.5]}}
@@ -582,6 +586,6 @@ def test_steep_climb_slows_and_keeps_airspeed() -> None:
 def test_airspeed_error_limits_climb_and_sink(
     shortfall: float, expected: tuple[float, float]
 ) -> None:
-    """The limits of climb and sink fall with the error of the airspeed."""
+    """The limits of climb and sink become smaller with the error of the airspeed."""
     # d = 9.81 x 2 / (0.4 x 25) = 1.96.
     assert climb_range(2.0, 3.0, shortfall, 25.0) == approx(expected, abs=5e-3)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A landing on a line of the route.
+"""Test a landing on a line of the route.
 
-Tested are what is refused, the flare, the nose along the line, and the go-around.
+The tests cover refusals, the flare, the alignment of the nose, and the go-around.
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ ROUTE = {
 
 @pytest.fixture(scope="module")
 def across() -> Scenario:
-    """An approach of the osprey in 4 m/s across, at 100 Hz."""
+    """Return an approach of the osprey in a crosswind of 4 m/s, at 100 Hz."""
     return calm_osprey(37.0, (0.0, 4.0), route=ROUTE, landing={"waypoint": 1})
 
 
@@ -55,7 +55,7 @@ def section_with(scenario: Scenario, **changes: Any) -> GuidanceConfig:
 
 
 def low(section: GuidanceConfig, height: float, north: float = 750.0) -> tuple[Any, ...]:
-    """The lander, the state on the glide path at a height, the pose and the route."""
+    """Return the lander, the state on the glide path at a height, the pose and the route."""
     route = section.plan(section.waypoints())
     pose = dict.fromkeys(POSE, 0.0) | {"v_north": section.speed, "climb": -1.2}
     pose |= {"north": north, "altitude": GROUND + height}
@@ -133,9 +133,9 @@ def test_box_ahead_is_flown_to_and_a_missed_box_goes_around(across: Scenario) ->
 def test_no_go_around_below_the_height_of_the_decrab(
     height: float, around: bool, across: Scenario
 ) -> None:
-    """A metre above the ground a drift out of the box ends on the ground beside it.
+    """A metre above the ground, a drift out of the box ends on the ground beside it.
 
-    It does not end in a climb from there.
+    The aircraft does not climb from there.
     """
     box = {"north": [700.0, 1000.0, 1000.0, 700.0], "east": [5.0, 5.0, 20.0, 20.0]}
     section = section_with(across, touchdown=box)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance of multicopters: the direction of the thrust, and flights in one process."""
+"""Test guidance of multicopters: the direction of the thrust, and flights in one process."""
 
 import math
 from typing import Any
@@ -36,7 +36,7 @@ DRAG = 0.9794  # 1/s, of the climb by the airframe file
 
 
 def flight(duration: float, aircraft: Any = None, **section: Any) -> tuple[Scenario, Tape]:
-    """The quadrotor in one process; without a route unless the section has one."""
+    """Fly the quadrotor in one process. It has no route unless the section has one."""
     changes: dict[str, Any] = {"flight": {"duration": duration}, "aircraft": aircraft or {}}
     scenario = SQUARE.vary(**changes, guidance={"route": None} | section)
     tape = simulate(scenario)
@@ -50,7 +50,7 @@ def square() -> tuple[Scenario, Tape]:
 
 
 def commanded(**values: float) -> dict[str, Any]:
-    """A program that commands channels after 1 s."""
+    """Return a program that commands channels from 1 s on."""
     return {name: {"start": [1.0], "value": [value]} for name, value in values.items()}
 
 

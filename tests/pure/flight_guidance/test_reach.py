@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance asks for no more than the inputs can do, by a model that was learned in flight."""
+"""Test that guidance asks for no more than the inputs can do, by a model learned in flight."""
 
 import math
 
@@ -40,7 +40,7 @@ OWN = CONFIG.params()
 def flown(
     target: dict[str, float], authority: Authority, **pose: float
 ) -> tuple[GuidanceState, StepCommands]:
-    """The commands after 10 s at a constant pose, level but for `pose`."""
+    """Return the commands after 10 s at a constant pose, which is level except for `pose`."""
     values = dict.fromkeys(POSE, 0.0) | {"v_north": SPEED} | pose
     state = None
     for k in range(500):
@@ -162,9 +162,9 @@ def test_authority_acts_from_the_next_step_on_and_is_logged() -> None:
 
 
 def rolled(share: float, test: RollTest) -> RollTest:
-    """The test after 60 s of steps of the bank to either side.
+    """Return the test after 60 s with steps of the bank to either side.
 
-    The aircraft rolls with a share of the command, 0.4 s behind it, and with gusts.
+    The aircraft rolls by a share of the command, 0.4 s late, in gusts.
     """
     dt = 0.02
     # rad/s, of which 0.05 rms are left: ten times those of an osprey in moderate turbulence.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Route files: WGS84 against pymap3d, and what each format holds or may not hold."""
+"""Test route files: WGS84 against pymap3d, and what each format may and may not contain."""
 
 import io
 import json
@@ -79,7 +79,7 @@ KML_POINTS = "".join(
 @pytest.mark.parametrize("latitude", [-89.0, -33.9, 0.0, 47.4, 78.2])
 @pytest.mark.parametrize("longitude", [-179.999, 8.5, 179.999])  # beside the date line
 def test_north_and_east_of_tangent_plane(latitude: float, longitude: float) -> None:
-    """North and east belong to the plane tangent to the ellipsoid at the origin."""
+    """North and east lie in the plane that is tangent to the ellipsoid at the origin."""
     for north, east in ((0.0, 0.0), (1e3, -2e3), (-5e4, 5e4)):
         lat, lon, up = pymap3d.enu2geodetic(east, north, 0.0, latitude, longitude, 0.0)
         expected = pymap3d.geodetic2enu(lat, lon, 0.0, latitude, longitude, 0.0)
@@ -94,7 +94,7 @@ def test_north_and_east_of_tangent_plane(latitude: float, longitude: float) -> N
 
 
 def test_plane_errs_by_4_m() -> None:
-    """At the largest distance the plane is 4 m short of the ground."""
+    """At the largest distance, lengths in the plane are 4 m shorter than on the ground."""
     lat = 47.4
     lon = 8.5 + math.degrees(MAX_DISTANCE / (SEMI_MAJOR * math.cos(math.radians(47.4))))
     on_ground, _ = vdist(47.4, 8.5, lat, lon)
@@ -170,9 +170,9 @@ def plan(
 
 
 def wpl(*rows: tuple[float, ...]) -> str:
-    """Rows of a QGC WPL 110, after the home at 400 m.
+    """Return rows of a QGC WPL 110 after the home at 400 m.
 
-    A row has frame, command, latitude, longitude, altitude, perhaps the first two parameters.
+    A row has frame, command, latitude, longitude, altitude, and possibly the first two parameters.
     """
     lines = [(*row, 0.0, 0.0)[:7] for row in [(0, 16, 47.4, 8.5, 400.0), *rows]]
     texts = [
@@ -291,7 +291,7 @@ def test_altitude_option_fills_what_file_lacks(
 
 
 def test_mission_counts_from_sea_where_pose_does(tmp_path: Path) -> None:
-    """The home is 400 m above the sea; its place is the origin where no origin is given."""
+    """The home is 400 m above the sea, and is the origin if no origin is given."""
     path = tmp_path / "r.waypoints"
     path.write_text(wpl((3, 16, 47.4, 8.52, 50.0), (0, 16, 47.42, 8.52, 500.0)))
     assert [waypoint.altitude for waypoint in read_route_file(path, above_sea=True).waypoints] == [
@@ -396,7 +396,10 @@ A, B, C, D = ((3, 16, 47.4 + 0.01 * k, 8.52, 50.0) for k in range(4))
 
 
 def jump(item: int, count: int) -> tuple[float, ...]:
-    """A row of DO_JUMP: the first parameter is the item, the second how often."""
+    """Return a row of DO_JUMP.
+
+    The first parameter is the item, and the second is how often it jumps.
+    """
     return (2, 177, 0.0, 0.0, 0.0, item, count)
 
 
@@ -449,7 +452,7 @@ def test_mission_that_is_no_route_is_refused_by_item(
 
 
 def test_jump_of_plan_names_the_id_of_an_item(tmp_path: Path) -> None:
-    """A survey takes an id for each of its items, so that positions in the list and ids differ."""
+    """A survey takes an id for each of its items, so that ids and positions in the list differ."""
     items = [
         survey([{**mission_item(47.4 + 0.01 * k, 8.52, 50.0), "doJumpId": 3 + k} for k in range(3)])
     ]
@@ -488,7 +491,10 @@ def test_jump_of_plan_names_the_id_of_an_item(tmp_path: Path) -> None:
 def test_item_of_a_plan_states_one_place(
     frame: int, further: dict[str, Any], refusal: str, tmp_path: Path
 ) -> None:
-    """What a program writes beside the params is the same place, or none is flown."""
+    """Some programs write a place beside the params.
+
+    If it is not the same place, the item is not flown.
+    """
     items = [mission_item(47.4 + 0.01 * k, 8.52, 50.0, frame) for k in range(2)]
     items[0] |= further
     content = plan(items, home=(47.4, 8.5, 0.0))
@@ -614,7 +620,7 @@ GEOJSON_FENCE: dict[str, Any] = {
 
 
 def test_segments_of_track_are_joined(tmp_path: Path) -> None:
-    """0.003 deg of latitude are 0.18 nautical miles."""
+    """A gap of 0.003 deg of latitude is 0.18 nautical miles."""
     (tmp_path / "r.gpx").write_text(gpx(SEGMENTS.format(47.403)))
     route = read_route_file(tmp_path / "r.gpx", ZURICH)
     assert len(route.waypoints) == 3
@@ -673,9 +679,9 @@ def test_fence_of_file_is_zones_and_home(tmp_path: Path, ending: str) -> None:
 
 
 def test_inclusion_zones_of_an_autopilot_are_one_group(tmp_path: Path) -> None:
-    """MAVLink: inside all zones of a group.
+    """By MAVLink, an aircraft stays inside all zones of a group.
 
-    A plan has no groups; PX4 and ArduPilot stay inside all of its zones.
+    A plan has no groups, and PX4 and ArduPilot stay inside all of its zones.
     """
     path = tmp_path / "fence.plan"
     polygon = PLAN_FENCE["geoFence"]["polygons"][0]
@@ -750,7 +756,10 @@ def test_zone_that_is_not_told_to_keep_in_or_out_refused(tmp_path: Path) -> None
 
 
 def test_fence_is_read_wherever_a_geojson_may_have_it(tmp_path: Path) -> None:
-    """RFC 7946, sections 3.1.8 and 3.2: a collection of geometries, and a Feature without one."""
+    """A fence may be a collection of geometries, and a Feature may have none.
+
+    RFC 7946 says so in sections 3.1.8 and 3.2.
+    """
     path = tmp_path / "fence.geojson"
     polygon = GEOJSON_FENCE["features"][0]["geometry"]
     tree = {
@@ -784,7 +793,7 @@ def test_file_without_fence_refused(tmp_path: Path) -> None:
 
 
 def test_line_cut_at_date_line_is_one(tmp_path: Path) -> None:
-    """RFC 7946, section 3.1.9: a line over the antimeridian is cut there."""
+    """By RFC 7946, section 3.1.9, a line over the antimeridian is cut there."""
     parts = [[[179.99, 0.0, 1.0], [180.0, 0.0, 1.0]], [[-180.0, 0.0, 1.0], [-179.99, 0.0, 1.0]]]
     (tmp_path / "r.geojson").write_text(
         json.dumps({"type": "MultiLineString", "coordinates": parts})
@@ -795,7 +804,10 @@ def test_line_cut_at_date_line_is_one(tmp_path: Path) -> None:
 
 
 def test_track_is_thinned_within_tolerance(tmp_path: Path) -> None:
-    """A track of positions 20 m apart, beside two lines by up to 4 m, is two lines within 5 m."""
+    """A track is thinned to the lines from which it is less than the tolerance away.
+
+    Its positions have a distance of 20 m and are up to 4 m beside two lines. The tolerance is 5 m.
+    """
     north = [(20.0 * k, 4.0 * math.sin(k), 100.0) for k in range(51)]
     east = [(1000.0, 20.0 * k, 100.0) for k in range(1, 51)]
     path = tmp_path / "r.yaml"

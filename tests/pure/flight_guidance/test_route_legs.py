@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Legs of a route are flown or said to be missed.
+"""Test that the legs of a route are flown, or are said to be missed.
 
-Joining circles, tangents and the wind are tested against closed forms of geometry.
+Joining circles, tangents and the wind are compared with closed forms of geometry.
 """
 
 import math
@@ -58,7 +58,7 @@ MS = 1_000_000  # ns
 
 @pytest.mark.parametrize("distance, radius", [(2000.0, 150.0), (2000.0, -150.0), (20e3, 150.0)])
 def test_circle_from_afar_joined_on_its_tangent(distance: float, radius: float) -> None:
-    """The way to a circle is the tangent and an arc, with a turn to the tangent at the start."""
+    """The way to a circle begins with a turn onto its tangent, and ends with an arc."""
 
     def derivative(_: float, z: Any) -> list[float]:
         north, east, course = map(float, z)
@@ -176,7 +176,7 @@ def test_overlapping_circles_refused(left: tuple[int, ...], distance: float, sen
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_way_onto_leg_is_tangent_and_arc(side: float) -> None:
-    """Lengths of the way onto a course to the north at the origin."""
+    """The lengths are for the way onto a course to the north at the origin."""
     at = (0.0, 0.0)
     north = 0.0
 
@@ -243,7 +243,7 @@ CORNER = ((0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0))
 
 
 class Flown:
-    """Guidance on a route, with poses as given."""
+    """Guidance on a route, with given poses."""
 
     def __init__(
         self,
@@ -260,7 +260,7 @@ class Flown:
     def at(
         self, north: float, east: float, course: float = 0.0, altitude: float = 100.0
     ) -> dict[str, float]:
-        """The log of a step at a position, on a course through calm air, rad."""
+        """Return the log of a step at a position, on a course, rad, through calm air."""
         now = 20 * MS * self._k
         v = (SPEED * math.cos(course), SPEED * math.sin(course))
         self.made.take_pose(
@@ -276,7 +276,7 @@ class Flown:
 
 
 def test_first_waypoint_has_to_be_reached() -> None:
-    """A route behind the aircraft is not passed at the start: the aircraft joins the first leg."""
+    """A route behind the aircraft is not passed at the start, because the first leg is joined."""
     flight = Flown((2500.0, 0.0, 150.0), (1200.0, 0.0, 100.0), (1200.0, 1200.0, 100.0))
     log = flight.at(10.0, 0.0)
     assert (log["leg"], log["missed"], abs(log["joining"])) == (0.0, 0.0, 1.0)
@@ -290,7 +290,7 @@ def test_first_waypoint_has_to_be_reached() -> None:
 
 
 def test_leg_after_sharp_corner_is_joined() -> None:
-    """A turn of 174 deg has no fillet.
+    """A corner of 174 deg has no fillet.
 
     The aircraft passes the waypoint, and a circle leads it onto the leg back.
     """
@@ -384,7 +384,7 @@ def test_altitude_changes_along_leg_or_at_its_begin(profile: str) -> None:
 def circling(
     flown: Flown, centre: path.Point, turns: float, altitude: float = 100.0, first: float = -90.0
 ) -> dict[str, float]:
-    """The log after steps of flight clockwise round a centre.
+    """Return the log after steps of a clockwise flight around a centre.
 
     The flight begins at a bearing of the centre in deg.
     """
@@ -401,9 +401,9 @@ def circling(
 
 @pytest.mark.parametrize("turns, wait", [(2.0, 0.0), (0.0, 60.0), (0.5, 60.0)])
 def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
-    """The route goes on to the north.
+    """The route continues to the north.
 
-    A circle takes 2 pi R / V = 36 s; the aircraft leaves it in the west.
+    A circle takes 2 pi R / V = 36 s, and the aircraft leaves it in the west.
     """
     centre = (2000.0, 0.0)
     flight = Flown((0.0, 0.0, 100.0), (*centre, 100.0, None, turns, wait), (5000.0, -R, 100.0))
@@ -452,7 +452,10 @@ def test_yaw_rate_beside_bank() -> None:
 
 
 def log_of(count: int, **channels: ArrayLike) -> Tape:
-    """A log of guidance on a route to the north, a sample a second; `_` stands for a dot."""
+    """Return a log of guidance on a route to the north with one sample per second.
+
+    In a name, `_` stands for a dot.
+    """
     names = guidance_log.names(CONFIG.outputs)
     level: dict[str, Any] = (
         dict.fromkeys(names, 0.0)
