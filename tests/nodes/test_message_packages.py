@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`make messages`: two small packages, built and imported.
+"""Test `make messages` with two small packages, which are built and imported.
 
 One of them contains messages of the other.
 """
@@ -37,7 +37,7 @@ ament_package()
 
 
 def write_package(folder: Path, name: str, files: dict[str, str], dependencies: list[str]) -> None:
-    """An interface package as its authors write it."""
+    """Write an interface package as its authors do."""
     for path, text in files.items():
         (folder / name / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / name / path).write_text(text)
@@ -51,7 +51,10 @@ def write_package(folder: Path, name: str, files: dict[str, str], dependencies: 
 
 @pytest.fixture
 def sources(tmp_path: Path) -> Path:
-    """plane_msgs, whose State contains a Wind of air_msgs and a Mode of its own; Drift a Wind."""
+    """Return the sources of plane_msgs and air_msgs.
+
+    State of plane_msgs has a Wind of air_msgs and a Mode of its own. Drift has a Wind.
+    """
     plane = {
         "msg/State.msg": "std_msgs/Header header\nair_msgs/Wind wind\nMode[2] modes\n",
         "msg/Mode.msg": "uint8 mode\n",

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes in the process of a test.
+"""Run nodes in the process of a test.
 
-Their time is moved by the test, and their topics are queues. Nothing else differs. A node is its
-class of the stack on a node of rclpy, with its parameters, its services and its ticks. Three things
-are replaced: the functions that make publishers, subscriptions and clients; the module `time`, as
-the modules of the stack see it; and the logger. A message is serialised where it is published, and
-waits in the queue of each subscription until the node takes it.
+The test moves their time, and their topics are queues. Nothing else differs. A node is its class of
+the stack on a node of rclpy, with its parameters, its services and its ticks. Three things are
+replaced: the functions that make publishers, subscriptions and clients; the module `time`, as the
+modules of the stack see it; and the logger. A message is serialised when it is published, and waits
+in the queue of each subscription until the node takes it.
 """
 
 import sys
@@ -47,7 +47,7 @@ LIMIT = 60.0  # s of the time of the test, until a wait fails
 
 
 class Clock:
-    """The time of the host, in place of the module `time`.
+    """The time of the host, which replaces the module `time`.
 
     Other functions of the module are unchanged.
     """
@@ -58,23 +58,23 @@ class Clock:
         self.suspended_ns = 0  # of the host, in which the monotonic clock stands still
 
     def monotonic_ns(self) -> int:
-        """The monotonic clock."""
+        """Return the monotonic clock, ns."""
         return self.now_ns
 
     def time_ns(self) -> int:
-        """The system clock."""
+        """Return the system clock, ns."""
         return EPOCH_NS + self.now_ns + self.step_ns
 
     def monotonic(self) -> float:
-        """The monotonic clock, s."""
+        """Return the monotonic clock, s."""
         return self.now_ns / NANOSECONDS
 
     def time(self) -> float:
-        """The system clock, s."""
+        """Return the system clock, s."""
         return self.time_ns() / NANOSECONDS
 
     def clock_gettime_ns(self, clock: int) -> int:
-        """CLOCK_BOOTTIME."""
+        """Return CLOCK_BOOTTIME, ns."""
         return self.now_ns + self.suspended_ns
 
     def sleep(self, duration: float) -> None:
@@ -86,7 +86,7 @@ class Clock:
 
 
 class Endpoint(NamedTuple):
-    """A publisher or subscription in the graph, as rclpy tells of it."""
+    """A publisher or subscription in the graph, as rclpy describes it."""
 
     topic: str
     topic_type: str
@@ -110,7 +110,7 @@ class Publisher(rclpy.publisher.Publisher):  # type: ignore[misc]
 
     @property
     def topic_name(self) -> str:
-        """The full name."""
+        """Return the full name."""
         return self._topic
 
     def publish(self, message: Any) -> None:
@@ -120,7 +120,7 @@ class Publisher(rclpy.publisher.Publisher):  # type: ignore[misc]
         self._world.deliver(self.topic_name, self.kind, raw, self.sequence)
 
     def lose(self, count: int) -> None:
-        """Messages that no subscription receives."""
+        """Skip the numbers of messages that no subscription receives."""
         self.sequence += count
 
     def leave(self) -> None:
@@ -128,12 +128,12 @@ class Publisher(rclpy.publisher.Publisher):  # type: ignore[misc]
         self._world.graph.remove(self.endpoint)
 
     def wait_for_all_acked(self, timeout: object) -> bool:
-        """Nothing waits."""
+        """Return at once, because nothing waits."""
         return True
 
 
 class Subscription:
-    """A subscription of a node; `handle`, as rclpy has it, is itself."""
+    """A subscription of a node. Its `handle`, which rclpy has, is the subscription itself."""
 
     def __init__(
         self, world: "World", kind: type, topic: str, qos: QoSProfile | int, node: str, *, raw: bool
@@ -149,7 +149,7 @@ class Subscription:
 
     @property
     def handle(self) -> Self:
-        """What takes messages."""
+        """Return the object that takes messages."""
         return self
 
     def __enter__(self) -> Self:
@@ -159,19 +159,19 @@ class Subscription:
         return None
 
     def take_message(self, kind: type, raw: bool) -> tuple[Any, dict[str, int]] | None:
-        """The oldest message with its metadata; None without one."""
+        """Return the oldest message with its metadata, or None if there is none."""
         if not self.queue:
             return None
         message, information = self.queue.popleft()
         return message if raw else deserialize_message(message, kind), information
 
     def get_publisher_count(self) -> int:
-        """Publishers of the topic."""
+        """Return the number of publishers of the topic."""
         return len(self._world.publishers(self.topic_name))
 
 
 class Client:
-    """A client of a service of another node of the world, or of one that the test answers."""
+    """A client of a service of another node, or of a service that the test answers."""
 
     def __init__(self, world: "World", service: str) -> None:
         self._world = world
@@ -179,11 +179,11 @@ class Client:
         self.srv_name = service
 
     def service_is_ready(self) -> bool:
-        """Whether anyone answers."""
+        """Return whether a service answers."""
         return self._service in self._world.services()
 
     def call_async(self, request: Any) -> Future:
-        """The response, at once; a service that returns None never answers."""
+        """Return the response at once. A service that returns None never answers."""
         future = Future()
         if (response := self._world.services()[self._service](request)) is not None:
             future.set_result(response)
@@ -191,7 +191,7 @@ class Client:
 
 
 class Log:
-    """The logger of a node: keeps the lines."""
+    """The logger of a node, which keeps the lines."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []  # "[SEVERITY] text"
@@ -204,22 +204,22 @@ class Log:
 
 
 class InWorld:
-    """Of a node before its class.
+    """A base that comes before the class of a node.
 
-    Publishers, subscriptions, clients and logger are those of the world.
+    Publishers, subscriptions, clients and the logger are then those of the world.
     """
 
     world: "World"
     log: Log
 
     def get_logger(self) -> Log:
-        """The lines."""
+        """Return the logger, which has the lines."""
         return self.log
 
     def create_publisher(
         self: Any, kind: type, topic: str, qos: QoSProfile | int, **_: object
     ) -> Publisher:
-        """A publisher of the world."""
+        """Return a publisher of the world."""
         return Publisher(
             self.world, kind, self.resolve_topic_name(topic), qos, self.get_fully_qualified_name()
         )
@@ -234,34 +234,34 @@ class InWorld:
         raw: bool = False,
         **_: object,
     ) -> Subscription:
-        """A subscription of the world."""
+        """Return a subscription of the world."""
         name = self.resolve_topic_name(topic)
         node = self.get_fully_qualified_name()
         return cast("World", self.world).subscribe(kind, name, qos, node, raw=raw)
 
     def destroy_subscription(self, subscription: Subscription) -> None:
-        """End it."""
+        """End a subscription."""
         self.world.subscriptions.remove(subscription)
         self.world.graph.remove(subscription.endpoint)
 
     def create_client(self: Any, kind: type, service: str, **_: object) -> Client:
-        """A client of the world."""
+        """Return a client of the world."""
         return Client(self.world, self.resolve_service_name(service))
 
     def count_publishers(self: Any, topic: str) -> int:
-        """Publishers of a topic."""
+        """Return the number of publishers of a topic."""
         return len(self.world.publishers(self.resolve_topic_name(topic)))
 
     def count_subscribers(self: Any, topic: str) -> int:
-        """Subscriptions of a topic."""
+        """Return the number of subscriptions of a topic."""
         return len(self.get_subscriptions_info_by_topic(self.resolve_topic_name(topic)))
 
     def get_publishers_info_by_topic(self, topic: str) -> list[Endpoint]:
-        """Of a topic by its full name."""
+        """Return the publishers of a topic by its full name."""
         return self.world.publishers(topic)
 
     def get_subscriptions_info_by_topic(self, topic: str) -> list[Endpoint]:
-        """Of a topic by its full name."""
+        """Return the subscriptions of a topic by its full name."""
         kind = TopicEndpointTypeEnum.SUBSCRIPTION
         return [
             each for each in self.world.graph if each.topic == topic and each.endpoint_type is kind
@@ -291,13 +291,13 @@ class World:
     # Nodes
 
     def make(self, node: type[AnyNode]) -> Any:
-        """A node that does not run."""
+        """Return a node that does not run."""
         made = cast(Any, type(node.__name__, (InWorld, node), {"world": self, "log": Log()}))()
         self.nodes.append(made)
         return made
 
     def start(self, node: type[AnyNode]) -> Any:
-        """A node that runs as the event loop runs it."""
+        """Return a node that runs as the event loop runs it."""
         made = self.make(node)
         self.begin(made)
         return made
@@ -308,7 +308,7 @@ class World:
 
     @contextmanager
     def stopped(self, node: AnyNode) -> Iterator[None]:
-        """SIGSTOP until the block is left."""
+        """Stop a node, as SIGSTOP does, until the block is left."""
         loop = self.loops.pop(node)
         yield
         self.loops[node] = loop
@@ -321,9 +321,9 @@ class World:
         node.destroy_node()
 
     def kill(self, node: AnyNode) -> None:
-        """SIGKILL.
+        """End a node as SIGKILL does.
 
-        What the node published stays in the graph, as for the lease of a participant.
+        What the node published stays in the graph, as during the lease of a participant.
         """
         self.loops.pop(node, None)
         self.nodes.remove(node)
@@ -339,7 +339,7 @@ class World:
     def until(
         self, condition: Callable[[], T], because: str, each: Callable[[], object] | None = None
     ) -> T:
-        """Run the nodes until a condition is true; what it returned."""
+        """Run the nodes until a condition is true, and return what it returned."""
         end_ns = self.clock.now_ns + nanoseconds(LIMIT)
         value = self._run(condition, each, end_ns)
         lines = [
@@ -381,7 +381,7 @@ class World:
         return self.graph[-1]
 
     def publishers(self, topic: str) -> list[Endpoint]:
-        """The publishers of a topic by its full name."""
+        """Return the publishers of a topic by its full name."""
         kind = TopicEndpointTypeEnum.PUBLISHER
         return [each for each in self.graph if each.topic == topic and each.endpoint_type is kind]
 
@@ -410,13 +410,13 @@ class World:
     def publisher(
         self, kind: type, topic: str, qos: QoSProfile | int = PUBLISH, node: str = "/peer"
     ) -> Publisher:
-        """A publisher of the test."""
+        """Return a publisher of the test."""
         return Publisher(self, kind, topic, qos, node)
 
     # As a node of rclpy has them, for what the test simulates
 
     def create_publisher(self, kind: type, topic: str, qos: QoSProfile | int) -> Publisher:
-        """A publisher of the test."""
+        """Return a publisher of the test."""
         return self.publisher(kind, topic, qos)
 
     def create_subscription(
@@ -435,7 +435,7 @@ class World:
     def send(
         self, topic: str, channels: Mapping[str, float], sender: str = "/peer#1", age: float = 0.0
     ) -> None:
-        """Publish a named vector of the test, with a stamp of `age` s ago."""
+        """Publish a named vector of the test with a stamp `age` s ago."""
         stamp_ns = self.clock.time_ns() - nanoseconds(age)
         raw = Encoder([*channels], sender).encode(
             stamp_ns, np.array([*channels.values()], dtype=np.float64)
@@ -451,21 +451,24 @@ class World:
             self._own.pop(key).leave()
 
     def vectors(self, topic: str) -> list[NamedSample]:
-        """The named vectors that were published on a topic."""
+        """Return the named vectors that were published on a topic."""
         return [NamedDecoder().decode(raw) for _, raw in self.sent[topic]]
 
     def last(self, topic: str) -> dict[str, float]:
-        """The channels of the last named vector of a topic; empty before the first."""
+        """Return the channels of the last named vector of a topic.
+
+        Before the first, it is empty.
+        """
         return NamedDecoder().decode(self.sent[topic][-1][1]).channels if self.sent[topic] else {}
 
     def messages(self, topic: str) -> list[Any]:
-        """The messages that were published on a topic."""
+        """Return the messages that were published on a topic."""
         return [deserialize_message(raw, kind) for kind, raw in self.sent[topic]]
 
     # Services
 
     def services(self) -> dict[str, Callable[[Any], Any]]:
-        """What answers a request, by the full name of the service."""
+        """Return the functions that answer requests, by the full name of the service."""
         found = dict(self.answers)
         for node in self.nodes:
             for service in node.services:
@@ -473,7 +476,7 @@ class World:
         return found
 
     def call(self, service: str, request: Any) -> Any:
-        """The response of a service by its full name."""
+        """Return the response of a service by its full name."""
         return self.services()[service](request)
 
 
@@ -482,12 +485,12 @@ def _answer(service: Any, request: Any) -> Any:
 
 
 def stamp_ns(message: Any) -> int:
-    """The stamp of a message with a header."""
+    """Return the stamp of a message with a header."""
     return int(message.header.stamp.sec) * NANOSECONDS + int(message.header.stamp.nanosec)
 
 
 def diagnostics(world: World, node: str) -> tuple[str, dict[str, str]]:
-    """Sentence and figures of the newest diagnostics of a node by its full name."""
+    """Return the sentence and the figures of the newest diagnostics of a node by its full name."""
     reports = [
         status
         for message in world.messages("/diagnostics")
@@ -503,7 +506,7 @@ def diagnostics(world: World, node: str) -> tuple[str, dict[str, str]]:
 
 @contextmanager
 def clients_of(world: World) -> Iterator[None]:
-    """The clients of commands that are made in the block have the endpoints of the world."""
+    """Give clients of commands that are made in the block the endpoints of the world."""
 
     def create(name: str, **values: Any) -> Any:
         made = type("ClientNode", (InWorld, Node), {"world": world, "log": Log()})
@@ -516,9 +519,9 @@ def clients_of(world: World) -> Iterator[None]:
 
 @contextmanager
 def world_of(*arguments: str) -> Iterator[World]:
-    """A world whose nodes have these arguments of ROS.
+    """Yield a world whose nodes have these arguments of ROS.
 
-    Its time is that of the modules of the stack.
+    Its time is the time of the stack's modules.
     """
     clock = Clock()
     with pytest.MonkeyPatch.context() as patch:
@@ -541,14 +544,14 @@ PACKAGES = {path.parent.name for path in SOURCES.glob("*/package.xml")}
 
 
 def modules_of_stack() -> Iterable[Any]:
-    """The loaded modules of the packages."""
+    """Return the loaded modules of the packages."""
     return [
         module for name, module in sys.modules.copy().items() if name.partition(".")[0] in PACKAGES
     ]
 
 
 def parameters(values: Mapping[str, object]) -> Sequence[str]:
-    """Arguments that set parameters of nodes, by "NODE.NAME"."""
+    """Return arguments that set parameters of nodes, by "NODE.NAME"."""
     return [
         word
         for key, value in values.items()

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Attacker of a flight: subscribes to y, and publishes u under the name of the controller.
+"""Attack a flight: subscribe to y, and publish u under the name of the controller.
 
-python -m tests.ros.attacker SECONDS     # ends early after ENOUGH samples of y and u
+python -m tests.ros.attacker SECONDS # ends early after ENOUGH samples of y and u
 
 The environment selects its transport. It prints the number of received samples of y as JSON.
 """

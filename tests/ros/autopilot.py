@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated autopilot with ArduPilot's DDS interface, as a process.
+"""Simulate an autopilot with ArduPilot's DDS interface, as a process.
 
 python -m tests.ros.autopilot SCENARIO RELEASE_AFTER
 
@@ -10,8 +10,8 @@ deflection, NaN releases a channel at once, and all channels are released after 
 seconds without Joy. A released channel is at trim. It imports nothing from the bridge. It prints "y
 STAMP q V p r" without noise, and "timeout" when the channels are released without Joy.
 
-With a third word `odometry` it is a simulator for the map of that name: Imu and Odometry in the
-frames of REP 103, and the last Float64 of each effector.
+With a third word `odometry` it is a simulator for the map of this name. It then sends Imu and
+Odometry in the frames of REP 103, and takes the last Float64 of each effector.
 """
 
 import math
@@ -86,7 +86,7 @@ class Autopilot:
 
     @property
     def period(self) -> float:
-        """Between two samples of y, s."""
+        """Return the time between two samples of y, s."""
         return self._simulator.period_ns / 1e9
 
     def step(self, number: int) -> None:
@@ -95,7 +95,7 @@ class Autopilot:
         self._publish(*sample.value.tolist())
 
     def truth(self) -> list[float]:
-        """q, V, p, r of the last sample without noise."""
+        """Return q, V, p, r of the last sample without noise."""
         places = [self._simulator.truth_names.index(f"x.{name}") for name in ("q", "V", "p", "r")]
         truth: list[float] = self._simulator.truth()[places].tolist()
         return truth
@@ -132,7 +132,7 @@ class Autopilot:
 class Odometer(Autopilot):
     """A simulator that publishes Imu and Odometry.
 
-    It takes commands of joints and of the thrust.
+    It takes commands for the joints and for the thrust.
     """
 
     def __init__(self, scenario: Path, release_after: float, node: Any) -> None:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures for real processes over real DDS.
+"""Provide fixtures for real processes over real DDS.
 
-Each test has its own domain; its processes are killed afterwards.
+Each test has its own domain, and its processes are killed afterwards.
 """
 
 import fcntl
@@ -48,7 +48,7 @@ T = TypeVar("T")
 class Process:
     """A process under test and the lines of its output.
 
-    It ends with pytest, also where no fixture ends it.
+    It ends when pytest ends, even if no fixture ends it.
     """
 
     def __init__(
@@ -70,13 +70,13 @@ class Process:
 
     @property
     def output(self) -> str:
-        """The output so far."""
+        """Return the output so far."""
         return "\n".join(self.lines)
 
     def has_logged(self, *parts: str) -> bool:
-        """Whether a line contains all parts.
+        """Return whether a line contains all parts.
 
-        A process that has ended without one never will: its output is the error.
+        If the process has ended without such a line, its output is raised as an error.
         """
         has_ended = not self._reader.is_alive()
         logged = any(all(part in line for part in parts) for line in list(self.lines))
@@ -89,15 +89,15 @@ class Process:
         return self
 
     def children(self) -> list[psutil.Process]:
-        """Its child processes."""
+        """Return its child processes."""
         return psutil.Process(self.popen.pid).children(recursive=True)
 
     def child(self, module: str) -> psutil.Process:
-        """Its child process of this module."""
+        """Return its child process that runs this module."""
         return next(child for child in self.children() if module in child.cmdline())
 
     def until(self, condition: Callable[[], T | None], because: str, timeout: float = HANG) -> T:
-        """Wait until a condition holds. The process must not end before."""
+        """Wait until a condition is true. The process must not end before."""
 
         def holds() -> T | None:
             value = condition()
@@ -115,7 +115,7 @@ class Process:
 
     @contextmanager
     def stopped(self) -> Iterator[None]:
-        """SIGSTOP until the block is left."""
+        """Stop the process, as SIGSTOP does, until the block is left."""
         self.popen.send_signal(signal.SIGSTOP)
         try:
             yield
@@ -133,7 +133,7 @@ class Process:
         return self
 
     def end(self, timeout: float = HANG) -> int:
-        """Wait for the end. Returns the exit status."""
+        """Wait for the end, and return the exit status."""
         try:
             status = self.popen.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -148,7 +148,7 @@ class Process:
 
 @pytest.fixture
 def host_delays() -> HostDelays:
-    """The delays of the host, by which a test extends its limits of time."""
+    """Return the delays of the host, by which a test extends its time limits."""
     return HOST
 
 
@@ -163,11 +163,11 @@ INCONCLUSIVE = "inconclusive"  # key of the property of a report
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Run a test again where it failed beside a delay of the host beyond what it bears.
+    """Run a test again if it failed during a longer delay of the host than it tolerates.
 
-    A failure without such a delay is a failure. Where the host delayed each of three attempts, the
-    test is skipped as inconclusive, but not where all failed alike: then the host is not the cause.
-    The summary names the test either way.
+    A failure without such a delay is a failure. If the host delayed each of three attempts, the
+    test is skipped as inconclusive. If all three failed alike, it fails, because then the host is
+    not the cause. The summary names the test in both cases.
     """
     if not item.path.is_relative_to(IN_REAL_TIME):
         return None
@@ -204,7 +204,7 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 
 def failure(report: pytest.TestReport) -> str:
-    """The first line of a failure without its numbers, which differ from attempt to attempt."""
+    """Return the first line of a failure without its numbers, which differ between attempts."""
     crash = getattr(report.longrepr, "reprcrash", None)
     return "" if crash is None else re.sub(r"[\d.]+", "#", str(crash.message).partition("\n")[0])
 
@@ -225,17 +225,17 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 def is_closed(run: Path) -> bool:
-    """Whether the recorder of a run has closed its file, by the reader of mcap.
+    """Return whether the recorder of a run has closed its file, by the reader of mcap.
 
-    A closed file has its summary. Notes of a log say besides what a busy host left out, and do not
-    serve.
+    A closed file has a summary. The notes of a log do not show this, because they also say what a
+    busy host left out.
     """
     with next(run.glob("*.mcap")).open("rb") as stream:
         return make_reader(stream).get_summary() is not None
 
 
 def settable_clock(folder: Path) -> Path:
-    """A library, of faults/clock.c, that gives processes a system clock that can be set."""
+    """Return a library, from faults/clock.c, that gives processes a clock that can be set."""
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler for a clock that can be set")
@@ -250,9 +250,9 @@ def settable_clock(folder: Path) -> Path:
 
 @contextmanager
 def reserved_domain() -> Iterator[int]:
-    """A ROS domain that no other test of this host has until the block is left.
+    """Yield a ROS domain that no other test of this host has until the block is left.
 
-    That includes tests of another worker or checkout. The ports of domains 1 to 100 are below the
+    This includes tests of other workers and checkouts. The ports of domains 1 to 100 are below the
     ephemeral ports of Linux.
     """
     for number in (1 + next(_numbers) % 100 for _ in range(100)):
@@ -268,7 +268,7 @@ def reserved_domain() -> Iterator[int]:
 
 @pytest.fixture(autouse=True)
 def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    """A ROS domain of this test alone."""
+    """Yield a ROS domain of this test alone."""
     with reserved_domain() as number:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
         yield number
@@ -330,7 +330,7 @@ def recorder(start_node: Start) -> Recorder:
 
 @pytest.fixture
 def publisher(domain: int) -> Iterator[subprocess.Popen[str]]:
-    """Six topics at 1 kHz, as wide as those of a flight, until the test ends."""
+    """Publish six topics at 1 kHz, as wide as those of a flight, until the test ends."""
     command = [sys.executable, "-m", "benchmarks.recorder", "1000", "120"]  # Hz, s
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY)
     yield process
@@ -340,13 +340,13 @@ def publisher(domain: int) -> Iterator[subprocess.Popen[str]]:
 
 @pytest.fixture
 def peer_node(request: pytest.FixtureRequest) -> Iterator[Peer]:
-    """A peer with subscriptions to the topics that the module names in PEER_TOPICS."""
+    """Yield a peer with subscriptions to the topics that the module names in PEER_TOPICS."""
     with peer(getattr(request.module, "PEER_TOPICS", ())) as node:
         yield node
 
 
 def logged(run: Path) -> Iterator[tuple[str, Message]]:
-    """All messages of a log, which may still grow, with their topics."""
+    """Yield all messages of a log, which may still grow, with their topics."""
     for path in run.glob("*.mcap"):
         topics: dict[int, str] = {}
         for record in Scan(path).records():

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The aircraft's node when u times out: its watchdog and failsafe.
+"""Test the node of the aircraft when u times out: its watchdog and failsafe.
 
-Its refusals, and when its flight begins, are tested too.
+The tests also cover its refusals, and when its flight begins.
 """
 
 from collections.abc import Iterator
@@ -38,7 +38,7 @@ class Flight:
         self.world.run(duration, lambda: self.send(aileron, sender))
 
     def ailerons(self, begin: int = 0) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """The positions of the aileron from a sample on."""
+        """Return the positions of the aileron from a sample on."""
         return np.array(
             [sample.channels["actuator.aileron"] for sample in self.world.vectors("/truth")[begin:]]
         )
@@ -46,7 +46,7 @@ class Flight:
 
 @contextmanager
 def flying(scenario: Scenario, **values: object) -> Iterator[Flight]:
-    """An aircraft of a scenario with other parameters."""
+    """Return an aircraft of a scenario with other parameters."""
     with world_of(
         "--params-file",
         str(scenario.path),
@@ -91,7 +91,7 @@ def test_u_that_times_out_held_then_ramped_to_trim_and_may_return(osprey_gust: S
 
 
 def test_u_older_than_age_limit_does_not_end_failsafe(osprey_gust: Scenario) -> None:
-    """A controller was stopped while its middleware sent.
+    """A controller was stopped while its middleware still sent messages.
 
     Its u is older than the age limit, and newer than the last u.
     """

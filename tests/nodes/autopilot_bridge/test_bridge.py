@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge node: the unchanged controller flies a simulated autopilot through a map.
+"""Test the bridge's node: the unchanged controller flies a simulated autopilot through a map.
 
 The map is examples/maps/ardupilot_2024.yaml. tests/ros/autopilot.py is no autopilot. These tests
-show that frames, signs, rates and engagement agree with the map, not that the map agrees with
+show that frames, signs, rates and engagement agree with the map, and not that the map agrees with
 ArduPilot.
 """
 
@@ -62,14 +62,14 @@ AIRSPEED = Vector3Stamped(vector=Vector3(x=-18.0, y=18.0, z=-9.0))  # of length 
 
 
 class Sent(NamedTuple):
-    """A message to the autopilot; t in s since the begin of the test."""
+    """A message to the autopilot. t is in s since the beginning of the test."""
 
     t: float
     axes: list[float]
 
     @property
     def released(self) -> bool:
-        """Whether it returns all channels."""
+        """Return whether the message returns all channels."""
         return all(map(math.isnan, self.axes))
 
 
@@ -93,11 +93,11 @@ class Setup:
 
     @property
     def t(self) -> float:
-        """The time of the test, s."""
+        """Return the time of the test, s."""
         return seconds(self.world.clock.now_ns - self.begin_ns)
 
     def start(self, **changes: Any) -> Any:
-        """Start the bridge with the map after some changes of it.
+        """Start the bridge with a changed map.
 
         A change is of a key, or of the keys of a row.
         """
@@ -111,7 +111,7 @@ class Setup:
         return self.bridge
 
     def step(self) -> None:
-        """What surrounds the bridge: y at 50 Hz, u and further messages."""
+        """Do what surrounds the bridge: send y at 50 Hz, u and further messages."""
         due = self.t >= self._number * self.autopilot.period
         if due and self.autopilot_runs:
             self.autopilot.step(self._number)
@@ -126,7 +126,7 @@ class Setup:
         self.world.run(duration, self.step)
 
     def until_logged(self, *parts: str) -> float:
-        """Run until the bridge logs a line with the parts; the time, s."""
+        """Run until the bridge logs a line with the given parts, and return the time, s."""
         before = len(self.bridge.log.lines)
 
         def logged() -> list[str]:
@@ -140,7 +140,7 @@ class Setup:
         return self.t
 
     def engage(self, *, on: bool = True, blind: bool = False) -> str:
-        """Call the service; the reason of a refusal, empty where there is none."""
+        """Call the service, and return the reason of a refusal, or ""."""
         name, request = (
             ("engage_blind", Trigger.Request()) if blind else ("engage", SetBool.Request(data=on))
         )
@@ -155,7 +155,7 @@ class Setup:
         assert not self.joys[-1].released
 
     def sent_since(self, t: float) -> tuple[list[float], list[float]]:
-        """When u and when release values were sent after a time, s from it."""
+        """Return when u and when release values were sent after a time, in s from this time."""
         since = [sent for sent in self.joys if sent.t > t]
         return [sent.t - t for sent in since if not sent.released], [
             sent.t - t for sent in since if sent.released
@@ -164,7 +164,7 @@ class Setup:
 
 @contextmanager
 def bridged(folder: Path, **values: object) -> Iterator[Setup]:
-    """A setup with parameters of the bridge."""
+    """Return a setup with parameters of the bridge."""
     channel_map = folder / "ardupilot.yaml"
     channel_map.write_bytes(MAP_FILES["ardupilot_2024"].read_bytes())
     given = parameters(
@@ -184,7 +184,7 @@ def setup(tmp_path: Path) -> Iterator[Setup]:
 
 
 def flown(setup: Setup, duration: float) -> dict[str, float]:
-    """Rms of the aircraft's y without noise less y_m over that of y_m, by output."""
+    """Return the rms of y without noise minus y_m, over the rms of y_m, by output."""
     ratios: list[tuple[list[float], list[float]]] = []
 
     def step() -> None:
@@ -320,7 +320,10 @@ def test_step_of_system_clock_leaves_engagement_and_release_as_they_are(
 def test_bridge_that_did_not_run_releases_and_can_be_engaged_again(
     suspended: bool, setup: Setup
 ) -> None:
-    """SIGSTOP of its process, and a suspended host, whose monotonic clock stands still."""
+    """After a stop by SIGSTOP, or a suspended host, the bridge can be engaged again.
+
+    The monotonic clock of a suspended host stands still.
+    """
     setup.start()
     setup.engaged()
     if suspended:
@@ -463,9 +466,9 @@ def test_max_engaged_is_announced_and_then_releases(setup: Setup) -> None:
 def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_time(
     setup: Setup,
 ) -> None:
-    """The publisher of u stays alive and u returns.
+    """The publisher of u stays alive, and u returns.
 
-    The age of u counts, not the presence of a publisher.
+    Only the age of u is judged, and not whether there is a publisher.
     """
     neutral = 0.4  # s
     setup.start(silence={"neutral": neutral})
@@ -589,7 +592,7 @@ def test_bridge_without_topics_of_autopilot_ends_with_the_cause_of_each(tmp_path
 
 
 def test_domain_or_profile_named_where_a_topic_has_no_publisher() -> None:
-    """A user with a domain of their own in the shell, and an agent in domain 0."""
+    """The user has a domain of their own in the shell, and the agent is in domain 0."""
     assert no_publisher({"ROS_DOMAIN_ID": "37"}).startswith("no publisher in domain 37. The ")
     sentence = no_publisher({PROFILE_VARIABLE: "mine.xml"})
     assert "needs the same DDS profile, FASTRTPS_DEFAULT_PROFILES_FILE=mine.xml" in sentence
@@ -618,9 +621,9 @@ def test_message_that_is_none_of_its_type_refused_and_counted(setup: Setup) -> N
 
 
 def test_imu_and_odometry_of_simulator_become_y_and_pose_in_namespace() -> None:
-    """The messages are of a publisher in the frames of REP 103.
+    """The publisher uses the frames of REP 103.
 
-    SciPy gives orientation and velocity in the body axes.
+    SciPy computes orientation and velocity in the body axes.
     """
     phi = 0.3
     theta = -0.2

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The map of PX4 with the real message package, where it is installed.
+"""Test the map of PX4 with the real message package, if it is installed.
 
-None of them is on PyPI; `make messages` builds each from its sources
-(docs/autopilots-reference.md). Without them tests/pure/autopilot_bridge/test_channel_map.py tests
+None of these packages is on PyPI. `make messages` builds each from its sources
+(docs/autopilots-reference.md). Without them, tests/pure/autopilot_bridge/test_channel_map.py tests
 each row with the published fields.
 """
 
@@ -41,7 +41,7 @@ ROS_MAPS = [name for name in MAPS if named_map(name).link is None]
 
 
 def needs(*packages: str) -> None:
-    """Skip where a message package is not installed."""
+    """Skip the test if a message package is not installed."""
     for package in packages:
         if find_spec(package) is None:
             pytest.skip(
@@ -71,7 +71,7 @@ def test_the_package_has_the_published_fields(name: str) -> None:
 
 
 def fill(message: Any, like: SimpleNamespace) -> Any:
-    """Set the fields of a message to those of a plain object."""
+    """Set the fields of a message to the values of a plain object."""
     for name, value in vars(like).items():
         if isinstance(value, SimpleNamespace):
             fill(getattr(message, name), value)
@@ -107,9 +107,9 @@ def test_inputs_are_written_into_real_messages(name: str) -> None:
 
 
 class Px4:
-    """Publishes y and its mode as PX4 does, and takes the messages to which PX4 subscribes.
+    """A PX4 that publishes y and its mode, and receives the messages to which PX4 subscribes.
 
-    A command changes the mode.
+    A command changes its mode.
     """
 
     HOLD, OFFBOARD, ARMED = 4, 14, 2
@@ -143,9 +143,9 @@ class Px4:
             world.create_subscription(getattr(types, name), f"/fmu/in/{topic}", messages.append, 5)
 
     def publish(self) -> None:
-        """Publish y, the mode, and u: elevator 0.02 rad.
+        """Publish y, the mode, and u with 0.02 rad of elevator.
 
-        Offboard is entered with a heartbeat alone.
+        Offboard can only be entered with a heartbeat.
         """
         commands = [
             (command.param2, command.param3)
@@ -161,14 +161,14 @@ class Px4:
 
     @property
     def mode(self) -> int:
-        """Its nav_state."""
+        """Return its nav_state."""
         return int(self._status.nav_state)
 
 
 def test_bridge_flies_px4_in_offboard_and_returns_it_to_hold() -> None:
-    """Heartbeats come from the request on, setpoints in offboard.
+    """Heartbeats are sent from the request on, and setpoints in offboard.
 
-    A release ends both and requests Hold.
+    A release ends both, and requests Hold.
     """
     needs("px4_msgs")
     with world_of("-p", "map:=px4", "-p", "dry_run:=false") as world:

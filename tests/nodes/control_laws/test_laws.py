@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's node under another law.
+"""Test the controller's node with another law.
 
-The tests are of a controller that it cannot fly, and of new gains of a law of another package.
+The tests are about a controller that it cannot fly, and about new gains for a law of another
+package.
 """
 
 from pathlib import Path
@@ -20,7 +21,7 @@ from rise_di_controller.node import ControllerNode
 
 
 def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
-    """A scenario under another controller."""
+    """Return a scenario with another controller."""
     tree = yaml.safe_load(find_scenario("osprey_servo").path.read_text())
     tree["/**/controller"]["ros__parameters"] = controller
     path.write_text(yaml.safe_dump(tree))

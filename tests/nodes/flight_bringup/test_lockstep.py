@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A lockstep flight of the nodes is equal to the byte to the loop in one process.
+"""Test that a lockstep flight of the nodes is equal to the byte to the loop in one process.
 
-It is so under each law and with guidance.
+This is tested with each law and with guidance.
 """
 
 import json
@@ -46,7 +46,7 @@ PULSES = {
 
 @contextmanager
 def lockstep(scenario: Scenario, folder: Path) -> Iterator[tuple[World, list[FlightNode[Any]]]]:
-    """The nodes of a flight in lockstep, without a recorder."""
+    """Return the nodes of a flight in lockstep, without a recorder."""
     values = parameter_overrides(ONE_PROCESS, scenario, folder, 0.0, lockstep=True)
     words = (
         word for name, value in values.items() for word in ("-p", f"{name}:={json.dumps(value)}")
@@ -62,7 +62,7 @@ def lockstep(scenario: Scenario, folder: Path) -> Iterator[tuple[World, list[Fli
 
 
 def flown(scenario: Scenario, folder: Path) -> World:
-    """The world after the flight."""
+    """Return the world after the flight."""
     with lockstep(scenario, folder) as (world, nodes):
         while any(node.advance() for node in nodes):
             pass
@@ -73,7 +73,7 @@ def flown(scenario: Scenario, folder: Path) -> World:
 def require_equal(world: World, scenario: Scenario) -> None:
     """Assert that each sample of the loop in one process was published, to the byte.
 
-    No other one was published.
+    No other sample may have been published.
     """
     tape = simulate(scenario)
     assert {"y", "y_m", "u", "internals", "truth"} <= tape.signals.keys()
@@ -87,9 +87,9 @@ def require_equal(world: World, scenario: Scenario) -> None:
 
 
 def varied(folder: Path, name: str, **sections: Any) -> Scenario:
-    """A second of a scenario with commands, disturbances and lost samples.
+    """Return a second of a scenario with commands, disturbances and lost samples.
 
-    Its sections have changes.
+    The given sections are changed.
     """
     changes = {"flight": {"duration": 1.0}, "aircraft": ROUGH, **sections}
     return load_scenario(scenario_file(folder / "varied.yaml", find_scenario(name).path, **changes))
@@ -204,7 +204,7 @@ def test_node_names_and_passes_on_the_role_that_a_peer_reports(
 ) -> None:
     """A reference model reports the loss of the controller.
 
-    A report of the node itself, and of no role, has no effect.
+    A report about the node itself, or about no role, has no effect.
     """
     with lockstep(osprey_gust, tmp_path) as (world, nodes):
         aircraft = nodes[-1]

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The access control policy.
+"""Test the access control policy.
 
-It allows no wildcard, one client of services, and the topics of the one table.
+It has no wildcard and one client of services, and it allows the topics of the one table.
 """
 
 import pytest

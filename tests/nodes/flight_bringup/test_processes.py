@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The processes of a flight, each a program of the test.
+"""Test the processes of a flight, each of which is a program of the test.
 
-What ended a flight is named, and a log has time to be closed.
+What ended a flight is named, and the log has time to be closed.
 """
 
 import time
@@ -36,7 +36,7 @@ SILENT_MONITOR: Any = SimpleNamespace(
 
 @pytest.fixture
 def only_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A first stage of one process: the module `fake.main`, whose file the test writes."""
+    """Return a first stage of one process, the module `fake.main`, whose file the test writes."""
     (tmp_path / "fake").mkdir()
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(processes, "FIRST_STAGE", (NodeSpec("fake", "controller"),))
@@ -90,7 +90,7 @@ def test_process_ending_while_others_wait_named_at_once(
 def test_end_before_ready_is_bad_input_only_by_its_status(
     end: str, flew_never: bool, cause: str, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    """`rise-di fly` ends with status 3 for NotReadyError, and else with 2."""
+    """`rise-di fly` ends with status 3 for NotReadyError, and otherwise with 2."""
     only_stage.write_text(end)
     with refusing(f"^{cause}$") as caught:
         start_stage(osprey_gust, tmp_path / "run")
@@ -112,7 +112,7 @@ def test_process_that_ends_named_with_fatal_line_not_last_one(
 def test_cause_named_that_is_before_a_long_traceback(
     only_stage: Path, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    """A traceback of the stack has 25 lines and more: it must not push its own cause out."""
+    """A traceback of the stack has 25 lines or more, and must not displace its own cause."""
     fatal = "[FATAL] [1.0] [controller]: unexpected exception, the node ends: ValueError: broken"
     lines = [fatal, "Traceback (most recent call last):", *(f"  frame {k}" for k in range(100))]
     only_stage.write_text(f"import sys\nprint({chr(10).join(lines)!r})\nsys.exit(1)\n")

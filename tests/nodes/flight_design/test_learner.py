@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner's node and the controller beside a learner.
+"""Test the learner's node, and the controller with a learner.
 
-Proposals of others, their storms, and the record of a flight.
+The tests cover proposals of other nodes, many proposals at once, and the record of a flight.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -29,7 +29,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 
 class Proposer:
-    """Proposes the model of osprey_observer to a controller that starts with other parameters."""
+    """A node that proposes the model of osprey_observer to a controller with other parameters."""
 
     def __init__(self, flight: Flight, start: RiseDiConfig) -> None:
         self.flight = flight
@@ -40,7 +40,7 @@ class Proposer:
     def propose(
         self, sender: str = "learner#1", change: Mapping[str, object] = MappingProxyType({})
     ) -> None:
-        """Publish a proposal whose window ended a tick or more ago."""
+        """Publish a proposal whose window ended at least one tick ago."""
         values = {
             "start": self.start.digest(),
             "flown": self.start.digest(),
@@ -53,7 +53,7 @@ class Proposer:
         )
 
     def answer(self, propose: Callable[[], None]) -> Report:
-        """What the controller says next."""
+        """Return what the controller says next."""
         messages = self.flight.world.sent["/learning"]
         count = len(messages)
         propose()
@@ -121,7 +121,7 @@ def test_storm_of_proposals_costs_one_decoding_a_tick_and_delays_none(proposer: 
 
 
 def test_deactivated_law_ends_the_record(tmp_path: Path) -> None:
-    """The times count from the next engagement, and the record before is forgotten."""
+    """The times are counted from the next engagement, and the record before it is forgotten."""
     scenario = save_scenario(
         find_scenario("osprey_learn").vary(
             controller={"learn": {"updates": [3.0], "latency": 0.5}}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The guidance node.
+"""Test guidance's node.
 
-Tested are targets, routes, services, learned authority, and what it does without its inputs.
+The tests cover targets, routes, services, learned authority, and what it does without its inputs.
 """
 
 import math
@@ -36,7 +36,7 @@ LEVEL = {"altitude": 50.0, "v_north": 25.0}
 
 
 class Flight:
-    """A guidance node; the test is aircraft, controller and operator."""
+    """A guidance node. The test plays the aircraft, the controller and the operator."""
 
     def __init__(self, world: World, outputs: tuple[str, ...] = OUTPUTS) -> None:
         self.world = world
@@ -47,7 +47,7 @@ class Flight:
         self._rng = np.random.default_rng(1)
 
     def send(self) -> None:
-        """One y, one pose and one sample of internals, stamped now."""
+        """Send a y, a pose and a sample of internals with the present stamp."""
         self.world.send("/y", dict.fromkeys(self.outputs, 0.0), "/aircraft#1")
         self.world.send("/internals", {"mode": self.mode}, "/controller#1")
         if self.has_pose:
@@ -58,7 +58,7 @@ class Flight:
             )
 
     def run(self, duration: float = 0.1, each: Callable[[], object] = lambda: None) -> None:
-        """Run for a duration, s, with what the test sends."""
+        """Run for a duration, s, while the test sends its messages."""
 
         def both() -> None:
             self.send()
@@ -67,31 +67,31 @@ class Flight:
         self.world.run(duration, both)
 
     def target(self, **values: float) -> None:
-        """Command by channels, and fly on."""
+        """Command some channels, and fly on."""
         self.world.send("/target", values, "/operator#1")
         self.run()
 
     def last(self, name: str) -> float:
-        """The last value of a channel of `guidance`; NaN before the first."""
+        """Return the last value of a channel of `guidance`, or NaN before the first."""
         return self.world.last("/guidance").get(name, math.nan)
 
     def refused(self, reason: str) -> int:
-        """How many samples were refused for a reason."""
+        """Return how many samples were refused for a reason."""
         return int(self.node.refusals.counts[reason])
 
     def call(self, kind: Any, name: str, **fields: object) -> tuple[bool, str]:
-        """The answer of a service of guidance."""
+        """Return the answer of a service of guidance."""
         response = self.world.call(f"/guidance/{name}", kind.Request(**fields))
         return response.success, response.message
 
     def logged(self, *parts: str) -> bool:
-        """Whether a line of the log has all parts."""
+        """Return whether a line of the log has all parts."""
         return any(all(part in line for part in parts) for line in self.node.log.lines)
 
 
 @pytest.fixture
 def flight(tmp_path: Path) -> Iterator[Flight]:
-    """Guidance that has engaged."""
+    """Return guidance that has engaged."""
     with world_of("--params-file", str(calm(tmp_path / "calm.yaml"))) as world:
         made = Flight(world)
         made.run()
@@ -159,7 +159,7 @@ def test_target_without_channels_keeps_link_and_silence_leads_home(tmp_path: Pat
 
 @pytest.fixture
 def learning(tmp_path: Path) -> Iterator[Flight]:
-    """Guidance of a flight that learns, which has engaged."""
+    """Return guidance of a flight that learns, which has engaged."""
     file = calm(tmp_path / "calm.yaml", authority_rate=10.0)
     with world_of("--params-file", str(file)) as world:
         made = Flight(world)
@@ -179,7 +179,10 @@ def test_learned_authority_limits_commands_and_a_bad_one_is_refused(learning: Fl
 
 
 def test_authority_is_the_controllers_alone(learning: Flight) -> None:
-    """Also before the controller has sent one, and of another process of its name."""
+    """No other publisher is accepted, even before the controller has sent an authority.
+
+    Another process with the controller's name is refused, too.
+    """
 
     def send(p: float, publisher: str) -> None:
         learning.world.send("/authority", dict.fromkeys(AUTHORITY, p), publisher)
@@ -194,7 +197,10 @@ def test_authority_is_the_controllers_alone(learning: Flight) -> None:
 
 
 def test_authority_that_stops_is_void(learning: Flight) -> None:
-    """Three periods of 0.1 s and the age limit of 0.2 s, from the stamp on."""
+    """An authority is valid for three periods plus the age limit, from its stamp.
+
+    The period is 0.1 s, and the age limit 0.2 s.
+    """
     learning.world.send("/authority", dict.fromkeys(AUTHORITY, 0.0), "/controller#1")
     learning.run(0.45)
     assert learning.last("authority.p") == 0.0
@@ -276,7 +282,7 @@ def test_services_hold_skip_and_disengage(flight: Flight) -> None:
 
 
 def route(frame: str, *points: tuple[float, float, float]) -> PathMessage:
-    """Waypoints by east, north, up."""
+    """Return waypoints with east, north and up."""
     message = PathMessage()
     message.header.frame_id = frame
     for east, north, up in points:
@@ -339,7 +345,7 @@ def test_stale_pose_levels_wings_and_guidance_engages_again(flight: Flight) -> N
 
 
 def test_guidance_alone_needs_parameters_of_run(tmp_path: Path) -> None:
-    """What follows from other sections of a scenario is in the parameters of a run alone."""
+    """Only the parameters of a run have the values that follow from other sections."""
     file = find_scenario("osprey_route").path
     refusal = "guidance: missing natural_frequency, speed, expected a value for each"
     with (
@@ -356,7 +362,10 @@ def test_guidance_alone_needs_parameters_of_run(tmp_path: Path) -> None:
 def test_step_that_fails_leaves_the_last_u_m_and_the_node_goes_on(
     flight: Flight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Three steps of a climb fail: u_m goes on, one line says why, and the diagnostics count."""
+    """Three steps of a climb fail.
+
+    u_m is kept, one line says why, and the diagnostics count the steps.
+    """
     flight.target(climb=1.0)
     flight.run(0.3)
     step = guidance_steps.step
@@ -386,7 +395,7 @@ def test_step_that_fails_leaves_the_last_u_m_and_the_node_goes_on(
 def test_steps_that_fail_to_the_end_leave_no_u_m_and_say_why(
     flight: Flight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The reference model levels the wings then; with the first good step u_m is back."""
+    """The reference model then levels the wings, and u_m is back with the first good step."""
 
     def raises(*arguments: Any) -> Any:
         raise IndexError("index 7 is out of bounds")

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder's node.
+"""Test the recorder's node.
 
-Tested are its topics and their qualities, lost messages, silences, a full disk, and the end of the
-log.
+The tests cover its topics and their qualities, lost messages, silences, a full disk, and the end of
+the log.
 """
 
 import re
@@ -66,22 +66,22 @@ class Recording:
         self.world.run(duration, lambda: self.send(*topics))
 
     def figures(self) -> dict[str, str]:
-        """The figures of the newest diagnostics."""
+        """Return the figures of the newest diagnostics."""
         return diagnostics(self.world, "/recorder")[1]
 
     def logged(self, *parts: str) -> list[str]:
-        """The lines with all parts."""
+        """Return the lines with all parts."""
         return [line for line in self.node.log.lines if all(part in line for part in parts)]
 
     def end(self) -> Any:
-        """End the node, and read its log."""
+        """End the node, and return its log."""
         self.world.end(self.node)
         return read_run(self.folder)
 
 
 @contextmanager
 def recording(scenario: Scenario, folder: Path, **values: object) -> Iterator[Recording]:
-    """A recorder of a scenario with other parameters."""
+    """Yield a recorder of a scenario with other parameters."""
     given = {f"recorder.{name}": value for name, value in {"directory": folder, **values}.items()}
     with world_of("--params-file", str(scenario.path), *parameters(given)) as world:
         yield Recording(world, folder)
@@ -167,7 +167,7 @@ def test_later_publisher_with_weaker_qos_recorded(recorder: Recording) -> None:
 def test_topic_of_any_publisher_is_recorded_with_the_quality_that_it_offers(
     topic: str, qos: QoSProfile, recorder: Recording
 ) -> None:
-    """A subscription that asks for more than a publisher offers receives nothing from it."""
+    """A subscription that asks for more than a publisher offers receives nothing."""
     plain = recorder.world.publisher(JointState, f"/{topic}", qos)
     recorder.run(1.5)
     (subscription,) = (
@@ -204,7 +204,7 @@ def test_flight_of_which_part_is_recorded_is_no_silent_failure(recorder: Recordi
 def test_log_of_remapped_topics_names_them_as_the_stack_does(
     osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    """The topics of the file keep the names by which they were sent."""
+    """The topics of the file keep the names with which they were sent."""
     names = {"y": "/sensors/y", "u": "/act/command", "y_m": "/uav1/ref/y_m"}
     remaps = [word for name, topic in names.items() for word in ("-r", f"{name}:={topic}")]
     arguments = (
@@ -263,7 +263,10 @@ def test_flight_that_falls_silent_named_each_time(recorder: Recording) -> None:
 
 
 def test_topic_that_stops_while_others_go_on_named_and_noted(recorder: Recording) -> None:
-    """A WARN, a figure of the diagnostics, and a note of the log; one that lasts is noted too."""
+    """A silence gives a warning, a figure of the diagnostics and a note in the log.
+
+    It also has a note if it lasts to the end.
+    """
     recorder.run(1.0, "y", "y_m", "truth")
     recorder.run(2.5, "y_m", "truth")
     assert len(recorder.logged("no message for 1 s while others go on")) == 1
@@ -311,7 +314,10 @@ def test_lost_messages_are_counted_and_reported(recorder: Recording) -> None:
 
 
 def test_each_topic_that_loses_messages_has_its_own_line(recorder: Recording) -> None:
-    """After a loss on several topics at once; of one topic a line in two seconds."""
+    """After a loss on several topics at once, each topic has its own line.
+
+    A single topic has at most one line in two seconds.
+    """
     names = ("/y", "/y_m", "/u", "/truth", "/pose")
     publishers = [recorder.world.publisher(JointState, name) for name in names]
     encoder = Encoder(OUTPUTS, "/aircraft#1")
@@ -341,7 +347,7 @@ def test_each_topic_that_loses_messages_has_its_own_line(recorder: Recording) ->
 
 
 def test_file_is_locked_as_long_as_the_recorder_holds_it(recorder: Recording) -> None:
-    """So no repair touches a log that is written, and a page follows it to its end."""
+    """So no repair changes a log that is being written, and a page follows it to its end."""
     recorder.run(0.5, *LOOP)
     (path,) = recorder.folder.glob("*.mcap")
     assert is_locked(path)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks of nodes on other hosts: the estimate of offset and delay."""
+"""Test the clocks of nodes on other hosts: the estimate of offset and delay."""
 
 import random
 
@@ -14,9 +14,9 @@ from flight_ros.clocks import AHEAD, HOST, Peers
 def exchanged(
     offset: float, there: float, back: float, jitter: float, hosts: tuple[float, float] = (0.0, 0.0)
 ) -> Peers:
-    """What a knows of b after six exchanges.
+    """Return what a knows about b after six exchanges.
 
-    The clock of b is ahead by the offset, s, and messages take there and back, s.
+    The clock of b is ahead by the offset, s. Messages take `there` and `back`, s.
     """
     a = Peers("/a", hosts[0])
     b = Peers("/b", hosts[1])
@@ -44,7 +44,7 @@ def test_error_of_offset_is_half_of_difference_of_delays() -> None:
 
 @pytest.mark.parametrize("offset", [0.0, 0.15])
 def test_delays_of_busy_host_shift_no_clock_of_that_host(offset: float) -> None:
-    """To another host one way of 0.002 s and one of 0.202 s are a clock that is 0.1 s off."""
+    """Between two hosts, 0.002 s one way and 0.202 s back mean that a clock is 0.1 s off."""
     clock = exchanged(offset, 0.002, 0.202, 0.0, (7.0, 7.0)).clocks()["/b"]
     assert clock.offset == approx(offset, abs=1e-9)
     assert clock.delay == approx(0.202)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzzing of the decoders.
+"""Test the decoders with random payloads.
 
-Any payload is decoded or rejected with a reason, and the next valid message is decoded.
+A payload is decoded or rejected with a reason, and the next valid message is decoded.
 """
 
 from typing import Any
@@ -28,7 +28,7 @@ many = settings(few, max_examples=300)
 
 @st.composite
 def payloads(draw: st.DrawFn) -> bytes:
-    """A valid payload with changed bytes, or truncated, or extended."""
+    """Draw a valid payload with changed bytes, or a truncated or extended one."""
     names = draw(st.sampled_from([NAMES, NAMES[::-1], ("q",), ("q", "q", "V", "p", "r"), ()]))
     values = draw(st.lists(st.floats(), min_size=len(names), max_size=len(names)))
     stamp = draw(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Named vectors as bytes.
+"""Test named vectors as bytes.
 
-They are held against the independent serialisation of rosbags, and against the middleware.
+They are compared with the independent serialisation of rosbags, and with the middleware.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters with which a node does not start: one sentence each, which the event loop prints."""
+"""Test parameters with which a node does not start. Each gives a sentence, which is printed."""
 
 import sys
 from collections.abc import Mapping
@@ -71,7 +71,10 @@ def test_an_invalid_parameter_is_one_sentence(
 def test_parameter_for_all_nodes_is_left_alone_by_a_node_that_has_no_such(
     given: str, osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As SetParameter of a launch file gives it to every node; the controller takes it."""
+    """SetParameter of a launch file gives a parameter to every node.
+
+    Only the controller has this one.
+    """
     file = tmp_path / "all.yaml"
     file.write_text(f"{given}:\n  ros__parameters: {{k_g: 2.0, other: {{depth: 1}}}}\n")
     words = ["--params-file", str(osprey_gust.path), "-p", f"recorder:directory:={tmp_path}/run"]
@@ -88,7 +91,7 @@ def test_parameter_for_all_nodes_is_left_alone_by_a_node_that_has_no_such(
 
 
 def test_all_missing_parameters_are_in_one_sentence(tmp_path: Path) -> None:
-    """What no aircraft shares has no default, and nothing else is asked for."""
+    """Values that differ between aircraft have no default, and no other value is asked for."""
     file = tmp_path / "mine.yaml"
     file.write_text("/**/controller:\n  ros__parameters: {rate: 100.0, max_age: 0.2}\n")
     needed = "outputs, inputs, D, input_scale, lag, k_g, k_d, Lambda, beta"
@@ -104,7 +107,7 @@ def test_all_missing_parameters_are_in_one_sentence(tmp_path: Path) -> None:
 def test_start_time_long_ago_is_refused(
     name: str, ago: float, refused: bool, osprey_gust: Scenario
 ) -> None:
-    """A late node catches up with its missed ticks, but not with those of more than 10 s."""
+    """A late node makes up for missed ticks, but not for those of more than 10 s."""
     now = 1000.0 + EPOCH_NS / NANOSECONDS
     with world_of(
         "--params-file", str(osprey_gust.path), "-p", f"start_time:={now - ago}"

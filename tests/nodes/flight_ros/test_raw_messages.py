@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Raw messages: any bytes on any topic are refused and counted. They end no node, and no command.
+"""Test that any bytes on any topic are refused and counted. They end no node and no command.
 
-Every subscription that gets bytes is fed: of the nodes in real time, in lockstep and by /clock, and
-of the clients of the commands.
+Every subscription that receives bytes is tested: those of the nodes in real time, in lockstep and
+by /clock, and those of the commands' clients.
 """
 
 import json
@@ -45,7 +45,7 @@ FOREIGN = b"\x07\x00" + STAMPED[2:]  # no plain CDR
 
 
 def learning_and_guided(folder: Path) -> Scenario:
-    """A scenario with every node but the bridge."""
+    """Return a scenario with every node except the bridge."""
     guided = find_scenario("osprey_route")
     assert guided.guidance is not None
     scenario = find_scenario("osprey_learn").vary(
@@ -55,7 +55,7 @@ def learning_and_guided(folder: Path) -> Scenario:
 
 
 def arguments(scenario: Scenario, folder: Path, **options: Any) -> list[str]:
-    """The arguments of all nodes of a flight."""
+    """Return the arguments of all nodes of a flight."""
     (folder / "run").mkdir()
     start = 0.0 if options["lockstep"] else ON_START
     values = parameter_overrides(ONE_PROCESS, scenario, folder / "run", start, **options)
@@ -72,7 +72,7 @@ def arguments(scenario: Scenario, folder: Path, **options: Any) -> list[str]:
 
 
 class Attack:
-    """A world, and how its nodes and clients take what was sent."""
+    """A world, and a function that lets its nodes and clients take what was sent."""
 
     def __init__(self, world: World, take: Callable[[], object]) -> None:
         self.world = world
@@ -92,11 +92,11 @@ class Attack:
         self.take()
 
     def now(self) -> bytes:
-        """The instant: as t = 0, and as the time of a simulator."""
+        """Return the present instant as a message for t = 0, and for the time of a simulator."""
         return instant(self.world.clock.time_ns())
 
     def topics(self, node: str) -> set[str]:
-        """The topics of the subscriptions of bytes of a node."""
+        """Return the topics of a node's subscriptions of bytes."""
         return {
             each.topic_name
             for each in self.world.subscriptions
@@ -106,7 +106,10 @@ class Attack:
 
 @contextmanager
 def nodes_in_real_time(folder: Path, *, use_sim_time: bool = False) -> Iterator[Attack]:
-    """All nodes but the bridge, before and after t = 0, and the clients of the commands."""
+    """Yield all nodes except the bridge, and the clients of the commands.
+
+    The nodes are before t = 0 and after it.
+    """
     scenario = learning_and_guided(folder)
     words = arguments(scenario, folder, lockstep=False, use_sim_time=use_sim_time)
     with world_of(*words) as world, clients_of(world):
@@ -129,14 +132,14 @@ def nodes_in_real_time(folder: Path, *, use_sim_time: bool = False) -> Iterator[
 
 @contextmanager
 def nodes_by_clock(folder: Path) -> Iterator[Attack]:
-    """The same in simulated time, before its first /clock."""
+    """Yield the same nodes in simulated time, before the first message of /clock."""
     with nodes_in_real_time(folder, use_sim_time=True) as attack:
         yield attack
 
 
 @contextmanager
 def nodes_in_lockstep(folder: Path) -> Iterator[Attack]:
-    """All nodes but the bridge."""
+    """Yield all nodes except the bridge."""
     scenario = learning_and_guided(folder)
     words = [
         *arguments(scenario, folder, lockstep=True),
@@ -159,7 +162,7 @@ def nodes_in_lockstep(folder: Path) -> Iterator[Attack]:
 
 @contextmanager
 def a_bridge(folder: Path) -> Iterator[Attack]:
-    """A bridge with an autopilot whose message types are installed."""
+    """Yield a bridge with an autopilot whose message types are installed."""
     with world_of(*parameters({"bridge.map": MAP_FILES["ardupilot_2024"]})) as world:
         world.start(BridgeNode)
         yield Attack(world, lambda: world.run(0.05))
@@ -208,7 +211,7 @@ def test_no_bytes_end_a_node_or_a_command(attack: Attack, bodies: list[bytes]) -
 
 
 def test_log_holds_the_bytes_that_were_refused(tmp_path: Path) -> None:
-    """A log is evidence of an attack, too."""
+    """A log should also be evidence of an attack."""
     with nodes_in_real_time(tmp_path) as attack:
         attack.send(*SHORT)
         attack.send(attack.now())

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A receiver looks at size and publisher before it decodes.
+"""Test that a receiver checks size and publisher before it decodes.
 
 It refuses, counts and logs what does not fit.
 """
@@ -25,7 +25,7 @@ MAX_AGE, TAKEOVER = 100, 1000  # ns
 
 
 class Topic(PolledSubscription):
-    """A subscription without middleware. It is also the node that logs."""
+    """A subscription without middleware, which is also the node that logs."""
 
     def __init__(self) -> None:
         self.topic = Y
@@ -35,7 +35,7 @@ class Topic(PolledSubscription):
         self.lines: list[tuple[str, str]] = []
 
     def take(self, most: int | None = None) -> list[ReceivedMessage]:
-        """The messages, without metadata."""
+        """Return the messages, without metadata."""
         taken = self.messages[:most]
         self.messages = self.messages[most or len(self.messages) :]
         numbers = self.numbers or [0] * len(taken)
@@ -46,7 +46,7 @@ class Topic(PolledSubscription):
         ]
 
     def get_logger(self) -> Any:
-        """Itself."""
+        """Return itself."""
         return self
 
     def error(self, line: str) -> None:
@@ -59,7 +59,7 @@ class Topic(PolledSubscription):
 
 
 class Setup:
-    """A receiver with what it decoded and took. `locked` None is the lock of a lockstep flight."""
+    """A receiver with what it decoded and took. With `locked` None, it has the lock of lockstep."""
 
     def __init__(
         self, *, locked: bool | None = True, max_age: int | None = None, max_size: int | None = None
@@ -144,9 +144,9 @@ def test_long_message_is_not_decoded(size: int, sender: str) -> None:
 
 
 def test_long_message_under_the_name_of_the_publisher_is_not_decoded() -> None:
-    """The longer, the dearer: 16 kB cost 22 times a right message.
+    """The cost of decoding grows with the length: 16 kB cost 22 times as much as a right message.
 
-    A publisher that timed out may have other channels.
+    After a time-out, the next publisher may have other channels.
     """
     setup = Setup()
     right = message()
@@ -169,9 +169,9 @@ def test_long_message_under_the_name_of_the_publisher_is_not_decoded() -> None:
 
 
 def test_report_may_be_much_longer_than_the_one_before() -> None:
-    """A learner without a model says so in 300 bytes.
+    """A learner without a model sends reports of 300 bytes.
 
-    It proposes 10,000 bytes half a timeout later.
+    Half a timeout later, it sends a proposal of 10,000 bytes.
     """
     right = message()
     long = message(names=(*NAMES, *(f"c{k}" for k in range(800))))
@@ -189,14 +189,14 @@ def test_size_limit_is_inclusive() -> None:
 def test_no_client_decodes_long_message(
     decoder: Decoder | NamedDecoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A command that waits for a topic has no receiver."""
+    """A command that waits for a topic has no receiver, so its decoder must check the size."""
     monkeypatch.setattr(messages, "deserialize_message", None)
     with pytest.raises(ChannelError, match="a message of 1200000 bytes"):
         decoder.decode(of_size(1_200_000))
 
 
 def big_endian(sender: str) -> bytes:
-    """A message of NAMES by the big-endian encoding of CDR."""
+    """Return a message of NAMES in the big-endian encoding of CDR."""
     made = STORE.deserialize_cdr(vector(0, NAMES, (0.5, 0.0), sender), JOINT_STATE)
     return bytes(STORE.serialize_cdr(made, JOINT_STATE, little_endian=False))
 
@@ -233,7 +233,7 @@ def test_big_endian_publisher_is_taken() -> None:
     "encapsulation", [b"\x00\x02", b"\x00\x03", b"\x00\x07", b"\x00\x0b", b"\xff\xff"]
 )
 def test_message_of_another_encoding_is_not_decoded(encapsulation: bytes) -> None:
-    """PL_CDR and XCDR2, whose publisher has another place."""
+    """PL_CDR and XCDR2 have the publisher in another place."""
     setup = Setup()
     assert setup.poll(encapsulation + message()[2:]) == [False]
     assert setup.decoded == []
@@ -272,7 +272,10 @@ def test_stamps_are_limited_both_ways(stamp_ns: int, reason: str) -> None:
 
 
 def lockstep(setup: Setup, *messages: tuple[bytes, int]) -> list[int | None]:
-    """The stamps of the instants that messages with these numbers are; None has no sample."""
+    """Return the stamps of the instants for messages with these numbers.
+
+    An instant without a sample gives None.
+    """
     setup.topic.messages += [raw for raw, _ in messages]
     setup.topic.numbers += [number for _, number in messages]
     return [sample and sample.stamp_ns for sample in setup.receiver.receive()]
@@ -298,7 +301,7 @@ NO_INSTANTS = {
 def test_message_of_a_foreign_publisher_is_no_instant_of_a_lockstep_flight(
     raw: bytes, number: int, reason: str
 ) -> None:
-    """Each message of the flight's publisher is an instant, and each other one is nothing."""
+    """Each message of the flight's publisher is an instant, and other messages are ignored."""
     setup = Setup(locked=None, max_age=MAX_AGE)
     own = [(message(stamp_ns=10 * k), 7 + k) for k in range(4)]
     assert lockstep(setup, own[0], (raw, number), own[1]) == [0, 10]
@@ -325,7 +328,7 @@ def test_refused_content_of_the_flights_publisher_is_an_instant_without_a_sample
 
 
 def test_polled_topic_of_a_lockstep_flight_is_locked_by_a_message_without_channels() -> None:
-    """As u: the controller says at each instant that there is none yet."""
+    """This is so for u, because the controller says at each instant that there is none yet."""
     setup = Setup(locked=None, max_age=MAX_AGE)
     foreign = [message("/foreign"), Encoder((), "").encode(0, np.zeros(0))]
     assert setup.poll(EMPTY, *foreign, message(), *foreign) == [
@@ -341,7 +344,7 @@ def test_polled_topic_of_a_lockstep_flight_is_locked_by_a_message_without_channe
 
 
 def test_received_sample_is_accepted_as_polled() -> None:
-    """Lockstep: all messages are decoded, then accepted at their instants."""
+    """In lockstep, all messages are decoded, and then accepted at their instants."""
     setup = Setup(max_age=MAX_AGE)
     setup.topic.messages += [message(), b"", message("/foreign"), message(stamp_ns=500)]
     samples = setup.receiver.receive()

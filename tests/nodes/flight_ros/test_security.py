@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sockets that are open to the network are found, and a replayed u is refused."""
+"""Test that sockets open to the network are found, and that a replayed u is refused."""
 
 import socket
 
@@ -19,7 +19,7 @@ from flight_ros.transport import LOOPBACK_PROFILE, open_to_network
 
 
 class EarlierProcess(psutil.Process):
-    """As psutil has it before release 6."""
+    """A process as psutil describes it before release 6."""
 
     connections = psutil.Process.net_connections
 
@@ -47,7 +47,7 @@ def test_socket_on_all_interfaces_found_in_spite_of_loopback_profile(
 
 
 def test_replayed_u_refused_by_stamp(osprey_gust: Scenario) -> None:
-    """Also by a restarted aircraft, which has no memory of the last stamp."""
+    """A restarted aircraft, which does not remember the last stamp, refuses it, too."""
     with flying(osprey_gust, max_age=MAX_AGE) as flight:
         publisher = flight.world.publisher(JointState, "/u")
         flight.fly(0.01)
@@ -65,7 +65,7 @@ def test_replayed_u_refused_by_stamp(osprey_gust: Scenario) -> None:
 
 
 def test_start_that_nodes_of_two_names_publish_is_told(osprey_gust: Scenario) -> None:
-    """The message does not name its publisher; a node that was started again has one name."""
+    """The message does not name its publisher. A node that was started again has the same name."""
     arguments = ("--params-file", str(osprey_gust.path), "-p", "start_time:=-1.0")
     with world_of(*arguments) as world:
         aircraft = world.make(AircraftNode)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes by the /clock of a simulator, at any speed.
+"""Test nodes that run by the /clock of a simulator, at any speed.
 
-The same flight, a pause, a restart, and the log.
+The tests cover the same flight, a pause, a restart, and the log.
 """
 
 from collections.abc import Iterator
@@ -32,7 +32,7 @@ STEP_NS = 2_000_000  # of /clock
 
 
 class Simulation:
-    """A simulator that publishes /clock `speed` times as fast as the time of the host."""
+    """A simulator whose /clock is `speed` times as fast as the time of the host."""
 
     def __init__(self, world: World, speed: float = 1.0) -> None:
         self.world = world
@@ -48,7 +48,7 @@ class Simulation:
             self.world.run(STEP_NS / NANOSECONDS / self.speed)
 
     def start(self, *nodes: type[Any]) -> list[Any]:
-        """Nodes that run, once they know the time."""
+        """Start nodes, and let them know the time."""
         made = [self.world.make(node) for node in nodes]
         assert not any(node.has_time() for node in made if not isinstance(node, RecorderNode))
         self.run(0.01)
@@ -60,7 +60,7 @@ class Simulation:
 
 @contextmanager
 def simulation(scenario: Scenario, *arguments: str, speed: float = 1.0) -> Iterator[Simulation]:
-    """A world by /clock."""
+    """Yield a world that runs by /clock."""
     with world_of(
         "--params-file", str(scenario.path), "-p", "use_sim_time:=true", *arguments
     ) as world:
@@ -68,9 +68,9 @@ def simulation(scenario: Scenario, *arguments: str, speed: float = 1.0) -> Itera
 
 
 def flown(scenario: Scenario, speed: float) -> tuple[list[bytes], float]:
-    """What the controller sent in 2.5 s of simulated time.
+    """Return what the controller sent in 2.5 s of simulated time.
 
-    The second result is how long that took on the host, s.
+    The second result is how long this took on the host, s.
     """
     with simulation(scenario, speed=speed) as simulator:
         simulator.start(AircraftNode, ReferenceModelNode, ControllerNode)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each input of each node refuses a stamp that is behind or ahead of the clock.
+"""Test that each input of a node refuses a stamp too far behind or ahead of the clock.
 
 The bound is the age limit of the input.
 """
@@ -74,9 +74,9 @@ NAMES = {
 
 
 def require_bounds(made: FlightNode[Any], limits: Mapping[str, float]) -> None:
-    """Assert that each receiver takes the stamps within the limit of the topic alone.
+    """Assert that each receiver accepts exactly the stamps within the limit of its topic.
 
-    The limit holds behind and ahead of the clock.
+    The limit applies behind and ahead of the clock.
     """
     receivers = {receiver.subscription.topic.name: receiver for receiver in made.receivers}
     for topic, limit in limits.items():
@@ -116,9 +116,9 @@ def test_each_input_is_bounded_both_ways(spec: NodeSpec, lockstep: bool, tmp_pat
 
 
 def test_u_of_the_bridge_is_bounded_both_ways() -> None:
-    """The topics of the autopilot have the same test elsewhere.
+    """The topics of the autopilot are tested elsewhere.
 
-    It is in tests/pure/autopilot_bridge/test_bridge.py.
+    The test is in tests/pure/autopilot_bridge/test_bridge.py.
     """
     channel_map = load_map(str(MAP))
     limit = channel_map.silence.max_age + max(row.max_age for row in channel_map.outputs.values())

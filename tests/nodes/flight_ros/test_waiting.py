@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A test in real time that fails beside a pause of the host is run again.
+"""Test that a test in real time is run again if it fails during a pause of the host.
 
-One that fails without a pause fails.
+A test that fails without a pause fails.
 """
 
 import subprocess
@@ -43,9 +43,9 @@ def test_bears_more(): assert False
 
 
 def printed(folder: Path, pause: float) -> str:
-    """What pytest prints of tests that pass at an attempt.
+    """Return what pytest prints for tests that pass at a later attempt.
 
-    One of them bears a longer pause and fails.
+    One of them tolerates a longer pause and fails.
     """
     (folder / "test_it.py").write_text(TESTS)
     (folder / "pytest.ini").write_text("[pytest]\nmarkers =\n  longest_pause(s): a test\n")

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Live commands u_m of the reference model's node.
+"""Test live commands u_m of the reference model's node.
 
-The tests are of one publisher, the ending when it falls silent, and lockstep.
+The tests cover one publisher, what happens when it falls silent, and lockstep.
 """
 
 from pathlib import Path
@@ -27,7 +27,7 @@ MS = 1_000_000  # ns
 
 @pytest.fixture
 def osprey(tmp_path: Path) -> Path:
-    """The osprey with Euler's kinematics in calm air, whose reference levels the wings."""
+    """Return the osprey with Euler's kinematics in calm air, whose reference levels the wings."""
     varied = find_scenario("osprey_servo").vary(
         aircraft={"kinematics": "euler", "gusts": {}},
         reference_model={

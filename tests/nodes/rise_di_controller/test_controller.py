@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's node.
+"""Test the controller's node.
 
-The tests are of bumpless engagement, the failsafe for stale inputs, malformed samples, parameters,
-lifecycle and overruns.
+The tests cover bumpless engagement, the failsafe for stale inputs, malformed samples, parameters,
+the lifecycle and overruns.
 """
 
 import math
@@ -46,12 +46,12 @@ class Flight:
         self.node: Any = world.start(ControllerNode)
 
     def send(self) -> None:
-        """Publish y and y_m, stamped now."""
+        """Publish y and y_m with the present stamp."""
         self.world.send("/y_m", dict.fromkeys(OUTPUTS, 0.0))
         self.world.send("/y", dict.fromkeys(OUTPUTS, self.y))
 
     def run(self, duration: float, *, silent: bool = False) -> None:
-        """Run for a duration, s; `silent`: without y and y_m."""
+        """Run for a duration, s. If `silent`, there is no y and no y_m."""
         self.world.run(duration, None if silent else self.send)
 
     def engage(self) -> "Flight":
@@ -62,34 +62,34 @@ class Flight:
 
     @property
     def mode(self) -> float:
-        """The mode of the last tick; NaN before the first."""
+        """Return the mode of the last tick, or NaN before the first."""
         return self.world.last("/internals").get("mode", math.nan)
 
     def column(self, name: str, begin: int = 0) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """A channel of `internals` from a tick on."""
+        """Return a channel of `internals` from a tick on."""
         return np.array(
             [sample.channels[name] for sample in self.world.vectors("/internals")[begin:]]
         )
 
     def at(self, begin: int = 0) -> np.ndarray[Any, np.dtype[np.int64]]:
-        """The instants of the ticks, ns of the system clock."""
+        """Return the instants of the ticks, ns of the system clock."""
         samples = self.world.vectors("/internals")[begin:]
         return np.array(
             [sample.stamp_ns + nanoseconds(sample.channels["age"]) for sample in samples]
         )
 
     def u(self, begin: int = 0) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """The published inputs, shape (N, m)."""
+        """Return the published inputs, (N, m)."""
         return np.array(
             [[*sample.channels.values()] for sample in self.world.vectors("/u")[begin:]]
         )
 
     def call(self, kind: Any, name: str, **fields: Any) -> Any:
-        """The response of a service of the controller."""
+        """Return the response of a service of the controller."""
         return self.world.call(f"/controller/{name}", kind.Request(**fields))
 
     def set(self, **values: object) -> tuple[bool, str]:
-        """Set parameters at once: whether, and why not."""
+        """Set parameters at once, and return whether this succeeded, and why not."""
         messages = [
             Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
         ]
@@ -99,27 +99,27 @@ class Flight:
         return result.successful, result.reason
 
     def values(self, *names: str) -> list[float]:
-        """Parameters of the type double."""
+        """Return parameters of the type double."""
         return [
             value.double_value
             for value in self.call(GetParameters, "get_parameters", names=list(names)).values
         ]
 
     def transition(self, number: int) -> bool:
-        """Request a transition; whether it succeeded."""
+        """Request a transition, and return whether it succeeded."""
         return bool(
             self.call(ChangeState, "change_state", transition=Transition(id=number)).success
         )
 
     @property
     def state(self) -> int:
-        """The lifecycle state."""
+        """Return the lifecycle state."""
         return int(self.call(GetState, "get_state").current_state.id)
 
 
 @contextmanager
 def flying(scenario: Scenario, **values: object) -> Iterator[Flight]:
-    """A controller of a scenario with other parameters."""
+    """Yield a controller of a scenario with other parameters."""
     updates = parameters({f"controller.{name}": value for name, value in values.items()})
     with world_of("--params-file", str(scenario.path), *updates) as world:
         yield Flight(world)
@@ -134,7 +134,10 @@ def flight(osprey_gust: Scenario) -> Iterator[Flight]:
 def test_forged_y_in_the_name_of_the_aircraft_is_held_and_told_until_it_ends(
     flight: Flight,
 ) -> None:
-    """Either y may be the forged one. A name of its own is refused alone, and the law flies on."""
+    """Either y may be the forged one.
+
+    A publisher with a name of its own is refused, and the law flies on.
+    """
     flight.engage()
     rogue = flight.world.publisher(JointState, "/y", node="/rogue")
     encoder = Encoder(OUTPUTS, "/peer#1")
@@ -183,7 +186,7 @@ def test_engages_bumpless_from_zero(flight: Flight) -> None:
 
 
 def test_failsafe_holds_u_ramps_to_trim_re_engages_bumpless(osprey_gust: Scenario) -> None:
-    """Mode and u are functions of the time since the last y was stale."""
+    """Mode and u are functions of the time since y became stale."""
     hold, ramp, y = 0.1, 1.5, 0.05
     with flying(osprey_gust, hold=hold, ramp=ramp) as flight:
         flight.y = y
@@ -242,7 +245,7 @@ def test_stopped_controller_re_engages_from_trim(osprey_gust: Scenario) -> None:
 def test_tick_that_is_stopped_half_way_publishes_no_old_u(
     flight: Flight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The aircraft has started its failsafe: u would jump."""
+    """The aircraft has already started its failsafe, so an old u would make the actuators jump."""
     flight.engage()
     ages: list[float] = []
     clock = flight.world.clock
@@ -410,7 +413,10 @@ def test_invalid_change_rejected_with_reason_and_has_no_effect(
 
 
 def test_parameters_of_several_nodes_set_none(flight: Flight) -> None:
-    """`ros2 param load` joins the sections of a file: max_age may then be that of the aircraft."""
+    """`ros2 param load` joins the sections of a file.
+
+    So max_age may be the value of the aircraft's section.
+    """
     messages = [
         Parameter(name, value=value).to_parameter_msg()
         for name, value in (("max_age", 0.7), ("step", 0.002))
@@ -440,9 +446,9 @@ def test_waits_for_configure_and_activate_without_autostart(osprey_gust: Scenari
 def test_deactivated_controller_publishes_trim_but_standby_that_was_never_activated_nothing(
     osprey_gust: Scenario,
 ) -> None:
-    """A bridge engages with a fresh u.
+    """A bridge engages only with a fresh u.
 
-    Beside another controller the u of a standby would be a conflict.
+    The u of a standby would conflict with another controller.
     """
     with flying(osprey_gust, autostart="false") as flight:
         assert flight.transition(Transition.TRANSITION_CONFIGURE)
@@ -482,7 +488,7 @@ def test_invalid_transition_refused_and_node_goes_on(flight: Flight) -> None:
 def test_tick_rate_is_kept_over_overruns(flight: Flight) -> None:
     """Deadlines are absolute.
 
-    After an overrun a tick is late, and the ones that it skipped are counted.
+    After an overrun a tick is late, and the skipped ticks are counted.
     """
     flight.engage()
     flight.run(2.0, silent=True)  # in the failsafe each tick publishes internals
@@ -507,7 +513,7 @@ def test_tick_rate_is_kept_over_overruns(flight: Flight) -> None:
 
 
 def missed(flight: Flight) -> int:
-    """The missed ticks that the diagnostics count."""
+    """Return how many missed ticks the diagnostics count."""
     return int(diagnostics(flight.world, "/controller")[1]["missed ticks"])
 
 
@@ -570,7 +576,7 @@ def test_waiting_for_y_is_told_with_its_cause(
 def test_node_of_a_user_that_waits_for_the_topic_start_in_vain_is_named(
     flight: Flight, *, is_sent: bool
 ) -> None:
-    """Nobody publishes `start` beside nodes that a user starts by hand."""
+    """If a user starts the nodes by hand, nobody may publish `start`."""
     flight.world.publisher(JointState, "/y")
     flight.world.subscribe(Time, "/start", STATE, "/my_aircraft", raw=False)
     if is_sent:
@@ -584,7 +590,7 @@ def test_node_of_a_user_that_waits_for_the_topic_start_in_vain_is_named(
 def test_rate_of_y_too_low_for_max_age_is_named_once_with_its_mend(
     rate: float, named: bool, flight: Flight
 ) -> None:
-    """At 9 Hz the law engages and holds in turns; at 20 Hz after two late samples."""
+    """At 9 Hz the law engages and holds in turns. At 20 Hz it does so after two late samples."""
     next_ns = 0
 
     def send(paused: bool = False) -> None:
@@ -633,16 +639,19 @@ def test_sample_without_stamp_is_no_old_one(flight: Flight) -> None:
 
 
 def test_node_waits_for_the_next_whole_period(flight: Flight) -> None:
-    """The node waits until 1 ms after whole periods of the system clock.
+    """The node waits until 1 ms after a whole period of the system clock.
 
-    The y and y_m of the instant have arrived there.
+    By then, y and y_m of this instant have arrived.
     """
     flight.engage()
     assert set(flight.at() % (10 * MS)) == {MS}
 
 
 def test_controller_that_was_shut_down_publishes_nothing(flight: Flight) -> None:
-    """Deactivated it ramps u to trim; shut down it says nothing: the aircraft has a failsafe."""
+    """A deactivated node ramps u to trim, and one that was shut down is silent.
+
+    The aircraft has a failsafe for this.
+    """
     flight.engage()
     assert flight.transition(Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert flight.state == State.PRIMARY_STATE_FINALIZED
@@ -665,7 +674,7 @@ def test_controller_that_was_shut_down_publishes_nothing(flight: Flight) -> None
     ],
 )
 def test_models_of_an_operator_are_refused_in_flight(changes: dict[str, Any]) -> None:
-    """A proposal of a learner is proved before it flies; the margin of the proof is no wish."""
+    """A proposal of a learner is proved before it flies, and its margin cannot be set by hand."""
     with flying(find_scenario("osprey_observer")) as flight:
         flight.engage()
         before = flight.values("observer.margin", "observer.part", "observer.fade", "k_g")

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge, over DDS: the unchanged controller flies a simulated autopilot.
+"""Test the bridge over DDS: the unchanged controller flies a simulated autopilot.
 
-The map is examples/maps/ardupilot_2024.yaml. tests/nodes/autopilot_bridge/test_bridge.py has what a
-bridge does with its messages. These tests have the commands, the flight with a bridge, and the ends
-of its process.
+The map is examples/maps/ardupilot_2024.yaml. tests/nodes/autopilot_bridge/test_bridge.py tests what
+a bridge does with its messages. These tests are about the commands, the flight with a bridge, and
+the ends of its process.
 """
 
 import json
@@ -48,7 +48,7 @@ LATE = 0.2
 
 
 class BridgeSetup:
-    """The processes around a bridge, and a subscription to the messages to the autopilot."""
+    """The processes around a bridge, and a subscription to the messages for the autopilot."""
 
     def __init__(self, start: Start, peer_node: Peer, folder: Path) -> None:
         self._start = start
@@ -66,7 +66,7 @@ class BridgeSetup:
         self.sent, self.axes = self.sent + 1, list(joy.axes)
 
     def change_map(self, **changes: Any) -> None:
-        """Change keys of the map; of a mapping some of its keys."""
+        """Change keys of the map. Of a mapping, only the given keys change."""
         content = yaml.safe_load(Path(self.map).read_text())
         Path(self.map).write_text(yaml.safe_dump(merged(content, changes), sort_keys=False))
 
@@ -80,7 +80,7 @@ class BridgeSetup:
         return self._start("autopilot_bridge.main", *arguments).wait_for("ready")
 
     def command(self, each: Callable[[], None] | None, *options: str) -> Process:
-        """`rise-di engage` until it has ended, while u is published."""
+        """Run `rise-di engage` until it has ended, while u is published."""
         client = self._start("flight_cli.cli", "engage", *options)
         self.peer.until(
             lambda: client.popen.poll() is not None, "the end of the command", each=each
@@ -93,7 +93,10 @@ class BridgeSetup:
 
 
 def merged(content: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """A map with changes of it. Merged keys of YAML share one object, which stays as it is."""
+    """Return a map with changes.
+
+    Merged keys of YAML share one object, which is not changed.
+    """
     inner = {
         key: merged(content[key], value) if is_part(content, key, value) else value
         for key, value in changes.items()
@@ -102,7 +105,7 @@ def merged(content: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
 
 
 def is_part(content: Mapping[str, Any], key: str, value: object) -> bool:
-    """Whether a change is one of some keys of a mapping."""
+    """Return whether a change is of some keys of a mapping."""
     return isinstance(value, Mapping) and isinstance(content.get(key), Mapping)
 
 
@@ -116,9 +119,9 @@ def setup(start: Start, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iter
 def test_command_engages_withdraws_and_says_what_still_releases(
     setup: BridgeSetup, start: Start
 ) -> None:
-    """A map without a bound needs `--blind`; Ctrl-C withdraws a request that waits for a condition.
+    """A map without a bound needs `--blind`, and Ctrl-C withdraws a request that waits.
 
-    A bridge that ends releases, and one that is killed leaves it to the autopilot.
+    A bridge that ends releases the autopilot. One that is killed leaves this to the autopilot.
     """
     condition = {
         "topic": "/ap/mode",

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A control law of another package over real DDS.
+"""Test a control law of another package over real DDS.
 
-In lockstep it is equal to the loop in one process, and replayed.
+In lockstep it is equal to the loop in one process, and it is replayed.
 """
 
 import os
@@ -36,7 +36,7 @@ PULSES = {
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder into which pip installs a copy of the example.
+    """Return the folder into which pip installs a copy of the example.
 
     Pip leaves build artefacts beside the source.
     """
@@ -61,7 +61,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def _example(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The installed example in this process and in those that it starts."""
+    """Make the installed example available in this process and in those that it starts."""
     path = os.environ.get("PYTHONPATH")
     monkeypatch.setenv("PYTHONPATH", f"{installed}{os.pathsep}{path}" if path else str(installed))
     monkeypatch.syspath_prepend(str(installed))
@@ -71,7 +71,7 @@ def _example(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
 
 
 def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
-    """A second of a scenario with commands and lost samples, under another controller."""
+    """Return a second of a scenario with commands, lost samples and another controller."""
     tree = yaml.safe_load(find_scenario("osprey_servo").path.read_text())
     sections = {
         name.removeprefix("/**/"): section["ros__parameters"] for name, section in tree.items()
@@ -89,7 +89,7 @@ def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
 def test_law_of_another_package_flies_in_lockstep_as_without_ros_and_replayed(
     start: Start, tmp_path: Path
 ) -> None:
-    """In four processes and in one.
+    """The law flies in four processes and in one.
 
     tests/nodes/flight_bringup/test_lockstep.py flies the other laws.
     """

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of flights over real DDS from their logs: bit by bit.
+"""Test the replay of flights over real DDS from their logs, bit by bit.
 
-Logs after faults of the controller and of the recorder are replayed too.
+Logs with faults of the controller and of the recorder are replayed, too.
 """
 
 import json
@@ -28,9 +28,9 @@ PEER_TOPICS = ("internals", "/diagnostics")
 
 
 def replayed(run: Path, *settings: str, equal: bool = True) -> dict[str, Any]:
-    """The JSON output of `rise-di replay`.
+    """Return the JSON output of `rise-di replay`.
 
-    Its exit status tells a log without 99 % of the ticks.
+    Its exit status shows a log with less than 99 % of the ticks.
     """
     done = invoke("replay", run, "--json", *settings)
     output: dict[str, Any] = json.loads(done.output)

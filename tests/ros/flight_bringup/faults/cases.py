@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The faults: injection, detection, response of u, and time of recovery.
+"""Define the faults: injection, detection, response of u, and time of recovery.
 
-A detection has a node, a way and a time. Among the faults: nodes killed and stopped (failsafe,
+A detection has a node, a way and a time. Among the faults are nodes killed and stopped (failsafe,
 re-engagement), message storms and conflicting publishers (publisher lock), malformed samples,
 incompatible QoS, overruns, a full disk and steps of the clock.
 """
@@ -73,7 +73,7 @@ STOP = 1.2  # s: beyond the age limits, hold and ramp
 
 
 class Response(Enum):
-    """The response of u to the fault."""
+    """The response of u to a fault."""
 
     UNCHANGED = "unchanged: the law flies on"
     CONTROLLER_FAILSAFE = "held, then ramped to trim by the controller"
@@ -110,12 +110,12 @@ class Case(NamedTuple):
 
 
 def logs(role: str, pattern: str) -> Detection:
-    """By a log line of a node, on /rosout."""
+    """Return a detection by a log line of a node, on /rosout."""
     return lambda flight: flight.first_line(role, pattern, flight.begin - 0.1)
 
 
 def enters(mode: Mode) -> Detection:
-    """By the mode of the controller."""
+    """Return a detection by the mode of the controller."""
 
     def detection(flight: Flight) -> float | None:
         ticks = flight.ticks(flight.begin)
@@ -126,7 +126,7 @@ def enters(mode: Mode) -> Detection:
 
 
 def counts(role: str, key: str) -> Detection:
-    """By a counter in the diagnostics of a node."""
+    """Return a detection by a counter in the diagnostics of a node."""
 
     def detection(flight: Flight) -> float | None:
         reports = flight.diagnostics(role, flight.begin - 2.5 * REPORT)
@@ -141,12 +141,12 @@ def counts(role: str, key: str) -> Detection:
 
 
 def refusal(topic: str, reason: str) -> str:
-    """The pattern of the line that logs a refused sample."""
+    """Return the pattern of the line that logs a refused sample."""
     return f"/{topic}: sample refused: .*{reason}"
 
 
 def conflicting(topic: str, publisher: str) -> Detection:
-    """By the line of the publisher lock that logs a conflicting publisher."""
+    """Return a detection by the publisher lock's line about a conflicting publisher."""
     return logs(
         CONSUMERS[topic], refusal(topic, rf"conflicting publisher /{publisher}(#\d+)? ignored")
     )
@@ -156,7 +156,7 @@ def conflicting(topic: str, publisher: str) -> Detection:
 
 
 def until_logged_again(flight: Flight, role: str, pattern: str, period: float) -> None:
-    """Wait until the rate limit of a log line is over: a node would log it again at once."""
+    """Wait until the rate limit of a log line is over, so that a node would log it at once."""
     flight.until(
         lambda: flight.first_line(role, pattern, time.time() - period) is None,
         10.0,
@@ -180,7 +180,7 @@ def at_random(flight: Flight, random: Generator) -> None:
 
 
 def kill(role: str) -> Injection:
-    """SIGKILL, and a restart when u is at trim; of the recorder at once."""
+    """Kill a node, and start it again when u is at trim. The recorder starts again at once."""
 
     def inject(flight: Flight, random: Generator) -> None:
         at_random(flight, random)
@@ -203,7 +203,7 @@ def kill(role: str) -> Injection:
 
 
 def restart(flight: Flight, role: str) -> None:
-    """Start a killed node again. The end of the fault is when it is ready."""
+    """Start a killed node again. The fault ends when the node is ready."""
     started = flight.start(role)
     flight.processes[role].wait_for("ready")
     run, waited = flight.spent(role)
@@ -227,7 +227,7 @@ def restart(flight: Flight, role: str) -> None:
 
 
 def disturb(flight: Flight, *words: str) -> float:
-    """Run a process of `foreign.py`, which is the fault; how much it sent."""
+    """Run a process of `foreign.py`, which is the fault, and return how much it sent."""
     process = Process(
         "tests.ros.flight_bringup.faults.foreign", *words, cwd=REPOSITORY, within=OWN_SESSION
     )
@@ -247,9 +247,9 @@ LEVEL = 10.0  # s after the loss of u_m, until the wings have to be level
 
 
 def kill_in_a_roll_in(flight: Flight, random: Generator) -> None:
-    """Guidance killed at any bank of a roll-in to either side.
+    """Kill guidance at any bank of a roll-in to either side.
 
-    It is started again when the wings have to be level.
+    It is started again when the wings should be level.
     """
     bank = float(random.choice((-BANK, BANK)))
     fraction = random.uniform(0.0, 0.95)
@@ -269,7 +269,10 @@ def kill_in_a_roll_in(flight: Flight, random: Generator) -> None:
 
 
 def pose_fault(word: str, *back: str) -> Injection:
-    """The pose with a fault for some time; then guidance logs that it is back."""
+    """Return a fault of the pose that lasts for some time.
+
+    Guidance then logs that the pose is back.
+    """
 
     def inject(flight: Flight, random: Generator) -> None:
         at_random(flight, random)
@@ -286,9 +289,9 @@ def pose_fault(word: str, *back: str) -> Injection:
 
 
 def reboot(flight: Flight, random: Generator) -> None:
-    """The autopilot killed and started again.
+    """Kill the autopilot, and start it again.
 
-    The bridge engages when it is requested to, not before.
+    The bridge engages when this is requested, and not before.
     """
     at_random(flight, random)
     begin = flight.begin_fault()
@@ -313,9 +316,9 @@ class Page(NamedTuple):
     address: str
 
     def state(self) -> str:
-        """What the page says of the recording, by one request of a browser that has just loaded it.
+        """Return what the page says about the recording, to a browser that has just loaded it.
 
-        Empty without an answer.
+        Without an answer, it is empty.
         """
         base, _, token = self.address.partition("#token=")
         request = urllib.request.Request(f"{base}data/0", headers={TOKEN_HEADER: token})  # noqa: S310 - http of this host
@@ -329,7 +332,7 @@ class Page(NamedTuple):
 
 @contextmanager
 def live_page(flight: Flight) -> Iterator[Page]:
-    """`rise-di watch` of the present recording, which it shows."""
+    """Run `rise-di watch` with the present recording, and check that it is shown."""
     words = ("flight_cli.cli", "watch", str(flight.runs[-1]), "--wait", "--port", "0")
     process = Process(*words, cwd=flight.folder, within=OWN_SESSION)
     try:
@@ -349,9 +352,9 @@ CONNECTIONS, PAGE_STORM = 1000, 2.0  # s
 
 
 def storm_on_the_page(flight: Flight, random: Generator) -> None:
-    """A thousand connections to the live page that ask for all samples at once and read nothing.
+    """Open a thousand connections to the live page that request all samples and read nothing.
 
-    The page answers afterwards.
+    The page must answer afterwards.
     """
     with live_page(flight) as page:
         disturb(flight, "clients", page.address, str(CONNECTIONS), str(PAGE_STORM))
@@ -362,7 +365,7 @@ def storm_on_the_page(flight: Flight, random: Generator) -> None:
 
 
 def recorder_killed_under_the_page(flight: Flight, random: Generator) -> None:
-    """The page says that its recording was interrupted; a page of the new recording shows that."""
+    """The page says that its recording was interrupted, and a new page shows the new recording."""
     with live_page(flight) as page:
         at_random(flight, random)
         flight.begin_fault()
@@ -375,7 +378,7 @@ def recorder_killed_under_the_page(flight: Flight, random: Generator) -> None:
 
 
 def ready_stamp(flight: Flight, role: str, begin: float) -> float | None:
-    """The stamp of a node's line "ready".
+    """Return the stamp of a node's line "ready".
 
     The line is received later, when the probe has discovered the node.
     """
@@ -387,9 +390,9 @@ def ready_stamp(flight: Flight, role: str, begin: float) -> float | None:
 
 
 def full_traffic(flight: Flight, role: str, begin: float) -> float | None:
-    """When the last of a node's topics had its first message.
+    """Return when the last of a node's topics had its first message.
 
-    For the recorder: when the log had a message of every topic.
+    For the recorder, this is when the log had a message of every topic.
     """
     if role == "recorder":
         return recorded_since(flight.runs[-1], 0.0)
@@ -398,7 +401,7 @@ def full_traffic(flight: Flight, role: str, begin: float) -> float | None:
 
 
 def recorded_since(run: Path, begin: float) -> float | None:
-    """When the log had a message of every topic that was sent after an instant."""
+    """Return when the log had a message of every topic that was sent after an instant."""
     firsts: dict[str, float] = {}
     for topic, record in logged(run):
         if seconds(record.publish_time) >= begin:
@@ -408,7 +411,7 @@ def recorded_since(run: Path, begin: float) -> float | None:
 
 
 def stop(role: str) -> Injection:
-    """SIGSTOP, then SIGCONT."""
+    """Stop a node with SIGSTOP, and continue it with SIGCONT."""
 
     def inject(flight: Flight, random: Generator) -> None:
         at_random(flight, random)
@@ -507,7 +510,7 @@ BAD_COUNT = 20
 
 
 def malformed(topic: str, kind: str) -> Injection:
-    """Twenty bad samples with the `frame_id` of the expected publisher."""
+    """Send twenty bad samples with the `frame_id` of the expected publisher."""
     make, reason, sentence = BAD[kind]
 
     def inject(flight: Flight, random: Generator) -> None:
@@ -542,7 +545,7 @@ def malformed(topic: str, kind: str) -> Injection:
 
 @contextmanager
 def relay(topic: str) -> Iterator[Callable[[JointState], None]]:
-    """A second publisher of a topic in a process of its own, discovered by all subscribers."""
+    """Start a second publisher of a topic in its own process, and wait until it is discovered."""
     process = Process(
         "tests.ros.flight_bringup.faults.foreign",
         "relay",
@@ -569,7 +572,7 @@ def relay(topic: str) -> Iterator[Callable[[JointState], None]]:
 
 
 def learner_killed(flight: Flight, random: Generator) -> None:
-    """The learner killed, and started again a second later."""
+    """Kill the learner, and start it again a second later."""
     at_random(flight, random)
     flight.begin_fault()
     flight.kill("learner")
@@ -580,7 +583,7 @@ def learner_killed(flight: Flight, random: Generator) -> None:
 
 
 def second_learner(flight: Flight, random: Generator) -> None:
-    """A second learner, from its first proposal on, for two seconds."""
+    """Run a second learner for two seconds after its first proposal."""
     flight.processes["learner"].wait_for("no model")  # the publisher that is locked
     until_refusal_logged_again(flight, "proposal", "conflicting publisher")
     process = flight.node("learner")
@@ -593,7 +596,7 @@ def second_learner(flight: Flight, random: Generator) -> None:
 
 
 def second(role: str, topic: str) -> Injection:
-    """A second node of the same role, which publishes for two seconds."""
+    """Run a second node of the same role, which publishes for two seconds."""
 
     def inject(flight: Flight, random: Generator) -> None:
         until_refusal_logged_again(flight, topic, "conflicting publisher")
@@ -616,7 +619,7 @@ def second(role: str, topic: str) -> Injection:
 def incompatible_qos(
     role: str, create: Callable[[Node], object], detection: Detection
 ) -> Injection:
-    """A publisher or a subscriber whose quality of service is incompatible with that of a node."""
+    """Create a publisher or a subscriber whose quality of service does not fit a node's."""
 
     def inject(flight: Flight, random: Generator) -> None:
         until_logged_again(flight, role, "quality of service", QOS_PERIOD)
@@ -648,9 +651,9 @@ stronger_qos = incompatible_qos(
 
 
 def step_of_clock(by: float) -> Injection:
-    """The system clock of all processes of the flight, set by so many seconds.
+    """Set the system clock of all processes of the flight by so many seconds.
 
-    It is corrected when all nodes have logged it.
+    It is set back when all nodes have logged the step.
     """
 
     def inject(flight: Flight, random: Generator) -> None:
@@ -676,7 +679,7 @@ def until_all_log(flight: Flight, pattern: str, begin: float) -> None:
 
 
 def starve(flight: Flight, random: Generator) -> None:
-    """All nodes on one core, together with six busy processes."""
+    """Put all nodes on one core, together with six busy processes."""
     core = max(os.sched_getaffinity(0))
     nodes = [psutil.Process(process.popen.pid) for process in flight.processes.values()]
     before = [node.cpu_affinity() for node in nodes]
@@ -704,7 +707,7 @@ def starve(flight: Flight, random: Generator) -> None:
 
 
 def full_disk(flight: Flight, random: Generator) -> None:
-    """The disk of the recorder runs full. Afterwards a new recorder uses another disk."""
+    """Fill the disk of the recorder. Afterwards a new recorder uses another disk."""
     with small_disk(flight.folder / f"disk{len(flight.runs)}", 4_000_000) as folder:
         flight.processes["recorder"].popen.terminate()
         assert flight.processes["recorder"].end() == 0
@@ -741,9 +744,9 @@ CHANGES, IN_FLIGHT = 300, 8  # requests; a service queues ten
 
 
 def parameters(flight: Flight, random: Generator) -> None:
-    """Three hundred changes of the controller's gains, half of them invalid, also the first one.
+    """Send three hundred changes of gains, half of them invalid, and the first one invalid.
 
-    Eight requests at once.
+    Eight requests are sent at once.
     """
     valid = random.random(CHANGES) < 0.5
     valid[0] = False
@@ -782,7 +785,10 @@ def parameters(flight: Flight, random: Generator) -> None:
 
 
 def invalid_change(random: Generator) -> tuple[str, object]:
-    """Out of range, not finite, read-only, unknown, of another type, or of another length."""
+    """Return a change that is out of range, not finite, read-only, unknown or of a wrong type.
+
+    It may also have a wrong length.
+    """
     gains = (("k_g", -1.0), ("k_g", math.nan), ("k_g", math.inf))
     changes = (*gains, ("rate", 200.0), ("k_gg", 1.0), ("k_g", "much"), ("beta", [1.0]))
     return changes[random.integers(len(changes))]
@@ -816,7 +822,7 @@ POSE_BENCHMARK = GUIDED | POSE_GATE
 
 
 def ends_of(topic: str) -> tuple[str, str]:
-    """Publisher and subscriber of a topic."""
+    """Return the publisher and the subscriber of a topic."""
     return PUBLISHERS[topic], CONSUMERS[topic]
 
 

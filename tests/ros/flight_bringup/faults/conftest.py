@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures of the fault tests: one flight for all faults, replaced when a fault ended it."""
+"""Provide fixtures of the fault tests.
+
+One flight is used for all faults, and replaced when a fault has ended it.
+"""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -22,7 +25,7 @@ LINES = 12
 
 
 def described(error: BaseException) -> str:
-    """An error in a line."""
+    """Return an error in one line."""
     return f"{type(error).__name__}: {' | '.join(str(error).splitlines()[:LINES])}"
 
 
@@ -63,23 +66,23 @@ def flight_domain() -> Iterator[int]:
 
 @pytest.fixture(autouse=True)
 def domain(flight_domain: int, monkeypatch: pytest.MonkeyPatch) -> int:
-    """One ROS domain for all fault tests: they share a flight."""
+    """Return the ROS domain of all fault tests, which share a flight."""
     monkeypatch.setenv("ROS_DOMAIN_ID", str(flight_domain))
     return flight_domain
 
 
 @pytest.fixture(scope="session")
 def seeds(pytestconfig: pytest.Config) -> range:
-    """One for each injection of a fault."""
+    """Return a seed for each injection of a fault."""
     first = int(pytestconfig.getoption("--faults-seed", 1))
     return range(first, first + int(pytestconfig.getoption("--faults-times", 1)))
 
 
 @pytest.fixture(scope="session")
 def draws(pytestconfig: pytest.Config) -> list[Draw]:
-    """Failures of the past and random faults, those of one kind of flight after one another.
+    """Return earlier failures and random faults, ordered by kind of flight.
 
-    None outside the campaign.
+    Outside of the campaign there are none.
     """
     first, count = (
         int(pytestconfig.getoption(f"--faults-{name}", 0)) for name in ("seed", "random")
@@ -90,7 +93,7 @@ def draws(pytestconfig: pytest.Config) -> list[Draw]:
 
 @pytest.fixture(scope="session")
 def lockstep_seeds(pytestconfig: pytest.Config) -> range:
-    """One for each lockstep flight with a random fault."""
+    """Return a seed for each lockstep flight with a random fault."""
     first, count = (
         int(pytestconfig.getoption(f"--faults-{name}", 0)) for name in ("seed", "lockstep")
     )
@@ -98,9 +101,9 @@ def lockstep_seeds(pytestconfig: pytest.Config) -> range:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """The cases of the suite.
+    """Add the cases of the suite.
 
-    All of them where benchmarks/faults.py runs the tests, with a table.
+    benchmarks/faults.py runs all of them, with a table.
     """
     if "case" in metafunc.fixturenames:
         every = metafunc.config.getoption("--faults-table", None) is not None
@@ -116,7 +119,7 @@ CAMPAIGNS = {
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the random faults where no option asks for them."""
+    """Leave out the random faults unless an option asks for them."""
     alive = [
         item
         for item in items
@@ -140,7 +143,7 @@ def record(pytestconfig: pytest.Config) -> Callable[[Row], None]:
 
 
 class Flights:
-    """The flight under test, of one kind or another. One runs at a time."""
+    """The flight under test, of one kind or another. Only one runs at a time."""
 
     def __init__(self, folder: Path, scenarios: Mapping[Kind, Scenario]) -> None:
         self._folder = folder
@@ -149,9 +152,9 @@ class Flights:
         self.all: list[Flight] = []  # including those that have ended
 
     def steady(self, kind: Kind) -> Flight:
-        """A flight that is steady and near trim.
+        """Return a flight that is steady and near trim.
 
-        It is the running one, or a new one where a fault has upset that.
+        It is the running one, or a new one if a fault has upset it.
         """
         if kind in self._running:
             with suppress(AssertionError):

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Random faults: any case at any instant, repeatable by their seed.
+"""Draw random faults: any case at any instant, repeatable by a seed.
 
-A tenth of them come two at a time.
+A tenth of them come in pairs.
 """
 
 import threading
@@ -26,7 +26,7 @@ class Draw(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The names of its cases."""
+        """Return the names of its cases."""
         return ", ".join(case.name for case in self.cases)
 
 
@@ -45,7 +45,7 @@ FOUND: tuple[tuple[int, tuple[str, ...]], ...] = (
 
 
 def together(one: Case, other: Case) -> bool:
-    """Whether each of two faults leaves the nodes that the other one needs, and a processor."""
+    """Return whether two faults leave a processor, and the nodes that the other one needs."""
     apart = all(
         a.victim not in (b.victim, *b.needs) for a, b in ((one, other), (other, one)) if a.victim
     )
@@ -55,7 +55,7 @@ def together(one: Case, other: Case) -> bool:
 
 
 def draw(seed: int) -> Draw:
-    """The faults of a seed."""
+    """Return the faults of a seed."""
     random = np.random.default_rng(seed)
     first = CASES[random.integers(len(CASES))]
     others = [case for case in CASES if together(first, case)]
@@ -65,7 +65,7 @@ def draw(seed: int) -> Draw:
 
 
 def found() -> list[Draw]:
-    """The draws of FOUND."""
+    """Return the draws of FOUND."""
     by_name = {case.name: case for case in CASES}
     return [Draw(seed, tuple(by_name[name] for name in names)) for seed, names in FOUND]
 
@@ -73,7 +73,7 @@ def found() -> list[Draw]:
 def inject(flight: Flight, draw: Draw) -> list[Flight]:
     """Inject the faults of a draw.
 
-    The flight as each of them sees it: with its own begin, end and figures.
+    Each fault has its own view of the flight, with its beginning, end and figures.
     """
     views = [copy(flight) for _ in draw.cases]
     errors: list[BaseException] = []
